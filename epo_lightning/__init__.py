@@ -1,0 +1,1 @@
+"""Energy-based potential games (EPO) for multi-agent motion forecasting."""

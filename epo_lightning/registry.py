@@ -1,0 +1,106 @@
+"""Named parts: every backbone, energy or forecaster is chosen by name, and its constructor is its schema.
+
+A part is registered where it is written::
+
+    @register("backbone", "v_lstm")
+    class VLSTM(nn.Module): ...
+
+and built from a mapping whose ``name`` selects it and whose other keys are its constructor's arguments. Packages outside
+this project add parts through the entry-point group ``epo_lightning.parts``: each entry point names a module whose import
+registers them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any, TypeVar
+
+Part = TypeVar("Part", bound=Callable[..., Any])
+
+_PARTS: dict[str, dict[str, Callable[..., Any]]] = {}
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot work: the message names the key or value, what was expected and what to do."""
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """A hint for a misspelt ``word``: the nearest of the ``known`` names, then all of them."""
+    known = sorted(known)
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return (f"did you mean {close[0]!r}? " if close else "") + "known: " + (", ".join(known) or "none")
+
+
+def register(kind: str, name: str) -> Callable[[Part], Part]:
+    """Make a class or function available as the part ``name`` of a ``kind`` (``"backbone"``, ``"solver"``, ...)."""
+
+    def add(part: Part) -> Part:
+        taken = _PARTS.setdefault(kind, {}).setdefault(name, part)
+        if taken is not part:
+            raise ValueError(f"two {kind} parts are called {name!r}: {taken!r} and {part!r}")
+        return part
+
+    return add
+
+
+@cache
+def _load_entry_points() -> None:
+    for entry in entry_points(group="epo_lightning.parts"):
+        entry.load()
+
+
+def lookup(kind: str, name: str) -> Callable[..., Any]:
+    """The part registered as ``name``.
+
+    Raises:
+        ConfigError: no such part; the message names the nearest one.
+    """
+    _load_entry_points()
+    parts = _PARTS.get(kind, {})
+    if name not in parts:
+        raise ConfigError(f"unknown {kind} {name!r}: {nearest(str(name), parts)}")
+    return parts[name]
+
+
+def check(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:
+    """Compare a part's configuration with its constructor's signature, without building it.
+
+    Args:
+        kind: the kind of part, which is also the name of its configuration group.
+        config: ``name`` and the part's keyword arguments.
+        supplied: arguments that the caller hands over in code and a configuration must not set.
+
+    Raises:
+        ConfigError: a missing ``name``, an unknown part, an unknown key (with the nearest known one) or a missing key.
+    """
+    if not config.get("name"):
+        raise ConfigError(f"{kind}.name is missing: {nearest('', _PARTS.get(kind, {}))}")
+    part = lookup(kind, config["name"])
+    schema = inspect.signature(part).parameters
+    keys = set(config) - {"name"}
+    known = set(schema) - set(supplied)
+    for key in sorted(keys - known):
+        raise ConfigError(f"unknown key {kind}.{key} for {kind} {config['name']!r}: {nearest(key, known)}")
+    required = {key for key, argument in schema.items() if argument.default is argument.empty}
+    for key in sorted(required - keys - set(supplied)):
+        raise ConfigError(f"missing key {kind}.{key} for {kind} {config['name']!r}")
+
+
+def build(kind: str, config: Mapping[str, Any], **supplied: Any) -> Any:
+    """Build the part that ``config["name"]`` selects, with the other keys and ``supplied`` as keyword arguments.
+
+    Raises:
+        ConfigError: as :func:`check`, or a value that the part refuses.
+    """
+    check(kind, config, supplied)
+    arguments = {key: value for key, value in config.items() if key != "name"}
+    try:
+        return lookup(kind, config["name"])(**arguments, **supplied)
+    except ConfigError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{kind} {config['name']!r}: {error}") from error

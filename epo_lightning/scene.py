@@ -1,0 +1,205 @@
+"""The vocabulary: what is observed, what is inferred, what is solved and what is forecast.
+
+Shapes use one alphabet everywhere:
+
+====  =========================  ======  ================================================================
+B     scenes in a batch          P       pairs of agents i < j, P = N (N - 1) / 2
+M     joint modes                G       goal candidates of an agent
+N     agents                     X = 4   state: x, y [m], heading [rad], speed [m/s]
+H     history steps              U = 2   control: acceleration [m/s^2], turn rate [rad/s]
+K     future steps               S       optimisation steps
+====  =========================  ======  ================================================================
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Self
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+X, Y, HEADING, SPEED = range(4)
+ACCELERATION, TURN_RATE = range(2)
+
+
+class _Batch:
+    """Tensors that share their leading dimension B, moved and indexed together."""
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """Apply ``function`` to every tensor, also inside mappings and tuples."""
+
+        def visit(value: Any) -> Any:
+            if isinstance(value, Tensor):
+                return function(value)
+            if isinstance(value, Mapping):
+                return {key: visit(entry) for key, entry in value.items()}
+            if isinstance(value, tuple):
+                return tuple(visit(entry) for entry in value)
+            return value
+
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        return type(self)(**{field.name: visit(getattr(self, field.name)) for field in fields})
+
+    def to(self, target: torch.device | torch.dtype | str) -> Self:
+        """Move to a device, or convert the floating-point tensors to another precision."""
+        if isinstance(target, torch.dtype):
+            return self.map(lambda tensor: tensor.to(target) if tensor.is_floating_point() else tensor)
+        return self.map(lambda tensor: tensor.to(target))
+
+    def __getitem__(self, index: Any) -> Self:
+        """Choose scenes of the batch; an integer keeps the batch dimension."""
+        if isinstance(index, int):
+            index = [index]
+        return self.map(lambda tensor: tensor[index])
+
+
+@dataclass(frozen=True)
+class Scene(_Batch):
+    """What is known of B scenes: agents' histories, their sizes, and, while learning, their futures.
+
+    Positions are in one fixed frame for the whole scene. Masks are True where an entry is real; whatever stands behind a
+    False never influences a result. A mask that is left out means that everything is real.
+
+    Attributes:
+        history: states x, y [m], heading [rad], speed [m/s]; the last step is the current one, t0.
+        dt: length of a time step [s].
+        history_mask: which history steps were observed. An agent that is present is observed at t0.
+        agent_mask: which agents exist.
+        future: observed states after t0, the first one dt later; None when forecasting.
+        future_mask: which future steps were observed.
+        goal_candidates: positions [m] that an agent may be heading for; G = 1 where the goal is given (RPI).
+        goal_mask: which candidates exist.
+        size: length and width [m].
+        subset: index of the named subset of the data that the future belongs to (RPI: executed 0, alternative 1).
+        id: which record of its data set a scene is.
+    """
+
+    history: Float[Tensor, "B N H 4"]
+    dt: float
+    history_mask: Bool[Tensor, "B N H"] | None = None
+    agent_mask: Bool[Tensor, "B N"] | None = None
+    future: Float[Tensor, "B N K 4"] | None = None
+    future_mask: Bool[Tensor, "B N K"] | None = None
+    goal_candidates: Float[Tensor, "B N G 2"] | None = None
+    goal_mask: Bool[Tensor, "B N G"] | None = None
+    size: Float[Tensor, "B N 2"] | None = None
+    subset: Int[Tensor, " B"] | None = None
+    id: Int[Tensor, " B"] | None = None
+
+    def __post_init__(self) -> None:
+        def default(name: str, shape: torch.Size) -> None:
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, torch.ones(shape, dtype=torch.bool, device=self.history.device))
+
+        default("history_mask", self.history.shape[:-1])
+        default("agent_mask", self.history.shape[:2])
+        if self.future is not None:
+            default("future_mask", self.future.shape[:-1])
+        if self.goal_candidates is not None:
+            default("goal_mask", self.goal_candidates.shape[:-1])
+
+    @property
+    def current(self) -> Float[Tensor, "B N 4"]:
+        """The states at t0."""
+        return self.history[:, :, -1]
+
+    @property
+    def finite(self) -> Bool[Tensor, " B"]:
+        """Which scenes hold finite numbers wherever their masks say that an entry is real."""
+
+        def sound(values: Tensor | None, mask: Tensor | None) -> Tensor:
+            if values is None:
+                return torch.ones(len(self.history), dtype=torch.bool, device=self.history.device)
+            bad = ~values.isfinite().all(-1)
+            bad &= self.agent_mask.view(*self.agent_mask.shape, *[1] * (bad.dim() - 2))
+            return ~(bad if mask is None else bad & mask).flatten(1).any(1)
+
+        return (
+            sound(self.history, self.history_mask)
+            & sound(self.future, self.future_mask)
+            & sound(self.goal_candidates, self.goal_mask)
+            & sound(self.size, None)
+        )
+
+
+@dataclass(frozen=True)
+class GameParameters(_Batch):
+    """The game that the network infers for every scene and mode (Section 4.2), p = (w, g), and where its solution starts.
+
+    Attributes:
+        own_weights: weight of each named feature of an agent; enters the energy squared.
+        pair_weights: weight of each named feature of a pair i < j, in the order of ``torch.triu_indices(N, N, 1)``.
+        goals: where each agent is heading [m]; None for energies without a goal feature.
+        initial_controls: the strategies from which the solver starts.
+    """
+
+    own_weights: Mapping[str, Float[Tensor, "B M N"]]
+    pair_weights: Mapping[str, Float[Tensor, "B M P"]]
+    initial_controls: Float[Tensor, "B M N K 2"]
+    goals: Float[Tensor, "B M N 2"] | None = None
+
+
+class Status(IntEnum):
+    """How the minimisation of one scene and mode went."""
+
+    SOLVED = 0
+    """Every step was taken as the method defines it."""
+    DAMPED = 1
+    """A factorisation failed at first and succeeded with more damping."""
+    STOPPED = 2
+    """A step could not be taken; the last good iterate was kept."""
+
+
+@dataclass(frozen=True)
+class Solution(_Batch):
+    """Joint strategies that a solver found, and how well.
+
+    Attributes:
+        controls: joint strategies u.
+        states: the states x_1 .. x_K that they lead to.
+        initial_energy, energy: E at the initial strategies and at ``controls``.
+        gradient_norm: Euclidean norm of dE/du at ``controls``.
+        status: a :class:`Status` per scene and mode.
+        iterates: u_0 .. u_S, when asked for.
+    """
+
+    controls: Float[Tensor, "B M N K 2"]
+    states: Float[Tensor, "B M N K 4"]
+    initial_energy: Float[Tensor, "B M"]
+    energy: Float[Tensor, "B M"]
+    gradient_norm: Float[Tensor, "B M"]
+    status: Int[Tensor, "B M"]
+    iterates: tuple[Float[Tensor, "B M N K 2"], ...] | None = None
+
+
+@dataclass(frozen=True)
+class JointForecast(_Batch):
+    """M joint futures of all agents of a scene and their probabilities.
+
+    Attributes:
+        states: futures; agents of one mode belong together.
+        probabilities: of the joint modes; sum to one.
+        agent_probabilities: of each agent's own modes, for forecasters that are marginal (per agent); the joint modes
+            are then ordered so that mode m is everyone's m-th most likely one.
+        controls: the strategies behind ``states``, where the forecaster has any.
+        initial_states: the futures of the strategies from which the solver started.
+        parameters: the inferred game.
+        solution: how the game was solved.
+        own_energy: energy by feature and agent at the solution.
+        pair_energy: energy by feature and pair at the solution.
+    """
+
+    states: Float[Tensor, "B M N K 4"]
+    probabilities: Float[Tensor, "B M"]
+    agent_probabilities: Float[Tensor, "B M N"] | None = None
+    controls: Float[Tensor, "B M N K 2"] | None = None
+    initial_states: Float[Tensor, "B M N K 4"] | None = None
+    parameters: GameParameters | None = None
+    solution: Solution | None = None
+    own_energy: Mapping[str, Float[Tensor, "B M N"]] | None = None
+    pair_energy: Mapping[str, Float[Tensor, "B M P"]] | None = None
