@@ -1,0 +1,167 @@
+"""The folder that a run leaves behind, and how to find it again.
+
+::
+
+    <run folder>/
+        config.yaml            the resolved configuration: all that is needed to continue or evaluate the run
+        run.json               who, what, when: title, experiment, budget, seed, data digest, versions, parameters, status
+        checkpoints/best.ckpt  the epoch with the smallest validation minSADE
+        checkpoints/last.ckpt  the last finished epoch, with everything that continuing needs
+        logs/metrics.csv       what was logged while training; TensorBoard's and W&B's files lie beside it
+        metrics.json           scores on the test split, written by ``evaluate`` ({"split", "data", "checkpoint", "metrics"})
+        metrics-val.json       the same on the validation split, if asked for
+
+Files are replaced as a whole: a reader, or a kill at any moment, never meets half of one. ``metrics.json`` holds no time,
+path or version, so that two equal runs give the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from epo_lightning.registry import ConfigError
+
+TRAINING, FINISHED = "training", "finished"
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write ``path`` as a whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write ``content`` as indented JSON with sorted keys, atomically."""
+    write_text(path, json.dumps(content, indent=2, sort_keys=True, allow_nan=True) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        ConfigError: the file is missing or is not JSON.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path} is not JSON ({error}); was it edited or copied by half?") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path} holds no JSON object")
+    return content
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths and records of one run."""
+
+    path: Path
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunFolder:
+        """The run in ``path``.
+
+        Raises:
+            ConfigError: there is no run; the message names the runs nearby.
+        """
+        run = cls(Path(path).expanduser())
+        if not run.path.is_dir():
+            raise ConfigError(f"no run folder {run.path}: the folder does not exist")
+        if not run.config_file.is_file() or not run.record_file.is_file():
+            below = [str(found.path) for found in discover(run.path)]
+            hint = f"; runs below it: {', '.join(below[:8])} (use runs={run.path} for all)" if below else ""
+            raise ConfigError(f"{run.path} is not a run folder: it has no config.yaml and run.json{hint}")
+        return run
+
+    @property
+    def config_file(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def record_file(self) -> Path:
+        return self.path / "run.json"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def logs(self) -> Path:
+        return self.path / "logs"
+
+    def checkpoint(self, which: str = "best") -> Path:
+        """The checkpoint called ``which``: best, last, or a path of its own."""
+        return self.checkpoints / f"{which}.ckpt" if which in ("best", "last") else Path(which).expanduser()
+
+    def metrics_file(self, split: str = "test") -> Path:
+        return self.path / ("metrics.json" if split == "test" else f"metrics-{split}.json")
+
+    @property
+    def exists(self) -> bool:
+        """Whether anything was written here."""
+        return self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The contents of run.json."""
+        return read_json(self.record_file)
+
+    @property
+    def finished(self) -> bool:
+        return self.record_file.is_file() and self.record.get("status") == FINISHED
+
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration as plain Python values.
+
+        Raises:
+            ConfigError: config.yaml is missing or damaged.
+        """
+        import yaml
+
+        try:
+            content = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(f"cannot read {self.config_file}: {error.strerror}") from error
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{self.config_file} is not YAML: {error}") from error
+        if not isinstance(content, dict):
+            raise ConfigError(f"{self.config_file} holds no configuration")
+        return content
+
+    def begin(self, config: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+        """Write the configuration, then the record: a folder with both is a run."""
+        import yaml
+
+        text = yaml.safe_dump(dict(config), sort_keys=False, default_flow_style=None, width=120)
+        write_text(self.config_file, "# The resolved configuration of this run.\n" + text)
+        write_json(self.record_file, {**record, "status": TRAINING})
+
+    def update(self, **changes: Any) -> None:
+        """Change entries of run.json."""
+        write_json(self.record_file, {**self.record, **changes})
+
+
+def discover(root: str | Path) -> Iterator[RunFolder]:
+    """All runs in or below ``root``, in the order of their paths."""
+    root = Path(root).expanduser()
+    for record in sorted(root.rglob("run.json")):
+        run = RunFolder(record.parent)
+        if run.config_file.is_file():
+            yield run
