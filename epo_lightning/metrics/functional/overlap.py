@@ -1,0 +1,134 @@
+"""Whether the most likely joint prediction lets agents run into each other (Section 5, Metrics; OR in the tables).
+
+Two definitions are in use, both on the most likely joint mode only:
+
+``jfp``
+    1 if any two agents overlap at any step, else 0 (JFP, MotionLM). A rate in [0, 1] when averaged over scenes.
+``authors``
+    the number of pairs that overlap at any step, divided by the number of agents, as the authors' code counts. With two
+    agents this is half of ``jfp``.
+
+and two shapes: ``disc`` (radius = half of the agent's length, the RPI environment) and ``box`` (oriented rectangles of
+length times width). Agents that only touch share no area and do not overlap.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.scene import HEADING
+
+Definition = Literal["jfp", "authors"]
+Shape = Literal["disc", "box"]
+
+TOUCH = 1e-6
+"""Overlaps that are less deep than this [m] are rounding errors of agents that touch."""
+
+
+def overlap_rate(
+    states: Float[Tensor, "B M N K 4"],
+    probabilities: Float[Tensor, "B M"],
+    size: Float[Tensor, "B N 2"],
+    agent_mask: Bool[Tensor, "B N"],
+    definition: str = "jfp",
+    shape: str = "disc",
+) -> Float[Tensor, " B"]:
+    """Overlaps of the most likely joint mode of each scene.
+
+    Args:
+        states: predictions of all agents at all steps, observed later or not.
+        probabilities: of the joint modes; of equally likely ones the first counts.
+        size: length and width [m].
+        agent_mask: which agents exist.
+        definition: ``jfp`` or ``authors``, see the module.
+        shape: ``disc`` or ``box``.
+
+    Returns:
+        One value per scene; NaN for a scene without agents. Where the predicted state of an agent is not finite, nobody
+        can say who overlaps: the value is infinite, so that a broken forecast cannot pass for a consistent one.
+
+    Raises:
+        ConfigError: an unknown definition or shape.
+    """
+    check_choice("definition", definition, get_args(Definition))
+    jfp, authors = overlap_rates(states, probabilities, size, agent_mask, shape)
+    return jfp if definition == "jfp" else authors
+
+
+def overlap_rates(
+    states: Float[Tensor, "B M N K 4"],
+    probabilities: Float[Tensor, "B M"],
+    size: Float[Tensor, "B N 2"],
+    agent_mask: Bool[Tensor, "B N"],
+    shape: str = "disc",
+) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
+    """Both definitions, ``jfp`` and ``authors``, at the price of one; see :func:`overlap_rate`."""
+    likely = probabilities.argmax(1)
+    chosen = states[torch.arange(len(states), device=states.device), likely]
+    pairs = overlapping_pairs(chosen, size, agent_mask, shape)
+    agents = agent_mask.sum(-1)
+    broken = (~chosen.isfinite().flatten(2).all(-1) & agent_mask).any(-1)
+
+    def valid(rate: Tensor) -> Tensor:
+        return rate.to(states.dtype).masked_fill(broken, torch.inf).masked_fill(agents == 0, torch.nan)
+
+    return valid(pairs.any(-1)), valid(pairs.sum(-1) / agents)
+
+
+def overlapping_pairs(
+    states: Float[Tensor, "B N K 4"], size: Float[Tensor, "B N 2"], agent_mask: Bool[Tensor, "B N"], shape: str = "disc"
+) -> Bool[Tensor, "B P"]:
+    """Which pairs i < j, in the order of ``torch.triu_indices(N, N, 1)``, overlap at any step.
+
+    Raises:
+        ConfigError: an unknown shape.
+    """
+    check_choice("shape", shape, get_args(Shape))
+    first, second = torch.triu_indices(states.shape[1], states.shape[1], 1, device=states.device)
+    overlap = _discs_overlap if shape == "disc" else _boxes_overlap
+    at_step = overlap(states[:, first], states[:, second], size[:, first, None], size[:, second, None])
+    return at_step.any(-1) & agent_mask[:, first] & agent_mask[:, second]
+
+
+def _discs_overlap(
+    a: Float[Tensor, "B P K 4"],
+    b: Float[Tensor, "B P K 4"],
+    size_a: Float[Tensor, "B P 1 2"],
+    size_b: Float[Tensor, "B P 1 2"],
+) -> Bool[Tensor, "B P K"]:
+    """Centres nearer than the sum of the radii."""
+    distance = torch.linalg.vector_norm(a[..., :2] - b[..., :2], dim=-1)
+    return distance < (size_a[..., 0] + size_b[..., 0]) / 2 - TOUCH
+
+
+def _boxes_overlap(
+    a: Float[Tensor, "B P K 4"],
+    b: Float[Tensor, "B P K 4"],
+    size_a: Float[Tensor, "B P 1 2"],
+    size_b: Float[Tensor, "B P 1 2"],
+) -> Bool[Tensor, "B P K"]:
+    """Separating axes: two rectangles are apart exactly if their shadows on one of their four sides' directions are."""
+    axes_a, axes_b = _axes(a[..., HEADING]), _axes(b[..., HEADING])
+    directions = torch.cat([axes_a, axes_b], dim=-2)  # B P K 4 2
+    offset = b[..., :2] - a[..., :2]
+    between = torch.einsum("bpkdx,bpkx->bpkd", directions, offset).abs()
+    shadow_a = torch.einsum("bpkdx,bpkex,bpe->bpkde", directions, axes_a, size_a[:, :, 0] / 2).abs().sum(-1)
+    shadow_b = torch.einsum("bpkdx,bpkex,bpe->bpkde", directions, axes_b, size_b[:, :, 0] / 2).abs().sum(-1)
+    return (between < shadow_a + shadow_b - TOUCH).all(-1)
+
+
+def _axes(heading: Float[Tensor, "B P K"]) -> Float[Tensor, "B P K 2 2"]:
+    """Unit vectors along and across an agent."""
+    cos, sin = heading.cos(), heading.sin()
+    return torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], -2)
+
+
+def check_choice(what: str, value: str, known: tuple[str, ...]) -> None:
+    """Refuse a value that is none of the known ones."""
+    if value not in known:
+        raise ConfigError(f"unknown {what} {value!r} of an overlap rate: {nearest(value, known)}")
