@@ -50,41 +50,50 @@ class Unicycle:
         self, initial: Float[Tensor, "*#batch 4"], controls: Float[Tensor, "*batch K 2"], dt: float
     ) -> Float[Tensor, "*batch K 4"]:
         """The states x_1 .. x_K that piecewise constant controls u_0 .. u_{K-1} lead to from x_0."""
-        beta = _BETA[self.integrator]
-        # Node l = 0 .. K: heading and speed before the first and after every step.
         start = initial[..., None, :].expand(*controls.shape[:-2], 1, 4)
         scan = dt * controls.cumsum(-2)
-        speed = torch.cat((start[..., SPEED], start[..., SPEED] + scan[..., ACCELERATION]), -1)
-        heading = torch.cat((start[..., HEADING], start[..., HEADING] + scan[..., TURN_RATE]), -1)
-        velocity = speed[..., None] * _direction(heading)
-        step = beta * velocity[..., :-1, :] + (1.0 - beta) * velocity[..., 1:, :]
-        position = start[..., :2] + dt * step.cumsum(-2)
-        return torch.cat((position, heading[..., 1:, None], speed[..., 1:, None]), -1)
+        heading = start[..., HEADING] + scan[..., TURN_RATE]
+        speed = start[..., SPEED] + scan[..., ACCELERATION]
+        # Velocities at the nodes l = 0 .. K: before the first step and after every step.
+        before = start[..., SPEED, None] * _direction(start[..., HEADING])
+        velocity = torch.cat((before, speed[..., None] * _direction(heading)), -2)
+        position = start[..., :2] + self._travel(velocity, dt)
+        return torch.cat((position, heading[..., None], speed[..., None]), -1)
 
-    def position_sensitivity(
+    def tangent(
+        self, states: Float[Tensor, "*batch K 4"], direction: Float[Tensor, "D *batch K 2"], dt: float
+    ) -> Float[Tensor, "D *batch K 4"]:
+        """How the states that :meth:`rollout` returned change along D directions of the controls."""
+        scan = dt * direction.cumsum(-2)
+        by_heading, by_speed = scan[..., TURN_RATE, None], scan[..., ACCELERATION, None]
+        ahead = _direction(states[..., HEADING])
+        velocity = by_speed * ahead + states[..., SPEED, None] * by_heading * _turn_left(ahead)
+        position = self._travel(torch.cat((torch.zeros_like(velocity[..., :1, :]), velocity), -2), dt)
+        return torch.cat((position, by_heading, by_speed), -1)
+
+    def _travel(self, velocity: Float[Tensor, "*batch K+1 2"], dt: float) -> Float[Tensor, "*batch K 2"]:
+        """Way covered up to every step, from the velocities at the nodes."""
+        beta = _BETA[self.integrator]
+        return dt * (beta * velocity[..., :-1, :] + (1.0 - beta) * velocity[..., 1:, :]).cumsum(-2)
+
+    def anchors(
         self, states: Float[Tensor, "*batch K 4"], initial: Float[Tensor, "*#batch 4"], dt: float
-    ) -> Float[Tensor, "*batch K 2 K 2"]:
-        """d p_k / d u_j in closed form, for positions k = 1 .. K (rows) and controls j = 0 .. K-1 (columns).
+    ) -> tuple[Float[Tensor, "*batch K 2 2"], Float[Tensor, "*batch K 2 2"]]:
+        """Sensitivities of positions in closed form: d p_k / d u_j = tip_k - root_j for j < k, zero otherwise.
 
-        A turn rate at step j rotates everything that is travelled after node j + 1 about that node, and an acceleration
-        stretches it along the headings: with q_k = dt sum_l e_l weighted as the positions are,
+        A turn rate at step j rotates all that is travelled after node j + 1 about that node, and an acceleration stretches
+        it along the headings: with q_k = dt sum_l e_l weighted as the positions are,
 
             d p_k / d omega_j = dt [R90 (p_k - p_{j+1}) + (1 - beta) dt v_{j+1} R90 e_{j+1}],
-            d p_k / d a_j     = dt [     q_k - q_{j+1}  + (1 - beta) dt           e_{j+1}],      k > j.
+            d p_k / d a_j     = dt [     q_k - q_{j+1}  + (1 - beta) dt           e_{j+1}].
+
+        Returns:
+            tips of positions k = 1 .. K and roots of controls j = 0 .. K-1; the last dimensions are control and x, y.
         """
-        beta = _BETA[self.integrator]
-        position, heading, speed = states[..., :2], states[..., HEADING], states[..., SPEED]
-        direction = _direction(heading)
-        before = torch.cat((_direction(initial[..., None, HEADING]).expand_as(direction[..., :1, :]), direction), -2)
-        distance = dt * (beta * before[..., :-1, :] + (1.0 - beta) * before[..., 1:, :]).cumsum(-2)
-        edge = (1.0 - beta) * dt * direction
-
-        def since(path: Tensor, edge: Tensor) -> Tensor:
-            return path[..., :, None, :] - (path - edge)[..., None, :, :]
-
-        by_turn_rate = _turn_left(since(position, speed[..., None] * edge))
-        by_acceleration = since(distance, edge)
-        steps = states.shape[-2]
-        reached = torch.ones(steps, steps, dtype=torch.bool, device=states.device).tril()
-        sensitivity = dt * torch.stack((by_acceleration, by_turn_rate), -1)  # [*batch K K 2 2]: row, column, xy, u
-        return sensitivity.mul(reached[:, :, None, None]).movedim(-2, -3)
+        ahead = _direction(states[..., HEADING])
+        before = _direction(initial[..., None, HEADING]).expand_as(ahead[..., :1, :])
+        position, distance = states[..., :2], self._travel(torch.cat((before, ahead), -2), dt)
+        edge = (1.0 - _BETA[self.integrator]) * dt * ahead
+        tip = torch.stack((distance, _turn_left(position)), -2)
+        root = torch.stack((distance - edge, _turn_left(position - states[..., SPEED, None] * edge)), -2)
+        return dt * tip, dt * root

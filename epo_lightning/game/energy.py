@@ -102,6 +102,39 @@ class Energy:
             residuals[name] = self.pair_weight(scene, parameters, name)[..., None] * depth
         return residuals
 
+    def linearisation(
+        self,
+        scene: Scene,
+        parameters: GameParameters,
+        controls: Float[Tensor, "B M N K 2"],
+        directions: Float[Tensor, "D B M N K 2"],
+    ) -> tuple[Float[Tensor, "B M R"], Float[Tensor, "D B M R"]]:
+        """All residuals r in one row, and their change J v along D directions v of the controls.
+
+        Both are differentiable with respect to controls and parameters; hinges keep their side.
+        """
+        controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
+        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
+        moved = self.dynamics.tangent(states, directions, scene.dt)
+        goals = self.goals(scene, parameters)
+        still = None if goals is None else torch.zeros_like(goals)
+        residuals, changes = [], []
+        for name, feature in self.own_features.items():
+            weight = self.own_weight(scene, parameters, name)[..., None]
+            value, slope = self.shape(feature, signal(feature, states, controls, goals, scene.dt))
+            residuals.append(weight * value)
+            changes.append(weight * slope * signal(feature, moved, directions, still, scene.dt))
+        if self.pair:
+            first, second = pairs(controls.shape[2], controls.device)
+            depth, normal, active = self.closeness(scene, states)
+            apart = moved[..., first, :, :2] - moved[..., second, :, :2]
+            closing = -torch.where(active, (normal * apart).sum(-1), 0.0)
+            for name in self.pair:
+                weight = self.pair_weight(scene, parameters, name)[..., None]
+                residuals.append(weight * depth)
+                changes.append(weight * closing)
+        return torch.cat([r.flatten(2) for r in residuals], -1), torch.cat([c.flatten(3) for c in changes], -1)
+
     def terms(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> dict[str, Float[Tensor, "B M _"]]:

@@ -30,9 +30,7 @@ def normal_equations(
     gradient = torch.zeros_like(controls)
     block = controls.new_zeros(batch, modes, agents, 2, steps, steps)
     matrix = controls.new_zeros(batch, modes, agents, steps, 2, agents, steps, 2)
-    sensitivity = None
-    if energy.needs_goals or (energy.pair and agents > 1):
-        sensitivity = energy.dynamics.position_sensitivity(states, initial, dt).flatten(-2)  # [B M N K 2 (K 2)]
+    tip, root = energy.dynamics.anchors(states, initial, dt)
 
     for name, feature in energy.own_features.items():
         value, slope = energy.shape(feature, signal(feature, states, controls, goals, dt))
@@ -59,34 +57,38 @@ def normal_equations(
                 gradient[..., ACCELERATION] += dt * pull.flip(-1).cumsum(-1).flip(-1)
                 block[..., ACCELERATION, :, :] += since[..., torch.maximum(step[:, None], step)]
             case Source.FINAL_POSITION:
-                assert sensitivity is not None
-                last = sensitivity[..., -1, :, :]  # [B M N 2 (K 2)]
-                gradient += (last.mT @ pull[..., None]).view_as(controls)
-                scaled = stiffness.sqrt()[..., None] * last
+                jacobian = tip[..., -1:, :, :] - root  # [B M N K 2 xy]
+                gradient += (jacobian * pull[..., None, None, :]).sum(-1)
+                rows = (jacobian * stiffness.sqrt()[..., None, None, :]).flatten(3, 4)
                 for agent in range(agents):
-                    rows = scaled[:, :, agent]
-                    matrix[:, :, agent, :, :, agent] += (rows.mT @ rows).view(batch, modes, steps, 2, steps, 2)
+                    product = rows[:, :, agent] @ rows[:, :, agent].mT
+                    matrix[:, :, agent, :, :, agent] += product.view(batch, modes, steps, 2, steps, 2)
 
     for agent in range(agents):
         for channel in range(2):
             matrix[:, :, agent, :, channel, agent, :, channel] += block[:, :, agent, channel]
 
-    if energy.pair and agents > 1:
-        assert sensitivity is not None
+    if energy.pair:
         depth, normal, active = energy.closeness(scene, states)
-        weight = sum(energy.pair_weight(scene, parameters, name).square() for name in energy.pair)
-        assert isinstance(weight, Tensor)
+        weight = torch.stack([energy.pair_weight(scene, parameters, name).square() for name in energy.pair]).sum(0)
         strength = weight.sqrt()[..., None] * active  # [B M P K]
-        for pair, (i, j) in enumerate(zip(*(index.tolist() for index in pairs(agents)), strict=True)):
-            # One row per step: how the overlap deepens with the controls of i and of j.
-            towards = (strength[:, :, pair, :, None] * normal[:, :, pair])[..., None, :]  # [B M K 1 2]
-            row_i = -(towards @ sensitivity[:, :, i]).squeeze(-2)  # [B M K (K 2)]
-            row_j = (towards @ sensitivity[:, :, j]).squeeze(-2)
+        reached = torch.ones(steps, steps, dtype=controls.dtype, device=controls.device).tril()[..., None]
+        for pair, both in enumerate(zip(*(index.tolist() for index in pairs(agents)), strict=True)):
+            # One row per step: how the overlap of the pair deepens with the controls of both, [B M K, 2 agents, K, 2].
+            away = strength[:, :, pair, :, None] * normal[:, :, pair]
+            rows = []
+            for agent, along in zip(both, (-away, away), strict=True):
+                at_tip = (along[..., None, :] * tip[:, :, agent]).sum(-1)  # [B M K 2]
+                at_root = along @ root[:, :, agent].flatten(2, 3).mT  # [B M K (K 2)]
+                rows.append((at_tip[..., None, :] - at_root.view(*at_tip.shape[:3], steps, 2)) * reached)
+            jacobian = torch.stack(rows, 3).flatten(3)
             residual = (strength[:, :, pair] * depth[:, :, pair])[..., None]
-            for a, row_a in ((i, row_i), (j, row_j)):
-                gradient[:, :, a] += (row_a.mT @ residual).view(batch, modes, steps, 2)
-                for b, row_b in ((i, row_i), (j, row_j)):
-                    matrix[:, :, a, :, :, b] += (row_a.mT @ row_b).view(batch, modes, steps, 2, steps, 2)
+            pull = (jacobian.mT @ residual).view(batch, modes, 2, steps, 2)
+            product = (jacobian.mT @ jacobian).view(batch, modes, 2, steps, 2, 2, steps, 2)
+            for a, i in enumerate(both):
+                gradient[:, :, i] += pull[:, :, a]
+                for b, j in enumerate(both):
+                    matrix[:, :, i, :, :, j] += product[:, :, a, :, :, b]
 
     size = agents * steps * 2
     return gradient, matrix.view(batch, modes, size, size)

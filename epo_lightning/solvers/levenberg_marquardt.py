@@ -9,7 +9,7 @@ mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
 
     phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
 
-to which v itself is added for u. J mu and J d are forward-mode products, so this holds for any residuals.
+to which v itself is added for u.
 """
 
 from __future__ import annotations
@@ -124,14 +124,13 @@ def _energy_and_gradient_norm(
 
 
 def _factorise(matrix: Tensor, damping: float, absent: Tensor) -> tuple[Tensor, Tensor]:
-    """Cholesky factors of matrix + damping I and a :class:`Status` per sample.
+    """Cholesky factors of matrix + damping I, which overwrites the matrix, and a :class:`Status` per sample.
 
     Unknowns of absent agents get a unit diagonal, so that they are regular even without damping. A sample that has no
     factor at any damping gets the identity.
     """
-    damped = matrix.clone()
-    damped.diagonal(dim1=-2, dim2=-1).add_(damping).masked_fill_(absent, 1.0)
-    factor, info = torch.linalg.cholesky_ex(damped)
+    matrix.diagonal(dim1=-2, dim2=-1).add_(damping).masked_fill_(absent, 1.0)
+    factor, info = torch.linalg.cholesky_ex(matrix)
     failed = info != 0
     status = torch.where(failed, Status.STOPPED, Status.SOLVED)
     raised = max(damping, _LEAST_RAISED_DAMPING)
@@ -141,7 +140,7 @@ def _factorise(matrix: Tensor, damping: float, absent: Tensor) -> tuple[Tensor, 
         if len(where[0]) == 0:
             return factor, status
         raised *= 10.0
-        again = damped[where]
+        again = matrix[where]
         again.diagonal(dim1=-2, dim2=-1).add_(raised)
         again_factor, again_info = torch.linalg.cholesky_ex(again)
         solved = tuple(index[again_info == 0] for index in where)
@@ -153,7 +152,9 @@ def _factorise(matrix: Tensor, damping: float, absent: Tensor) -> tuple[Tensor, 
 
 
 def _solve(factor: Tensor, right: Tensor) -> Tensor:
-    return torch.cholesky_solve(right.flatten(2)[..., None], factor)[..., 0].view_as(right)
+    # Two triangular solves: `cholesky_solve` would copy the factors first.
+    half = torch.linalg.solve_triangular(factor, right.flatten(2)[..., None], upper=False)
+    return torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0].view_as(right)
 
 
 class _Step(torch.autograd.Function):
@@ -194,13 +195,8 @@ class _Step(torch.autograd.Function):
         with torch.enable_grad():
             controls = controls.detach().requires_grad_()
             tensors = [tensor.detach().requires_grad_() for tensor in tensors]
-            parameters = rebuild(tensors)
-
-            def residuals(controls: Tensor) -> Tensor:
-                return torch.cat([r.flatten(2) for r in energy.residuals(scene, parameters, controls).values()], -1)
-
-            value, along_adjoint = torch.func.jvp(residuals, (controls,), (adjoint,))
-            _, along_step = torch.func.jvp(residuals, (controls,), (step,))
-            phi = -(along_adjoint * (value + along_step)).sum()
+            directions = torch.stack((adjoint, step))
+            residuals, (along_adjoint, along_step) = energy.linearisation(scene, rebuild(tensors), controls, directions)
+            phi = -(along_adjoint * (residuals + along_step)).sum()
             by_controls, *by_tensors = torch.autograd.grad(phi, [controls, *tensors], materialize_grads=True)
         return None, None, None, None, None, cotangent + by_controls, *by_tensors
