@@ -1,1 +1,54 @@
-"""Energy-based potential games (EPO) for multi-agent motion forecasting."""
+"""Energy-based potential games (EPO) for multi-agent motion forecasting.
+
+The layer on plain tensors::
+
+    from epo_lightning import Energy, GameParameters, LevenbergMarquardt, Scene
+
+A trained forecaster from any folder::
+
+    forecaster = epo_lightning.load("RUN/checkpoints/best.ckpt")
+    forecast = forecaster.predict(scene)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from epo_lightning.forecasters import load
+    from epo_lightning.game.dynamics import Unicycle
+    from epo_lightning.game.energy import Energy
+    from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
+    from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
+
+_HOMES = {
+    "load": "forecasters",
+    "Unicycle": "game.dynamics",
+    "Energy": "game.energy",
+    "GameParameters": "scene",
+    "JointForecast": "scene",
+    "Scene": "scene",
+    "Solution": "scene",
+    "Status": "scene",
+    "LevenbergMarquardt": "solvers.levenberg_marquardt",
+}
+
+__all__ = [
+    "Energy",
+    "GameParameters",
+    "JointForecast",
+    "LevenbergMarquardt",
+    "Scene",
+    "Solution",
+    "Status",
+    "Unicycle",
+    "load",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # Loaded when first asked for, so that `epo --help` does not wait for torch.
+    if name in _HOMES:
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

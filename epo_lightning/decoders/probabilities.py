@@ -1,0 +1,40 @@
+"""Scene probability decoding: how likely each joint future is."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from epo_lightning.decoders.mlp import MLP
+
+
+class SceneProbabilities(nn.Module):
+    """phi_prob: probabilities of the M joint futures from all agents' features and all futures (Section 4.4).
+
+    The paper concatenates the features and trajectories of all agents and applies a linear layer. Here that layer has the
+    same block for every agent, so its result is a sum over agents: any number of agents, in any order, with any padding.
+    The futures are read as positions relative to the agent's current one and are not trained through this decoder.
+
+    Args:
+        width: size of the agent features.
+        modes: number M of joint modes.
+        horizon: number K of future steps.
+    """
+
+    def __init__(self, width: int, modes: int, horizon: int) -> None:
+        super().__init__()
+        self.agent = nn.Linear(width + modes * horizon * 2, 16 * modes)
+        self.scene = MLP(16 * modes, 16 * modes, modes, layers=2, norm="batch")
+
+    def forward(
+        self,
+        z: Float[Tensor, "B N D"],
+        positions: Float[Tensor, "B M N K 2"],
+        current: Float[Tensor, "B N 2"],
+        mask: Bool[Tensor, "B N"],
+    ) -> Float[Tensor, "B M"]:
+        """Probabilities, which sum to one over the modes."""
+        travelled = (positions.detach() - current[:, None, :, None]).transpose(1, 2).flatten(2)
+        agents = self.agent(torch.cat((z, travelled), -1))
+        return self.scene(torch.where(mask[..., None], agents, 0.0).sum(1)).softmax(-1)

@@ -1,0 +1,31 @@
+"""Trajectory decoding: futures of each agent on its own, as the marginal baselines predict them."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from epo_lightning.decoders.mlp import MLP
+
+
+class Trajectories(nn.Module):
+    """M futures of an agent and their marginal probabilities from the agent's feature z_i, shared by all agents.
+
+    Args:
+        width: size of the agent features.
+        modes: number M of modes of each agent.
+        horizon: number K of future steps.
+    """
+
+    def __init__(self, width: int, modes: int, horizon: int) -> None:
+        super().__init__()
+        self.modes, self.horizon = modes, horizon
+        self.positions = MLP(width, 64, modes * horizon * 2, norm="layer")
+        self.logits = MLP(width, 64, modes, norm="layer")
+
+    def forward(
+        self, z: Float[Tensor, "B N D"], current: Float[Tensor, "B N 2"]
+    ) -> tuple[Float[Tensor, "B M N K 2"], Float[Tensor, "B M N"]]:
+        """Positions [m] and each agent's probabilities, which sum to one over the modes."""
+        travelled = self.positions(z).unflatten(-1, (self.modes, self.horizon, 2)).transpose(1, 2)
+        return current[:, None, :, None] + travelled, self.logits(z).softmax(-1).transpose(1, 2)

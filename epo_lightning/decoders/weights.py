@@ -1,0 +1,62 @@
+"""Weight decoding: how much each agent, and each pair of agents, cares about every named feature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from epo_lightning.decoders.mlp import MLP
+from epo_lightning.game.energy import pairs
+
+
+def _by_name(weights: Float[Tensor, "B R M*F"], names: Sequence[str], modes: int) -> dict[str, Float[Tensor, "B M R"]]:
+    per_mode = weights.unflatten(-1, (modes, len(names))).transpose(1, 2)
+    return dict(zip(names, per_mode.unbind(-1), strict=True))
+
+
+class OwnWeights(nn.Module):
+    """phi_own: weights W_i of an agent's own features from that agent's feature z_i alone, shared by all agents.
+
+    Args:
+        width: size of the agent features.
+        modes: number M of joint modes.
+        features: names of the own features.
+        start: weight that a network output of zero stands for.
+    """
+
+    def __init__(self, width: int, modes: int, features: Sequence[str], start: float = 1.0) -> None:
+        super().__init__()
+        self.modes, self.features, self.start = modes, tuple(features), start
+        self.mlp = MLP(width, 64, modes * len(self.features), norm="batch")
+
+    def forward(self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> dict[str, Float[Tensor, "B M N"]]:
+        """Weights by feature name."""
+        return _by_name(self.start + self.mlp(z, mask), self.features, self.modes)
+
+
+class PairWeights(nn.Module):
+    """phi_pair: interaction weights of a pair from the features of both agents, shared by all pairs.
+
+    For two agents this is the paper's decoder on the concatenation of all agent features. For more agents the paper
+    concatenates all N of them, which ties a model to one N; a decoder per pair does not.
+
+    Args:
+        width: size of the agent features.
+        modes: number M of joint modes.
+        features: names of the pair features.
+        start: weight that a network output of zero stands for.
+    """
+
+    def __init__(self, width: int, modes: int, features: Sequence[str], start: float = 3.0) -> None:
+        super().__init__()
+        self.modes, self.features, self.start = modes, tuple(features), start
+        self.mlp = MLP(2 * width, 64, modes * len(self.features), norm="layer")
+
+    def forward(self, z: Float[Tensor, "B N D"]) -> dict[str, Float[Tensor, "B M P"]]:
+        """Weights by feature name."""
+        first, second = pairs(z.shape[1], z.device)
+        both = torch.cat((z[:, first], z[:, second]), -1)
+        return _by_name(self.start + self.mlp(both), self.features, self.modes)

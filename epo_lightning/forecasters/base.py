@@ -1,0 +1,159 @@
+"""What all forecasters share: how they are trained, measured, saved and asked."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from lightning import LightningModule
+from torch import Tensor
+
+from epo_lightning.metrics import ForecastMetrics
+from epo_lightning.optimizers import Adam
+from epo_lightning.scene import JointForecast, Scene
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a data set asks of every forecaster.
+
+    Attributes:
+        horizon: number K of future steps.
+        dt: length of a time step [s].
+        subsets: names of the subsets of the data that metrics are also reported for.
+        shape: agents' outline in the overlap rates, ``disc`` or ``box``.
+    """
+
+    horizon: int
+    dt: float
+    subsets: tuple[str, ...] = ()
+    shape: str = "disc"
+
+
+class Forecaster(LightningModule):
+    """A model from a :class:`Scene` to a :class:`JointForecast`, as a LightningModule.
+
+    A subclass defines ``forward(scene)`` and ``losses(scene, forecast)``; their weighted sum is minimised, and all of them
+    are logged. Validation and test metrics are those of :class:`~epo_lightning.metrics.ForecastMetrics`.
+
+    Args:
+        task: what the data asks for.
+        optimizer: how parameters are trained.
+    """
+
+    configuration: dict[str, Any]
+    """The configuration this forecaster was built from; travels in every checkpoint."""
+
+    def __init__(self, task: Task, optimizer: Adam) -> None:
+        super().__init__()
+        self.task = task
+        self.optimizer = optimizer
+        self.val_metrics = ForecastMetrics(task.subsets, task.shape)
+        self.test_metrics = ForecastMetrics(task.subsets, task.shape)
+
+    def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
+        """Weight and value of every term of the training objective (Eq. 12)."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def predict(self, scene: Scene) -> JointForecast:
+        """Forecast in evaluation mode, with everything that explains the forecast.
+
+        A scene that holds non-finite numbers is answered with NaN, with a warning that names it, and leaves the forecasts of
+        the others as they are.
+
+        Raises:
+            ValueError: the scene does not fit the data that this forecaster was trained for.
+        """
+        if abs(scene.dt - self.task.dt) > 1e-6:
+            raise ValueError(f"the scene has dt = {scene.dt} s, but this forecaster was built for {self.task.dt} s")
+        broken = (~scene.finite).nonzero().flatten().tolist()
+        if broken:
+            warnings.warn(
+                f"non-finite numbers in scene(s) {broken} of the batch: their forecasts are NaN", stacklevel=2
+            )
+        training = self.training
+        self.eval()
+        try:
+            reference = next(self.parameters(), torch.zeros(0))
+            scene = scene.to(reference.device).to(reference.dtype)
+            forecast = self.explain(scene, self(scene))
+        finally:
+            self.train(training)
+        return forecast.map(lambda tensor: _blank(tensor, broken)) if broken else forecast
+
+    def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
+        """Add what is of interest to a reader but not to training."""
+        return forecast
+
+    def training_step(self, scene: Scene, _: int) -> Tensor:
+        terms = self.losses(scene, self(scene))
+        total = torch.stack([weight * value for weight, value in terms.values()]).sum()
+        values = {f"train/{name}": value.detach() for name, (_, value) in terms.items()}
+        size = len(scene.history)
+        self.log_dict({"train/loss": total.detach(), **values}, on_step=False, on_epoch=True, batch_size=size)
+        return total
+
+    def validation_step(self, scene: Scene, _: int) -> None:
+        self.val_metrics.update(self(scene), scene)
+
+    def on_validation_epoch_end(self) -> None:
+        self._log_metrics("val", self.val_metrics)
+
+    def test_step(self, scene: Scene, _: int) -> None:
+        self.test_metrics.update(self(scene), scene)
+
+    def on_test_epoch_end(self) -> None:
+        self._log_metrics("test", self.test_metrics)
+
+    def _log_metrics(self, split: str, metrics: ForecastMetrics) -> None:
+        self.log_dict({f"{split}/{name}": value for name, value in metrics.compute().items()})
+        metrics.reset()
+
+    def configure_optimizers(self) -> Any:
+        parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
+        if not parameters:
+            return None
+        return self.optimizer.configure(parameters, self.trainer.estimated_stepping_batches)
+
+    def configure_gradient_clipping(self, *_: Any, **__: Any) -> None:
+        """Clip by the optimizer's own limit, so that a run's recipe is in one place."""
+        if self.optimizer.clip is not None:
+            torch.nn.utils.clip_grad_norm_(self.parameters(), self.optimizer.clip)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["configuration"] = self.configuration
+
+
+def observed_future(scene: Scene) -> tuple[Tensor, Bool[Tensor, "B N K"]]:
+    """The futures that a forecaster learns from, and which of their steps are real.
+
+    Raises:
+        ValueError: the scene has no future.
+    """
+    if scene.future is None or scene.future_mask is None:
+        raise ValueError("learning needs scene.future, which is None")
+    return scene.future, scene.future_mask & scene.agent_mask[..., None]
+
+
+def weights_of(weights: Mapping[str, float], names: tuple[str, ...]) -> dict[str, float]:
+    """The loss weights lambda, all of them and no others.
+
+    Raises:
+        ValueError: a missing or an unknown name.
+    """
+    if set(weights) != set(names):
+        raise ValueError(f"loss_weights must name {list(names)}, not {sorted(weights)}")
+    return dict(weights)
+
+
+def _blank(tensor: Tensor, scenes: list[int]) -> Tensor:
+    if not tensor.is_floating_point():
+        return tensor
+    tensor = tensor.clone()
+    tensor[scenes] = torch.nan
+    return tensor

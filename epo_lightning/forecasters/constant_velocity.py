@@ -1,0 +1,33 @@
+"""The kinematic baseline: everybody goes on as they are."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from epo_lightning.forecasters.base import Forecaster, Task
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.optimizers import Adam
+from epo_lightning.registry import register
+from epo_lightning.scene import JointForecast, Scene
+
+
+@register("forecaster", "constant_velocity")
+class ConstantVelocity(Forecaster):
+    """Const. Vel.: one joint future, controls of zero (Section 5, "Baselines"). Nothing is learned."""
+
+    def __init__(self, task: Task, optimizer: Adam, dynamics: Unicycle) -> None:
+        super().__init__(task, optimizer)
+        self.dynamics = dynamics
+
+    def forward(self, scene: Scene) -> JointForecast:
+        batch, agents = scene.agent_mask.shape
+        controls = scene.history.new_zeros(batch, 1, agents, self.task.horizon, 2)
+        return JointForecast(
+            states=self.dynamics.rollout(scene.current[:, None], controls, scene.dt),
+            probabilities=scene.history.new_ones(batch, 1),
+            controls=controls,
+        )
+
+    def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
+        return {"imitation": (1.0, torch.zeros((), device=scene.history.device))}

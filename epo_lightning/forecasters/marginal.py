@@ -1,0 +1,69 @@
+"""The marginal baselines: every agent's futures on their own (V-LSTM, VIBES, HiVT-M)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from epo_lightning import losses
+from epo_lightning.decoders.trajectories import Trajectories
+from epo_lightning.forecasters.base import Forecaster, Task, observed_future, weights_of
+from epo_lightning.metrics.functional import marginal_to_joint
+from epo_lightning.optimizers import Adam
+from epo_lightning.registry import register
+from epo_lightning.scene import HEADING, JointForecast, Scene
+
+
+@register("forecaster", "marginal")
+class Marginal(Forecaster):
+    """Trajectories per agent, trained by minADE and a classification loss per agent (Section 5, "Baselines").
+
+    Joint futures are made afterwards: each agent's modes are ordered by probability, and joint mode m is everyone's m-th.
+
+    Args:
+        backbone: the observation encoder.
+        modes: number M of modes.
+        loss_weights: lambda of ``imitation`` and ``probability``.
+    """
+
+    def __init__(
+        self, task: Task, optimizer: Adam, backbone: nn.Module, modes: int, loss_weights: Mapping[str, float]
+    ) -> None:
+        super().__init__(task, optimizer)
+        self.backbone = backbone
+        self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))
+        self.decoder = Trajectories(backbone.width, modes, task.horizon)
+
+    def forward(self, scene: Scene) -> JointForecast:
+        current = scene.current.where(scene.agent_mask[..., None], 0.0)
+        positions, probabilities = self.decoder(self.backbone(scene), current[..., :2])
+        states, probabilities = marginal_to_joint(_with_motion(positions, current, scene.dt), probabilities)
+        joint = probabilities.where(scene.agent_mask[:, None], 1.0).prod(-1)
+        return JointForecast(
+            states=states,
+            probabilities=joint / joint.sum(1, keepdim=True),
+            agent_probabilities=probabilities,
+        )
+
+    def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
+        future, mask = observed_future(scene)
+        distance = losses.distances(forecast.states[..., :2], future, mask)
+        imitation, mode = losses.marginal_imitation(distance, mask)
+        assert forecast.agent_probabilities is not None
+        probability = losses.marginal_probability(forecast.agent_probabilities, mode, mask)
+        return {
+            "imitation": (self.loss_weights["imitation"], imitation),
+            "probability": (self.loss_weights["probability"], probability),
+        }
+
+
+def _with_motion(positions: Tensor, current: Tensor, dt: float) -> Tensor:
+    """States from positions: heading and speed of the way from each step to the next; a standing agent keeps its heading."""
+    before = torch.cat((current[:, None, :, None, :2].expand_as(positions[..., :1, :]), positions[..., :-1, :]), -2)
+    travelled = (positions - before).detach()
+    length = travelled.norm(dim=-1)
+    heading = torch.atan2(travelled[..., 1], travelled[..., 0])
+    heading = torch.where(length > 1e-6, heading, current[:, None, :, None, HEADING])
+    return torch.cat((positions, heading[..., None], length[..., None] / dt), -1)

@@ -1,0 +1,70 @@
+"""The scene-consistent baselines: joint controls straight from the network (+SC)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+
+from epo_lightning import losses
+from epo_lightning.decoders.probabilities import SceneProbabilities
+from epo_lightning.decoders.strategies import InitialStrategies
+from epo_lightning.forecasters.base import Forecaster, Task, observed_future, weights_of
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.optimizers import Adam
+from epo_lightning.registry import register
+from epo_lightning.scene import JointForecast, Scene
+
+
+@register("forecaster", "scene_consistent")
+class SceneConsistent(Forecaster):
+    """Controls of all agents, unrolled, trained by minSADE and the scene probability loss (Section 5, "Baselines").
+
+    Args:
+        backbone: the observation encoder.
+        dynamics: what turns controls into states.
+        modes: number M of joint modes.
+        loss_weights: lambda of ``imitation`` and ``probability``.
+        control_scale: control that a network output of one stands for.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        optimizer: Adam,
+        backbone: nn.Module,
+        dynamics: Unicycle,
+        modes: int,
+        loss_weights: Mapping[str, float],
+        control_scale: float = 0.3,
+    ) -> None:
+        super().__init__(task, optimizer)
+        self.backbone = backbone
+        self.dynamics = dynamics
+        self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))
+        self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
+        self.probabilities = SceneProbabilities(backbone.width, modes, task.horizon)
+
+    def forward(self, scene: Scene) -> JointForecast:
+        z = self.backbone(scene)
+        controls = self.strategies(z)
+        current = scene.current.where(scene.agent_mask[..., None], 0.0)
+        states = self.dynamics.rollout(current[:, None], controls, scene.dt)
+        return JointForecast(
+            states=states,
+            probabilities=self.probabilities(z, states[..., :2], current[..., :2], scene.agent_mask),
+            controls=controls,
+        )
+
+    def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
+        return joint_losses(scene, forecast, self.loss_weights)
+
+
+def joint_losses(
+    scene: Scene, forecast: JointForecast, weights: Mapping[str, float]
+) -> dict[str, tuple[float, Tensor]]:
+    """Imitation of the closest joint future, and the probability that it was given."""
+    future, mask = observed_future(scene)
+    imitation, mode = losses.scene_imitation(losses.distances(forecast.states[..., :2], future, mask), mask)
+    probability = losses.scene_probability(forecast.probabilities, mode)
+    return {"imitation": (weights["imitation"], imitation), "probability": (weights["probability"], probability)}

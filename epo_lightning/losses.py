@@ -1,0 +1,55 @@
+"""Training objectives (Appendix C.4). Every loss is the mean over scenes of what it says."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+def distances(
+    positions: Float[Tensor, "B M N K 2"], future: Float[Tensor, "B N K 4"], mask: Bool[Tensor, "B N K"]
+) -> Float[Tensor, "B M N"]:
+    """Mean Euclidean distance [m] of each agent's futures to the observed one, over observed steps; 0 without any."""
+    observed = mask[:, None]
+    truth = torch.where(mask[..., None], future[..., :2], 0.0)[:, None]
+    error = torch.linalg.vector_norm(torch.where(observed[..., None], positions - truth, 0.0), dim=-1)
+    return error.sum(-1) / observed.sum(-1).clamp_min(1)
+
+
+def _mean_over_agents(values: Tensor, mask: Bool[Tensor, "B N K"]) -> Tensor:
+    present = mask.any(-1)
+    present = present[:, None].expand_as(values) if values.dim() == 3 else present
+    return torch.where(present, values, 0.0).sum(-1) / present.sum(-1).clamp_min(1)
+
+
+def scene_imitation(
+    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"]
+) -> tuple[Float[Tensor, ""], Int[Tensor, " B"]]:
+    """L_imit, the minSADE: distance of the joint future closest to the observed one, and which that is."""
+    closest, mode = _mean_over_agents(distance, mask).min(1)
+    return closest.mean(), mode
+
+
+def scene_probability(probabilities: Float[Tensor, "B M"], mode: Int[Tensor, " B"]) -> Float[Tensor, ""]:
+    """L_prob: cross entropy between the joint futures' probabilities and the closest one."""
+    return -_log(probabilities).gather(1, mode[:, None]).mean()
+
+
+def marginal_imitation(
+    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"]
+) -> tuple[Float[Tensor, ""], Int[Tensor, "B N"]]:
+    """The minADE: each agent's distance to its own closest future, averaged, and which future that is."""
+    closest, mode = distance.min(1)
+    return _mean_over_agents(closest, mask).mean(), mode
+
+
+def marginal_probability(
+    probabilities: Float[Tensor, "B M N"], mode: Int[Tensor, "B N"], mask: Bool[Tensor, "B N K"]
+) -> Float[Tensor, ""]:
+    """Cross entropy between each agent's probabilities and its own closest future, averaged over agents."""
+    return _mean_over_agents(-_log(probabilities).gather(1, mode[:, None])[:, 0], mask).mean()
+
+
+def _log(probabilities: Tensor) -> Tensor:
+    return probabilities.clamp_min(torch.finfo(probabilities.dtype).tiny).log()

@@ -1,0 +1,49 @@
+"""Optimisers and learning-rate schedules by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from epo_lightning.registry import ConfigError, nearest, register
+
+_SCHEDULES: dict[str, Callable[[float], float]] = {
+    "constant": lambda progress: 1.0,
+    "cosine": lambda progress: 0.5 * (1.0 + math.cos(math.pi * min(progress, 1.0))),
+}
+
+
+@register("optimizer", "adam")
+@dataclass(frozen=True)
+class Adam:
+    """Adam (Appendix C.4), at a constant learning rate as in the paper or with cosine decay to zero.
+
+    Attributes:
+        lr: learning rate.
+        schedule: ``constant`` or ``cosine``.
+        clip: largest norm of the gradient of a step; None for no limit.
+    """
+
+    lr: float = 5e-5
+    schedule: str = "constant"
+    clip: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.lr > 0:
+            raise ConfigError(f"optimizer.lr must be positive, not {self.lr}")
+        if self.clip is not None and not self.clip > 0:
+            raise ConfigError(f"optimizer.clip must be positive or null, not {self.clip}")
+        if self.schedule not in _SCHEDULES:
+            raise ConfigError(f"unknown optimizer.schedule {self.schedule!r}: {nearest(self.schedule, _SCHEDULES)}")
+
+    def configure(self, parameters: Iterable[nn.Parameter], total_steps: float) -> dict[str, Any]:
+        """What Lightning's ``configure_optimizers`` returns; the schedule runs over ``total_steps`` steps."""
+        adam = torch.optim.Adam(parameters, lr=self.lr)
+        shape = _SCHEDULES[self.schedule]
+        schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: shape(step / total_steps))
+        return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
