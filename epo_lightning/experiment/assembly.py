@@ -1,0 +1,128 @@
+"""From settings to the objects of a run: data, forecaster and trainer."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
+from lightning.pytorch.loggers import Logger
+
+import epo_lightning.data  # noqa: F401 - registers the data parts
+from epo_lightning.experiment.run_folder import RunFolder
+from epo_lightning.experiment.settings import PARTS, Settings, TrainerSettings, check_part
+from epo_lightning.forecasters import build_forecaster
+from epo_lightning.registry import ConfigError, build
+
+
+def build_data(section: Mapping[str, Any]) -> Any:
+    """The data module of a configuration; it looks at no data yet.
+
+    Raises:
+        ConfigError: an unknown part or key, or a value that it refuses.
+    """
+    check_part("data", section)
+    return build("data", section)
+
+
+def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
+    """All that a forecaster is built from, as plain values: what a checkpoint remembers of its architecture."""
+    sections = {kind: dict(getattr(settings, kind)) for kind in PARTS if kind != "data"}
+    return {
+        **sections,
+        "goal": settings.goal,
+        "horizon": int(data.horizon),
+        "history": int(data.history),
+        "dt": float(data.dt),
+        "subsets": list(data.subsets),
+    }
+
+
+def build_model(settings: Settings, data: Any) -> LightningModule:
+    """The forecaster of a configuration, with weights drawn from the global random state.
+
+    Raises:
+        ConfigError: an unknown part or key, or sizes that do not fit together.
+    """
+    return build_forecaster(describe_model(settings, data))
+
+
+def parameters(model: torch.nn.Module) -> int:
+    """How many numbers are learned."""
+    return sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
+
+
+def check(settings: Settings) -> tuple[Any, LightningModule]:
+    """Build data and forecaster once, only to see that they can be built; touches no file.
+
+    Raises:
+        ConfigError: what is wrong, in one sentence.
+    """
+    data = build_data(settings.data)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            model = build_model(settings, data)
+    except ConfigError:
+        raise
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"the forecaster cannot be built: {' '.join(str(error).split())}") from error
+    return data, model
+
+
+def quiet() -> None:
+    """Silence the notes of Lightning that concern its own defaults."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
+    for text in (
+        ".*does not have many workers.*",
+        ".*Checkpoint directory .* exists and is not empty.*",
+        ".*Experiment logs directory .* exists and is not empty.*",
+        ".*dirpath has changed.*",
+        ".*LeafSpec.*",
+        ".*configure_optimizers.*returned .None.*",
+        ".*Found .* module.s. in eval mode.*",
+        ".*number of training batches .* is smaller than the logging interval.*",
+    ):
+        warnings.filterwarnings("ignore", message=text)
+
+
+def build_trainer(
+    settings: TrainerSettings, run: RunFolder, callbacks: Sequence[Callback], loggers: Sequence[Logger], bar: bool
+) -> Trainer:
+    """Lightning's trainer for one run.
+
+    Raises:
+        ConfigError: a device or precision that this machine does not have.
+    """
+    torch.set_num_threads(settings.threads)
+    try:
+        return Trainer(
+            default_root_dir=run.path,
+            accelerator=settings.accelerator,
+            devices=settings.devices,
+            precision=settings.precision,  # type: ignore[arg-type]
+            max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,
+            max_steps=settings.max_steps,
+            gradient_clip_val=settings.gradient_clip,
+            check_val_every_n_epoch=settings.validate_every,
+            limit_train_batches=settings.limit_train_batches,
+            limit_val_batches=settings.limit_val_batches,
+            log_every_n_steps=settings.log_every,
+            deterministic=settings.deterministic,
+            callbacks=list(callbacks),
+            logger=list(loggers),
+            enable_progress_bar=bar,
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+        )
+    except (ValueError, RuntimeError) as error:  # Lightning's MisconfigurationException among them
+        raise ConfigError(f"trainer: {' '.join(str(error).split())}") from error
+
+
+def as_data(data: Any) -> LightningDataModule:
+    """The data module, typed for Lightning."""
+    assert isinstance(data, LightningDataModule)
+    return data

@@ -1,0 +1,206 @@
+"""Hydra, with its errors in one sentence each.
+
+The configuration tree lies beside the package in a checkout and inside it in an installed wheel. A configuration is
+composed here and checked before anything else happens, so that a misspelt word costs a second and leaves no folder.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from epo_lightning.registry import ConfigError, nearest
+
+if TYPE_CHECKING:
+    from hydra._internal.hydra import Hydra
+    from omegaconf import DictConfig
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def tree() -> Path:
+    """The folder that holds ``conf/`` and ``sweeps/``: the package of a wheel, the root of a checkout."""
+    for folder in (PACKAGE, PACKAGE.parent):
+        if (folder / "conf" / "train.yaml").is_file():
+            return folder
+    raise ConfigError(f"the configuration tree is missing: no conf/train.yaml in {PACKAGE} or {PACKAGE.parent}; reinstall")
+
+
+@contextmanager
+def hydra(extra: Sequence[str] = ()) -> Iterator[Hydra]:
+    """Hydra with this project's tree on its search path, and ``extra`` folders before it.
+
+    Raises:
+        ConfigError: one of the ``extra`` folders does not exist.
+    """
+    from hydra import version
+    from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
+    from hydra._internal.hydra import Hydra
+    from hydra.core.global_hydra import GlobalHydra
+
+    version.setbase("1.3")
+    root = tree()
+    path = ConfigSearchPathImpl()
+    path.append("hydra", "pkg://hydra.conf")
+    for folder in extra:
+        if not Path(folder).is_dir():
+            raise ConfigError(f"--config-dir {folder}: the folder does not exist")
+        path.append("command-line", f"file://{Path(folder).resolve()}")
+    path.append("main", f"file://{root / 'conf'}")
+    # The group `sweeps` lies beside conf/, where somebody looks who wants a table of the paper.
+    path.append("sweeps", f"file://{root}")
+    path.append("schema", "structured://")
+    GlobalHydra.instance().clear()
+    try:
+        yield Hydra.create_main_hydra2("epo", path)
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def compose(name: str, overrides: Sequence[str] = (), extra: Sequence[str] = ()) -> dict[str, Any]:
+    """The configuration ``name`` with ``overrides``, resolved to plain Python values.
+
+    Raises:
+        ConfigError: an unknown key, an unknown option of a group, or an override that cannot be read.
+    """
+    with hydra(extra) as instance:
+        return resolve(_composed(instance, name, overrides))
+
+
+def resolve(config: DictConfig) -> dict[str, Any]:
+    """Plain Python values, with every interpolation replaced and without Hydra's own part; adds ``experiment``.
+
+    Raises:
+        ConfigError: an interpolation that leads nowhere, or a value that is still missing.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
+    plain = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    try:
+        values = OmegaConf.to_container(plain, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise ConfigError(_sentence(error)) from error
+    assert isinstance(values, dict)
+    if choices.get("experiment"):
+        values["experiment"] = choices["experiment"]
+    return {str(key): value for key, value in values.items()}
+
+
+def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list[list[str]]:
+    """The overrides of every job that Hydra's basic sweeper would launch; empty for sweepers that choose as they go."""
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    with hydra(extra) as instance:
+        config = _composed(instance, name, overrides, multirun=True)
+        sweeper = config.hydra.sweeper
+        if not str(sweeper.get("_target_", "")).endswith("BasicSweeper"):
+            return []
+        params = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
+        arguments = [*params, *config.hydra.overrides.task]
+        parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(arguments)
+        batches = BasicSweeper.split_arguments(parsed, None)
+        return [list(job) for batch in batches for job in batch]
+
+
+def multirun(name: str, overrides: Sequence[str], task: Callable[[DictConfig], Any], extra: Sequence[str] = ()) -> Any:
+    """Hand the sweep to Hydra's own sweeper and launcher."""
+    with hydra(extra) as instance, _one_sentence(instance, name, overrides):
+        return instance.multirun(config_name=name, task_function=task, overrides=list(overrides))
+
+
+def _composed(instance: Hydra, name: str, overrides: Sequence[str], multirun: bool = False) -> DictConfig:
+    from hydra.types import RunMode
+
+    with _one_sentence(instance, name, overrides):
+        return instance.compose_config(
+            config_name=name,
+            overrides=list(overrides),
+            run_mode=RunMode.MULTIRUN if multirun else RunMode.RUN,
+            with_log_configuration=False,
+        )
+
+
+@contextmanager
+def _one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterator[None]:
+    """Turn Hydra's and OmegaConf's exceptions into a :class:`ConfigError` that names the nearest valid word."""
+    from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        yield
+    except OverrideParseException as error:
+        raise ConfigError(f"cannot read the override {error.override!r}: write key=value, for example seed=1") from error
+    except MissingConfigException as error:
+        raise ConfigError(_missing_option(instance, error.missing_cfg_file or "", str(error))) from error
+    except (HydraException, OmegaConfBaseException) as error:
+        unknown = re.search(r"Could not (?:override|delete from config\. )'?([\w./@]+)", str(error))
+        if unknown and "Multiple values" not in str(error):
+            raise ConfigError(_unknown_key(instance, name, unknown.group(1), overrides)) from error
+        raise ConfigError(_sentence(error)) from error
+
+
+def _missing_option(instance: Hydra, missing: str, message: str) -> str:
+    """``experiment/rpi/v_lst`` is no file: name the files that are."""
+    group, _, option = missing.removesuffix(".yaml").partition("/")
+    options = sorted(options_of(instance, group)) if option else []
+    if not options:
+        return f"unknown configuration {missing!r}: " + " ".join(message.split())
+    return f"unknown option {group}={option}: {nearest(option, options)}"
+
+
+def options_of(instance: Hydra, group: str, prefix: str = "") -> Iterator[str]:
+    """The options of a group, also those in folders within it: ``rpi/v_lstm`` for ``experiment``."""
+    from hydra.core.object_type import ObjectType
+
+    loader = instance.config_loader
+    for option in loader.get_group_options(f"{group}/{prefix}".rstrip("/"), ObjectType.CONFIG):
+        yield prefix + option
+    for folder in loader.get_group_options(f"{group}/{prefix}".rstrip("/"), ObjectType.GROUP):
+        yield from options_of(instance, group, f"{prefix}{folder}/")
+
+
+def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str]) -> str:
+    """Find the level at which ``key`` leaves the configuration, and the names known there."""
+    config: Any = None
+    for kept in (_groups(instance, overrides), []):
+        try:
+            config = instance.compose_config(config_name=name, overrides=kept, run_mode=None, with_log_configuration=False)
+            break
+        except Exception:  # the other overrides are wrong as well; the plain tree still tells the names
+            continue
+    walked: list[str] = []
+    for word in key.replace("/", ".").split("."):
+        names = [str(known) for known in config if known != "hydra"] if isinstance(config, Mapping | _dict_config()) else []
+        if word not in names:
+            level = f" in {'.'.join(walked)}" if walked else ""
+            return f"unknown key {key!r}{level}: {nearest(word, names)}"
+        walked.append(word)
+        config = config[word]
+    return f"unknown key {key!r}"
+
+
+def _dict_config() -> type:
+    from omegaconf import DictConfig
+
+    return DictConfig
+
+
+def _groups(instance: Hydra, overrides: Iterable[str]) -> list[str]:
+    """Only those overrides that choose an option of a group."""
+    groups = set(instance.config_loader.list_groups(""))
+    return [text for text in overrides if text.split("=", 1)[0].split("@")[0].split("/")[0] in groups]
+
+
+def _sentence(error: BaseException) -> str:
+    """An exception's message in one line, without OmegaConf's notes for programmers."""
+    texts = [str(error)] + ([str(error.__cause__)] if error.__cause__ else [])
+    lines = [line.strip() for text in texts for line in text.splitlines()]
+    notes = ("object_type=", "reference_type=")
+    kept = [line.replace("full_key:", "key:") for line in lines if line and not line.startswith(notes)]
+    return "; ".join(dict.fromkeys(kept))

@@ -1,0 +1,285 @@
+"""What a configuration may say: its sections and their types, checked before anything is loaded or written.
+
+Sections that choose a registered part (data, backbone, ...) are checked against the part's own constructor; the others
+are dataclasses here. Nothing is built from ``_target_`` or any other path to code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from epo_lightning.registry import ConfigError, check, lookup, nearest
+
+PARTS = ("data", "backbone", "forecaster", "energy", "solver", "optimizer")
+
+
+@dataclass(frozen=True)
+class TrainerSettings:
+    """How long and on what (``conf/trainer``)."""
+
+    max_epochs: int | None = 100
+    max_steps: int = -1
+    accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
+    devices: int = 1
+    precision: str = "32-true"
+    threads: int = 1
+    gradient_clip: float | None = None
+    validate_every: int = 1
+    limit_train_batches: int | float = 1.0
+    limit_val_batches: int | float = 1.0
+    log_every: int = 50
+    deterministic: bool = True
+
+    def __post_init__(self) -> None:
+        if (self.max_epochs is None or self.max_epochs < 0) and self.max_steps < 0:
+            raise ConfigError("trainer.max_epochs and trainer.max_steps are both open: the run would never end")
+        for name in ("threads", "devices", "validate_every", "log_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"trainer.{name} must be 1 or more, not {getattr(self, name)}")
+        for name in ("limit_train_batches", "limit_val_batches"):
+            value = getattr(self, name)
+            if value <= 0 or (isinstance(value, float) and value > 1):
+                raise ConfigError(f"trainer.{name} must be a share in (0, 1] or a number of batches, not {value}")
+
+
+@dataclass(frozen=True)
+class CallbackSettings:
+    """What watches the training (``conf/callbacks``)."""
+
+    monitor: str = "val/minSADE"
+    patience: int | None = 10
+    min_delta: float = 0.0
+    progress: Literal["auto", "bar", "lines", "none"] = "auto"
+    refresh: int = 50
+
+    def __post_init__(self) -> None:
+        if self.patience is not None and self.patience < 1:
+            raise ConfigError(f"callbacks.patience must be 1 or more, or null for never, not {self.patience}")
+
+
+@dataclass(frozen=True)
+class CSVSettings:
+    """``conf/logger/csv.yaml``"""
+
+    flush: int = 100
+
+
+@dataclass(frozen=True)
+class TensorBoardSettings:
+    """``conf/logger/tensorboard.yaml``"""
+
+    hyperparameters: bool = True
+
+
+@dataclass(frozen=True)
+class WandbSettings:
+    """``conf/logger/wandb.yaml``"""
+
+    project: str = "epo_lightning"
+    mode: Literal["auto", "offline", "online"] = "auto"
+    entity: str | None = None
+    tags: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class LoggerSettings:
+    """Where the log goes besides the CSV file; None is not chosen."""
+
+    csv: CSVSettings = field(default_factory=CSVSettings)
+    tensorboard: TensorBoardSettings | None = None
+    wandb: WandbSettings | None = None
+
+
+@dataclass(frozen=True)
+class BudgetSettings:
+    """Which budget was chosen; what it sets lies in the other sections."""
+
+    name: str = "paper"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """One training run, whole."""
+
+    data: Mapping[str, Any]
+    backbone: Mapping[str, Any]
+    forecaster: Mapping[str, Any]
+    energy: Mapping[str, Any]
+    solver: Mapping[str, Any]
+    optimizer: Mapping[str, Any]
+    trainer: TrainerSettings
+    callbacks: CallbackSettings
+    logger: LoggerSettings
+    budget: BudgetSettings
+    title: str = "untitled"
+    goal: Literal["energy", "all"] = "energy"
+    seed: int = 0
+    runs: str = "runs"
+    run_dir: str | None = None
+    existing: Literal["error", "continue"] = "error"
+    resume: str | None = None
+    experiment: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**32:
+            raise ConfigError(f"seed must be between 0 and {2**32 - 1}, not {self.seed}")
+
+
+@dataclass(frozen=True)
+class GenerateSettings:
+    """``epo generate``"""
+
+    data: Mapping[str, Any]
+    workers: int | None = None
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ConfigError(f"workers must be 1 or more, or null for one per core, not {self.workers}")
+
+
+@dataclass(frozen=True)
+class EvaluateSettings:
+    """``epo evaluate``"""
+
+    run: str | None = None
+    runs: str | None = None
+    split: Literal["test", "val"] = "test"
+    checkpoint: str = "best"
+    batch_size: int = 256
+
+    def __post_init__(self) -> None:
+        if (self.run is None) == (self.runs is None):
+            raise ConfigError("say what to evaluate: run=<run folder>, or runs=<folder> for all runs below it")
+        if self.batch_size < 1:
+            raise ConfigError(f"batch_size must be 1 or more, not {self.batch_size}")
+
+
+@dataclass(frozen=True)
+class PredictSettings:
+    """``epo predict``"""
+
+    run: str
+    out: str = "predictions"
+    split: Literal["test", "val"] = "test"
+    checkpoint: str = "best"
+    scenes: int | None = 64
+    figures: int = 4
+
+    def __post_init__(self) -> None:
+        if self.scenes is not None and self.scenes < 1:
+            raise ConfigError(f"scenes must be 1 or more, or null for all, not {self.scenes}")
+        if self.figures < 0:
+            raise ConfigError(f"figures must be 0 or more, not {self.figures}")
+
+
+@dataclass(frozen=True)
+class ReportSettings:
+    """``epo report``"""
+
+    runs: str = "runs"
+    out: str = "report"
+
+
+Section = typing.TypeVar("Section")
+
+
+def read(schema: type[Section], values: Mapping[str, Any], where: str = "") -> Section:
+    """Make a ``schema`` of ``values``, as closed as it is typed.
+
+    Raises:
+        ConfigError: an unknown key (with the nearest known one), a missing key or a value of another type.
+    """
+    hints = typing.get_type_hints(schema)
+    prefix = f"{where}." if where else ""
+    for key in values:
+        if key not in hints:
+            raise ConfigError(f"unknown key {prefix}{key}: {nearest(str(key), hints)}")
+    required = [f.name for f in dataclasses.fields(schema) if _required(f)]  # type: ignore[arg-type]
+    for key in required:
+        if key not in values:
+            raise ConfigError(f"missing key {prefix}{key}")
+    return schema(**{key: _read(hints[key], value, prefix + key) for key, value in values.items()})
+
+
+def _required(entry: dataclasses.Field[Any]) -> bool:
+    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
+
+
+def _read(hint: Any, value: Any, where: str) -> Any:
+    for option in typing.get_args(hint) or (hint,):
+        if dataclasses.is_dataclass(option) and isinstance(value, Mapping):
+            return read(typing.cast(type[Any], option), value, where)
+    if not fits(value, hint):
+        raise ConfigError(f"{where} must be {describe(hint)}, not {value!r}")
+    return float(value) if hint is float else value
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Whether ``value``, as YAML gives it, can stand for a type. Types that YAML cannot write always fit."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return any(fits(value, option) for option in arguments)
+    if origin is Literal:
+        return value in arguments and type(value) in {type(option) for option in arguments}
+    if hint in (None, type(None)):
+        return value is None
+    if hint is bool:
+        return isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is str:
+        return isinstance(value, str)
+    kind = origin or hint
+    if isinstance(kind, type) and issubclass(kind, Mapping):
+        entry = arguments[1] if len(arguments) == 2 else Any
+        return isinstance(value, Mapping) and all(fits(item, entry) for item in value.values())
+    if isinstance(kind, type) and issubclass(kind, Sequence):
+        entry = arguments[0] if arguments else Any
+        return isinstance(value, Sequence) and not isinstance(value, str) and all(fits(item, entry) for item in value)
+    return True
+
+
+def describe(hint: Any) -> str:
+    """A type in words for people who write YAML."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(describe(option) for option in arguments)
+    if origin is Literal:
+        return "one of " + ", ".join(str(option) for option in arguments)
+    names = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"}
+    if hint in names:
+        return names[hint]
+    kind = origin or hint
+    if isinstance(kind, type) and issubclass(kind, Mapping):
+        return "a mapping"
+    if isinstance(kind, type) and issubclass(kind, Sequence):
+        return "a list" + (f" of {describe(arguments[0])}" if arguments else "")
+    return str(getattr(kind, "__name__", kind))
+
+
+def check_part(kind: str, values: Any, supplied: Sequence[str] = ()) -> None:
+    """Compare a part's section with its constructor: names by :func:`registry.check`, types by its annotations.
+
+    Raises:
+        ConfigError: as :func:`registry.check`, or a value of another type.
+    """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{kind} must be a mapping with a name, not {values!r}")
+    check(kind, values, supplied)
+    part = lookup(kind, values["name"])
+    function = part.__init__ if isinstance(part, type) else part  # type: ignore[misc]
+    try:
+        hints = typing.get_type_hints(function)
+    except (NameError, TypeError, SyntaxError):  # annotations that exist for type checkers only, or spell tensor shapes
+        return
+    for key, value in values.items():
+        if key in hints and not fits(value, hints[key]):
+            raise ConfigError(f"{kind}.{key} must be {describe(hints[key])}, not {value!r}")
