@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import pkgutil
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
+from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
@@ -47,8 +49,25 @@ def register(kind: str, name: str) -> Callable[[Part], Part]:
     return add
 
 
+_HOMES = {
+    "backbone": "backbones",
+    "data": "data",
+    "dynamics": "game",
+    "energy": "game",
+    "forecaster": "forecasters",
+    "optimizer": "optimizers",
+    "solver": "solvers",
+}
+"""Module or folder of this package whose files register the parts of a kind: a new part is a new file there."""
+
+
 @cache
-def _load_entry_points() -> None:
+def _load(kind: str) -> None:
+    """Import whatever registers parts of a kind, when the first of them is asked for."""
+    if kind in _HOMES:
+        home = import_module(f"epo_lightning.{_HOMES[kind]}")
+        for module in pkgutil.walk_packages(getattr(home, "__path__", []), f"{home.__name__}."):
+            import_module(module.name)
     for entry in entry_points(group="epo_lightning.parts"):
         entry.load()
 
@@ -59,7 +78,7 @@ def lookup(kind: str, name: str) -> Callable[..., Any]:
     Raises:
         ConfigError: no such part; the message names the nearest one.
     """
-    _load_entry_points()
+    _load(kind)
     parts = _PARTS.get(kind, {})
     if name not in parts:
         raise ConfigError(f"unknown {kind} {name!r}: {nearest(str(name), parts)}")
@@ -78,6 +97,7 @@ def check(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) ->
         ConfigError: a missing ``name``, an unknown part, an unknown key (with the nearest known one) or a missing key.
     """
     if not config.get("name"):
+        _load(kind)
         raise ConfigError(f"{kind}.name is missing: {nearest('', _PARTS.get(kind, {}))}")
     part = lookup(kind, config["name"])
     schema = inspect.signature(part).parameters

@@ -81,8 +81,8 @@ class Scene(_Batch):
 
     history: Float[Tensor, "B N H 4"]
     dt: float
-    history_mask: Bool[Tensor, "B N H"] | None = None
-    agent_mask: Bool[Tensor, "B N"] | None = None
+    history_mask: Bool[Tensor, "B N H"] = None  # type: ignore[assignment]  # filled in below
+    agent_mask: Bool[Tensor, "B N"] = None  # type: ignore[assignment]
     future: Float[Tensor, "B N K 4"] | None = None
     future_mask: Bool[Tensor, "B N K"] | None = None
     goal_candidates: Float[Tensor, "B N G 2"] | None = None

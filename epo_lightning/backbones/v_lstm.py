@@ -5,6 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.goals import given_goals
 from epo_lightning.encoders.history import LSTMHistory
 from epo_lightning.encoders.interaction import Attention
@@ -13,7 +14,7 @@ from epo_lightning.scene import Scene
 
 
 @register("backbone", "v_lstm")
-class VLSTM(nn.Module):
+class VLSTM(Backbone):
     """Vector-LSTM: each history through an LSTM, then one layer of attention (Appendix C.1, "Global Interaction").
 
     Args:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -34,7 +36,7 @@ class MLP(nn.Module):
         super().__init__()
         sizes = [inputs, *[width] * (layers - 1)]
         normalisation = {"batch": _MaskedBatchNorm, "layer": nn.LayerNorm}[norm]
-        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True))
+        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
         self.norms = nn.ModuleList(normalisation(size) for size in sizes[1:])
         self.output = nn.Linear(sizes[-1], outputs)
 

@@ -10,13 +10,8 @@ from typing import Any
 
 import torch
 
-# Importing a part registers it.
-from epo_lightning.backbones import v_lstm
-from epo_lightning.forecasters import constant_velocity, epo, marginal, scene_consistent
 from epo_lightning.forecasters.base import Forecaster, Task
-from epo_lightning.game import dynamics, energy
 from epo_lightning.registry import ConfigError, build, check, lookup, nearest
-from epo_lightning.solvers import levenberg_marquardt
 
 __all__ = ["Forecaster", "Task", "build_forecaster", "check_model", "load"]
 
@@ -74,7 +69,7 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
     task = Task(model["horizon"], model["dt"], tuple(model.get("subsets", ())), model.get("shape", "disc"))
     optimizer = build("optimizer", model["optimizer"])
     forecaster: Forecaster = build("forecaster", model["forecaster"], task=task, optimizer=optimizer, **parts)
-    forecaster.configuration = {key: value for key, value in model.items()}
+    forecaster.configuration = dict(model)
     return forecaster
 
 

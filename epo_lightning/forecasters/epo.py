@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
-from torch import Tensor, nn
+from torch import Tensor
 
+from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.goals import given_goals
 from epo_lightning.decoders.probabilities import SceneProbabilities
 from epo_lightning.decoders.strategies import InitialStrategies
@@ -38,7 +39,7 @@ class EPO(Forecaster):
         self,
         task: Task,
         optimizer: Adam,
-        backbone: nn.Module,
+        backbone: Backbone,
         energy: Energy,
         solver: LevenbergMarquardt,
         modes: int,

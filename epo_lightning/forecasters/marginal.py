@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from epo_lightning import losses
+from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.trajectories import Trajectories
 from epo_lightning.forecasters.base import Forecaster, Task, observed_future, weights_of
 from epo_lightning.metrics.functional import marginal_to_joint
@@ -29,7 +30,7 @@ class Marginal(Forecaster):
     """
 
     def __init__(
-        self, task: Task, optimizer: Adam, backbone: nn.Module, modes: int, loss_weights: Mapping[str, float]
+        self, task: Task, optimizer: Adam, backbone: Backbone, modes: int, loss_weights: Mapping[str, float]
     ) -> None:
         super().__init__(task, optimizer)
         self.backbone = backbone

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from epo_lightning import losses
+from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.probabilities import SceneProbabilities
 from epo_lightning.decoders.strategies import InitialStrategies
 from epo_lightning.forecasters.base import Forecaster, Task, observed_future, weights_of
@@ -32,7 +33,7 @@ class SceneConsistent(Forecaster):
         self,
         task: Task,
         optimizer: Adam,
-        backbone: nn.Module,
+        backbone: Backbone,
         dynamics: Unicycle,
         modes: int,
         loss_weights: Mapping[str, float],

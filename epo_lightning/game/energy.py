@@ -169,14 +169,16 @@ class Energy:
                 if name not in given:
                     raise ValueError(f"{kind} lacks the feature {name!r}; it has {sorted(given)}")
                 if given[name].shape != (batch, modes, count):
-                    shape, expected = list(given[name].shape), [batch, modes, count]
-                    raise ValueError(f"{kind}[{name!r}] has shape {shape}; these controls take {expected}")
+                    shape = list(given[name].shape)
+                    raise ValueError(
+                        f"{kind}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}"
+                    )
         if self.needs_goals:
             if parameters.goals is None:
                 raise ValueError("the energy has the feature 'goal', but parameters.goals is None")
             if parameters.goals.shape != (batch, modes, agents, 2):
-                expected = [batch, modes, agents, 2]
-                raise ValueError(f"goals have shape {list(parameters.goals.shape)}; these controls take {expected}")
+                shape = list(parameters.goals.shape)
+                raise ValueError(f"goals have shape {shape}; these controls take {[batch, modes, agents, 2]}")
         if self.pair and scene.size is None:
             raise ValueError("pair features take the agents' radii from scene.size [B, N, 2], which is None")
 

@@ -59,9 +59,9 @@ def normal_equations(
             case Source.FINAL_POSITION:
                 jacobian = tip[..., -1:, :, :] - root  # [B M N K 2 xy]
                 gradient += (jacobian * pull[..., None, None, :]).sum(-1)
-                rows = (jacobian * stiffness.sqrt()[..., None, None, :]).flatten(3, 4)
+                scaled = (jacobian * stiffness.sqrt()[..., None, None, :]).flatten(3, 4)
                 for agent in range(agents):
-                    product = rows[:, :, agent] @ rows[:, :, agent].mT
+                    product = scaled[:, :, agent] @ scaled[:, :, agent].mT
                     matrix[:, :, agent, :, :, agent] += product.view(batch, modes, steps, 2, steps, 2)
 
     for agent in range(agents):
