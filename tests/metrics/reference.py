@@ -1,4 +1,4 @@
-"""The metrics once more, as loops over scenes, modes, agents and steps, with polygons from shapely: slow and obvious."""
+"""The metrics once more, as loops over scenes, modes, agents and steps, with shapely polygons: slow and obvious."""
 
 from __future__ import annotations
 
