@@ -17,7 +17,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -27,10 +27,13 @@ X, Y, HEADING, SPEED = range(4)
 ACCELERATION, TURN_RATE = range(2)
 
 
+Batch = TypeVar("Batch", bound="_Batch")
+
+
 class _Batch:
     """Tensors that share their leading dimension B, moved and indexed together."""
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+    def map(self: Batch, function: Callable[[Tensor], Tensor]) -> Batch:
         """Apply ``function`` to every tensor, also inside mappings and tuples."""
 
         def visit(value: Any) -> Any:
@@ -45,13 +48,13 @@ class _Batch:
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         return type(self)(**{field.name: visit(getattr(self, field.name)) for field in fields})
 
-    def to(self, target: torch.device | torch.dtype | str) -> Self:
+    def to(self: Batch, target: torch.device | torch.dtype | str) -> Batch:
         """Move to a device, or convert the floating-point tensors to another precision."""
         if isinstance(target, torch.dtype):
             return self.map(lambda tensor: tensor.to(target) if tensor.is_floating_point() else tensor)
         return self.map(lambda tensor: tensor.to(target))
 
-    def __getitem__(self, index: Any) -> Self:
+    def __getitem__(self: Batch, index: Any) -> Batch:
         """Choose scenes of the batch; an integer keeps the batch dimension."""
         if isinstance(index, int):
             index = [index]

@@ -71,7 +71,7 @@ class Unicycle:
         position = self._travel(torch.cat((torch.zeros_like(velocity[..., :1, :]), velocity), -2), dt)
         return torch.cat((position, by_heading, by_speed), -1)
 
-    def _travel(self, velocity: Float[Tensor, "*batch K+1 2"], dt: float) -> Float[Tensor, "*batch K 2"]:
+    def _travel(self, velocity: Float[Tensor, "*batch nodes 2"], dt: float) -> Float[Tensor, "*batch nodes-1 2"]:
         """Way covered up to every step, from the velocities at the nodes."""
         beta = _BETA[self.integrator]
         return dt * (beta * velocity[..., :-1, :] + (1.0 - beta) * velocity[..., 1:, :]).cumsum(-2)

@@ -78,7 +78,7 @@ def signal(
     feature: OwnFeature,
     states: Float[Tensor, "*batch K 4"],
     controls: Float[Tensor, "*batch K 2"],
-    goals: Float[Tensor, "*batch 2"] | None,
+    goals: Float[Tensor, "... 2"] | None,
     dt: float,
 ) -> Float[Tensor, "*batch R"]:
     """The signal of a feature over time: R = K, K - 1 for rates, 2 (x and y) for the goal."""

@@ -73,7 +73,10 @@ def normal_equations(
         weight = torch.stack([energy.pair_weight(scene, parameters, name).square() for name in energy.pair]).sum(0)
         strength = weight.sqrt()[..., None] * active  # [B M P K]
         reached = torch.ones(steps, steps, dtype=controls.dtype, device=controls.device).tril()[..., None]
+        near = active.any(-1).any(1).any(0).tolist()  # pairs that are apart in all scenes cost nothing
         for pair, both in enumerate(zip(*(index.tolist() for index in pairs(agents)), strict=True)):
+            if not near[pair]:
+                continue
             # One row per step: how the overlap of the pair deepens with the controls of both, [B M K, 2 agents, K, 2].
             away = strength[:, :, pair, :, None] * normal[:, :, pair]
             rows = []

@@ -1,0 +1,24 @@
+"""Every test runs on one thread and with the shapes in the annotations checked."""
+
+from __future__ import annotations
+
+import os
+
+for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+from jaxtyping import install_import_hook
+
+# Everything that speaks the alphabet of shapes; compiled kernels take no decorators.
+CHECKED = "scene game solvers encoders backbones decoders forecasters losses metrics optimizers".split()
+install_import_hook([f"epo_lightning.{name}" for name in CHECKED], "beartype.beartype")
+
+import pytest
+import torch
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def seed() -> None:
+    torch.manual_seed(0)

@@ -1,0 +1,78 @@
+"""Random scenes and games for tests."""
+
+from __future__ import annotations
+
+import torch
+
+from epo_lightning.game.features import OWN_FEATURES
+from epo_lightning.scene import GameParameters, Scene
+
+BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}
+"""Narrow enough for random controls to leave them."""
+ALL = tuple(OWN_FEATURES)
+
+
+def random_scene(
+    scenes: int = 3,
+    agents: int = 2,
+    *,
+    history: int = 19,
+    horizon: int = 40,
+    size: float = 0.5,
+    dtype: torch.dtype = torch.float32,
+) -> Scene:
+    """Agents within a few metres of each other, moving."""
+    state = torch.randn(scenes, agents, history, 4, dtype=dtype)
+    state[..., 3].abs_()
+    return Scene(
+        history=state,
+        dt=0.1,
+        future=torch.randn(scenes, agents, horizon, 4, dtype=dtype),
+        goal_candidates=torch.randn(scenes, agents, 1, 2, dtype=dtype),
+        size=torch.full((scenes, agents, 2), size, dtype=dtype),
+        subset=torch.arange(scenes) % 2,
+        id=torch.arange(scenes),
+    )
+
+
+def random_game(
+    scene: Scene, modes: int = 2, horizon: int = 7, own: tuple[str, ...] = ALL, spread: float = 0.5
+) -> GameParameters:
+    """Weights around one and controls of about ``spread``."""
+    scenes, agents = scene.agent_mask.shape
+    dtype = scene.history.dtype
+    pairs = agents * (agents - 1) // 2
+    return GameParameters(
+        own_weights={name: 0.5 + torch.rand(scenes, modes, agents, dtype=dtype) for name in own},
+        pair_weights={"proximity": 0.5 + 3.0 * torch.rand(scenes, modes, pairs, dtype=dtype)},
+        initial_controls=spread * torch.randn(scenes, modes, agents, horizon, 2, dtype=dtype),
+        goals=torch.randn(scenes, modes, agents, 2, dtype=dtype),
+    )
+
+
+def pad(scene: Scene, agents: int = 2, steps: int = 0, filling: float = float("nan")) -> Scene:
+    """The same scene with absent agents appended and unobserved steps put before its history, all holding ``filling``."""
+
+    def grow(tensor: torch.Tensor | None, dim: int, count: int, value: float | bool, before: bool = False):
+        if tensor is None or count == 0:
+            return tensor
+        shape = list(tensor.shape)
+        shape[dim] = count
+        extra = torch.full(shape, value, dtype=tensor.dtype)
+        return torch.cat((extra, tensor) if before else (tensor, extra), dim)
+
+    history = grow(grow(scene.history, 1, agents, filling), 2, steps, filling, before=True)
+    history_mask = grow(grow(scene.history_mask, 1, agents, False), 2, steps, False, before=True)
+    return Scene(
+        history=history,
+        dt=scene.dt,
+        history_mask=history_mask,
+        agent_mask=grow(scene.agent_mask, 1, agents, False),
+        future=grow(scene.future, 1, agents, filling),
+        future_mask=grow(scene.future_mask, 1, agents, False),
+        goal_candidates=grow(scene.goal_candidates, 1, agents, filling),
+        goal_mask=grow(scene.goal_mask, 1, agents, False),
+        size=grow(scene.size, 1, agents, filling),
+        subset=scene.subset,
+        id=scene.id,
+    )
