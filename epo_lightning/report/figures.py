@@ -70,7 +70,7 @@ def joint_predictions(
             _limits(panels[row, 0], scene[row], [forecast.to("cpu")[row] for forecast in forecasts.values()])
         for axes in panels[-1]:
             axes.set_xlabel("x [m]")
-        _explain(figure, scene, max(f.states.shape[1] for f in forecasts.values()), alternatives is not None)
+        _explain(figure, scene, columns, max(f.states.shape[1] for f in forecasts.values()), alternatives is not None)
         return save(figure, path)
 
 
@@ -80,7 +80,7 @@ def _draw_scene(axes: Axes, scene: Scene, other: Tensor | None, agents: Sequence
     for i in _present(scene):
         history, future = _observed(scene, i)
         axes.plot(*history.T, color=HISTORY, lw=1.6, ls=(0, (1, 1)), zorder=2)
-        _fading_line(axes, np.concatenate([history[-1:], future]), HISTORY, TRUTH, width=1.2, zorder=6)
+        _fading_line(axes, np.concatenate([history[-1:], future]), HISTORY, TRUTH, width=1.2, zorder=6.0)
         axes.plot(*history[0], marker="o", ms=3.5, color=HISTORY, zorder=2)
         if other is not None:
             axes.plot(*other[i, :, :2].double().numpy().T, color=OTHER, lw=1.2, ls=(0, (4, 2)), zorder=5)
@@ -170,7 +170,7 @@ def _limits(axes: Axes, scene: Scene, forecasts: Sequence[JointForecast]) -> Non
     axes.yaxis.set_major_locator(MultipleLocator(step))
 
 
-def _explain(figure: Figure, scene: Scene, modes: int, alternatives: bool) -> None:
+def _explain(figure: Figure, scene: Scene, columns: int, modes: int, alternatives: bool) -> None:
     """One legend for what all panels share."""
     handles = [
         Line2D([], [], color=HISTORY, lw=1.6, ls=(0, (1, 1)), marker="o", ms=3.5, markevery=[0], label="history"),
@@ -181,4 +181,4 @@ def _explain(figure: Figure, scene: Scene, modes: int, alternatives: bool) -> No
     if scene.goal_candidates is not None and scene.goal_candidates.shape[2] == 1:
         handles.append(Line2D([], [], marker="*", ms=11, mfc="white", mec=TRUTH, ls="", label="goal"))
     handles += [Line2D([], [], color=MODES[m], lw=3, label=f"mode {m + 1}") for m in range(modes)]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8.5)
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 2 * columns), fontsize=8.5)

@@ -71,6 +71,11 @@ def collect(folder: str | Path) -> list[EvaluatedRun]:
     return [read_run(run) for run in evaluated]
 
 
+def not_evaluated(folder: str | Path) -> list[Path]:
+    """Run folders in and below a folder that a report has to leave out."""
+    return [run.path for run in discover(Path(folder).expanduser()) if not run.metrics_file().is_file()]
+
+
 def read_run(run: RunFolder) -> EvaluatedRun:
     """Read one evaluated run folder.
 
@@ -79,27 +84,26 @@ def read_run(run: RunFolder) -> EvaluatedRun:
     """
     config, record, result = run.config(), run.record, read_json(run.metrics_file())
 
-    def entry(content: Mapping[str, Any], file: Path, *keys: str) -> Any:
-        """The entry of the first key that is there; of a section its name."""
+    def entry(content: Any, file: Path, *keys: str) -> Any:
         for key in keys:
-            value = content.get(key)
-            if value is not None:
-                return value.get("name", "") if isinstance(value, Mapping) and key != "metrics" else value
-        raise ConfigError(f"{file} has no entry {' or '.join(keys)}: was it written by another version?")
+            content = content.get(key) if isinstance(content, Mapping) else None
+        if content is None:
+            raise ConfigError(f"{file} has no entry {'.'.join(keys)}: was it written by another version?")
+        return content
 
     metrics = entry(result, run.metrics_file(), "metrics")
     if not isinstance(metrics, Mapping) or not all(isinstance(value, int | float) for value in metrics.values()):
         raise ConfigError(f"{run.metrics_file()}: metrics must be numbers by name")
-    digest = str(entry(result, run.metrics_file(), "data_digest", "data"))
+    digest = str(entry(result, run.metrics_file(), "data_digest"))
     return EvaluatedRun(
         path=run.path,
-        name=str(entry(config, run.config_file, "title", "name")),
+        name=str(entry(config, run.config_file, "title")),
         seed=int(entry(config, run.config_file, "seed")),
-        data=str(entry(config, run.config_file, "data")),
-        backbone=str(entry(config, run.config_file, "backbone")),
-        forecaster=str(entry(config, run.config_file, "forecaster")),
+        data=str(entry(config, run.config_file, "data", "name")),
+        backbone=str(entry(config, run.config_file, "backbone", "name")),
+        forecaster=str(entry(config, run.config_file, "forecaster", "name")),
         goal=str(config.get("goal", "energy")),
-        budget=str(entry(config, run.config_file, "budget")),
+        budget=str(entry(config, run.config_file, "budget", "name")),
         split=str(result.get("split", "test")),
         data_digest=digest,
         trained_digest=str(record.get("data_digest") or digest),

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from epo_lightning.experiment.run_folder import write_text
 from epo_lightning.report.render import LEGEND, to_csv, to_markdown, to_rich
-from epo_lightning.report.runs import EvaluatedRun, collect
+from epo_lightning.report.runs import EvaluatedRun, collect, not_evaluated
 from epo_lightning.report.tables import Table, build_tables
 
 
@@ -75,12 +75,20 @@ def how_made(tables: Sequence[Table], folder: Path) -> str:
         for first in row.runs[:1]
     )
     lines += ["| " + " | ".join(entry) + " |" for entry in shown]
-    return "\n".join([*lines, "", f"Made of the runs in `{folder}` by `epo report runs={folder}`.", ""])
+    lines += ["", f"Made of the runs in `{folder}` by `epo report runs={folder}`."]
+    if missing := not_evaluated(folder):
+        lines.append(f"Left out, not evaluated yet: {', '.join(f'`{path}`' for path in missing)}.")
+    return "\n".join([*lines, ""])
+
+
+def _short(commit: str) -> str:
+    """Enough of a commit to find it; ``+`` says that files had been changed since."""
+    return commit[:10] + ("+" if commit.endswith("+") else "")
 
 
 def _conditions(runs: Sequence[EvaluatedRun]) -> tuple[str, str, str, str]:
     """Budget, seeds, parameters and commits of a row; what learns nothing has no budget."""
     parameters = ", ".join(sorted({"-" if run.parameters is None else str(run.parameters) for run in runs}))
-    commits = ", ".join(sorted({run.git_commit[:10] for run in runs}))
+    commits = ", ".join(sorted({_short(run.git_commit) for run in runs}))
     budget = runs[0].budget if runs[0].learned else "-"
     return budget, ", ".join(str(seed) for seed in sorted(run.seed for run in runs)), parameters, commits

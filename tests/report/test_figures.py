@@ -1,0 +1,107 @@
+"""Figures: written where asked, at the promised size, showing what differs; what cannot be drawn is said."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import torch
+from matplotlib.image import imread
+
+from epo_lightning.report.figures import joint_predictions
+from epo_lightning.report.weights import learned_weights
+from epo_lightning.scene import GameParameters, JointForecast, Scene
+
+HISTORY, FUTURE, MODES, AGENTS = 5, 8, 2, 2
+
+
+def scenes(count: int = 2) -> Scene:
+    """Agents that walk towards each other's start."""
+    time = torch.linspace(-1, 1, HISTORY + FUTURE)
+    states = torch.zeros(count, AGENTS, HISTORY + FUTURE, 4)
+    states[:, 0, :, 0], states[:, 1, :, 1] = 2 * time, -2 * time
+    return Scene(
+        history=states[:, :, :HISTORY],
+        dt=0.1,
+        future=states[:, :, HISTORY:],
+        goal_candidates=torch.full((count, AGENTS, 1, 2), 2.0),
+        size=torch.full((count, AGENTS, 2), 0.5),
+    )
+
+
+def forecast(scene: Scene, offset: float = 0.3) -> JointForecast:
+    assert scene.future is not None
+    states = torch.stack([scene.future, scene.future + offset], dim=1)
+    return JointForecast(states, torch.tensor([[0.7, 0.3]]).expand(len(states), 2))
+
+
+def game(count: int = 20, scale: float = 1.0) -> GameParameters:
+    random = torch.Generator().manual_seed(0)
+    own = {name: torch.randn(count, MODES, AGENTS, generator=random) * scale for name in ("goal", "vel", "acc")}
+    pair = {"proximity": torch.randn(count, MODES, 1, generator=random)}
+    return GameParameters(own, pair, torch.zeros(count, MODES, AGENTS, FUTURE, 2))
+
+
+def pixels(path: Path) -> np.ndarray:
+    return imread(path)[..., :3]
+
+
+def test_joint_predictions_grow_with_scenes_and_forecasters(tmp_path: Path) -> None:
+    one, many = scenes(1), scenes(2)
+    small = joint_predictions(one, {"SC": forecast(one)}, tmp_path / "deep" / "one.png")
+    large = joint_predictions(many, {"SC": forecast(many), "EPO": forecast(many)}, tmp_path / "many.png")
+    assert pixels(large).shape[0] > 1.5 * pixels(small).shape[0]
+    assert pixels(large).shape[1] > 1.5 * pixels(small).shape[1]
+
+
+def test_joint_predictions_show_forecasts_and_alternatives(tmp_path: Path) -> None:
+    scene = scenes(1)
+    near, far = (joint_predictions(scene, {"a": forecast(scene, d)}, tmp_path / f"{d}.png") for d in (0.2, 0.4))
+    assert pixels(near).shape == pixels(far).shape
+    assert not np.array_equal(pixels(near), pixels(far))
+    other = joint_predictions(scene, {"a": forecast(scene, 0.2)}, tmp_path / "alternative.png", scene.future)
+    assert pixels(other).shape != pixels(near).shape or not np.array_equal(pixels(other), pixels(near))
+
+
+def test_what_stands_behind_a_mask_is_not_drawn(tmp_path: Path) -> None:
+    scene = scenes(1)
+    pictures = []
+    for garbage in (torch.nan, 1e9):
+        mask = torch.tensor([[True, False]])
+        broken = torch.tensor([False, True])[:, None, None].expand(-1, HISTORY, 4)
+        masked = dataclasses.replace(scene, agent_mask=mask, history=scene.history.masked_fill(broken, garbage))
+        predicted = forecast(scene)
+        predicted.states[:, :, 1] = garbage
+        pictures.append(pixels(joint_predictions(masked, {"a": predicted}, tmp_path / "masked.png")))
+    assert np.array_equal(*pictures)
+
+
+def test_same_figure_same_bytes_and_the_readers_settings_stay(tmp_path: Path) -> None:
+    scene, size = scenes(1), mpl.rcParams["font.size"]
+    first, second = (joint_predictions(scene, {"a": forecast(scene)}, tmp_path / name) for name in ("a.png", "b.png"))
+    assert first.read_bytes() == second.read_bytes()
+    assert mpl.rcParams["font.size"] == size
+
+
+def test_weights_of_one_and_of_several_forecasters(tmp_path: Path) -> None:
+    plain = forecast(scenes())
+    learned = dataclasses.replace(plain, parameters=game())
+    one = learned_weights(learned, tmp_path / "one.png")
+    several = learned_weights({"SC": plain, "EPO": learned, "EPO 2": learned}, tmp_path / "several.png")
+    assert pixels(several).shape[0] > 1.5 * pixels(one).shape[0]
+    zero = learned_weights(dataclasses.replace(plain, parameters=game(scale=0.0)), tmp_path / "zero.png")
+    assert not np.array_equal(pixels(zero), pixels(one))
+
+
+def test_what_cannot_be_drawn_is_said(tmp_path: Path) -> None:
+    scene = scenes()
+    with pytest.raises(ValueError, match=r"\['SC'\] has inferred a game"):
+        learned_weights({"SC": forecast(scene)}, tmp_path / "no.png")
+    with pytest.raises(ValueError, match="without a forecast"):
+        joint_predictions(scene, {}, tmp_path / "no.png")
+    with pytest.raises(ValueError, match=r"Scene\.future is missing"):
+        joint_predictions(Scene(scene.history, 0.1), {"a": forecast(scene)}, tmp_path / "no.png")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,96 @@
+"""The written report: Markdown, CSV and the terminal."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from epo_lightning.registry import ConfigError
+from epo_lightning.report import write_report
+
+from .run_folders import make_run, scores
+
+
+def three_rows(folder: Path) -> None:
+    make_run(folder / "m", "V-LSTM", "marginal", scores(0.3, 0.006))
+    make_run(folder / "sc", "V-LSTM + SC", "scene_consistent", scores(0.1, 0.0012))
+    make_run(folder / "e0", "V-LSTM + EPO", "epo", scores(0.02))
+    make_run(folder / "e1", "V-LSTM + EPO", "epo", scores(0.04), seed=1)
+
+
+def report(runs: Path, out: Path, **options: object) -> tuple[str, str]:
+    console = Console(file=io.StringIO(), width=160)
+    markdown = write_report(runs, out, console=console, **options)  # type: ignore[arg-type]
+    return markdown, console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_markdown_by_hand(tmp_path: Path) -> None:
+    three_rows(tmp_path / "runs")
+    markdown, _ = report(tmp_path / "runs", tmp_path / "out", preface="A reduced budget.")
+    assert (tmp_path / "out" / "results.md").read_text() == markdown
+    lines = markdown.splitlines()
+    assert "| method | n | ADE | FDE | SADE | SFDE | OR (JFP) | OR (authors) |" in lines
+    assert (
+        "| V-LSTM | 1 | 0.300 (0.12) | 0.300 (0.20) | 0.300 (0.13) | 0.300 (0.23) | 0.0060 (0.006) | 0.0060 |" in lines
+    )
+    assert (
+        "| V-LSTM + EPO | 2 | **0.030 ± 0.014** (0.03) | **0.030 ± 0.014** (0.08) | **0.030 ± 0.014** (0.03) | "
+        "**0.030 ± 0.014** (0.08) | **0.0000 ± 0.0000** (0.000) | **0.0000 ± 0.0000** |" in lines
+    )
+    assert "<u>0.100</u> (0.04)" in markdown
+    assert lines.index("A reduced budget.") < lines.index("### rpi, test split")
+    assert "| V-LSTM + EPO | rpi | test | reduced | 0, 1 | 1234 | 0123456789 | abc |" in lines
+
+
+def test_terminal_shows_the_same_numbers(tmp_path: Path) -> None:
+    three_rows(tmp_path / "runs")
+    _, printed = report(tmp_path / "runs", tmp_path / "out")
+    assert "V-LSTM + EPO" in printed
+    assert "0.030 ± 0.014 (0.08)" in printed
+
+
+def test_csv_holds_every_score_once_in_full_precision(tmp_path: Path) -> None:
+    three_rows(tmp_path / "runs")
+    extra = scores(1 / 3) | {"executed/minSADE": 0.25, "executed/minSFDE": 0.5, "executed/overlap_jfp": 0.0}
+    make_run(tmp_path / "runs" / "other", "Other", "marginal", extra)
+    report(tmp_path / "runs", tmp_path / "out")
+    records = list(csv.DictReader((tmp_path / "out" / "results.csv").open()))
+    assert len(records) == 4 * 6 + 3
+    by_key = {(record["method"], record["metric"]): record for record in records}
+    assert len(by_key) == len(records)
+    assert float(by_key["Other", "minADE"]["mean"]) == 1 / 3
+    assert by_key["Other", "executed/minSADE"]["mean"] == "0.25"
+    assert by_key["V-LSTM + EPO", "minSADE"]["seeds"] == "0 1"
+    assert by_key["V-LSTM + EPO", "minSADE"]["paper"] == "0.03"
+
+
+def test_figures_are_linked_from_the_report(tmp_path: Path) -> None:
+    three_rows(tmp_path / "runs")
+    markdown, _ = report(tmp_path / "runs", tmp_path / "out", figures=[tmp_path / "out" / "figures" / "joint.png"])
+    assert "![joint](figures/joint.png)" in markdown
+
+
+def test_runs_that_are_left_out_and_changed_code_are_said(tmp_path: Path) -> None:
+    three_rows(tmp_path / "runs")
+    assert "Left out" not in report(tmp_path / "runs", tmp_path / "out")[0]
+    late = make_run(tmp_path / "runs" / "late", "Late", "epo", None)
+    make_run(tmp_path / "runs" / "m", "V-LSTM", "marginal", scores(0.3)).update(git_commit="0123456789abcdef+")
+    markdown, _ = report(tmp_path / "runs", tmp_path / "out")
+    assert f"Left out, not evaluated yet: `{late.path}`." in markdown
+    assert "| V-LSTM | rpi | test | reduced | 0 | 1234 | 0123456789+ | abc |" in markdown
+
+
+def test_nothing_is_overwritten_by_a_report_that_fails(tmp_path: Path) -> None:
+    three_rows(tmp_path / "runs")
+    before, _ = report(tmp_path / "runs", tmp_path / "out")
+    make_run(tmp_path / "runs" / "odd", "Odd", "epo", scores(0.1), budget="paper")
+    with pytest.raises(ConfigError, match="budget"):
+        report(tmp_path / "runs", tmp_path / "out")
+    assert (tmp_path / "out" / "results.md").read_text() == before
+    with pytest.raises(ConfigError, match="no run"):
+        report(tmp_path / "out", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
