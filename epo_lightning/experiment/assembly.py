@@ -13,8 +13,8 @@ from lightning.pytorch.loggers import Logger
 
 import epo_lightning.data  # noqa: F401 - registers the data parts
 from epo_lightning.experiment.run_folder import RunFolder
-from epo_lightning.experiment.settings import PARTS, Settings, TrainerSettings, check_part
-from epo_lightning.forecasters import build_forecaster
+from epo_lightning.experiment.settings import PARTS, Settings, TrainerSettings, check_part, check_types
+from epo_lightning.forecasters import build_forecaster, check_model
 from epo_lightning.registry import ConfigError, build
 
 
@@ -35,9 +35,9 @@ def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
         **sections,
         "goal": settings.goal,
         "horizon": int(data.horizon),
-        "history": int(data.history),
         "dt": float(data.dt),
         "subsets": list(data.subsets),
+        "shape": getattr(data, "shape", "disc"),
     }
 
 
@@ -62,14 +62,18 @@ def check(settings: Settings) -> tuple[Any, LightningModule]:
         ConfigError: what is wrong, in one sentence.
     """
     data = build_data(settings.data)
+    model = describe_model(settings, data)
+    check_model(model)
+    for kind in PARTS[1:]:
+        check_types(kind, model[kind])
     try:
-        with torch.random.fork_rng(devices=[]):
-            model = build_model(settings, data)
+        with torch.random.fork_rng(devices=[]), warnings.catch_warnings(action="ignore"):
+            forecaster = build_forecaster(model)
     except ConfigError:
         raise
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, ArithmeticError) as error:
         raise ConfigError(f"the forecaster cannot be built: {' '.join(str(error).split())}") from error
-    return data, model
+    return data, forecaster
 
 
 def quiet() -> None:
@@ -106,7 +110,6 @@ def build_trainer(
             precision=settings.precision,  # type: ignore[arg-type]
             max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,
             max_steps=settings.max_steps,
-            gradient_clip_val=settings.gradient_clip,
             check_val_every_n_epoch=settings.validate_every,
             limit_train_batches=settings.limit_train_batches,
             limit_val_batches=settings.limit_val_batches,
@@ -117,6 +120,7 @@ def build_trainer(
             enable_progress_bar=bar,
             enable_model_summary=False,
             num_sanity_val_steps=0,
+            inference_mode=False,  # the layer differentiates its energy also when it only forecasts
         )
     except (ValueError, RuntimeError) as error:  # Lightning's MisconfigurationException among them
         raise ConfigError(f"trainer: {' '.join(str(error).split())}") from error

@@ -65,18 +65,23 @@ class EpochLines(Callback):
     def __init__(self, title: str, monitor: str) -> None:
         self._title, self._monitor = title, monitor
         self._best = math.inf
+        self._validated = False
         self._started = time.monotonic()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._started = time.monotonic()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.state.fn != "fit" or trainer.sanity_checking:
+        self._validated = True
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not self._validated:
             return
+        self._validated = False
         metrics = trainer.callback_metrics
         value = float(metrics.get(self._monitor, math.nan))
         self._best = min(self._best, value) if not math.isnan(value) else self._best
-        loss = next((float(metrics[key]) for key in ("train/loss_epoch", "train/loss") if key in metrics), math.nan)
+        loss = float(metrics.get("train/loss", math.nan))
         epochs = f"/{trainer.max_epochs}" if trainer.max_epochs and trainer.max_epochs > 0 else ""
         print(
             f"{self._title}: epoch {trainer.current_epoch + 1}{epochs}, step {trainer.global_step}, loss {loss:.4f}, "

@@ -26,7 +26,9 @@ def tree() -> Path:
     for folder in (PACKAGE, PACKAGE.parent):
         if (folder / "conf" / "train.yaml").is_file():
             return folder
-    raise ConfigError(f"the configuration tree is missing: no conf/train.yaml in {PACKAGE} or {PACKAGE.parent}; reinstall")
+    raise ConfigError(
+        f"the configuration tree is missing: no conf/train.yaml in {PACKAGE} or {PACKAGE.parent}; reinstall"
+    )
 
 
 @contextmanager
@@ -37,22 +39,20 @@ def hydra(extra: Sequence[str] = ()) -> Iterator[Hydra]:
         ConfigError: one of the ``extra`` folders does not exist.
     """
     from hydra import version
-    from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
     from hydra._internal.hydra import Hydra
+    from hydra._internal.utils import create_config_search_path
+    from hydra.core.config_search_path import SearchPathQuery
     from hydra.core.global_hydra import GlobalHydra
 
     version.setbase("1.3")
     root = tree()
-    path = ConfigSearchPathImpl()
-    path.append("hydra", "pkg://hydra.conf")
-    for folder in extra:
+    path = create_config_search_path(f"file://{root / 'conf'}")
+    # The group `sweeps` lies beside conf/, where somebody looks who wants a table of the paper.
+    path.append("sweeps", f"file://{root}", SearchPathQuery(provider="main"))
+    for folder in reversed(extra):
         if not Path(folder).is_dir():
             raise ConfigError(f"--config-dir {folder}: the folder does not exist")
-        path.append("command-line", f"file://{Path(folder).resolve()}")
-    path.append("main", f"file://{root / 'conf'}")
-    # The group `sweeps` lies beside conf/, where somebody looks who wants a table of the paper.
-    path.append("sweeps", f"file://{root}")
-    path.append("schema", "structured://")
+        path.prepend("command-line", f"file://{Path(folder).resolve()}", SearchPathQuery(provider="main"))
     GlobalHydra.instance().clear()
     try:
         yield Hydra.create_main_hydra2("epo", path)
@@ -77,12 +77,14 @@ def resolve(config: DictConfig) -> dict[str, Any]:
         ConfigError: an interpolation that leads nowhere, or a value that is still missing.
     """
     from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
+    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
     plain = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
     try:
         values = OmegaConf.to_container(plain, resolve=True, throw_on_missing=True)
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"{error.full_key}=<value> is needed: it has no default") from error
     except OmegaConfBaseException as error:
         raise ConfigError(_sentence(error)) from error
     assert isinstance(values, dict)
@@ -135,11 +137,13 @@ def _one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Itera
     try:
         yield
     except OverrideParseException as error:
-        raise ConfigError(f"cannot read the override {error.override!r}: write key=value, for example seed=1") from error
+        raise ConfigError(
+            f"cannot read the override {error.override!r}: write key=value, for example seed=1"
+        ) from error
     except MissingConfigException as error:
         raise ConfigError(_missing_option(instance, error.missing_cfg_file or "", str(error))) from error
     except (HydraException, OmegaConfBaseException) as error:
-        unknown = re.search(r"Could not (?:override|delete from config\. )'?([\w./@]+)", str(error))
+        unknown = re.search(r"Could not (?:override|delete from config\.) +'([\w./@]+)'", str(error))
         if unknown and "Multiple values" not in str(error):
             raise ConfigError(_unknown_key(instance, name, unknown.group(1), overrides)) from error
         raise ConfigError(_sentence(error)) from error
@@ -170,13 +174,17 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
     config: Any = None
     for kept in (_groups(instance, overrides), []):
         try:
-            config = instance.compose_config(config_name=name, overrides=kept, run_mode=None, with_log_configuration=False)
+            config = instance.compose_config(
+                config_name=name, overrides=kept, run_mode=None, with_log_configuration=False
+            )
             break
         except Exception:  # the other overrides are wrong as well; the plain tree still tells the names
             continue
     walked: list[str] = []
     for word in key.replace("/", ".").split("."):
-        names = [str(known) for known in config if known != "hydra"] if isinstance(config, Mapping | _dict_config()) else []
+        names = (
+            [str(known) for known in config if known != "hydra"] if isinstance(config, Mapping | _dict_config()) else []
+        )
         if word not in names:
             level = f" in {'.'.join(walked)}" if walked else ""
             return f"unknown key {key!r}{level}: {nearest(word, names)}"

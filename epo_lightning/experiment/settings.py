@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from epo_lightning.registry import ConfigError, check, lookup, nearest
 
-PARTS = ("data", "backbone", "forecaster", "energy", "solver", "optimizer")
+PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "optimizer")
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,6 @@ class TrainerSettings:
     devices: int = 1
     precision: str = "32-true"
     threads: int = 1
-    gradient_clip: float | None = None
     validate_every: int = 1
     limit_train_batches: int | float = 1.0
     limit_val_batches: int | float = 1.0
@@ -109,6 +108,7 @@ class Settings:
     data: Mapping[str, Any]
     backbone: Mapping[str, Any]
     forecaster: Mapping[str, Any]
+    dynamics: Mapping[str, Any]
     energy: Mapping[str, Any]
     solver: Mapping[str, Any]
     optimizer: Mapping[str, Any]
@@ -274,6 +274,15 @@ def check_part(kind: str, values: Any, supplied: Sequence[str] = ()) -> None:
     if not isinstance(values, Mapping):
         raise ConfigError(f"{kind} must be a mapping with a name, not {values!r}")
     check(kind, values, supplied)
+    check_types(kind, values)
+
+
+def check_types(kind: str, values: Mapping[str, Any]) -> None:
+    """Compare the values of a part's section with the annotations of its constructor.
+
+    Raises:
+        ConfigError: a value of another type.
+    """
     part = lookup(kind, values["name"])
     function = part.__init__ if isinstance(part, type) else part  # type: ignore[misc]
     try:

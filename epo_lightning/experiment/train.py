@@ -24,7 +24,8 @@ from epo_lightning.experiment.settings import Settings, read
 from epo_lightning.registry import ConfigError
 
 # What does not make it another run: these are in the folder's name, or do not touch the result.
-NOT_HASHED = ("experiment", "seed", "budget", "sweeps", "runs", "run_dir", "existing", "logger", "hydra")
+NOT_HASHED = ("experiment", "seed", "budget", "sweeps", "runs", "run_dir", "existing", "logger", "hydra", "title")
+NOT_HASHED_KEYS = ("trainer.threads", "callbacks.progress", "callbacks.refresh")
 PACKAGES = ("epo_lightning", "torch", "lightning", "hydra-core", "omegaconf", "torchmetrics", "numpy", "numba")
 
 
@@ -32,7 +33,8 @@ def folder_for(settings: Settings, overrides: Sequence[str]) -> RunFolder:
     """``<runs>/<experiment>/<budget>-s<seed>``, and a hash of the other overrides where there are any."""
     if settings.run_dir:
         return RunFolder(Path(settings.run_dir).expanduser())
-    special = sorted(text for text in overrides if text.lstrip("+~").split("=")[0].split(".")[0] not in NOT_HASHED)
+    keys = {text: text.lstrip("+~").split("=")[0].split("@")[0] for text in overrides}
+    special = sorted(t for t, key in keys.items() if key.split(".")[0] not in NOT_HASHED and key not in NOT_HASHED_KEYS)
     suffix = "-" + hashlib.sha256("\n".join(special).encode()).hexdigest()[:6] if special else ""
     group = settings.experiment or f"custom/{settings.forecaster['name']}"
     return RunFolder(Path(settings.runs).expanduser() / group / f"{settings.budget.name}-s{settings.seed}{suffix}")
@@ -56,12 +58,12 @@ def train(config: dict[str, Any], overrides: Sequence[str] = ()) -> tuple[RunFol
     assembly.check(settings)
     run = folder_for(settings, overrides)
     if run.exists:
-        if settings.existing == "continue" and run.record_file.is_file():
+        refuse_occupied(settings, run)
+        if run.record_file.is_file():
             if run.finished:
                 print(f"{settings.title}: {run.path} is finished, nothing to do")
                 return run, {}
             return resume(run, config)
-        raise ConfigError(_occupied(run))
     data = _ready(settings)
     run.begin(config, _record(settings, data, overrides))
     return run, _fit(settings, config, run)
@@ -87,7 +89,7 @@ def resume(run: RunFolder, expected: dict[str, Any] | None = None) -> tuple[RunF
     if run.finished:
         raise ConfigError(f"{run.path} is finished: score it with `epo evaluate run={run.path}`")
     data = _ready(settings)
-    began_with = run.record.get("data", {}).get("digest")
+    began_with = run.record.get("data_digest")
     if began_with != data.digest:
         raise ConfigError(
             f"the data of {run.path} has changed since the run began (digest {began_with}, now {data.digest}): "
@@ -144,7 +146,7 @@ def _check_learned(run: RunFolder, trainer: Trainer) -> None:
     if not run.checkpoint("best").is_file():
         raise ConfigError(
             f"{run.path}: {trainer.global_step} steps without a single finite validation score; look at "
-            f"{run.logs / 'metrics.csv'}, and try a smaller optimizer.lr or trainer.gradient_clip=1"
+            f"{run.logs / 'metrics.csv'}, and try a smaller optimizer.lr, or optimizer.clip=1"
         )
 
 
@@ -185,6 +187,16 @@ def _steps_in(path: Path, model: LightningModule) -> int:
     return int(content.get("global_step", 0))
 
 
+def refuse_occupied(settings: Settings, run: RunFolder) -> None:
+    """Nothing is ever overwritten.
+
+    Raises:
+        ConfigError: the folder holds something, and it is not a run that ``settings`` may continue.
+    """
+    if run.exists and not (settings.existing == "continue" and run.record_file.is_file()):
+        raise ConfigError(_occupied(run))
+
+
 def _occupied(run: RunFolder) -> str:
     if not run.record_file.is_file():
         return f"{run.path} exists and is not a run folder: nothing is overwritten; choose another run_dir=<folder>"
@@ -208,8 +220,12 @@ def _essence(config: dict[str, Any]) -> dict[str, Any]:
 def _differences(one: Any, other: Any, where: str = "") -> list[str]:
     if isinstance(one, dict) and isinstance(other, dict):
         keys = sorted({*one, *other})
-        return [found for key in keys for found in _differences(one.get(key), other.get(key), f"{where}.{key}".strip("."))]
-    same = one == other or (isinstance(one, float) and isinstance(other, float) and math.isnan(one) and math.isnan(other))
+        return [
+            found for key in keys for found in _differences(one.get(key), other.get(key), f"{where}.{key}".strip("."))
+        ]
+    same = one == other or (
+        isinstance(one, float) and isinstance(other, float) and math.isnan(one) and math.isnan(other)
+    )
     return [] if same else [f"{where}: {one!r} there, {other!r} here"]
 
 
@@ -221,11 +237,12 @@ def _record(settings: Settings, data: Any, overrides: Sequence[str]) -> dict[str
         "goal": settings.goal,
         "seed": settings.seed,
         "budget": settings.budget.name,
-        "data": {"name": settings.data["name"], "digest": data.digest},
+        "data": settings.data["name"],
+        "data_digest": data.digest,
         "command": " ".join(["epo", "train", *overrides]),
         "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
-        "commit": _commit(),
+        "git_commit": _commit(),
     }
 
 
@@ -243,7 +260,9 @@ def _commit() -> str | None:
         return None
     try:
         commit = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-        changes = subprocess.run(["git", "-C", root, "status", "--porcelain"], capture_output=True, text=True, check=True)
+        changes = subprocess.run(
+            ["git", "-C", root, "status", "--porcelain"], capture_output=True, text=True, check=True
+        )
     except (OSError, subprocess.CalledProcessError):
         return None
     return commit.stdout.strip() + ("+" if changes.stdout.strip() else "")

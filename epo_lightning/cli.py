@@ -1,0 +1,248 @@
+"""``epo <verb> [overrides]``: the command line.
+
+Nothing heavy is imported before it is needed, so that help comes at once. Every error that a user can cause is one message
+and exit status 2; ``--traceback`` shows where it came from.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from epo_lightning.registry import ConfigError, nearest
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+USAGE = """\
+epo - energy-based potential games for multi-agent motion forecasting
+
+  epo generate                               make the data set
+  epo train experiment=rpi/v_lstm_epo        train a row of the paper's table
+  epo train -m sweeps=rpi_main               train all rows, with seeds
+  epo train resume=<run folder>              continue after a kill
+  epo evaluate runs=runs                     score finished runs on the test split
+  epo predict run=<run folder> out=<folder>  write and draw forecasts
+  epo report runs=runs out=report            the table beside the paper's values
+  epo config experiment=rpi/v_lstm_epo       print the resolved configuration
+  epo config check experiment=...            check it, without loading anything
+
+Everything after the verb is a Hydra override, key=value. `epo <verb> --help` lists what can be set.
+
+Options
+  -m, --multirun        run every combination of comma-separated values (epo train -m seed=0,1,2)
+  --config-dir FOLDER   look for configurations here first
+  --traceback           show where an error came from
+  --version
+  -h, --help
+"""
+
+VERBS = {
+    "generate": "make a data set and print its report",
+    "train": "train a forecaster into a run folder",
+    "evaluate": "score runs on the test split",
+    "predict": "write and draw a run's forecasts",
+    "report": "tables and figures of evaluated runs",
+    "config": "print or check a resolved configuration",
+}
+
+
+@dataclass
+class Arguments:
+    """A command line, taken apart."""
+
+    verb: str
+    overrides: list[str] = field(default_factory=list)
+    multirun: bool = False
+    help: bool = False
+    extra: list[str] = field(default_factory=list)
+
+
+def parse(words: Sequence[str]) -> Arguments:
+    """Take a command line apart.
+
+    Raises:
+        ConfigError: an unknown verb or option.
+    """
+    found = Arguments(verb="")
+    rest = iter(words)
+    for word in rest:
+        if word in ("-h", "--help"):
+            found.help = True
+        elif word in ("-m", "--multirun"):
+            found.multirun = True
+        elif word == "--config-dir" or word.startswith("--config-dir="):
+            folder = word.partition("=")[2] or next(rest, "")
+            if not folder:
+                raise ConfigError("--config-dir needs a folder")
+            found.extra.append(folder)
+        elif word.startswith("-"):
+            known = ("--multirun", "--config-dir", "--traceback", "--version", "--help")
+            raise ConfigError(f"unknown option {word}: {nearest(word, known)}")
+        elif not found.verb:
+            if word not in VERBS:
+                raise ConfigError(f"unknown verb {word!r}: {nearest(word, VERBS)}")
+            found.verb = word
+        else:
+            found.overrides.append(word)
+    return found
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run a command line and exit: 0 done, 1 failed, 2 a mistake in what was asked for, 130 interrupted."""
+    words = list(sys.argv[1:] if words is None else words)
+    trace = "--traceback" in words
+    try:
+        _run([word for word in words if word != "--traceback"])
+    except ConfigError as error:
+        if trace:
+            raise
+        print(f"epo: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("epo: interrupted; an unfinished run continues with `epo train resume=<run folder>`", file=sys.stderr)
+        raise SystemExit(130) from None
+    except BrokenPipeError:  # `epo config ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+
+
+def _run(words: Sequence[str]) -> None:
+    if "--version" in words:
+        from importlib.metadata import version
+
+        print(f"epo_lightning {version('epo_lightning')}")
+        return
+    arguments = parse(words)
+    if not arguments.verb:
+        print(USAGE, end="")
+    elif arguments.help:
+        _help(arguments)
+    elif arguments.verb == "config":
+        _config(arguments)
+    elif arguments.multirun:
+        _sweep(arguments)
+    else:
+        _single(arguments)
+
+
+def _help(arguments: Arguments) -> None:
+    """The verb's own configuration file is its help: every line of it is commented."""
+    from epo_lightning.experiment.compose import hydra, options_of, tree
+
+    print(f"epo {arguments.verb} [-m] [key=value ...]: {VERBS[arguments.verb]}\n")
+    if arguments.verb == "config":
+        print(
+            "  epo config [verb] [key=value ...]         print what `epo <verb>` would use; verb is train if left out"
+        )
+        print("  epo config check [verb] [key=value ...]   check it, without loading data or making a folder")
+        return
+    hidden = ("hydra:", "  output_subdir", "  run: {", "  sweep: {", "  - override hydra")
+    for line in (tree() / "conf" / f"{arguments.verb}.yaml").read_text(encoding="utf-8").splitlines():
+        if not line.startswith(hidden):
+            print(f"  {line}")
+    if arguments.verb == "train":
+        with hydra(arguments.extra) as instance:
+            for group in ("experiment", "budget", "data", "backbone", "forecaster", "logger", "debug", "sweeps"):
+                print(f"  {group + '=':<14}{' | '.join(sorted(options_of(instance, group)))}")
+
+
+def _config(arguments: Arguments) -> None:
+    words = list(arguments.overrides)
+    checking = bool(words) and words[0] == "check"
+    words = words[1:] if checking else words
+    verb = words.pop(0) if words and words[0] in VERBS and words[0] != "config" else "train"
+    if words and "=" not in words[0] and not words[0].startswith("~"):
+        raise ConfigError(f"epo config knows no {words[0]!r}: {nearest(words[0], ['check', *VERBS])}")
+    from epo_lightning.experiment.compose import compose
+
+    config = compose(verb, words, arguments.extra)
+    if not checking:
+        import yaml
+
+        print(yaml.safe_dump(config, sort_keys=False, default_flow_style=None, width=120), end="")
+        return
+    if verb != "train":
+        from epo_lightning.experiment.verbs import check
+
+        check(verb, config)
+        print(f"{verb}: the configuration is sound")
+        return
+    from epo_lightning.experiment import assembly, train
+    from epo_lightning.experiment.settings import Settings, read
+
+    settings = read(Settings, config)
+    data, model = assembly.check(settings)
+    run = train.folder_for(settings, words)
+    print(f"{settings.title}: the configuration is sound")
+    print(f"  parameters  {assembly.parameters(model)}")
+    print(f"  data        {settings.data['name']}, digest {data.digest}")
+    print(f"  run folder  {run.path}" + (" (exists)" if run.exists else ""))
+
+
+def _single(arguments: Arguments) -> None:
+    resumed = [word for word in arguments.overrides if word.startswith("resume=")]
+    if arguments.verb == "train" and resumed:
+        _resume(resumed[-1].partition("=")[2], [word for word in arguments.overrides if word not in resumed])
+        return
+    from epo_lightning.experiment.compose import compose
+
+    config = compose(arguments.verb, arguments.overrides, arguments.extra)
+    from epo_lightning.experiment import verbs
+
+    verbs.RUN[arguments.verb](config, arguments.overrides)
+
+
+def _resume(folder: str, others: Sequence[str]) -> None:
+    if others:
+        raise ConfigError(
+            f"a resumed run keeps its own configuration, so `{' '.join(others)}` cannot be changed: "
+            f"leave it out, or begin a new run"
+        )
+    from epo_lightning.experiment import verbs
+    from epo_lightning.experiment.run_folder import RunFolder
+
+    verbs.resume(RunFolder.open(folder))
+
+
+def _sweep(arguments: Arguments) -> None:
+    """Check every job, then let Hydra launch them."""
+    if arguments.verb != "train":
+        raise ConfigError(f"epo {arguments.verb} takes no -m: give it runs=<folder> to work on several runs")
+    from epo_lightning.experiment import compose
+
+    listed = compose.jobs("train", arguments.overrides, arguments.extra)
+    if listed:
+        from epo_lightning.experiment import assembly, train
+        from epo_lightning.experiment.settings import Settings, read
+
+        for job in listed:
+            settings = read(Settings, compose.compose("train", job, arguments.extra))
+            assembly.check(settings)
+            train.refuse_occupied(settings, train.folder_for(settings, job))
+        print(f"{len(listed)} runs")
+    compose.multirun("train", arguments.overrides, job_of_sweep, arguments.extra)
+
+
+def job_of_sweep(config: DictConfig) -> float | None:
+    """One job of a sweep; at module level, so that launchers can send it to other processes.
+
+    Returns:
+        the best validation score, which is what sweepers that search minimise.
+    """
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
+
+    from epo_lightning.experiment import verbs
+    from epo_lightning.experiment.compose import resolve
+
+    whole = OmegaConf.merge({"hydra": HydraConfig.get()}, config)
+    OmegaConf.set_struct(whole, False)
+    return verbs.train(resolve(whole), list(HydraConfig.get().overrides.task))  # type: ignore[arg-type]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""What each verb of the command line does, and what it says when it is done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from epo_lightning.experiment.run_folder import RunFolder
+from epo_lightning.experiment.settings import (
+    EvaluateSettings,
+    GenerateSettings,
+    PredictSettings,
+    ReportSettings,
+    check_part,
+    read,
+)
+
+SCHEMAS: dict[str, type] = {
+    "generate": GenerateSettings,
+    "evaluate": EvaluateSettings,
+    "predict": PredictSettings,
+    "report": ReportSettings,
+}
+HEADLINE = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp")
+
+
+def check(verb: str, config: dict[str, Any]) -> Any:
+    """The settings of a verb other than train.
+
+    Raises:
+        ConfigError: what is wrong with them.
+    """
+    settings = read(SCHEMAS[verb], config)
+    if isinstance(settings, GenerateSettings):
+        import epo_lightning.data  # noqa: F401 - registers the data parts
+
+        check_part("data", settings.data)
+    return settings
+
+
+def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Make the data set, unless it is there already, and print its report."""
+    settings = check("generate", config)
+    from epo_lightning.experiment import assembly
+
+    data = assembly.build_data(settings.data)
+    folder = data.generate(workers=settings.workers, progress=settings.progress)
+    print(f"\ndata in {folder}, digest {data.digest}")
+    _print_report(data.report())
+    print("\nnext: epo train experiment=rpi/v_lstm_epo" + "".join(f" {o}" for o in overrides if o.startswith("data")))
+
+
+def train(config: dict[str, Any], overrides: Sequence[str]) -> float | None:
+    """Train a run and say where it is."""
+    from epo_lightning.experiment import train as training
+
+    run, _ = training.train(config, overrides)
+    return _trained(run)
+
+
+def resume(run: RunFolder) -> float | None:
+    """Continue a run and say where it is."""
+    from epo_lightning.experiment import train as training
+
+    training.resume(run)
+    return _trained(run)
+
+
+def _trained(run: RunFolder) -> float | None:
+    record = run.record
+    best = next(iter(record.get("best", {}).items()), None)
+    score = f", best {best[0]} {best[1]:.4f}" if best and best[1] is not None else ""
+    print(f"{record['title']}, seed {record['seed']}: {record.get('parameters', 0)} parameters{score}")
+    print(f"run folder: {run.path}\nnext: epo evaluate run={run.path}")
+    return best[1] if best else None
+
+
+def evaluate(config: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Score runs and print the headline metrics."""
+    settings = check("evaluate", config)
+    from epo_lightning.experiment.evaluate import evaluate as score
+
+    for run, metrics in score(config):
+        shown = ", ".join(f"{name} {metrics[name]:.4f}" for name in HEADLINE if name in metrics)
+        print(f"{run.path} ({settings.split}): {shown}")
+    print(f"next: epo report runs={settings.runs or settings.run} out=report")
+
+
+def predict(config: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Write and draw forecasts."""
+    settings = check("predict", config)
+    from epo_lightning.experiment.predict import predict as forecast
+
+    written = forecast(settings)
+    print("\n".join(f"wrote {path}" for path in written))
+
+
+def report(config: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Tables and figures of all evaluated runs below a folder."""
+    settings = check("report", config)
+    from epo_lightning.experiment.report import report as write
+
+    write(settings)
+    print(f"wrote {Path(settings.out) / 'results.md'}")
+
+
+def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
+    for key, value in report.items():
+        if isinstance(value, dict):
+            print(f"{indent}{key}")
+            _print_report(value, indent + "  ")
+        elif isinstance(value, float):
+            print(f"{indent}{key:<34} {value:.4g}")
+        else:
+            print(f"{indent}{key:<34} {value}")
+
+
+RUN: dict[str, Callable[[dict[str, Any], Sequence[str]], Any]] = {
+    "generate": generate,
+    "train": train,
+    "evaluate": evaluate,
+    "predict": predict,
+    "report": report,
+}
