@@ -63,7 +63,7 @@ def overlaps(
                     outline(states[b, mode, i, k].tolist(), size[b, i].tolist(), shape)
                     .intersection(outline(states[b, mode, j, k].tolist(), size[b, j].tolist(), shape))
                     .area
-                    > 1e-5
+                    > 1e-11
                     for k in range(states.shape[3])
                 )
         result["jfp"].append(float(pairs > 0) if present else math.nan)
