@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Iterable
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -37,22 +38,19 @@ def own_text(cell: Cell, column: Column) -> str:
     return mean if cell.deviation is None else f"{mean} ± {number(cell.deviation, column.digits)}"
 
 
-def paper_text(cell: Cell, column: Column) -> str:
-    """The paper's value with the digits that it is printed with, or nothing."""
-    return "" if cell.paper is None else f" ({number(cell.paper, column.digits - 1)})"
-
-
 def to_rich(table: Table) -> RichTable:
-    """For the terminal: bold and underlined as in the paper, its values dimmed, a line between groups."""
-    rich = RichTable(title=table.title, title_justify="left", caption_justify="left")
-    rich.add_column("method", no_wrap=True)
-    rich.add_column("n", justify="right")
+    """For the terminal, where 80 columns have to do: deviations stand under their means, the paper's values below a row."""
+    rich = RichTable(title=table.title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    rich.add_column("method")  # the one column that may break its lines: half a number is worse than none
+    rich.add_column("n", justify="right", no_wrap=True)
     for column in table.columns:
-        rich.add_column(column.label, justify="right")
+        rich.add_column(column.label.replace(" ", "\n"), justify="right", no_wrap=True, vertical="top")
     for row, last in _with_ends(table.rows):
-        rich.add_row(
-            row.name, str(len(row.runs)), *(_rich_cell(row, column) for column in table.columns), end_section=last
-        )
+        paper = [_paper_number(row, column) for column in table.columns]
+        cells = (_rich_cell(row, column) for column in table.columns)
+        rich.add_row(row.name, str(len(row.runs)), *cells, end_section=last and not any(paper))
+        if any(paper):
+            rich.add_row("  paper", "", *paper, style="dim", end_section=last)
     return rich
 
 
@@ -61,7 +59,14 @@ def _rich_cell(row: Row, column: Column) -> Text:
     if cell is None:
         return Text("")
     style = {1: "bold", 2: "underline"}.get(cell.rank or 0, "")
-    return Text.assemble((own_text(cell, column), style), (paper_text(cell, column), "dim"))
+    deviation = "" if cell.deviation is None else f"\n±{number(cell.deviation, column.digits)}"
+    return Text.assemble((number(cell.mean, column.digits), style), (deviation, "dim"))
+
+
+def _paper_number(row: Row, column: Column) -> str:
+    """The paper's value with the digits that it is printed with, or nothing."""
+    cell = row.cells.get(column.metric)
+    return "" if cell is None or cell.paper is None else number(cell.paper, column.digits - 1)
 
 
 def to_markdown(table: Table) -> str:
@@ -83,7 +88,8 @@ def _markdown_cell(row: Row, column: Column) -> str:
     if cell is None:
         return ""
     form = {1: "**{}**", 2: "<u>{}</u>"}.get(cell.rank or 0, "{}")
-    return form.format(own_text(cell, column)) + paper_text(cell, column)
+    paper = _paper_number(row, column)
+    return form.format(own_text(cell, column)) + (f" ({paper})" if paper else "")
 
 
 def to_csv(tables: Iterable[Table]) -> str:

@@ -99,7 +99,7 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
         names = dict.fromkeys(metric.split("/")[0] for row in rows for metric in row.cells if "/" in metric)
         # What happened comes before what could have happened as well; files sort their keys the other way.
         subsets = sorted(names.keys() - {"initial"}, key=lambda name: (name != "executed", name))
-        short = (Column("minSADE", "SADE"), Column("minSFDE", "SFDE"), Column("overlap_jfp", "OR (JFP)"))
+        short = (Column("minSADE", "SADE"), Column("minSFDE", "SFDE"))
         columns = tuple(Column(f"{name}/{c.metric}", f"{name} {c.label}") for name in subsets for c in short)
         tables += _shown(f"{where}: {' and '.join(subsets)} apart", columns, rows)
         initial = tuple(

@@ -101,7 +101,7 @@ def test_broken_forecast_is_loud() -> None:
     assert all(value.isposinf() for value in metrics.compute().values())
 
 
-@pytest.mark.parametrize("metric_class, function", DISPLACEMENTS)
+@pytest.mark.parametrize(("metric_class", "function"), DISPLACEMENTS)
 def test_displacement_class_adds_up_its_function(metric_class: type, function: object) -> None:
     case, _ = big_case()
     metric = metric_class()

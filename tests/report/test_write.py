@@ -46,11 +46,21 @@ def test_markdown_by_hand(tmp_path: Path) -> None:
     assert "| V-LSTM + EPO | rpi | test | reduced | 0, 1 | 1234 | 0123456789 | abc |" in lines
 
 
-def test_terminal_shows_the_same_numbers(tmp_path: Path) -> None:
+def test_terminal_shows_whole_numbers_in_80_columns(tmp_path: Path) -> None:
     three_rows(tmp_path / "runs")
-    _, printed = report(tmp_path / "runs", tmp_path / "out")
-    assert "V-LSTM + EPO" in printed
-    assert "0.030 ± 0.014 (0.08)" in printed
+    subsets = {f"{part}/{name}": x for part in ("executed", "alternative") for name, x in scores(0.25).items()}
+    for seed in (0, 1):
+        make_run(
+            tmp_path / f"runs/g{seed}", "V-LSTM + EPO, goal known", "epo", scores(0.5) | subsets, seed=seed, goal="all"
+        )
+    console = Console(file=io.StringIO(), width=80)
+    write_report(tmp_path / "runs", tmp_path / "out", console=console)
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "…" not in printed
+    lines = [line.split() for line in printed.splitlines()]
+    row = lines.index(["V-LSTM", "+", "EPO", "2", "0.030", "0.030", "0.030", "0.030", "0.0000", "0.0000"])
+    assert lines[row + 1] == ["±0.014"] * 4 + ["±0.0000"] * 2
+    assert lines[row + 2] == ["paper", "0.03", "0.08", "0.03", "0.08", "0.000"]
 
 
 def test_csv_holds_every_score_once_in_full_precision(tmp_path: Path) -> None:

@@ -27,14 +27,14 @@ def rate(positions: list[list[float]], shape: str = "disc", definition: str = "j
 
 
 @pytest.mark.parametrize(
-    "distance, expected", [(0.4999, 1.0), (0.5, 0.0), (0.5001, 0.0), (0.0, 1.0)], ids=["in", "touch", "out", "same"]
+    ("distance", "expected"), [(0.4999, 1.0), (0.5, 0.0), (0.5001, 0.0), (0.0, 1.0)], ids=["in", "touch", "out", "same"]
 )
 @pytest.mark.parametrize("shape", ["disc", "box"])
 def test_radius_is_half_of_the_size_and_touching_is_no_overlap(shape: str, distance: float, expected: float) -> None:
     assert rate([[0, 0, 0], [distance, 0, 0]], shape) == expected
 
 
-@pytest.mark.parametrize("shape, expected", [("disc", 0.0), ("box", 1.0)])
+@pytest.mark.parametrize(("shape", "expected"), [("disc", 0.0), ("box", 1.0)])
 def test_corners_belong_to_boxes_only(shape: str, expected: float) -> None:
     assert rate([[0, 0, 0], [0.45, 0.45, 0]], shape) == expected
 
