@@ -1,0 +1,153 @@
+"""Batches of scenes for Lightning: data sets that are indexed by whole batches, and an order that can be resumed.
+
+All records of a split stay in memory; a batch is one ``index_select``. That is faster than any worker process here, so
+there are none. The order of an epoch depends on (seed, epoch) alone: a run that goes on at the beginning of an epoch sees
+exactly what it would have seen without the pause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+import torch
+from lightning import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader, Sampler
+
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import Scene
+
+
+class SceneDataset(Protocol):
+    """Records of a split; ``dataset[indices]`` with a LongTensor is a Scene of that many."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, indices: Tensor) -> Scene: ...
+
+    def set_epoch(self, epoch: int) -> None:
+        """Make the choices that differ from epoch to epoch."""
+
+
+class BatchSampler(Sampler[Tensor]):
+    """Index tensors of the batches of an epoch.
+
+    Lightning calls ``set_epoch`` of a loader's sampler before each epoch, with the epoch that a checkpoint restored; the
+    order follows from the seed and that number. Under distributed training every rank takes each world-size-th index, of
+    a number of indices that all ranks have.
+
+    Args:
+        dataset: is told the epoch as well.
+        batch_size: scenes per batch and rank.
+        shuffle: whether the order is random; then also an incomplete last batch is dropped.
+        seed: of the order.
+    """
+
+    def __init__(self, dataset: SceneDataset, batch_size: int, shuffle: bool, seed: int) -> None:
+        self.dataset, self.batch_size, self.shuffle, self.seed = dataset, batch_size, shuffle, seed
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch of the next iteration."""
+        self.epoch = epoch
+        self.dataset.set_epoch(epoch)
+
+    def indices(self) -> Tensor:
+        """All indices of this rank in this epoch, in order."""
+        count = len(self.dataset)
+        if self.shuffle:
+            # Two numbers below 2^32 make one seed of 64 bits: no two (seed, epoch) share it.
+            generator = torch.Generator().manual_seed((self.seed << 32) + self.epoch)
+            order = torch.randperm(count, generator=generator)
+        else:
+            order = torch.arange(count)
+        rank, world = _rank()
+        if self.shuffle:
+            order = order[: count - count % world]
+        return order[rank::world]
+
+    def __iter__(self) -> Iterator[Tensor]:
+        batches = self.indices().split(self.batch_size)
+        return iter(batches[: len(self)])
+
+    def __len__(self) -> int:
+        rank, world = _rank()
+        count = len(self.dataset)
+        if self.shuffle:
+            return count // world // self.batch_size
+        return -(-len(range(rank, count, world)) // self.batch_size)
+
+
+def _rank() -> tuple[int, int]:
+    """This process's rank and the number of processes."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        return torch.distributed.get_rank(), torch.distributed.get_world_size()
+    return 0, 1
+
+
+class SceneDataModule(LightningDataModule):
+    """Loaders over the splits ``train``, ``val`` and ``test``; a subclass says how a split is opened.
+
+    Attributes:
+        subsets: names of the subsets that ``Scene.subset`` counts; empty where there are none.
+        dt: time step [s].
+        horizon: future steps K.
+        num_agents: agents per scene N.
+    """
+
+    subsets: tuple[str, ...] = ()
+    dt: float
+    horizon: int
+    num_agents: int
+
+    def __init__(self, batch_size: int, seed: int) -> None:
+        super().__init__()
+        if not isinstance(batch_size, int) or isinstance(batch_size, bool) or batch_size < 2:
+            raise ConfigError(f"batch_size is {batch_size!r}, but batch normalisation needs at least 2 scenes in a batch")
+        if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**31:
+            raise ConfigError(f"seed is {seed!r}, expected a whole number from 0 to 2^31 - 1")
+        self.batch_size, self.seed = batch_size, seed
+        self._opened: dict[str, SceneDataset] = {}
+
+    def open(self, split: str) -> SceneDataset:
+        """The data set of a split, read from disk."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how a split is opened")
+
+    def setup(self, stage: str | None = None) -> None:
+        """Open what a stage needs. The test split is not even read before the stage is ``test`` or ``predict``."""
+        names = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
+        for name in names.get(stage or "fit", ("train", "val")):
+            if name not in self._opened:
+                self._opened[name] = self.open(name)
+
+    def dataset(self, split: str) -> SceneDataset:
+        """The opened data set of a split.
+
+        Raises:
+            RuntimeError: the split has not been set up.
+        """
+        if split not in self._opened:
+            raise RuntimeError(f"the split {split!r} is not open: call setup with a stage that needs it")
+        return self._opened[split]
+
+    def _loader(self, split: str, shuffle: bool) -> DataLoader:
+        data = self.dataset(split)
+        sampler = BatchSampler(data, self.batch_size, shuffle, self.seed)
+        if not len(sampler):
+            raise ConfigError(
+                f"batch_size is {self.batch_size}, but the split {split!r} has only {len(data)} samples: not one full batch"
+            )
+        return DataLoader(data, sampler=sampler, batch_size=None, num_workers=0)  # type: ignore[arg-type]
+
+    def train_dataloader(self) -> DataLoader:
+        return self._loader("train", shuffle=True)
+
+    def val_dataloader(self) -> DataLoader:
+        return self._loader("val", shuffle=False)
+
+    def test_dataloader(self) -> DataLoader:
+        return self._loader("test", shuffle=False)
+
+    def predict_dataloader(self) -> DataLoader:
+        return self._loader("test", shuffle=False)

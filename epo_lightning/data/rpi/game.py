@@ -1,0 +1,115 @@
+"""The robot-pedestrian game: who starts where, who wants what, and what it costs (App. "RPI").
+
+Two unicycles cross a circle of radius 3 m. The robot's start and goal never change; the pedestrian starts at the angle
+``phi`` from the robot and walks to the antipode. Agent i pays, as a plain sum over the steps,
+
+    1/2 effort (a^2 + omega^2) + 1/2 slowness v^2 + soft bounds + 1/2 terminal (|p_K - goal|^2 + (theta_K - theta_goal)^2)
+    + w max(0, radius - distance)^2,
+
+where the last term is the same for both: an exact potential game, whose potential is the sum of the own costs plus the
+shared term once.
+
+Sources: the paper's appendix; the constants that it does not print are those of GameInference.jl (Peters, 2020), but for
+the radius of the proximity cost (1.5 m there), with which agents of 0.25 m never come near each other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+AGENTS = 2
+ROBOT, PEDESTRIAN = range(AGENTS)
+DISC_RADIUS = 0.25
+"""Radius of an agent's body [m] (App. "Energy Features")."""
+
+
+@dataclass(frozen=True)
+class GameConstants:
+    """Constants of every main game and sub-game. ``array()`` lists them in this order for the compiled kernels.
+
+    Attributes:
+        dt: time step [s].
+        effort: weight of squared acceleration [m/s^2] and turn rate [rad/s].
+        slowness: weight of squared speed [m/s].
+        bound: weight of squared violations of the bounds.
+        turn_limit: bound of the absolute turn rate [rad/s].
+        acceleration_limit: bound of the absolute acceleration [m/s^2].
+        speed_min, speed_max: bounds of the speed [m/s].
+        terminal: weight of the squared distance [m] and heading error [rad] at the end.
+        radius: distance [m] below which the agents disturb each other.
+        circle: radius of the circle of starts and goals [m].
+        steps: horizon of a main game.
+        weight_min, weight_max: range of the weight w of the proximity cost.
+        sector: smallest angle [rad] between the starts of robot and pedestrian.
+    """
+
+    dt: float = 0.1
+    effort: float = 10.0
+    slowness: float = 30.0
+    bound: float = 50.0
+    turn_limit: float = math.radians(10.0)
+    acceleration_limit: float = 9.81
+    speed_min: float = -0.05
+    speed_max: float = 2.0
+    terminal: float = 300.0
+    radius: float = 1.0
+    circle: float = 3.0
+    steps: int = 100
+    weight_min: float = 10.0
+    weight_max: float = 100.0
+    sector: float = math.radians(30.0)
+
+    def array(self) -> Array:
+        """The constants as the vector that the kernels read by the indices of ``kernels``."""
+        return np.array(dataclasses.astuple(self), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class MainGame:
+    """One main game at one placement of the pedestrian.
+
+    Attributes:
+        game, placement: which one it is.
+        weight: w, drawn once per main game and the same for both agents.
+        phi: angle [rad] from the robot's start to the pedestrian's, seen from the middle; also the pedestrian's heading.
+        start: joint start state, 2 x (x, y, heading, speed).
+        goals: (x, y, heading) of each agent.
+    """
+
+    game: int
+    placement: int
+    weight: float
+    phi: float
+    start: Array
+    goals: Array
+
+
+def generator(*key: int) -> np.random.Generator:
+    """Random numbers that depend on what they are for, (seed, game, placement, ...), never on who draws them when."""
+    return np.random.default_rng(np.random.SeedSequence(list(key)))
+
+
+def main_game(seed: int, game: int, placement: int, placements: int, constants: GameConstants) -> MainGame:
+    """Draw w (once per game) and the jittered angle (once per placement), and place both agents at rest.
+
+    The circle without the sector around the robot is cut into ``placements`` equal arcs; the pedestrian stands anywhere
+    within its own.
+    """
+    weight = float(generator(seed, game).uniform(constants.weight_min, constants.weight_max))
+    arc = (2 * math.pi - 2 * constants.sector) / placements
+    jitter = float(generator(seed, game, placement, 0).uniform())
+    phi = constants.sector + arc * (placement + jitter)
+    phi = math.remainder(phi, 2 * math.pi)
+    start, goals = [], []
+    for heading in (0.0, phi):
+        x, y = constants.circle * math.cos(heading), constants.circle * math.sin(heading)
+        start += [-x, -y, heading, 0.0]
+        goals.append([x, y, heading])
+    return MainGame(game, placement, weight, phi, np.array(start), np.array(goals))

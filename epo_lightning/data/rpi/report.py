@@ -1,0 +1,254 @@
+"""What a generated set is like: sizes, modes over time, how well the games were solved, and how hard the set is.
+
+Every number goes into the manifest; :func:`markdown` writes them for people.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from epo_lightning.data.rpi.game import DISC_RADIUS, Array, GameConstants, generator
+from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, Records
+
+BINS = ((18, 28), (28, 38), (38, 48), (48, 61))
+"""Steps k of the current state; 18 .. 27 is 1.8 .. 2.7 s after the start."""
+GAIN = 1e-6
+"""Relative gain of a best response above which a strategy is no equilibrium."""
+
+
+def describe(
+    parts: Mapping[str, Records], counts: Mapping[str, int], weights: Array, pool: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The report of a set.
+
+    Args:
+        parts: records of training, validation and test.
+        counts: what the solver did, for the whole pool.
+        weights: w of every main game.
+        pool: configuration of the pool.
+    """
+    rows = {name: np.concatenate([part[name] for part in parts.values()]) for name in parts["train"]}
+    return {
+        "sizes": {part: _sizes(records) for part, records in parts.items()},
+        "weights": {part: sorted({float(w) for w in records["weight"]}) for part, records in parts.items()},
+        "two_modes": {"all": float((rows["modes"] == 2).mean()), **_over_time(rows)},
+        "solver": _solver(counts, pool["solver"]),
+        "nash": _nash(rows),
+        "motion": _motion(rows, weights),
+        "baselines": {"constant_velocity": _constant_velocity(parts["test"]), "nearest_neighbour": _nearest(parts)},
+    }
+
+
+def _sizes(records: Records) -> dict[str, int]:
+    return {
+        "records": len(records["step"]),
+        "samples": int(records["modes"].sum()),
+        "games": len(np.unique(records["game"])),
+    }
+
+
+def _over_time(rows: Records) -> dict[str, float]:
+    """Share of records with two modes, by the time since the main game's start."""
+    shares = {}
+    for first, end in BINS:
+        chosen = (rows["step"] >= first) & (rows["step"] < end)
+        if chosen.any():
+            shares[f"{first / 10:.1f}-{(end - 1) / 10:.1f} s"] = float((rows["modes"][chosen] == 2).mean())
+    return shares
+
+
+def _solver(counts: Mapping[str, int], solver: str) -> dict[str, Any]:
+    return {
+        "solver": solver,
+        "main_converged": counts["main_converged"] / counts["main_starts"],
+        "main_kept": counts["main_kept"] / counts["main_starts"],
+        "main_two_modes": counts["main_both"] / counts["main_games"],
+        "sub_games": counts["sub_games"],
+        "sub_converged": counts["sub_converged"] / max(1, counts["sub_starts"]),
+        "sub_kept": counts["sub_kept"] / max(1, counts["sub_starts"]),
+        "sub_games_dropped": counts["sub_dropped"],
+    }
+
+
+def _quantiles(values: NDArray, digits: tuple[float, ...] = (0.0, 0.5, 0.9, 0.99, 1.0)) -> dict[str, float]:
+    if not len(values):
+        return {}
+    return {f"{q:g}": float(v) for q, v in zip(digits, np.quantile(values, digits), strict=True)}
+
+
+def _nash(rows: Records) -> dict[str, Any]:
+    """How far from an equilibrium: unilateral gradients, and what a best response from a perturbed start would win."""
+    two = rows["modes"] == 2
+    found = {}
+    for name, gradient, gain in (
+        ("executed", rows["gradient"][:, 0], rows["gain"][:, 0]),
+        ("alternative", rows["gradient"][two, 1], rows["gain"][two, 1]),
+    ):
+        found[name] = {
+            "gradient_max": _quantiles(gradient),
+            "gain": _quantiles(gain),
+            "gain_share": float((gain > GAIN).mean()) if len(gain) else 0.0,
+        }
+    ratio = rows["cost"][two, 1] / rows["cost"][two, 0]
+    return {**found, "cost_ratio": _quantiles(ratio, (0.0, 0.05, 0.5, 0.95, 1.0)), "bellman": _bellman(rows)}
+
+
+def _bellman(rows: Records) -> dict[str, float]:
+    """Largest difference [m, rad, m/s] of an executed mode from the rest of the one before: zero by Bellman's principle."""
+    order = np.lexsort((rows["step"], rows["executed"], rows["placement"], rows["game"]))
+    follows = np.diff(rows["step"][order]) == 1
+    for name in ("game", "placement", "executed"):
+        follows &= np.diff(rows[name][order]) == 0
+    executed = rows["states"][order, 0]
+    rest = np.abs(executed[1:, :, :-1] - executed[:-1, :, 1:])[follows]
+    return {"pairs": int(follows.sum()), "max": float(rest.max()) if len(rest) else 0.0}
+
+
+def _motion(rows: Records, weights: Array) -> dict[str, Any]:
+    """Distances between agents and between modes, sizes of controls, and the residual of the dynamics."""
+    two = rows["modes"] == 2
+    states = rows["states"].astype(np.float64)
+    controls = rows["controls"].astype(np.float64)
+    between = np.linalg.norm(states[:, :, 0, :, :2] - states[:, :, 1, :, :2], axis=-1)
+    executed, alternative = between[:, 0].min(1), between[two, 1].min(1)
+    apart = np.linalg.norm(states[two, 0, ..., :2] - states[two, 1, ..., :2], axis=-1).mean((1, 2))
+    acceleration = np.concatenate([controls[:, 0], controls[two, 1]])[..., 0]
+    by_weight = [
+        [float(w), float(np.median(rows["distance"][np.isclose(rows["weight"], w), 0]))]
+        for w in np.sort(weights)
+        if np.isclose(rows["weight"], w).any()
+    ]
+    return {
+        "distance_executed": _quantiles(executed),
+        "distance_alternative": _quantiles(alternative),
+        "disc_overlaps": int((executed < 2 * DISC_RADIUS).sum() + (alternative < 2 * DISC_RADIUS).sum()),
+        "median_distance_by_weight": by_weight,
+        "sade_between_modes": _quantiles(apart),
+        "acceleration_99": float(np.quantile(np.abs(acceleration), 0.99)),
+        "jerk_99": float(np.quantile(np.abs(np.diff(acceleration, axis=-1)) / GameConstants().dt, 0.99)),
+        "euler_residual": _euler(states[:, 0], controls[:, 0], rows["history"].astype(np.float64)),
+    }
+
+
+def _euler(states: Array, controls: Array, history: Array) -> float:
+    """Largest difference of a stored state from one Euler step before it, over the executed futures."""
+    dt = GameConstants().dt
+    before = np.concatenate([history[:, :, -1:], states[:, :, :-1]], axis=2)
+    heading, speed = before[..., 2], before[..., 3]
+    rate = np.stack([speed * np.cos(heading), speed * np.sin(heading), controls[..., 1], controls[..., 0]], axis=-1)
+    return float(np.abs(before + dt * rate - states).max())
+
+
+def constant_velocity(history: Array) -> Array:
+    """Positions [B, 2, 40, 2] of agents that go on with their current velocity."""
+    now = history[:, :, -1]
+    velocity = now[..., 3:4] * np.stack([np.cos(now[..., 2]), np.sin(now[..., 2])], axis=-1)
+    time = GameConstants().dt * np.arange(1, FUTURE + 1)
+    return now[:, :, None, :2] + velocity[:, :, None] * time[:, None]
+
+
+def _errors(forecast: Array, records: Records) -> dict[str, dict[str, float]]:
+    """ADE = SADE of one forecast: without modes to choose from, the mean over agents and steps is both."""
+    two = records["modes"] == 2
+    found = {}
+    for name, mode, chosen in (("executed", 0, slice(None)), ("alternative", 1, two)):
+        error = np.linalg.norm(forecast[chosen] - records["states"][chosen, mode, :, :, :2], axis=-1)
+        found[name] = {"ade": float(error.mean()), "fde": float(error[..., -1].mean())} if len(error) else {}
+    return found
+
+
+def _constant_velocity(test: Records) -> dict[str, Any]:
+    return _errors(constant_velocity(test["history"].astype(np.float64)), test)
+
+
+def _key(records: Records) -> Tensor:
+    """What a nearest neighbour is looked up by: positions of the history and goals. Shape [B, 2 * 19 * 2 + 4]."""
+    history = torch.from_numpy(records["history"][..., :2].reshape(len(records["step"]), -1))
+    return torch.cat([history, torch.from_numpy(records["goals"]).flatten(1)], dim=1)
+
+
+def _nearest(parts: Mapping[str, Records]) -> dict[str, Any]:
+    """Copy the futures of the training record with the nearest history and goal (at most 6000 test records).
+
+    An alternative mode is compared with that neighbour's alternative, where the neighbour has one; otherwise with its
+    executed mode.
+    """
+    train, test = parts["train"], parts["test"]
+    count = len(test["step"])
+    chosen = np.sort(generator(0, 3).permutation(count)[:6000])
+    test = {name: values[chosen] for name, values in test.items()}
+    keys, queries = _key(train), _key(test)
+    distances, indices = [], []
+    for block in queries.split(500):
+        distance, index = torch.cdist(block, keys).min(1)
+        distances.append(distance)
+        indices.append(index)
+    index = torch.cat(indices).numpy()
+    step = torch.cat(distances).numpy() / np.sqrt(2 * (HISTORY + 1))
+    same = train["states"][index, 0, :, :, :2].astype(np.float64)
+    other = np.where(
+        (train["modes"][index] == 2)[:, None, None, None], train["states"][index, 1, :, :, :2], same
+    )
+    return {
+        "rms_distance_per_step": _quantiles(step),
+        "executed": _errors(same, test)["executed"],
+        "alternative": _errors(other, test)["alternative"],
+    }
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The report as markdown tables."""
+    lines = ["| split | records | samples | main games | w |", "|---|---|---|---|---|"]
+    for part, size in report["sizes"].items():
+        weights = report["weights"][part]
+        lines.append(
+            f"| {part} | {size['records']} | {size['samples']} | {size['games']} "
+            f"| {weights[0]:.1f} .. {weights[-1]:.1f} |"
+        )
+    lines += ["", "| records with two modes | share |", "|---|---|"]
+    lines += [f"| {name} | {share:.3f} |" for name, share in report["two_modes"].items()]
+    lines += ["", "| solver | |", "|---|---|"]
+    lines += [f"| {name.replace('_', ' ')} | {_show(value)} |" for name, value in report["solver"].items()]
+    nash, motion, baselines = report["nash"], report["motion"], report["baselines"]
+    lines += ["", "| quantity | " + " | ".join(f"quantile {q}" for q in ("0", "0.5", "0.9", "0.99", "1")) + " |"]
+    lines += ["|---|---|---|---|---|---|"]
+    for name, values in (
+        ("unilateral gradient, executed", nash["executed"]["gradient_max"]),
+        ("unilateral gradient, alternative", nash["alternative"]["gradient_max"]),
+        ("best-response gain, executed", nash["executed"]["gain"]),
+        ("best-response gain, alternative", nash["alternative"]["gain"]),
+        ("smallest distance, executed [m]", motion["distance_executed"]),
+        ("smallest distance, alternative [m]", motion["distance_alternative"]),
+        ("SADE between the modes [m]", motion["sade_between_modes"]),
+        ("test to nearest training record, RMS per step [m]", baselines["nearest_neighbour"]["rms_distance_per_step"]),
+    ):
+        lines.append(f"| {name} | " + " | ".join(_show(value) for value in values.values()) + " |")
+    lines += ["", "| quantity | |", "|---|---|"]
+    for name, value in (
+        (f"share of executed modes with a gain above {GAIN:g}", nash["executed"]["gain_share"]),
+        (f"share of alternative modes with a gain above {GAIN:g}", nash["alternative"]["gain_share"]),
+        ("cost of alternative / executed, median", nash["cost_ratio"].get("0.5")),
+        ("largest difference from the tail before (Bellman)", nash["bellman"]["max"]),
+        ("records in which the discs overlap", motion["disc_overlaps"]),
+        ("Euler residual", motion["euler_residual"]),
+        ("acceleration, 99% [m/s^2]", motion["acceleration_99"]),
+        ("jerk, 99% [m/s^3]", motion["jerk_99"]),
+    ):
+        lines.append(f"| {name} | {_show(value)} |")
+    lines += ["", "| test | ADE executed | FDE executed | ADE alternative | FDE alternative |", "|---|---|---|---|---|"]
+    for name in ("constant_velocity", "nearest_neighbour"):
+        rows = [baselines[name][subset].get(key) for subset in ("executed", "alternative") for key in ("ade", "fde")]
+        lines.append(f"| {name.replace('_', ' ')} | " + " | ".join(_show(value) for value in rows) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _show(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

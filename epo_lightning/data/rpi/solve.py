@@ -1,0 +1,241 @@
+"""Two ways to solve the game from a start strategy, compiled per problem.
+
+``potential``: open-loop Nash, as the minimiser of the exact potential (iterative LQR). ``feedback``: feedback Nash, by the
+general-sum iterative linear-quadratic game of Fridovich-Keil et al. (2020) with the settings of Peters (2020).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from epo_lightning.data.rpi import kernels as game
+from epo_lightning.data.rpi.game import Array
+from epo_lightning.data.rpi.lq import lq_game, lq_minimum
+
+SOLVERS = ("potential", "feedback")
+
+
+@dataclass(frozen=True)
+class PotentialSettings:
+    """Settings of the potential solver.
+
+    Attributes:
+        tolerance: largest entry of the gradient at which it stops.
+        iterations: most iterations.
+        exact_from, exact_below: iteration, or largest entry of the gradient, from which the exact Hessian of costs and
+            dynamics replaces Gauss-Newton's: the latter is safe far away, the exact one finishes quadratically, also near
+            the ridge between two ways of passing.
+    """
+
+    tolerance: float = 1e-4
+    iterations: int = 100
+    exact_from: int = 25
+    exact_below: float = 20.0
+
+    def array(self) -> Array:
+        return np.array(dataclasses.astuple(self), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class FeedbackSettings:
+    """Settings of the feedback solver.
+
+    Attributes:
+        step: scale of the offsets in the first trial of an iteration; halved until the move is small enough.
+        halvings: most halvings.
+        largest_move: largest change of an element of the states in one iteration.
+        tolerance: largest change of an element of the states at which it stops.
+        iterations: most iterations.
+        regularisation: multiple of the identity added to the Hessians of states and controls.
+    """
+
+    step: float = 0.5
+    halvings: int = 20
+    largest_move: float = 1.5
+    tolerance: float = 0.05
+    iterations: int = 200
+    regularisation: float = 5.0
+
+    def array(self) -> Array:
+        return np.array(dataclasses.astuple(self), dtype=np.float64)
+
+
+@njit(cache=True)
+def follow(x: Array, u: Array, gains: Array, offsets: Array, scale: float, dt: float) -> tuple[Array, Array]:
+    """Roll out the affine policy around (x, u): u_k + scale * offset_k + gain_k (new x_k - x_k)."""
+    new_x, new_u = np.empty_like(x), u.copy()
+    new_x[0] = x[0]
+    for k in range(len(u)):
+        for i in range(4):
+            change = scale * offsets[k, i]
+            for j in range(8):
+                change += gains[k, i, j] * (new_x[k, j] - x[k, j])
+            new_u[k, i] += change
+        game.step(new_x[k], new_u[k], dt, new_x[k + 1])
+    return new_x, new_u
+
+
+@njit(cache=True)
+def total(x: Array, u: Array, c: Array, goals: Array, w: float) -> float:
+    """The potential: own costs plus the shared cost once."""
+    robot, pedestrian, pair = game.costs(x, u, c, goals, w)
+    return robot + pedestrian + pair
+
+
+@njit(cache=True)
+def solve_potential(
+    start: Array, u: Array, c: Array, goals: Array, w: float, moves: Array, settings: Array
+) -> tuple[Array, Array, bool, int]:
+    """Minimise the potential over the controls of the agents that move ([1, 1]: Nash; [1, 0]: a best response).
+
+    Iterative LQR: a quadratic model around the trajectory, its exact minimiser as a policy, a line search along it, and
+    Levenberg damping of the controls where the model is not convex or the search fails.
+
+    Returns:
+        states [K+1, 8], controls [K, 4], whether the gradient fell below the tolerance, iterations.
+    """
+    tolerance, iterations, exact_from, exact_below = settings[0], int(settings[1]), int(settings[2]), settings[3]
+    steps = len(u)
+    A, B = np.empty((steps, 8, 8)), np.empty((steps, 8, 4))
+    Q, q = np.empty((steps + 1, 8, 8)), np.empty((steps + 1, 8))
+    R, r = np.empty((steps, 4, 4)), np.empty((steps, 4))
+    x = game.rollout(start, u, c[game.DT])
+    cost = total(x, u, c, goals, w)
+    damping = 0.0
+    exact = False
+    for iteration in range(iterations + 1):
+        game.linearise(x, c, moves, A, B)
+        Q[:], q[:], R[:], r[:] = 0.0, 0.0, 0.0, 0.0
+        for i in range(2):
+            game.add_own(i, x, u, c, goals, Q, q, R, r)
+            if moves[i] == 0.0:
+                r[:, 2 * i : 2 * i + 2] = 0.0
+        game.add_pair(x, c, w, exact, Q, q)
+        gradient, costates = game.adjoint(A, B, q, r)
+        size = np.abs(gradient).max()
+        if size < tolerance:
+            return x, u, True, iteration
+        if exact:
+            game.add_curvature(x, c, costates, Q)
+        exact = size < exact_below or iteration + 1 >= exact_from
+        moved = False
+        while not moved and damping < 1e8 and iteration < iterations:
+            convex, gains, offsets, promised = lq_minimum(A, B, Q, q, R, r, damping)
+            scale = 1.0
+            while convex and not moved and scale > 1e-3:
+                new_x, new_u = follow(x, u, gains, offsets, scale, c[game.DT])
+                new_cost = total(new_x, new_u, c, goals, w)
+                if new_cost < cost - 1e-4 * scale * promised:
+                    x, u, cost, moved = new_x, new_u, new_cost, True
+                scale *= 0.5
+            damping = (damping / 10.0 if damping > 1.0 else 0.0) if moved else max(10.0 * damping, 1.0)
+        if not moved:
+            return x, u, False, iteration
+    return x, u, False, iterations
+
+
+@njit(cache=True)
+def solve_feedback(
+    start: Array, u: Array, c: Array, goals: Array, w: float, settings: Array
+) -> tuple[Array, Array, bool, int]:
+    """Iterate LQ games around the trajectory until it stands still: an approximate feedback Nash equilibrium.
+
+    Returns:
+        states [K+1, 8], controls [K, 4], whether the trajectory stood still, iterations.
+    """
+    first, halvings, largest, tolerance = settings[0], int(settings[1]), settings[2], settings[3]
+    iterations, regularisation = int(settings[4]), settings[5]
+    steps = len(u)
+    owner = np.array([0, 0, 1, 1])
+    A, B = np.empty((steps, 8, 8)), np.empty((steps, 8, 4))
+    Q, q = np.empty((2, steps + 1, 8, 8)), np.empty((2, steps + 1, 8))
+    R, r = np.empty((2, steps, 4, 4)), np.empty((2, steps, 4))
+    x = game.rollout(start, u, c[game.DT])
+    for iteration in range(iterations):
+        game.linearise(x, c, np.ones(2), A, B)
+        Q[:], q[:], R[:], r[:] = 0.0, 0.0, 0.0, 0.0
+        for i in range(2):
+            game.add_own(i, x, u, c, goals, Q[i], q[i], R[i], r[i])
+            game.add_pair(x, c, w, False, Q[i], q[i])
+            for j in range(8):
+                Q[i, :, j, j] += regularisation
+            for j in range(4):
+                R[i, :, j, j] += regularisation
+        unique, gains, offsets = lq_game(A, B, Q, q, R, r, owner)
+        if not unique:
+            return x, u, False, iteration
+        scale, change = first, np.inf
+        for _ in range(halvings + 1):
+            new_x, new_u = follow(x, u, gains, offsets, scale, c[game.DT])
+            change = np.abs(new_x - x).max()
+            if change <= largest:
+                break
+            scale *= 0.5
+        if not change <= largest:
+            return x, u, False, iteration
+        x, u = new_x, new_u
+        if change < tolerance:
+            return x, u, True, iteration + 1
+    return x, u, False, iterations
+
+
+@njit(cache=True)
+def _solve_many(
+    start: Array, starts: Array, c: Array, goals: Array, w: float, feedback: bool, settings: Array
+) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """Solve from each start strategy [S, K, 4]; see :class:`Solutions`."""
+    count, steps = starts.shape[:2]
+    states, controls = np.empty((count, steps + 1, 8)), np.empty((count, steps, 4))
+    converged, facts = np.empty(count, dtype=np.bool_), np.empty((count, 7))
+    for s in range(count):
+        if feedback:
+            x, u, done, iterations = solve_feedback(start, starts[s], c, goals, w, settings)
+        else:
+            x, u, done, iterations = solve_potential(start, starts[s], c, goals, w, np.ones(2), settings)
+        states[s], controls[s], converged[s] = x, u, done
+        robot, pedestrian, pair = game.costs(x, u, c, goals, w)
+        smallest, _, rotation, slowest = game.passage(x)
+        facts[s, 0], facts[s, 1], facts[s, 2] = robot + pair, pedestrian + pair, robot + pedestrian + pair
+        facts[s, 3], facts[s, 4], facts[s, 5] = smallest, rotation, slowest
+        facts[s, 6] = iterations
+    return states, controls, converged, facts
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """What was found from S start strategies.
+
+    Attributes:
+        states [S, K+1, 8], controls [S, K, 4]: the trajectories.
+        converged [S]: whether the solver stopped at its tolerance.
+        agent_costs [S, 2], potential [S]: what each agent pays, and the potential.
+        distance [S], rotation [S], speed [S]: smallest distance [m], rotation of the line of sight [rad] and smallest
+            speed [m/s] along the way.
+        iterations [S]: of the solver.
+    """
+
+    states: Array
+    controls: Array
+    converged: NDArray[np.bool_]
+    agent_costs: Array
+    potential: Array
+    distance: Array
+    rotation: Array
+    speed: Array
+    iterations: Array
+
+
+def solve(
+    start: Array, starts: Array, constants: Array, goals: Array, weight: float, solver: str = "potential"
+) -> Solutions:
+    """Solve the game from ``start`` [8] once per start strategy [S, K, 4]."""
+    settings = FeedbackSettings().array() if solver == "feedback" else PotentialSettings().array()
+    states, controls, converged, facts = _solve_many(
+        start, np.ascontiguousarray(starts), constants, goals, weight, solver == "feedback", settings
+    )
+    return Solutions(states, controls, converged, facts[:, :2], *facts[:, 2:].T)
