@@ -10,7 +10,18 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
 from jaxtyping import install_import_hook
 
 # Everything that speaks the alphabet of shapes; compiled kernels take no decorators.
-CHECKED = "scene game solvers encoders backbones decoders forecasters losses metrics optimizers".split()
+CHECKED = (
+    "scene",
+    "game",
+    "solvers",
+    "encoders",
+    "backbones",
+    "decoders",
+    "forecasters",
+    "losses",
+    "metrics",
+    "optimizers",
+)
 install_import_hook([f"epo_lightning.{name}" for name in CHECKED], "beartype.beartype")
 
 import pytest

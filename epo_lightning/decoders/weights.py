@@ -12,7 +12,7 @@ from epo_lightning.decoders.mlp import MLP
 from epo_lightning.game.energy import pairs
 
 
-def _by_name(weights: Float[Tensor, "B R M*F"], names: Sequence[str], modes: int) -> dict[str, Float[Tensor, "B M R"]]:
+def _by_name(weights: Float[Tensor, "B R out"], names: Sequence[str], modes: int) -> dict[str, Float[Tensor, "B M R"]]:
     per_mode = weights.unflatten(-1, (modes, len(names))).transpose(1, 2)
     return dict(zip(names, per_mode.unbind(-1), strict=True))
 

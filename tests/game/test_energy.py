@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -41,8 +42,8 @@ def slow_energy(scene, parameters, controls, b, m):
             x, y, theta, v = x + v * math.cos(theta) * dt, y + v * math.sin(theta) * dt, theta + w * dt, v + a * dt
             path.append((x, y))
             signals["vel"].append(v)
-        signals["jerk"] = [(b[0] - a[0]) / dt for a, b in zip(u, u[1:], strict=False)]
-        signals["turnacc"] = [(b[1] - a[1]) / dt for a, b in zip(u, u[1:], strict=False)]
+        signals["jerk"] = [(b[0] - a[0]) / dt for a, b in pairwise(u)]
+        signals["turnacc"] = [(b[1] - a[1]) / dt for a, b in pairwise(u)]
         for name, values in signals.items():
             low, high = BOUNDS[name]
             total += 0.5 * sum((own[name][b, m, i].item() * z) ** 2 for z in values)

@@ -1,0 +1,123 @@
+"""The four forecasters: what all of them must do, and what each of them is."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from games import random_scene
+from suites import LOSS_WEIGHTS, OWN, ForecasterSuite, model
+
+import epo_lightning
+from epo_lightning.forecasters import build_forecaster
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import Scene
+
+
+class TestConstantVelocity(ForecasterSuite):
+    config = {"name": "constant_velocity"}
+    modes = 1
+
+    def test_agents_go_straight_on(self):
+        scene = Scene(torch.tensor([[[[1.0, 2.0, math.pi / 2, 3.0]]]]), 0.1)
+        states = self.forecaster().predict(scene).states[0, 0, 0]
+        torch.testing.assert_close(states[:, 0], torch.ones(40))
+        torch.testing.assert_close(states[:, 1], 2.0 + 0.3 * torch.arange(1.0, 41.0))
+
+
+class TestMarginal(ForecasterSuite):
+    config = {"name": "marginal", "modes": 2, "loss_weights": LOSS_WEIGHTS}
+
+    def test_modes_are_ordered_by_probability(self):
+        forecast = self.forecaster().predict(random_scene(8, 2))
+        assert (forecast.agent_probabilities[:, 0] >= forecast.agent_probabilities[:, 1]).all()
+        assert (forecast.probabilities[:, 0] >= forecast.probabilities[:, 1]).all()
+
+    def test_heading_and_speed_are_those_of_the_way(self):
+        scene = random_scene(2, 2)
+        states = self.forecaster().predict(scene).states
+        step = states[..., 1:, :2] - states[..., :-1, :2]
+        torch.testing.assert_close(states[..., 1:, 3], step.norm(dim=-1) / 0.1, rtol=1e-3, atol=1e-3)
+
+
+class TestSceneConsistent(ForecasterSuite):
+    config = {"name": "scene_consistent", "modes": 2, "loss_weights": LOSS_WEIGHTS}
+
+    def test_futures_obey_the_dynamics(self):
+        scene = random_scene(2, 2)
+        forecast = self.forecaster().predict(scene)
+        speed = scene.current[:, None, :, 3, None] + 0.1 * forecast.controls[..., 0].cumsum(-1)
+        torch.testing.assert_close(forecast.states[..., 3], speed)
+
+
+class TestEPO(ForecasterSuite):
+    config = {"name": "epo", "modes": 2, "loss_weights": LOSS_WEIGHTS}
+
+    def test_the_forecast_is_the_solution_of_the_inferred_game(self):
+        forecaster, scene = self.forecaster(), random_scene(3, 2)
+        forecast = forecaster.predict(scene)
+        again = forecaster.solver(forecaster.energy, scene, forecast.parameters)
+        assert torch.equal(again.controls, forecast.controls)
+        assert set(forecast.parameters.own_weights) == set(OWN)
+        assert torch.equal(forecast.parameters.goals[:, 1], scene.goal_candidates[:, :, 0])
+        total = sum(term.sum(-1) for term in (*forecast.own_energy.values(), *forecast.pair_energy.values()))
+        torch.testing.assert_close(total, forecast.solution.energy)
+
+    def test_weights_start_where_they_are_told_to(self):
+        forecaster = self.forecaster()
+        for decoder in (forecaster.own_weights, forecaster.pair_weights, forecaster.strategies):
+            torch.nn.init.zeros_(decoder.mlp.output.weight)
+            torch.nn.init.zeros_(decoder.mlp.output.bias)
+        parameters = forecaster.predict(random_scene(2, 2)).parameters
+        assert all((weight == 1.0).all() for weight in parameters.own_weights.values())
+        assert (parameters.pair_weights["proximity"] == 3.0).all()
+        assert (parameters.initial_controls == 0.0).all()
+
+    def test_a_scene_without_a_goal_is_refused(self):
+        scene = Scene(**{**vars(random_scene(2, 2)), "goal_candidates": None, "goal_mask": None})
+        with pytest.raises(ValueError, match="goal_candidates is None"):
+            self.forecaster().predict(scene)
+
+
+EPO = TestEPO.config
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"goal": "everyone"}, "unknown goal 'everyone'"),
+        ({"backbone": {"name": "v_lsmt"}}, "did you mean 'v_lstm'"),
+        ({"backbone": {"name": "v_lstm", "widht": 3}}, "did you mean 'width'"),
+        ({"backbone": {}}, r"backbone\.name is missing"),
+        ({"energy": {"name": "features", "own": ["gaol"]}}, "did you mean 'goal'"),
+        ({"energy": {"name": "features"}}, r"missing key energy\.own"),
+        ({"solver": {"name": "levenberg_marquardt", "stepsize": 1}}, "did you mean 'step_size'"),
+        ({"optimizer": {"name": "adam", "lr": -1.0}}, "optimizer.lr must be positive"),
+        ({"optimizer": {"name": "adam", "schedule": "cosin"}}, "did you mean 'cosine'"),
+        ({"forecaster": {**EPO, "loss_weights": {"imitation": 1.0}}}, "loss_weights must name"),
+        ({"speed": 1}, "unknown key 'speed'"),
+    ],
+)
+def test_configurations_that_cannot_work_are_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        build_forecaster(model(**{"forecaster": EPO, **changes}))
+
+
+def test_loading_what_is_not_a_checkpoint(tmp_path):
+    with pytest.raises(ConfigError, match="no checkpoint at"):
+        epo_lightning.load(tmp_path / "missing.ckpt")
+    (tmp_path / "text.ckpt").write_text("not a checkpoint")
+    with pytest.raises(ConfigError, match="not a checkpoint that epo_lightning wrote"):
+        epo_lightning.load(tmp_path / "text.ckpt")
+    torch.save({"state_dict": {}}, tmp_path / "other.ckpt")
+    with pytest.raises(ConfigError, match="not a checkpoint that epo_lightning wrote"):
+        epo_lightning.load(tmp_path / "other.ckpt")
+
+
+def test_loading_a_checkpoint_of_another_architecture(tmp_path):
+    forecaster = build_forecaster(model(EPO))
+    configuration = model(EPO, backbone={"name": "v_lstm", "width": 64})
+    torch.save({"configuration": configuration, "state_dict": forecaster.state_dict()}, tmp_path / "wide.ckpt")
+    with pytest.raises(ConfigError, match="does not fit the architecture"):
+        epo_lightning.load(tmp_path / "wide.ckpt")

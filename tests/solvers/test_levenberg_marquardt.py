@@ -1,0 +1,262 @@
+"""The layer against a dense reference, finite differences, Theseus and closed-form solutions."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from games import ALL, BOUNDS, pad, random_game, random_scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from epo_lightning.game.energy import Energy
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import GameParameters, Status
+from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
+
+
+def stacked(energy, scene, parameters, controls):
+    return torch.cat([r.flatten(2) for r in energy.residuals(scene, parameters, controls).values()], -1)
+
+
+def reference(energy, scene, parameters, steps, step_size, damping):
+    """Damped Gauss-Newton with a dense Jacobian from forward-mode differentiation and a general linear solver."""
+    controls = parameters.initial_controls
+    for _ in range(steps):
+        jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
+        jacobian = jacobian.permute(1, 2, 0, 3, 4, 5).flatten(3)
+        residual = stacked(energy, scene, parameters, controls)[..., None]
+        matrix = jacobian.mT @ jacobian + damping * torch.eye(jacobian.shape[-1], dtype=controls.dtype)
+        controls = controls - step_size * torch.linalg.solve(matrix, jacobian.mT @ residual).view_as(controls)
+    return controls
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    agents=st.integers(1, 4),
+    modes=st.integers(1, 3),
+    horizon=st.integers(2, 10),
+    steps=st.integers(1, 4),
+    own=st.sets(st.sampled_from(ALL), min_size=1),
+    size=st.sampled_from([0.01, 2.0]),
+    seed=st.integers(0, 1000),
+)
+def test_steps_equal_a_dense_reference(agents, modes, horizon, steps, own, size, seed):
+    torch.manual_seed(seed)
+    scene = random_scene(2, agents, history=2, size=size, dtype=torch.float64)
+    parameters = random_game(scene, modes, horizon)
+    energy = Energy(sorted(own), bounds=BOUNDS)
+    solution = LevenbergMarquardt(steps, 0.3, 10.0)(energy, scene, parameters)
+    expected = reference(energy, scene, parameters, steps, 0.3, 10.0)
+    torch.testing.assert_close(solution.controls, expected, rtol=0, atol=1e-9)
+    assert (solution.status == Status.SOLVED).all()
+    torch.testing.assert_close(solution.energy, energy(scene, parameters, expected), rtol=1e-9, atol=1e-9)
+
+
+def central_differences(function, tensor, cotangent, step=1e-6):
+    """d <cotangent, function(tensor)> / d tensor, one entry of all (independent) scenes and modes at a time."""
+    columns = []
+    for index in range(tensor[0, 0].numel()):
+        shift = torch.zeros_like(tensor)
+        shift.flatten(2)[..., index] = step
+        change = function(tensor + shift) - function(tensor - shift)
+        columns.append((change * cotangent).flatten(2).sum(-1) / (2 * step))
+    return torch.stack(columns, -1).view_as(tensor)
+
+
+@pytest.mark.parametrize("size", [0.01, 2.0], ids=["pairs apart", "pairs overlapping"])
+@pytest.mark.parametrize("bounds", [BOUNDS, dict.fromkeys(BOUNDS, (-99.0, 99.0))], ids=["bounds active", "bounds idle"])
+@pytest.mark.parametrize("agents", [2, 3])
+def test_unrolled_gradients_equal_central_differences(size, bounds, agents):
+    scene = random_scene(2, agents, history=2, size=size, dtype=torch.float64)
+    parameters = random_game(scene, modes=2, horizon=5)
+    energy = Energy(ALL, bounds=bounds)
+    residuals = energy.residuals(scene, parameters, parameters.initial_controls)
+    assert (residuals["proximity"] != 0).any() == (size == 2.0)
+    assert (residuals["velb"] != 0).any() == (bounds is BOUNDS)
+    solve = LevenbergMarquardt(2, 0.3, 10.0)
+    cotangent = torch.randn_like(parameters.initial_controls)
+
+    leaves = parameters.map(lambda tensor: tensor.clone().requires_grad_())
+    (solve(energy, scene, leaves).controls * cotangent).sum().backward()
+
+    def compare(analytic, replace, tensor):
+        numeric = central_differences(lambda t: solve(energy, scene, replace(t)).controls, tensor, cotangent)
+        error = (analytic - numeric).norm() / numeric.norm().clamp_min(1e-3)
+        assert error < 1e-6
+
+    compare(leaves.goals.grad, lambda t: dataclasses.replace(parameters, goals=t), parameters.goals)
+    compare(
+        leaves.initial_controls.grad,
+        lambda t: dataclasses.replace(parameters, initial_controls=t),
+        parameters.initial_controls,
+    )
+    for kind in ("own_weights", "pair_weights"):
+        given_weights = getattr(parameters, kind)
+        for name, weight in given_weights.items():
+            compare(
+                getattr(leaves, kind)[name].grad,
+                lambda t, kind=kind, name=name, rest=given_weights: dataclasses.replace(
+                    parameters, **{kind: {**rest, name: t}}
+                ),
+                weight,
+            )
+
+
+def test_a_linear_quadratic_game_is_solved_in_one_full_step():
+    """With speed and control features alone the energy is quadratic, and its minimiser is known in closed form."""
+    scene = random_scene(2, 2, history=2, dtype=torch.float64)
+    parameters = random_game(scene, horizon=6)
+    energy = Energy(["vel", "acc", "turnr"], pair=[])
+    solution = LevenbergMarquardt(1, 1.0, 0.0)(energy, scene, parameters)
+    # Without turning costs pulling anywhere else, turn rates vanish; accelerations solve (w_v^2 S^T S + w_a^2 I) a = -w_v^2 S^T v0.
+    sums = 0.1 * torch.ones(6, 6, dtype=torch.float64).tril()
+    for b in range(2):
+        for m in range(2):
+            for i in range(2):
+                speed = parameters.own_weights["vel"][b, m, i] ** 2
+                effort = parameters.own_weights["acc"][b, m, i] ** 2
+                matrix = speed * sums.T @ sums + effort * torch.eye(6, dtype=torch.float64)
+                right = -speed * sums.T @ scene.current[b, i, 3].expand(6)
+                expected = torch.linalg.solve(matrix, right)
+                torch.testing.assert_close(solution.controls[b, m, i, :, 0], expected, rtol=0, atol=1e-12)
+    assert solution.controls[..., 1].abs().max() < 1e-12
+    assert solution.gradient_norm.max() < 1e-10
+
+
+def test_many_steps_reach_an_equilibrium():
+    scene = random_scene(4, 3, history=2, size=2.0, dtype=torch.float64)
+    parameters = random_game(scene, horizon=8)
+    energy = Energy(["goal", "vel", "acc", "turnr"])
+    solution = LevenbergMarquardt(200, 1.0, 1.0, keep_iterates=True)(energy, scene, parameters)
+    assert solution.gradient_norm.max() < 1e-8
+    assert (solution.energy < solution.initial_energy).all()
+    assert len(solution.iterates) == 201
+    assert (solution.iterates[0] == parameters.initial_controls).all()
+
+
+def test_absent_agents_and_their_padding_change_nothing():
+    scene = random_scene(3, 2, history=2, size=2.0)
+    parameters = random_game(scene)
+    solve, energy = LevenbergMarquardt(2, 0.3, 0.0), Energy(ALL, bounds=BOUNDS)
+    nan = torch.full((3, 2, 2), torch.nan)
+    pair = torch.full((3, 2, 6), torch.nan)
+    pair[..., 0] = parameters.pair_weights["proximity"][..., 0]
+    wide = GameParameters(
+        own_weights={name: torch.cat((w, nan), -1) for name, w in parameters.own_weights.items()},
+        pair_weights={"proximity": pair},
+        initial_controls=torch.cat((parameters.initial_controls, torch.zeros(3, 2, 2, 7, 2)), 2),
+        goals=torch.cat((parameters.goals, nan[..., None].expand(3, 2, 2, 2)), 2),
+    )
+    alone, padded = solve(energy, scene, parameters), solve(energy, pad(scene), wide)
+    torch.testing.assert_close(padded.controls[:, :, :2], alone.controls, rtol=0, atol=1e-5)
+    assert (padded.status == Status.SOLVED).all()
+    assert padded.gradient_norm.isfinite().all()
+
+
+def poison(kind, scene, parameters):
+    if kind == "nan history":
+        history = scene.history.clone()
+        history[1] = torch.nan
+        return dataclasses.replace(scene, history=history), parameters
+    if kind == "nan weight":
+        weight = parameters.own_weights["acc"].clone()
+        weight[1] = torch.nan
+        return scene, dataclasses.replace(parameters, own_weights={**parameters.own_weights, "acc": weight})
+    if kind == "overflow":
+        weights = {name: weight.clone() for name, weight in parameters.own_weights.items()}
+        weights["goal"][1] = 1e30
+        return scene, dataclasses.replace(parameters, own_weights=weights)
+    zero = {name: weight.clone() for name, weight in parameters.own_weights.items()}
+    for weight in zero.values():
+        weight[1] = 0.0
+    return scene, dataclasses.replace(parameters, own_weights=zero)
+
+
+@pytest.mark.parametrize("kind", ["nan history", "nan weight", "overflow", "singular"])
+def test_a_poisoned_sample_leaves_the_others_bit_identical(kind):
+    scene = random_scene(4, 2, history=2, size=0.01)
+    parameters = random_game(scene)
+    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt(2, 0.3, 0.0 if kind == "singular" else 10.0)
+    sound = solve(energy, scene, parameters)
+    scene, parameters = poison(kind, scene, parameters)
+    leaves = parameters.map(lambda tensor: tensor.clone().requires_grad_())
+    poisoned = solve(energy, scene, leaves)
+    others = [0, 2, 3]
+    assert torch.equal(poisoned.controls[others], sound.controls[others])
+    assert torch.equal(poisoned.energy[others], sound.energy[others])
+    assert (poisoned.status[others] == sound.status[others]).all()
+    expected = Status.DAMPED if kind == "singular" else Status.STOPPED
+    assert (poisoned.status[1] == expected).all()
+    # The last good iterate is where it started.
+    assert torch.equal(poisoned.controls[1], parameters.initial_controls[1])
+    poisoned.controls[others].sum().backward()
+    assert leaves.initial_controls.grad[others].isfinite().all()
+    assert all(weight.grad[others].isfinite().all() for weight in leaves.own_weights.values())
+
+
+def test_zero_steps_return_the_initial_strategy():
+    scene = random_scene(2, 2, history=2)
+    parameters = random_game(scene)
+    solution = LevenbergMarquardt(0)(Energy(ALL, bounds=BOUNDS), scene, parameters)
+    assert torch.equal(solution.controls, parameters.initial_controls)
+    assert torch.equal(solution.energy, solution.initial_energy)
+
+
+def test_samples_do_not_depend_on_their_batch():
+    scene = random_scene(5, 3, history=2, size=2.0)
+    parameters = random_game(scene)
+    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt()
+    together = solve(energy, scene, parameters)
+    for index in range(5):
+        alone = solve(energy, scene[index], parameters[index])
+        torch.testing.assert_close(alone.controls[0], together.controls[index], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": -1}, "solver.steps"),
+        ({"step_size": 0.0}, r"solver.step_size must be in \(0, 1\]"),
+        ({"step_size": 1.5}, "solver.step_size"),
+        ({"damping": -1.0}, "solver.damping"),
+        ({"damping": float("nan")}, "solver.damping"),
+    ],
+)
+def test_bad_settings_are_refused(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        LevenbergMarquardt(**arguments)
+
+
+def test_the_gradient_of_a_float32_layer_is_close_to_float64():
+    scene = random_scene(4, 2, size=0.5, dtype=torch.float64)
+    parameters = random_game(scene, horizon=40, spread=0.1)
+    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt()
+
+    def gradient(dtype):
+        leaves = parameters.to(dtype).map(lambda tensor: tensor.clone().requires_grad_())
+        solve(energy, scene.to(dtype), leaves).states.sum().backward()
+        return leaves.initial_controls.grad.double()
+
+    exact = gradient(torch.float64)
+    assert (gradient(torch.float32) - exact).norm() / exact.norm() < 1e-4
+
+
+def test_the_ten_line_example_of_the_readme():
+    from epo_lightning import Energy, GameParameters, LevenbergMarquardt, Scene
+
+    history = torch.tensor([[[[-2.0, 0.0, 0.0, 1.0]], [[2.0, 0.1, torch.pi, 1.0]]]])  # [B=1, N=2, H=1, 4]
+    scene = Scene(history, dt=0.1, size=torch.full((1, 2, 2), 0.5))
+    parameters = GameParameters(
+        own_weights={name: torch.ones(1, 1, 2) for name in ("goal", "acc", "turnr")},
+        pair_weights={"proximity": torch.full((1, 1, 1), 10.0)},
+        goals=torch.tensor([[[[2.0, 0.0], [-2.0, 0.0]]]]),
+        initial_controls=torch.zeros(1, 1, 2, 40, 2),
+    )
+    solve = LevenbergMarquardt(steps=100, step_size=0.3, damping=1.0)
+    solution = solve(Energy(own=["goal", "acc", "turnr"], pair=["proximity"]), scene, parameters)
+    gap = (solution.states[0, 0, 0, :, :2] - solution.states[0, 0, 1, :, :2]).norm(dim=-1).min()
+    assert gap > 0.4, "they start on a collision course and should pass each other"
+    assert solution.energy < solution.initial_energy
+    assert isinstance(scene, Scene)
