@@ -170,9 +170,7 @@ class Energy:
                     raise ValueError(f"{kind} lacks the feature {name!r}; it has {sorted(given)}")
                 if given[name].shape != (batch, modes, count):
                     shape = list(given[name].shape)
-                    raise ValueError(
-                        f"{kind}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}"
-                    )
+                    raise ValueError(f"{kind}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}")
         if self.needs_goals:
             if parameters.goals is None:
                 raise ValueError("the energy has the feature 'goal', but parameters.goals is None")

@@ -26,36 +26,41 @@ def normal_equations(
     states = energy.dynamics.rollout(initial, controls, dt)
     goals = energy.goals(scene, parameters)
 
-    # Per agent and channel: gradient, and the K x K block of the matrix.
-    gradient = torch.zeros_like(controls)
-    block = controls.new_zeros(batch, modes, agents, 2, steps, steps)
-    matrix = controls.new_zeros(batch, modes, agents, steps, 2, agents, steps, 2)
-    tip, root = energy.dynamics.anchors(states, initial, dt)
-
+    # Features that read the same signal pull together: add them up before any K x K block is touched.
+    pulls: dict[tuple[Source, int], Tensor] = {}
+    stiffnesses: dict[tuple[Source, int], Tensor] = {}
     for name, feature in energy.own_features.items():
         value, slope = energy.shape(feature, signal(feature, states, controls, goals, dt))
         weight = energy.own_weight(scene, parameters, name)[..., None].square()
-        pull, stiffness = weight * slope * value, weight * slope.square()
-        channel = feature.channel
-        match feature.source:
+        key = feature.source, feature.channel
+        pulls[key] = pulls.get(key, 0.0) + weight * slope * value
+        stiffnesses[key] = stiffnesses.get(key, 0.0) + weight * slope.square()
+
+    gradient = torch.zeros_like(controls)
+    matrix = controls.new_zeros(batch, modes, agents, steps, 2, agents, steps, 2)
+    block = controls.new_zeros(batch, modes, agents, 2, steps, steps)  # what couples a control with itself over time
+    tip, root = energy.dynamics.anchors(states, initial, dt)
+    for (source, channel), pull in pulls.items():
+        stiffness = stiffnesses[source, channel]
+        own = block[..., channel, :, :]
+        match source:
             case Source.CONTROL:
                 gradient[..., channel] += pull
-                block[..., channel, :, :].diagonal(dim1=-2, dim2=-1).add_(stiffness)
+                own.diagonal(dim1=-2, dim2=-1).add_(stiffness)
             case Source.RATE:
                 pull, stiffness = pull / dt, stiffness / dt**2
                 gradient[..., 1:, channel] += pull
                 gradient[..., :-1, channel] -= pull
-                of_channel = block[..., channel, :, :]
-                of_channel[..., 1:, 1:].diagonal(dim1=-2, dim2=-1).add_(stiffness)
-                of_channel[..., :-1, :-1].diagonal(dim1=-2, dim2=-1).add_(stiffness)
-                of_channel.diagonal(offset=1, dim1=-2, dim2=-1).sub_(stiffness)
-                of_channel.diagonal(offset=-1, dim1=-2, dim2=-1).sub_(stiffness)
+                own[..., 1:, 1:].diagonal(dim1=-2, dim2=-1).add_(stiffness)
+                own[..., :-1, :-1].diagonal(dim1=-2, dim2=-1).add_(stiffness)
+                own.diagonal(offset=1, dim1=-2, dim2=-1).sub_(stiffness)
+                own.diagonal(offset=-1, dim1=-2, dim2=-1).sub_(stiffness)
             case Source.SPEED:
                 # v_k moves by dt with every a_j, j < k: what two accelerations share begins after the later one.
                 since = dt**2 * stiffness.flip(-1).cumsum(-1).flip(-1)
                 step = torch.arange(steps, device=controls.device)
                 gradient[..., ACCELERATION] += dt * pull.flip(-1).cumsum(-1).flip(-1)
-                block[..., ACCELERATION, :, :] += since[..., torch.maximum(step[:, None], step)]
+                own += since[..., torch.maximum(step[:, None], step)]
             case Source.FINAL_POSITION:
                 jacobian = tip[..., -1:, :, :] - root  # [B M N K 2 xy]
                 gradient += (jacobian * pull[..., None, None, :]).sum(-1)
