@@ -72,8 +72,20 @@ def check(settings: Settings) -> tuple[Any, LightningModule]:
     except ConfigError:
         raise
     except (TypeError, ValueError, RuntimeError, ArithmeticError) as error:
-        raise ConfigError(f"the forecaster cannot be built: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"the forecaster cannot be built{_suspects(model)}: {' '.join(str(error).split())}") from error
     return data, forecaster
+
+
+def _suspects(model: Mapping[str, Any]) -> str:
+    """Sizes below one, which constructors rarely mention in their complaints."""
+    sections = ((kind, model[kind]) for kind in PARTS[1:])
+    small = [
+        f"{kind}.{key}={value}"
+        for kind, section in sections
+        for key, value in section.items()
+        if isinstance(value, int) and not isinstance(value, bool) and value < 1
+    ]
+    return f" with {', '.join(small)}" if small else ""
 
 
 def quiet() -> None:

@@ -1,0 +1,86 @@
+"""The report over many runs: tables by :mod:`epo_lightning.report`, with figures of what the runs forecast."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.evaluate import open_checkpoint, open_data, split_of
+from epo_lightning.experiment.predict import examples, forecast_of, gather, spread
+from epo_lightning.experiment.run_folder import RunFolder, discover
+from epo_lightning.experiment.settings import ReportSettings, Settings, read
+from epo_lightning.registry import ConfigError
+from epo_lightning.report import build_tables, collect, write_report
+
+SCENES, GAMES = 4, 512
+"""How many scenes are drawn, and over how many the distribution of learned weights is taken."""
+
+ORDER = ("constant_velocity", "marginal", "scene_consistent", "epo")
+
+
+def report(settings: ReportSettings) -> str:
+    """Print the tables; write results.md, results.csv and figures/.
+
+    Raises:
+        ConfigError: no evaluated run below the folder, or one that cannot be read.
+    """
+    assembly.quiet()
+    runs, out = Path(settings.runs).expanduser(), Path(settings.out).expanduser()
+    build_tables(collect(runs))  # whatever cannot be reported is said before anything is drawn
+    evaluated = [run for run in discover(runs) if run.metrics_file().is_file()]
+    drawn = draw(evaluated, out / "figures")
+    return write_report(runs, out, figures=drawn, preface=preface(evaluated))
+
+
+def preface(runs: Iterable[RunFolder]) -> str:
+    """What a reader has to know before the numbers: that the budget was not the paper's, and how to use that."""
+    budgets = sorted({run.record.get("budget", "paper") for run in runs} - {"paper"})
+    if not budgets:
+        return ""
+    return (
+        f"**Budget: {', '.join(budgets)}.** These runs saw less data or fewer steps than the paper's, so the numbers show "
+        "that everything works and which way it points; they do not reproduce the table. The paper's settings:\n\n"
+        "```\nepo generate\nepo train -m sweeps=rpi_main\nepo evaluate runs=runs\nepo report runs=runs out=report\n```\n\n"
+        "With `budget=long` after the sweep it takes about an hour per run."
+    )
+
+
+def draw(runs: list[RunFolder], folder: Path) -> list[Path]:
+    """The joint predictions of all rows over the same scenes, and the weights of the games they inferred.
+
+    Every row is drawn by its first run; rows that were trained on other data than the first row are left out.
+    """
+    from epo_lightning.report.figures import joint_predictions
+    from epo_lightning.report.weights import learned_weights
+
+    rows: dict[str, RunFolder] = {}
+    for run in runs:
+        record = run.record
+        same_data = not rows or record["data_digest"] == next(iter(rows.values())).record["data_digest"]
+        if same_data:
+            rows.setdefault(record["title"], run)
+    rows = dict(sorted(rows.items(), key=lambda row: _rank(row[1])))
+    of_rows = {title: read(Settings, run.config()) for title, run in rows.items()}
+    try:
+        first = next(iter(rows))
+        scenes = gather(split_of(open_data(rows[first], of_rows[first]), "test"))
+        forecasters = {title: open_checkpoint(of_rows[title], run.checkpoint()) for title, run in rows.items()}
+    except ConfigError as error:
+        print(f"no figures: {error}")
+        return []
+    shown, other = examples(scenes, SCENES)
+    forecasts = {title: forecast_of(forecaster, shown) for title, forecaster in forecasters.items()}
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = [joint_predictions(shown, forecasts, folder / "joint_predictions.png", other)]
+    many = spread(scenes, GAMES)
+    games = {title: forecast_of(forecasters[title], many) for title, f in forecasts.items() if f.parameters is not None}
+    if games:
+        drawn.append(learned_weights(games, folder / "learned_weights.png"))
+    return drawn
+
+
+def _rank(run: RunFolder) -> tuple[bool, int, str]:
+    record = run.record
+    name = record["forecaster"]
+    return record["goal"] != "energy", ORDER.index(name) if name in ORDER else len(ORDER), record["title"]
