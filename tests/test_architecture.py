@@ -1,0 +1,63 @@
+"""Arrows between the rooms of the house point one way."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import epo_lightning
+
+ROOT = Path(epo_lightning.__file__).parent
+FLOORS = {
+    "scene": set(),
+    "registry": set(),
+    "optimizers": {"registry"},
+    "losses": set(),
+    "game": {"scene", "registry"},
+    "solvers": {"game", "scene", "registry"},
+    "encoders": {"scene"},
+    "metrics": {"scene", "registry"},
+    "decoders": {"scene", "game"},
+    "backbones": {"scene", "registry", "encoders", "decoders"},
+    "data": {"scene", "registry"},
+    "forecasters": {
+        "scene",
+        "registry",
+        "game",
+        "solvers",
+        "backbones",
+        "decoders",
+        "metrics",
+        "losses",
+        "optimizers",
+    },
+    "report": {"scene", "registry", "metrics"},
+}
+"""What each room may import, besides itself; `experiment` and `cli` stand on top of everything."""
+
+
+def imported_rooms(path: Path) -> set[str]:
+    rooms = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("epo_lightning."):
+            rooms.add(node.module.split(".")[1])
+        elif isinstance(node, ast.ImportFrom) and node.module == "epo_lightning":
+            rooms |= {name.name for name in node.names}
+        elif isinstance(node, ast.Import):
+            rooms |= {name.name.split(".")[1] for name in node.names if name.name.startswith("epo_lightning.")}
+    return rooms
+
+
+def test_no_room_imports_from_a_higher_floor():
+    wrong = []
+    for room, allowed in FLOORS.items():
+        home = ROOT / room
+        for path in home.rglob("*.py") if home.is_dir() else [home.with_suffix(".py")]:
+            for other in imported_rooms(path) - allowed - {room}:
+                wrong.append(f"{path.relative_to(ROOT)} imports {other}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_room_has_its_floor():
+    rooms = {path.stem for path in ROOT.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert rooms - {"__init__", "cli", "experiment", "conf", "sweeps"} == set(FLOORS)
