@@ -13,7 +13,8 @@ from typing import Protocol
 import torch
 from lightning import LightningDataModule
 from torch import Tensor
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import DataLoader
+from torch.utils.data.distributed import DistributedSampler
 
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
@@ -30,12 +31,12 @@ class SceneDataset(Protocol):
         """Make the choices that differ from epoch to epoch."""
 
 
-class BatchSampler(Sampler[Tensor]):
+class BatchSampler(DistributedSampler):
     """Index tensors of the batches of an epoch.
 
     Lightning calls ``set_epoch`` of a loader's sampler before each epoch, with the epoch that a checkpoint restored; the
-    order follows from the seed and that number. Under distributed training every rank takes each world-size-th index, of
-    a number of indices that all ranks have.
+    order follows from the seed and that number. Under distributed training rank r of n takes every n-th index from r on;
+    being a DistributedSampler only tells Lightning not to put one of its own in this one's place.
 
     Args:
         dataset: is told the epoch as well.
@@ -45,21 +46,20 @@ class BatchSampler(Sampler[Tensor]):
     """
 
     def __init__(self, dataset: SceneDataset, batch_size: int, shuffle: bool, seed: int) -> None:
-        self.dataset, self.batch_size, self.shuffle, self.seed = dataset, batch_size, shuffle, seed
-        self.epoch = 0
+        super().__init__(dataset, num_replicas=1, rank=0, shuffle=shuffle, seed=seed)  # type: ignore[arg-type]
+        self.scenes, self.batch_size = dataset, batch_size
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch of the next iteration."""
-        self.epoch = epoch
-        self.dataset.set_epoch(epoch)
+        """Choose the epoch of the next iteration. Validation and test are the same in every epoch."""
+        if self.shuffle:
+            super().set_epoch(epoch)
+            self.scenes.set_epoch(epoch)
 
     def indices(self) -> Tensor:
         """All indices of this rank in this epoch, in order."""
-        count = len(self.dataset)
+        count = len(self.scenes)
         if self.shuffle:
-            # Two numbers below 2^32 make one seed of 64 bits: no two (seed, epoch) share it.
-            generator = torch.Generator().manual_seed((self.seed << 32) + self.epoch)
-            order = torch.randperm(count, generator=generator)
+            order = torch.randperm(count, generator=epoch_generator(self.seed, self.epoch))
         else:
             order = torch.arange(count)
         rank, world = _rank()
@@ -73,10 +73,15 @@ class BatchSampler(Sampler[Tensor]):
 
     def __len__(self) -> int:
         rank, world = _rank()
-        count = len(self.dataset)
+        count = len(self.scenes)
         if self.shuffle:
             return count // world // self.batch_size
         return -(-len(range(rank, count, world)) // self.batch_size)
+
+
+def epoch_generator(seed: int, epoch: int) -> torch.Generator:
+    """Random numbers of one epoch: two numbers below 2^32 make one seed, so no two (seed, epoch) share it."""
+    return torch.Generator().manual_seed((seed << 32) + epoch)
 
 
 def _rank() -> tuple[int, int]:

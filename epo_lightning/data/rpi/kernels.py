@@ -1,7 +1,8 @@
 """The game as compiled code: rollout, costs, their derivatives, and the trajectories' characteristics.
 
-Joint states are rows of 8, agent after agent (x, y, heading, speed); joint controls rows of 4 (acceleration, turn rate).
-States [K+1, 8] include the start, which costs nothing: nobody chooses it. ``c`` is ``GameConstants.array()``, ``goals`` [2, 3].
+Joint states are rows of 8, agent after agent (x, y, heading, speed); joint controls rows of 4 (acceleration, turn
+rate). States [K+1, 8] include the start, which costs nothing: nobody chooses it. ``c`` is ``GameConstants.array()``,
+``goals`` [2, 3] are (x, y, heading) of each agent.
 """
 
 from __future__ import annotations

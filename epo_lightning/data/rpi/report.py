@@ -189,12 +189,11 @@ def _nearest(parts: Mapping[str, Records]) -> dict[str, Any]:
         distance, index = torch.cdist(block, keys).min(1)
         distances.append(distance)
         indices.append(index)
-    index = torch.cat(indices).numpy()
+    nearest = torch.cat(indices).numpy()
     step = torch.cat(distances).numpy() / np.sqrt(2 * (HISTORY + 1))
-    same = train["states"][index, 0, :, :, :2].astype(np.float64)
-    other = np.where(
-        (train["modes"][index] == 2)[:, None, None, None], train["states"][index, 1, :, :, :2], same
-    )
+    same = train["states"][nearest, 0, :, :, :2].astype(np.float64)
+    both = (train["modes"][nearest] == 2)[:, None, None, None]
+    other = np.where(both, train["states"][nearest, 1, :, :, :2], same)
     return {
         "rms_distance_per_step": _quantiles(step),
         "executed": _errors(same, test)["executed"],

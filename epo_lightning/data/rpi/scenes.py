@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from epo_lightning.data import cache
-from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
+from epo_lightning.data.datamodule import SceneDataModule, SceneDataset, epoch_generator
 from epo_lightning.data.rpi.splits import PARTS, SPLITS
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import Scene
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray  # noqa: F401 - kept for readers of the records
 
 TARGETS = ("executed", "sampled", "both")
 SOLVERS = ("potential", "feedback")
@@ -53,8 +50,7 @@ class RPIDataset:
     def set_epoch(self, epoch: int) -> None:
         """Draw the modes of an epoch."""
         if self.targets == "sampled":
-            generator = torch.Generator().manual_seed((self.seed << 32) + epoch)
-            draw = torch.rand(len(self.history), generator=generator)
+            draw = torch.rand(len(self.history), generator=epoch_generator(self.seed, epoch))
             self.mode = (draw * self.modes).long()
 
     def __len__(self) -> int:
@@ -128,8 +124,9 @@ class RPIData(SceneDataModule):
         self.split = _one_of("split", split, SPLITS)
         self.targets = _one_of("targets", targets, TARGETS)
         if sizes is not None and (isinstance(sizes, str) or len(sizes) != len(PARTS)):
-            raise ConfigError(f"data.sizes is {sizes!r}, expected three numbers, {', '.join(PARTS)}, or null for all records")
-        self.sizes = None if sizes is None else [_whole("sizes", size, 1, "an empty split is of no use") for size in sizes]
+            raise ConfigError(f"data.sizes is {sizes!r}, expected three numbers ({', '.join(PARTS)}) or null for all")
+        why = "an empty split is of no use"
+        self.sizes = None if sizes is None else [_whole("sizes", size, 1, why) for size in sizes]
 
     @property
     def config(self) -> dict[str, Any]:
@@ -189,7 +186,7 @@ class RPIData(SceneDataModule):
         """The scenes of a split.
 
         Raises:
-            cache.CacheError: the set is missing, truncated, altered, of another format, or holds numbers that are not finite.
+            cache.CacheError: the set is missing, broken, of another format, or holds numbers that are not finite.
         """
         records = cache.load(self.folder, split, ("history", "goals", "states", "modes"), self.command)
         return RPIDataset(records, self.targets, self.seed)

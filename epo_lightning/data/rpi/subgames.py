@@ -6,8 +6,6 @@ one record: what was seen until k, and the ways in which the agents could go on.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,8 +62,8 @@ def best_response_gain(
     for i in range(AGENTS):
         moves = np.zeros(AGENTS)
         moves[i] = 1.0
-        x, response, _, _ = solve_potential(start, u + noise * np.repeat(moves, 2), constants, game.goals, game.weight, moves,
-                                            settings)
+        perturbed = u + noise * np.repeat(moves, 2)
+        x, response, _, _ = solve_potential(start, perturbed, constants, game.goals, game.weight, moves, settings)
         best = max(best, (agent_costs[i] - _agent_cost(x, response, constants, game, i)) / agent_costs[i])
     return best
 
@@ -97,7 +95,7 @@ def play(seed: int, game: MainGame, constants: GameConstants, solver: str) -> tu
         "sub_games": 0,
         "sub_dropped": 0,
     }
-    rows: list[Records] = []
+    rows: list[dict[str, Any]] = []
     for side, index in modes.items():
         x, u = main.states[index], main.controls[index]
         last = min(int(passage(x)[1]), constants.steps - FUTURE)
@@ -116,7 +114,7 @@ def play(seed: int, game: MainGame, constants: GameConstants, solver: str) -> tu
                 counts["sub_dropped"] += 1
                 continue
             picks = [chosen[side]] + ([chosen[-side]] if -side in chosen else [])
-            row: Records = {
+            row: dict[str, Any] = {
                 "history": by_agent(x[k - HISTORY : k + 1]),
                 "goals": game.goals[:, :2],
                 "states": np.zeros((MODES, AGENTS, FUTURE, 4)),
@@ -126,14 +124,14 @@ def play(seed: int, game: MainGame, constants: GameConstants, solver: str) -> tu
                 "gradient": np.zeros(MODES),
                 "gain": np.zeros(MODES),
                 "distance": np.zeros(MODES),
-                "modes": np.int64(len(picks)),
-                "converged": np.int64(found.converged.sum()),
-                "weight": np.float64(game.weight),
-                "phi": np.float64(game.phi),
-                "game": np.int64(game.game),
-                "placement": np.int64(game.placement),
-                "executed": np.int64(side),
-                "step": np.int64(k),
+                "modes": len(picks),
+                "converged": found.converged.sum(),
+                "weight": game.weight,
+                "phi": game.phi,
+                "game": game.game,
+                "placement": game.placement,
+                "executed": side,
+                "step": k,
             }
             for m, pick in enumerate(picks):
                 row["states"][m] = by_agent(found.states[pick, 1 : FUTURE + 1])

@@ -1,0 +1,209 @@
+"""Batches: whole, in an order that depends on (seed, epoch) alone, and never from the test split by accident."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from epo_lightning.data import cache, datamodule
+from epo_lightning.data.datamodule import BatchSampler
+from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
+from epo_lightning.registry import ConfigError, build
+
+
+def records(count=50):
+    generator = torch.Generator().manual_seed(count)
+    return {
+        "history": torch.rand(count, 2, 19, 4, generator=generator),
+        "goals": torch.rand(count, 2, 2, generator=generator),
+        "states": torch.rand(count, 2, 2, 40, 4, generator=generator),
+        "modes": torch.randint(1, 3, (count,), generator=generator),
+    }
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A data module over random records, in the folder where its own would be."""
+
+    def make(**settings):
+        module = RPIData(root=str(tmp_path), batch_size=8, **settings)
+        if not module.folder.exists():
+            splits = {name: records(count) for name, count in (("train", 50), ("val", 21), ("test", 22))}
+            cache.write(module.folder, splits, module.config, {"size": 50})
+        return module
+
+    return make
+
+
+def order(loader, epoch):
+    loader.sampler.set_epoch(epoch)
+    return [batch.id.tolist() for batch in loader]
+
+
+def test_a_scene_is_what_the_vocabulary_says(data):
+    module = data()
+    module.setup("fit")
+    scene = next(iter(module.train_dataloader()))
+    assert scene.history.shape == (8, 2, 19, 4)
+    assert scene.future.shape == (8, 2, 40, 4)
+    assert scene.goal_candidates.shape == (8, 2, 1, 2)
+    assert (scene.size == 0.5).all()
+    assert scene.dt == module.dt == 0.1
+    assert scene.history.dtype == torch.float32
+    rows = records(50)
+    for i in range(8):
+        assert torch.equal(scene.history[i], rows["history"][scene.id[i]])
+        assert torch.equal(scene.future[i], rows["states"][scene.id[i], scene.subset[i]])
+
+
+@pytest.mark.parametrize("targets", ["executed", "sampled", "both"])
+def test_targets(targets):
+    rows = records(200)
+    dataset = RPIDataset(rows, targets, seed=3)
+    seen = dataset[torch.arange(len(dataset))]
+    if targets == "executed":
+        assert len(dataset) == 200
+        assert (seen.subset == 0).all()
+    if targets == "both":
+        assert len(dataset) == rows["modes"].sum()
+        pairs = set(zip(seen.id.tolist(), seen.subset.tolist(), strict=True))
+        assert pairs == {(i, m) for i in range(200) for m in range(int(rows["modes"][i]))}
+    if targets == "sampled":
+        assert len(dataset) == 200
+        assert (seen.subset < rows["modes"]).all()
+        share = seen.subset[rows["modes"] == 2].float().mean()
+        assert 0.3 < share < 0.7
+        dataset.set_epoch(1)
+        again = dataset[torch.arange(200)]
+        assert not torch.equal(again.subset, seen.subset)
+        dataset.set_epoch(0)
+        assert torch.equal(dataset[torch.arange(200)].subset, seen.subset)
+
+
+def test_training_is_shuffled_by_seed_and_epoch_and_drops_the_rest(data):
+    module = data(targets="executed")
+    module.setup("fit")
+    loader = module.train_dataloader()
+    first, second = order(loader, 0), order(loader, 1)
+    assert len(loader) == len(first) == 6
+    assert all(len(batch) == 8 for batch in first)
+    assert first != second
+    assert order(module.train_dataloader(), 1) == second
+    other = data(targets="executed", seed=1)
+    other.setup("fit")
+    assert order(other.train_dataloader(), 0) != first
+
+
+def test_validation_keeps_everything_in_order_and_does_not_change(data):
+    module = data(targets="sampled")
+    module.setup("fit")
+    loader = module.val_dataloader()
+    assert sum(order(loader, 0), []) == list(range(21))
+    before = [batch.subset.tolist() for batch in loader]
+    loader.sampler.set_epoch(5)
+    assert [batch.subset.tolist() for batch in loader] == before
+
+
+def test_the_test_split_is_not_touched_before_its_stage(data):
+    module = data()
+    (module.folder / "test.safetensors").unlink()
+    module.setup("fit")
+    module.setup("validate")
+    with pytest.raises(RuntimeError, match="'test' is not open"):
+        module.test_dataloader()
+    with pytest.raises(cache.CacheError, match=r"test\.safetensors is missing"):
+        module.setup("test")
+
+
+class Recorder(LightningModule):
+    """Notes which records it was given."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen = []
+
+    def training_step(self, scene, _):
+        self.seen.append((self.current_epoch, scene.id.tolist(), scene.subset.tolist()))
+        return self.weight * scene.history.mean()
+
+    def validation_step(self, scene, _):
+        pass
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+def fit(module, folder, epochs, checkpoint=None):
+    keep = ModelCheckpoint(folder, filename="{epoch}", save_top_k=-1)
+    model = Recorder()
+    trainer = Trainer(
+        max_epochs=epochs, logger=False, callbacks=[keep], enable_progress_bar=False, enable_model_summary=False,
+        accelerator="cpu", default_root_dir=folder,
+    )
+    trainer.fit(model, module, ckpt_path=checkpoint)
+    return model.seen
+
+
+@pytest.mark.parametrize("targets", ["both", "sampled"])
+def test_a_resumed_run_sees_what_it_would_have_seen(data, tmp_path, targets):
+    whole = fit(data(targets=targets), tmp_path / "a", 4)
+    begun = fit(data(targets=targets), tmp_path / "b", 2)
+    rest = fit(data(targets=targets), tmp_path / "c", 4, tmp_path / "b" / "epoch=1.ckpt")
+    assert begun + rest == whole
+    assert len({tuple(ids) for _, ids, _ in whole}) > len(whole) // 2
+
+
+def test_ranks_share_the_samples(data, monkeypatch):
+    dataset = RPIDataset(records(51), "executed")
+    for shuffle in (True, False):
+        shares = []
+        for rank in range(2):
+            monkeypatch.setattr(datamodule, "_rank", lambda rank=rank: (rank, 2))
+            sampler = BatchSampler(dataset, 8, shuffle, 0)
+            batches = list(sampler)
+            assert len(batches) == len(sampler)
+            shares.append(torch.cat(batches).tolist())
+        assert not set(shares[0]) & set(shares[1])
+        assert len(shares[0]) + len(shares[1]) == (48 if shuffle else 51)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"batch_size": 1}, "batch normalisation needs at least 2"),
+        ({"games": 2}, r"data\.games is 2, expected a whole number of at least 3"),
+        ({"placements": 0}, r"data\.placements is 0"),
+        ({"placements": -4}, r"data\.placements is -4"),
+        ({"placements": 2.5}, r"data\.placements is 2\.5"),
+        ({"sizes": [10, 0, 10]}, r"data\.sizes is 0"),
+        ({"sizes": [10, 10]}, "expected three numbers"),
+        ({"seed": -1}, "seed is -1"),
+        ({"split": "papr"}, r"unknown data\.split 'papr': did you mean 'paper'"),
+        ({"targets": "sample"}, "did you mean 'sampled'"),
+        ({"solver": "potentail"}, "did you mean 'potential'"),
+        ({"plcements": 3}, r"unknown key data\.plcements"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        build("data", {"name": "rpi", **settings})
+
+
+def test_the_digest_follows_what_a_run_depends_on(tmp_path):
+    base = RPIData(root=str(tmp_path)).digest
+    assert RPIData(batch_size=64).digest == base
+    for change in ({"seed": 1}, {"games": 5}, {"split": "hard"}, {"targets": "executed"}, {"sizes": None}):
+        assert RPIData(**change).digest != base
+    folders = {RPIData(targets=targets).folder for targets in ("executed", "sampled", "both")}
+    assert len(folders) == 1
+
+
+def test_a_set_that_is_too_small_for_a_batch_is_refused(data):
+    module = data()
+    module.batch_size = 1000
+    module.setup("fit")
+    with pytest.raises(ConfigError, match="not one full batch"):
+        module.train_dataloader()

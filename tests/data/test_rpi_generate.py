@@ -1,0 +1,178 @@
+"""Generation: the same bytes whatever the workers and interruptions, and records that are what they say."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from epo_lightning.data import cache
+from epo_lightning.data.rpi.report import markdown
+from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.data.rpi.splits import PAPER_SIZES, assign, games_of
+
+SMALL = {"games": 3, "placements": 2, "seed": 1}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    made = RPIData(root=str(tmp_path_factory.mktemp("rpi")), **SMALL)
+    made.generate(workers=1, progress=False)
+    return made
+
+
+@pytest.fixture(scope="module")
+def records(data):
+    return {split: load_file(data.folder / f"{split}.safetensors") for split in ("train", "val", "test")}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def test_the_bytes_do_not_depend_on_the_workers(data, tmp_path):
+    other = RPIData(root=str(tmp_path), **SMALL)
+    other.generate(workers=2, progress=False)
+    assert contents(other.folder) == contents(data.folder)
+
+
+def test_generation_goes_on_after_a_kill(data, tmp_path):
+    code = (
+        "from epo_lightning.data.rpi.scenes import RPIData\n"
+        f"if __name__ == '__main__': RPIData(root={str(tmp_path)!r}, **{SMALL}).generate(workers=1, progress=False)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], start_new_session=True)
+    deadline = time.time() + 60
+    while not list(tmp_path.glob("rpi-pool-*/game-*.safetensors")):
+        assert process.poll() is None, "it ended before it could be killed"
+        assert time.time() < deadline
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    parts = {path: path.stat().st_mtime_ns for path in tmp_path.glob("rpi-pool-*/game-*.safetensors")}
+    other = RPIData(root=str(tmp_path), **SMALL)
+    assert not other.folder.exists()
+    other.generate(workers=1, progress=False)
+    assert contents(other.folder) == contents(data.folder)
+    assert all(path.stat().st_mtime_ns == when for path, when in parts.items()), "a finished main game was solved again"
+
+
+def test_a_broken_part_is_solved_again_and_a_made_set_is_left_alone(data, tmp_path):
+    other = RPIData(root=str(tmp_path), **SMALL)
+    pool = next(data.root.glob("rpi-pool-*"))
+    (tmp_path / pool.name).mkdir()
+    for path in pool.iterdir():
+        (tmp_path / pool.name / path.name).write_bytes(path.read_bytes())
+    broken = tmp_path / pool.name / "game-0001.safetensors"
+    broken.write_bytes(broken.read_bytes()[:-100])
+    other.generate(workers=1, progress=False)
+    assert contents(other.folder) == contents(data.folder)
+    before = {path: path.stat().st_mtime_ns for path in other.folder.iterdir()}
+    other.generate(workers=1, progress=False)
+    assert {path: path.stat().st_mtime_ns for path in other.folder.iterdir()} == before
+
+
+def test_splits_share_the_pool(data, monkeypatch):
+    def refuse(*_):
+        raise AssertionError("solved again")
+
+    monkeypatch.setattr("epo_lightning.data.rpi.generate._play", refuse)
+    hard = RPIData(root=str(data.root), split="hard", **SMALL)
+    assert hard.generate(workers=1, progress=False) != data.folder
+
+
+def test_shapes_and_finite(records):
+    for rows in records.values():
+        count = len(rows["step"])
+        assert rows["history"].shape == (count, 2, 19, 4)
+        assert rows["states"].shape == (count, 2, 2, 40, 4)
+        assert rows["controls"].shape == (count, 2, 2, 40, 2)
+        assert rows["history"].dtype == np.float32
+        assert all(np.isfinite(values).all() for values in rows.values())
+        assert set(np.unique(rows["modes"])) <= {1, 2}
+
+
+def test_splits_have_games_of_their_own(records):
+    games = [set(rows["game"]) for rows in records.values()]
+    assert all(games)
+    assert sum(map(len, games)) == len(set.union(*games)) == SMALL["games"]
+
+
+def test_states_follow_from_controls_by_euler(records):
+    rows = records["train"]
+    for mode in range(2):
+        chosen = rows["modes"] > mode
+        states, controls = rows["states"][chosen, mode].astype(float), rows["controls"][chosen, mode].astype(float)
+        before = np.concatenate([rows["history"][chosen][:, :, -1:].astype(float), states[:, :, :-1]], 2)
+        v, t = before[..., 3], before[..., 2]
+        rate = np.stack([v * np.cos(t), v * np.sin(t), controls[..., 1], controls[..., 0]], -1)
+        assert np.abs(before + 0.1 * rate - states).max() < 1e-6
+
+
+def test_bellman_and_history(records):
+    """An executed mode is the rest of the one before, and what was a future becomes history."""
+    rows = records["train"]
+    pairs = 0
+    for i in range(len(rows["step"]) - 1):
+        j = i + 1
+        if any(rows[name][i] != rows[name][j] for name in ("placement", "executed")):
+            continue
+        assert rows["step"][j] == rows["step"][i] + 1
+        np.testing.assert_allclose(rows["states"][j, 0, :, :-1], rows["states"][i, 0, :, 1:], atol=1e-6)
+        np.testing.assert_allclose(rows["history"][j, :, -1], rows["states"][i, 0, :, 0], atol=1e-6)
+        np.testing.assert_allclose(rows["history"][j, :, :-1], rows["history"][i, :, 1:], atol=0)
+        pairs += 1
+    assert pairs > 100
+
+
+def test_modes_pass_on_different_sides_and_without_contact(records):
+    rows = records["train"]
+    two = rows["modes"] == 2
+    assert 0.2 < two.mean() < 0.7
+    assert rows["distance"][:, 0].min() > 0.5
+    assert rows["distance"][two, 1].min() > 0.5
+    apart = np.linalg.norm(rows["states"][two, 0, ..., :2] - rows["states"][two, 1, ..., :2], axis=-1)
+    assert apart.mean((1, 2)).min() > 0.1
+    assert (rows["states"][~two, 1] == 0).all()
+
+
+def test_the_report_covers_the_set(data, records):
+    report = data.report()
+    assert report["sizes"]["train"]["records"] == len(records["train"]["step"])
+    assert report["solver"]["main_converged"] == 1.0
+    assert report["nash"]["executed"]["gain_share"] == 0.0
+    assert report["motion"]["disc_overlaps"] == 0
+    assert report["motion"]["euler_residual"] < 1e-6
+    assert 0.05 < report["baselines"]["constant_velocity"]["executed"]["ade"] < 0.3
+    assert "records with two modes" in markdown(report)
+
+
+def test_paper_sizes_and_disjoint_hard_split():
+    random = np.random.default_rng(0)
+    game = np.repeat(np.arange(20), 3200)
+    phi = random.uniform(-np.pi, np.pi, len(game))
+    weights = random.uniform(10, 100, 20)
+    paper = assign("paper", 0, weights, game, phi, PAPER_SIZES)
+    assert tuple(map(len, paper.values())) == PAPER_SIZES
+    assert [len(np.unique(game[index])) for index in paper.values()] == [16, 2, 2]
+    hard = assign("hard", 0, weights, game, phi, None)
+    assert len(np.unique(np.concatenate(list(hard.values())))) == sum(map(len, hard.values()))
+    extreme = games_of("hard", weights)["test"]
+    assert set(extreme) == {weights.argmin(), weights.argmax()}
+    learned = np.concatenate([hard["train"], hard["val"]])
+    angle = np.abs(np.degrees(phi[learned]))
+    assert not np.isin(game[learned], extreme).any()
+    assert not ((angle > 75) & (angle < 105)).any()
+
+
+def test_a_missing_set_names_the_command(tmp_path):
+    data = RPIData(root=str(tmp_path), **SMALL)
+    with pytest.raises(cache.CacheError, match=r"no RPI data at .*`epo generate data=rpi data.seed=1 data.games=3"):
+        data.setup("fit")
