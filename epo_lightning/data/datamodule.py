@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
+import numpy as np
 import torch
 from lightning import LightningDataModule
 from torch import Tensor
@@ -68,8 +69,9 @@ class BatchSampler(DistributedSampler):
         return order[rank::world]
 
     def __iter__(self) -> Iterator[Tensor]:
-        batches = self.indices().split(self.batch_size)
-        return iter(batches[: len(self)])
+        # A generator, so that the order is drawn with the first batch: a resumed Lightning asks for the iterator before
+        # it says which epoch it is.
+        yield from self.indices().split(self.batch_size)[: len(self)]
 
     def __len__(self) -> int:
         rank, world = _rank()
@@ -80,8 +82,8 @@ class BatchSampler(DistributedSampler):
 
 
 def epoch_generator(seed: int, epoch: int) -> torch.Generator:
-    """Random numbers of one epoch: two numbers below 2^32 make one seed, so no two (seed, epoch) share it."""
-    return torch.Generator().manual_seed((seed << 32) + epoch)
+    """Random numbers of one epoch. Mixed by numpy: torch's generator looks at the last 32 bits of a seed only."""
+    return torch.Generator().manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
 
 
 def _rank() -> tuple[int, int]:

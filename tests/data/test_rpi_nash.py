@@ -59,9 +59,8 @@ def gains(mode, noise, random, constant=False):
         value = dense.alone(mode.start, u, CONSTANTS, mode.game.goals, mode.game.weight, agent)
         mine = u.reshape(-1, 2, 2)[:, agent]
         shift = random.normal(0.0, noise, (1 if constant else len(mine), 2))
-        result = minimize(
-            value, (mine + shift).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 2000, "ftol": 1e-14, "gtol": 1e-6}
-        )
+        settings = {"maxiter": 2000, "ftol": 1e-14, "gtol": 1e-6}
+        result = minimize(value, (mine + shift).ravel(), jac=True, method="L-BFGS-B", options=settings)
         cost = own[agent] + pair
         assert value(mine.ravel())[0] == pytest.approx(cost, rel=1e-12)
         found.append((cost - result.fun) / cost)
