@@ -103,7 +103,9 @@ def write(
 
 
 def _broken(what: str, folder: Path, command: str) -> CacheError:
-    return CacheError(f"{what}; delete the folder {folder} and make it again" + (f" with `{command}`" if command else ""))
+    return CacheError(
+        f"{what}; delete the folder {folder} and make it again" + (f" with `{command}`" if command else "")
+    )
 
 
 def manifest(folder: Path, command: str = "") -> dict[str, Any]:
@@ -150,7 +152,9 @@ def verify_file(folder: Path, split: str, command: str = "") -> Path:
     if path.stat().st_size != expected["bytes"]:
         raise _broken(f"{path} has {path.stat().st_size} bytes instead of {expected['bytes']}", folder, command)
     if file_digest(path) != expected["sha256"]:
-        raise _broken(f"{path} has the right size but not the checksum of its manifest: it was altered", folder, command)
+        raise _broken(
+            f"{path} has the right size but not the checksum of its manifest: it was altered", folder, command
+        )
     return path
 
 

@@ -111,7 +111,9 @@ class SceneDataModule(LightningDataModule):
     def __init__(self, batch_size: int, seed: int) -> None:
         super().__init__()
         if not isinstance(batch_size, int) or isinstance(batch_size, bool) or batch_size < 2:
-            raise ConfigError(f"batch_size is {batch_size!r}, but batch normalisation needs at least 2 scenes in a batch")
+            raise ConfigError(
+                f"batch_size is {batch_size!r}, but batch normalisation needs at least 2 scenes in a batch"
+            )
         if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**31:
             raise ConfigError(f"seed is {seed!r}, expected a whole number from 0 to 2^31 - 1")
         self.batch_size, self.seed = batch_size, seed

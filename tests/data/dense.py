@@ -114,7 +114,13 @@ def coupled_riccati(A, B, Q, q, R, r, owner):
         closed = A1 + B1 @ policy
         for i in range(players):
             linear = np.outer(one, r[i][k]) @ policy
-            P[i] = homogeneous(Q[i][k], q[i][k]) + policy.T @ R[i][k] @ policy + linear + linear.T + closed.T @ P[i] @ closed
+            P[i] = (
+                homogeneous(Q[i][k], q[i][k])
+                + policy.T @ R[i][k] @ policy
+                + linear
+                + linear.T
+                + closed.T @ P[i] @ closed
+            )
     return gains, offsets
 
 

@@ -102,7 +102,9 @@ def test_numbers_that_are_not_finite_are_located(tmp_path):
     states = torch.zeros(5, 2, 3)
     states[3, 1, 0] = float("nan")
     folder = cache.write(tmp_path / "rpi-1", {"val": {"states": states}}, {}, {})
-    with pytest.raises(cache.CacheError, match=r"split 'val' in .*: tensor 'states' is not finite in 1 records, first 3"):
+    with pytest.raises(
+        cache.CacheError, match=r"split 'val' in .*: tensor 'states' is not finite in 1 records, first 3"
+    ):
         cache.load(folder, "val")
 
 

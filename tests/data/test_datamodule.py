@@ -140,8 +140,13 @@ def fit(module, folder, epochs, checkpoint=None):
     keep = ModelCheckpoint(folder, filename="{epoch}", save_top_k=-1)
     model = Recorder()
     trainer = Trainer(
-        max_epochs=epochs, logger=False, callbacks=[keep], enable_progress_bar=False, enable_model_summary=False,
-        accelerator="cpu", default_root_dir=folder,
+        max_epochs=epochs,
+        logger=False,
+        callbacks=[keep],
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        accelerator="cpu",
+        default_root_dir=folder,
     )
     trainer.fit(model, module, ckpt_path=checkpoint)
     return model.seen

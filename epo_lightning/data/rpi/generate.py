@@ -131,7 +131,9 @@ def default_workers() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def make_pool(root: Path, config: Mapping[str, Any], workers: int | None, progress: bool) -> tuple[Records, dict[str, int]]:
+def make_pool(
+    root: Path, config: Mapping[str, Any], workers: int | None, progress: bool
+) -> tuple[Records, dict[str, int]]:
     """All records of all main games, solving those that are not on disk yet.
 
     Raises:
@@ -191,7 +193,9 @@ def make_pool(root: Path, config: Mapping[str, Any], workers: int | None, progre
     parts = [_read_part(path, name) for path in paths]
     broken = [path for path, part in zip(paths, parts, strict=True) if part is None]
     if broken:
-        raise cache.CacheError(f"{broken[0]} cannot be read back: is the disk full? Delete it and run the command again")
+        raise cache.CacheError(
+            f"{broken[0]} cannot be read back: is the disk full? Delete it and run the command again"
+        )
     full = [part[0] for part in parts if part is not None and part[0]]
     if not full:
         raise cache.CacheError("no placement of any main game gave a record: use more placements or another seed")
@@ -224,7 +228,9 @@ def make_set(
     }
     empty = [part for part, values in parts.items() if not len(values["step"])]
     if empty:
-        raise cache.CacheError(f"split {split!r} leaves no records for {', '.join(empty)}: use more games or placements")
+        raise cache.CacheError(
+            f"split {split!r} leaves no records for {', '.join(empty)}: use more games or placements"
+        )
     report = describe(parts, counts, weights, pool)
     tensors = {part: {name: torch.from_numpy(values) for name, values in rows.items()} for part, rows in parts.items()}
     return cache.write(folder, tensors, config, rounded(report))

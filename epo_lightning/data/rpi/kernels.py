@@ -86,9 +86,7 @@ def linearise(x: Array, c: Array, moves: Array, A: Array, B: Array) -> None:
 
 
 @njit(cache=True)
-def add_own(
-    i: int, x: Array, u: Array, c: Array, goals: Array, Q: Array, q: Array, R: Array, r: Array
-) -> None:
+def add_own(i: int, x: Array, u: Array, c: Array, goals: Array, Q: Array, q: Array, R: Array, r: Array) -> None:
     """Add gradient and (exact) Hessian of agent i's own cost."""
     s, a = 4 * i, 2 * i
     steps = len(u)

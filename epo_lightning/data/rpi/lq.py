@@ -182,9 +182,7 @@ def lq_minimum(
 
 
 @njit(cache=True)
-def lq_game(
-    A: Array, B: Array, Q: Array, q: Array, R: Array, r: Array, owner: Array
-) -> tuple[bool, Array, Array]:
+def lq_game(A: Array, B: Array, Q: Array, q: Array, R: Array, r: Array, owner: Array) -> tuple[bool, Array, Array]:
     """The feedback Nash equilibrium of an LQ game, by the coupled Riccati recursion (Basar and Olsder, Corollary 6.1).
 
     At every step each player minimises its own cost to go against the others' policies; the N stationarity conditions

@@ -22,11 +22,7 @@ TIE = 1e-6
 
 def sound(solutions: Solutions, constants: GameConstants) -> NDArray[np.bool_]:
     """Which solutions may become modes: converged, without contact, without driving backwards. Shape [S]."""
-    return (
-        solutions.converged
-        & (solutions.distance > SMALLEST_DISTANCE)
-        & (solutions.speed >= constants.speed_min)
-    )
+    return solutions.converged & (solutions.distance > SMALLEST_DISTANCE) & (solutions.speed >= constants.speed_min)
 
 
 def cheapest(solutions: Solutions, constants: GameConstants) -> dict[int, int]:

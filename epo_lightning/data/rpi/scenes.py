@@ -151,7 +151,9 @@ class RPIData(SceneDataModule):
     def command(self) -> str:
         """The command that makes this set, for error messages."""
         defaults = {"seed": 0, "games": 20, "placements": 39, "solver": "potential", "split": "paper"}
-        words = [f"data.{name}={getattr(self, name)}" for name, value in defaults.items() if getattr(self, name) != value]
+        words = [
+            f"data.{name}={getattr(self, name)}" for name, value in defaults.items() if getattr(self, name) != value
+        ]
         if self.sizes != [47822, 6228, 6228]:
             words.append("data.sizes=" + ("null" if self.sizes is None else "[" + ",".join(map(str, self.sizes)) + "]"))
         if self.root != cache.default_root():

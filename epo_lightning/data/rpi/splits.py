@@ -46,7 +46,12 @@ def games_of(split: str, weights: NDArray[np.float64]) -> dict[str, Index]:
 
 
 def assign(
-    split: str, seed: int, weights: NDArray[np.float64], game: Index, phi: NDArray[np.float64], sizes: Sequence[int] | None
+    split: str,
+    seed: int,
+    weights: NDArray[np.float64],
+    game: Index,
+    phi: NDArray[np.float64],
+    sizes: Sequence[int] | None,
 ) -> dict[str, Index]:
     """Indices of the records of each part, in the order of the pool.
 
