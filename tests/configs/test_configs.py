@@ -1,0 +1,159 @@
+"""Every experiment composes and can be built; every mistake is refused in one message that names the right word."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.compose import compose, jobs, tree
+from epo_lightning.experiment.settings import Settings, read
+from tests.experiment import tiny
+from tests.experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
+
+CONF = tree() / "conf"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("experiment", names(CONF / "experiment"))
+def test_experiments_can_be_built(experiment: str) -> None:
+    config = compose("train", [f"experiment={experiment}"])
+    settings = read(Settings, config)
+    assembly.check(settings)
+    assert settings.title != "untitled"
+    assert settings.experiment == experiment
+
+
+def test_titles_are_told_apart() -> None:
+    titles = [compose("train", [f"experiment={name}"])["title"] for name in names(CONF / "experiment")]
+    assert len(set(titles)) == len(titles)
+
+
+def test_the_papers_settings() -> None:
+    config = compose("train", ["experiment=rpi/v_lstm_epo"])
+    assert config["data"]["batch_size"] == 32
+    assert config["optimizer"]["name"] == "adam"
+    assert config["optimizer"]["lr"] == 5e-5
+    assert {key: config["solver"][key] for key in ("steps", "step_size", "damping")} == {
+        "steps": 2,
+        "step_size": 0.3,
+        "damping": 10.0,
+    }
+    assert config["forecaster"]["loss_weights"] == {"imitation": 1.0, "probability": 0.1}
+    assert config["forecaster"]["modes"] == 2
+    assert config["goal"] == "energy"
+
+
+@pytest.mark.parametrize("row", ["v_lstm", "v_lstm_sc", "v_lstm_epo"])
+def test_fair_twins_differ_in_the_goal_only(row: str) -> None:
+    one, twin = (compose("train", [f"experiment=rpi/{row}{suffix}"]) for suffix in ("", "_goal"))
+    differing = {key for key in one if one[key] != twin[key]}
+    assert differing == {"goal", "title", "experiment"}
+    assert twin["goal"] == "all"
+
+
+@pytest.mark.parametrize("budget", names(CONF / "budget"))
+@pytest.mark.parametrize("debug", ["null", *names(CONF / "debug")])
+def test_budgets_and_debugging_compose(budget: str, debug: str) -> None:
+    settings = read(Settings, compose("train", ["experiment=rpi/v_lstm_epo", f"budget={budget}", f"debug={debug}"]))
+    assert settings.budget.name == budget
+
+
+@pytest.mark.parametrize("data", [name for name in names(CONF / "data")])
+def test_data_sets_can_be_described(data: str) -> None:
+    assembly.build_data(compose("generate", [f"data={data}"])["data"])
+
+
+@pytest.mark.parametrize("sweep", names(tree() / "sweeps"))
+def test_sweeps_list_their_runs(sweep: str) -> None:
+    listed = jobs("train", [f"sweeps={sweep}"])
+    assert len(listed) > 1
+    for job in listed:
+        read(Settings, compose("train", job))
+
+
+def test_a_budget_in_the_command_line_wins_over_the_experiment() -> None:
+    config = compose("train", ["experiment=rpi/v_lstm", "budget=reduced", "optimizer.lr=0.5"])
+    assert config["budget"]["name"] == "reduced"
+    assert config["optimizer"] == {"name": "adam", "lr": 0.5, "schedule": "cosine", "clip": None}
+
+
+MISTAKES = {
+    "trian": "'train'",
+    "train sede=1": "'seed'",
+    "train +sede=1": "'seed'",
+    "train data.batch=1": "'batch_size'",
+    "train +data.foo=1": "data.foo",
+    "train solver.step=3": "'steps'",
+    "train trainer.max_epoch=3": "'max_epochs'",
+    "train +callbacks.patient=3": "'patience'",
+    "train experiment=rpi/v_lst": "'rpi/v_lstm'",
+    "train forecaster=epos": "'epo'",
+    "train forecaster.name=epos": "'epo'",
+    "train logger=[wand]": "'wandb'",
+    "train energy.own=[gaol]": "'goal'",
+    "train seed=one": "seed must be a whole number",
+    "train optimizer.lr=fast": "optimizer.lr must be a number",
+    "train forecaster.modes=1.5": "forecaster.modes must be a whole number",
+    "train goal=some": "goal must be one of energy, all",
+    "train seed=${nope}": "nope",
+    "train ~energy": "energy",
+    "train foo": "key=value",
+    "train backbone.width=0": "backbone.width=0",
+    "train optimizer.lr=-1": "optimizer.lr",
+    "train seed=0,1": "--multirun",
+    "train seed=-1": "seed",
+    "train trainer.max_epochs=null": "would never end",
+    "train -m sweeps=rpi_mein": "'rpi_main'",
+    "train -m solver.steps=1,x": "solver.steps must be a whole number",
+    "train --multrun": "'--multirun'",
+    "train resume=nowhere": "does not exist",
+    "config chekc": "'check'",
+    "config check solver.step=3": "'steps'",
+    "config check generate workers=0": "workers",
+    "evaluate": "run=<run folder>",
+    "evaluate run=nowhere": "does not exist",
+    "evaluate runs=.": "no finished run",
+    "evaluate run=a split=train": "split must be one of test, val",
+    "predict": "run=<value>",
+    "report runs=nowhere": "nowhere",
+    "report -m runs=a,b": "takes no -m",
+    "generate worker=3": "'workers'",
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_mistakes_are_refused_in_one_message(words: str, refused: Callable[..., str]) -> None:  # noqa: F811
+    verb, *rest = words.split()
+    data = ["data=tiny"] if verb == "train" and "resume" not in words else []
+    assert MISTAKES[words] in refused(verb, *data, *rest)
+
+
+def test_missing_data_is_said_before_a_folder_is_made(refused: Callable[..., str]) -> None:  # noqa: F811
+    assert "epo generate" in refused("train", "experiment=rpi/v_lstm", "data.root=nowhere")
+
+
+def test_help_and_configurations_are_printed(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    for words, expected in (
+        (["--help"], "epo train"),
+        ([], "epo generate"),
+        (["train", "--help"], "rpi/v_lstm_epo"),
+        (["evaluate", "--help"], "split"),
+        (["config", "--help"], "check"),
+        (["--version"], "epo_lightning"),
+        (["config", "experiment=rpi/v_lstm_epo"], "step_size: 0.3"),
+        (["config", "evaluate", "run=x"], "split: test"),
+        (["config", "check", "experiment=rpi/v_lstm_epo"], "is sound"),
+    ):
+        assert epo(*words) == 0
+        assert expected in capsys.readouterr().out
+    assert not list(Path.cwd().iterdir())
+
+
+def test_folders_of_ones_own_come_first() -> None:
+    assert compose("train", ["data=tiny"], [str(tiny.CONF)])["data"]["name"] == "tiny"

@@ -1,0 +1,36 @@
+"""The wheel brings its configuration tree along."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_works_from_any_folder(tmp_path: Path) -> None:
+    pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", "--no-deps", "-w", str(tmp_path), str(ROOT)], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    site = tmp_path / "site"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    program = f"import sys; sys.path.insert(0, {str(site)!r}); from epo_lightning import cli; cli.main()"
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+
+    def epo(*words: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", program, *words], cwd=elsewhere, check=True, capture_output=True, text=True
+        )
+        return done.stdout
+
+    assert "title: V-LSTM + EPO" in epo("config", "experiment=rpi/v_lstm_epo")
+    assert "is sound" in epo("config", "check", "experiment=rpi/v_lstm_epo_goal", "budget=reduced")
+    assert "rpi_main" in epo("train", "--help")
+    assert not list(elsewhere.iterdir())

@@ -1,0 +1,51 @@
+"""Runs on the tiny data set, in a folder of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from epo_lightning import cli
+from tests.experiment import tiny
+
+TINY = ("data=tiny", "budget=smoke", "callbacks.progress=none")
+"""The paper's rows in a second."""
+
+Epo = Callable[..., int]
+
+
+@pytest.fixture
+def epo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Epo:
+    """Run a command line in an empty folder; returns its exit status."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> int:
+        try:
+            cli.main([f"--config-dir={tiny.CONF}", *words])
+        except SystemExit as done:
+            return int(done.code or 0)
+        return 0
+
+    return run
+
+
+@pytest.fixture
+def refused(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run a command line that must be refused: one message, exit status 2, and no new file. Returns the message."""
+
+    def run(*words: str) -> str:
+        before = sorted(tmp_path.rglob("*"))
+        capsys.readouterr()
+        status = epo(*words)
+        captured = capsys.readouterr()
+        assert status == 2, captured
+        message = captured.err.strip()
+        assert message.startswith("epo: "), message
+        assert "Traceback" not in message
+        assert "\n" not in message
+        assert sorted(tmp_path.rglob("*")) == before
+        return message
+
+    return run

@@ -1,0 +1,207 @@
+"""Run folders: what is in them, that equal runs are equal, and that a stopped run goes on as if it had not been."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+import epo_lightning
+from epo_lightning.experiment import train as training
+from epo_lightning.experiment.callbacks import RandomStates
+from epo_lightning.experiment.run_folder import RunFolder, write_json
+from epo_lightning.registry import ConfigError
+from tests.experiment import tiny
+from tests.experiment.conftest import TINY, Epo
+
+ROW = "experiment=rpi/v_lstm_sc"
+
+
+def weights(folder: str | Path, which: str = "last") -> dict[str, torch.Tensor]:
+    return torch.load(RunFolder(Path(folder)).checkpoint(which), weights_only=True)["state_dict"]
+
+
+def test_a_run_folder_holds_what_a_run_needs(epo: Epo) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run", "seed=3") == 0
+    run = RunFolder.open("run")
+    record, config = run.record, run.config()
+    assert record["status"] == "finished"
+    assert record["seed"] == config["seed"] == 3
+    assert record["data_digest"] == "tiny-64-0"
+    assert record["versions"]["torch"]
+    assert record["parameters"] > 0
+    assert "experiment=rpi/v_lstm_sc" in record["command"]
+    assert (run.logs / "metrics.csv").read_text().count("\n") > 2
+    assert run.checkpoint("best").is_file()
+    assert run.checkpoint("last").is_file()
+    assert not run.metrics_file().exists(), "the test split is nobody's business while training"
+    assert "run_dir" in yaml.safe_load(run.config_file.read_text())
+
+
+def test_checkpoints_load_from_anywhere_and_forecast(epo: Epo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert epo("train", "experiment=rpi/v_lstm_epo", *TINY, "run_dir=run") == 0
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    forecast = epo_lightning.load(tmp_path / "run" / "checkpoints" / "best.ckpt").predict(tiny.scenes(3, seed=9))
+    assert forecast.states.shape == (3, 2, 2, 40, 4)
+
+
+def test_the_same_seed_gives_the_same_metrics_and_another_does_not(epo: Epo) -> None:
+    for name, seed in (("one", 0), ("two", 0), ("three", 1)):
+        assert epo("train", ROW, *TINY, f"run_dir={name}", f"seed={seed}") == 0
+        assert epo("evaluate", f"run={name}") == 0
+    one, two, three = (RunFolder(Path(name)).metrics_file().read_bytes() for name in ("one", "two", "three"))
+    assert one == two
+    assert one != three
+    assert set(json.loads(one)) == {"split", "data_digest", "checkpoint", "metrics"}
+
+
+def test_constant_velocity_is_kept_and_scored_like_any_other(epo: Epo) -> None:
+    assert epo("train", "experiment=rpi/const_vel", *TINY, "run_dir=run") == 0
+    assert epo("evaluate", "run=run") == 0
+    assert RunFolder(Path("run")).record["parameters"] == 0
+    assert json.loads(Path("run/metrics.json").read_text())["metrics"]["minSADE"] > 0
+
+
+def test_validation_scores_go_to_their_own_file(epo: Epo) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run") == 0
+    assert epo("evaluate", "run=run", "split=val") == 0
+    assert Path("run/metrics-val.json").is_file()
+    assert not Path("run/metrics.json").exists()
+
+
+def test_a_stopped_run_goes_on_bit_for_bit(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ("train", ROW, *TINY, "trainer.max_epochs=4", "callbacks.patience=3")
+    assert epo(*words, "run_dir=whole") == 0
+
+    starts = []
+    original = RandomStates.on_train_epoch_start
+
+    def stop(self: RandomStates, trainer: object, module: object) -> None:
+        starts.append(1)
+        if len(starts) == 3:
+            raise RuntimeError("power failure")
+        original(self, trainer, module)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RandomStates, "on_train_epoch_start", stop)
+        with pytest.raises(RuntimeError, match="power failure"):
+            epo(*words, "run_dir=parts")
+    assert not RunFolder(Path("parts")).finished
+    torch.manual_seed(1234)  # another process would have another random state
+    assert epo("train", "resume=parts") == 0
+    for which in ("last", "best"):
+        whole, parts = weights("whole", which), weights("parts", which)
+        assert all(torch.equal(whole[key], parts[key]) for key in whole)
+    assert Path("whole/logs/metrics.csv").read_text() == Path("parts/logs/metrics.csv").read_text()
+
+
+@pytest.mark.slow
+def test_a_killed_process_goes_on_to_the_same_metrics(tmp_path: Path) -> None:
+    program = [sys.executable, str(Path(tiny.__file__).resolve())]
+    root = Path(__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    words = ["train", ROW, *TINY, "trainer.max_epochs=60", "+data.count=256", "trainer.limit_train_batches=1.0"]
+    subprocess.run([*program, *words, "run_dir=whole"], cwd=tmp_path, env=environment, check=True)
+    process = subprocess.Popen([*program, *words, "run_dir=parts"], cwd=tmp_path, env=environment)
+    last = tmp_path / "parts" / "checkpoints" / "last.ckpt"
+    deadline = time.monotonic() + 120
+    while not last.is_file() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not RunFolder(tmp_path / "parts").finished, "the run ended before it could be killed"
+    subprocess.run([*program, "train", "resume=parts"], cwd=tmp_path, env=environment, check=True)
+    subprocess.run([*program, "evaluate", "runs=."], cwd=tmp_path, env=environment, check=True)
+    assert (tmp_path / "whole/metrics.json").read_bytes() == (tmp_path / "parts/metrics.json").read_bytes()
+
+
+def test_a_finished_run_is_never_overwritten(epo: Epo, refused: Callable[..., str]) -> None:
+    words = ("train", ROW, *TINY, "run_dir=run")
+    assert epo(*words) == 0
+    before = weights("run")
+    assert "nothing is overwritten" in refused(*words)
+    assert "is finished" in refused("train", "resume=run")
+    assert epo(*words, "existing=continue") == 0
+    assert all(torch.equal(before[key], value) for key, value in weights("run").items())
+
+
+def test_another_configuration_does_not_continue_a_run(epo: Epo, refused: Callable[..., str]) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run") == 0
+    RunFolder(Path("run")).update(status="training")
+    assert "solver.steps" in refused("train", ROW, *TINY, "run_dir=run", "existing=continue", "solver.steps=5")
+    assert "keeps its own configuration" in refused("train", "resume=run", "seed=4")
+    RunFolder(Path("run")).update(data_digest="other")
+    assert "data" in refused("train", "resume=run")
+
+
+def test_checkpoints_that_do_not_fit_are_refused(epo: Epo, refused: Callable[..., str]) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=sc") == 0
+    assert epo("train", "experiment=rpi/v_lstm", *TINY, "run_dir=marginal") == 0
+    assert "another architecture" in refused("evaluate", "run=sc", "checkpoint=marginal/checkpoints/best.ckpt")
+    assert "not a checkpoint" in refused("evaluate", "run=sc", "checkpoint=sc/run.json")
+    assert "no checkpoint" in refused("evaluate", "run=sc", "checkpoint=nowhere.ckpt")
+    Path("sc/checkpoints/best.ckpt").write_bytes(b"half a file")
+    assert "not a checkpoint" in refused("predict", "run=sc", "out=out")
+
+
+def test_forecasts_are_written_with_an_index(epo: Epo, refused: Callable[..., str]) -> None:
+    from safetensors.torch import load_file
+
+    assert epo("train", "experiment=rpi/v_lstm_epo", *TINY, "run_dir=run") == 0
+    assert epo("predict", "run=run", "out=out", "scenes=5", "figures=1") == 0
+    tensors, index = load_file("out/forecasts.safetensors"), json.loads(Path("out/index.json").read_text())
+    assert tensors["states"].shape == (5, 2, 2, 40, 4)
+    assert set(tensors) == set(index["tensors"])
+    assert Path("out/figures/joint_predictions.png").stat().st_size > 1000
+    assert "nothing is overwritten" in refused("predict", "run=run", "out=out")
+
+
+def test_a_sweep_trains_every_row_and_the_report_shows_them(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo("train", "-m", "sweeps=rpi_main", *TINY, "seed=0", "runs=runs") == 0
+    assert epo("evaluate", "runs=runs") == 0
+    assert epo("report", "runs=runs", "out=out") == 0
+    text = Path("out/results.md").read_text()
+    assert "Budget: smoke" in text
+    for title in ("Constant velocity", "V-LSTM", "V-LSTM + SC", "V-LSTM + EPO"):
+        assert title in text
+    assert Path("out/figures/joint_predictions.png").is_file()
+    assert Path("out/figures/learned_weights.png").is_file()
+    assert sorted(path.name for path in Path.cwd().iterdir()) == ["out", "runs"]
+
+
+@pytest.mark.parametrize("logger", ["logger=[tensorboard]", "logger=[csv,tensorboard]"])
+def test_tensorboard_is_an_option(epo: Epo, logger: str) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run", logger) == 0
+    assert list(Path("run/logs/tensorboard").glob("events.*"))
+    assert Path("run/logs/metrics.csv").is_file()
+
+
+def test_wandb_works_offline(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    assert epo("train", ROW, *TINY, "run_dir=run", "logger=[wandb]") == 0
+    assert list(Path("run/logs/wandb").rglob("*.wandb"))
+
+
+def test_files_are_replaced_as_a_whole(tmp_path: Path) -> None:
+    file = tmp_path / "metrics.json"
+    write_json(file, {"a": 1})
+    with pytest.raises(TypeError):
+        write_json(file, {"a": object()})
+    assert json.loads(file.read_text()) == {"a": 1}
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_missing_checkpoints_are_said_to_be_missing(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="does not exist"):
+        training.load_checkpoint(tmp_path / "no.ckpt")
