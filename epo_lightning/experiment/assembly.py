@@ -72,7 +72,9 @@ def check(settings: Settings) -> tuple[Any, LightningModule]:
     except ConfigError:
         raise
     except (TypeError, ValueError, RuntimeError, ArithmeticError) as error:
-        raise ConfigError(f"the forecaster cannot be built{_suspects(model)}: {' '.join(str(error).split())}") from error
+        raise ConfigError(
+            f"the forecaster cannot be built{_suspects(model)}: {' '.join(str(error).split())}"
+        ) from error
     return data, forecaster
 
 

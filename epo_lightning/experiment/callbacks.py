@@ -206,4 +206,4 @@ def close(loggers: Sequence[Logger]) -> None:
         if isinstance(logger, WandbLogger):
             import wandb
 
-            wandb.finish(quiet=True)
+            wandb.finish()

@@ -147,6 +147,10 @@ def _one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Itera
         if unknown and "Multiple values" not in str(error):
             raise ConfigError(_unknown_key(instance, name, unknown.group(1), overrides)) from error
         raise ConfigError(_sentence(error)) from error
+    except ValueError as error:  # Hydra's own, for example debug=null
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(_sentence(error)) from error
 
 
 def _missing_option(instance: Hydra, missing: str, message: str) -> str:
