@@ -38,7 +38,13 @@ class RandomStates(Callback):
         return {
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-            "numpy": [name, torch.tensor(keys.astype("int64")), int(position), int(has_gauss), float(gauss)],
+            "numpy": [
+                name,
+                torch.tensor(numpy.asarray(keys, dtype="int64")),
+                int(position),
+                int(has_gauss),
+                float(gauss),
+            ],
             "python": random.getstate(),
         }
 

@@ -7,7 +7,7 @@ composed here and checked before anything else happens, so that a misspelt word 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,7 +80,7 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
-    plain = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    plain = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     try:
         values = OmegaConf.to_container(plain, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
@@ -107,7 +107,7 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
         arguments = [*params, *config.hydra.overrides.task]
         parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(arguments)
         batches = BasicSweeper.split_arguments(parsed, None)
-        return [list(job) for batch in batches for job in batch]
+        return [[str(text) for text in job] for batch in batches for job in batch]
 
 
 def multirun(name: str, overrides: Sequence[str], task: Callable[[DictConfig], Any], extra: Sequence[str] = ()) -> Any:
@@ -175,32 +175,27 @@ def options_of(instance: Hydra, group: str, prefix: str = "") -> Iterator[str]:
 
 def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str]) -> str:
     """Find the level at which ``key`` leaves the configuration, and the names known there."""
+    from hydra.types import RunMode
+    from omegaconf import DictConfig
+
     config: Any = None
     for kept in (_groups(instance, overrides), []):
         try:
             config = instance.compose_config(
-                config_name=name, overrides=kept, run_mode=None, with_log_configuration=False
+                config_name=name, overrides=kept, run_mode=RunMode.RUN, with_log_configuration=False
             )
             break
         except Exception:  # the other overrides are wrong as well; the plain tree still tells the names
             continue
     walked: list[str] = []
     for word in key.replace("/", ".").split("."):
-        names = (
-            [str(known) for known in config if known != "hydra"] if isinstance(config, Mapping | _dict_config()) else []
-        )
+        names = [str(known) for known in config if known != "hydra"] if isinstance(config, DictConfig) else []
         if word not in names:
             level = f" in {'.'.join(walked)}" if walked else ""
             return f"unknown key {key!r}{level}: {nearest(word, names)}"
         walked.append(word)
         config = config[word]
     return f"unknown key {key!r}"
-
-
-def _dict_config() -> type:
-    from omegaconf import DictConfig
-
-    return DictConfig
 
 
 def _groups(instance: Hydra, overrides: Iterable[str]) -> list[str]:

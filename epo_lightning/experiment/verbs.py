@@ -31,7 +31,7 @@ def check(verb: str, config: dict[str, Any]) -> Any:
     Raises:
         ConfigError: what is wrong with them.
     """
-    settings = read(SCHEMAS[verb], config)
+    settings: Any = read(SCHEMAS[verb], config)
     if isinstance(settings, GenerateSettings):
         import epo_lightning.data  # noqa: F401 - registers the data parts
 
