@@ -40,15 +40,19 @@ def hydra(extra: Sequence[str] = ()) -> Iterator[Hydra]:
     """
     from hydra import version
     from hydra._internal.hydra import Hydra
+    from hydra._internal.sources_registry import SourcesRegistry
     from hydra._internal.utils import create_config_search_path
     from hydra.core.config_search_path import SearchPathQuery
     from hydra.core.global_hydra import GlobalHydra
+
+    from epo_lightning.experiment.sweeps_source import SweepsSource
 
     version.setbase("1.3")
     root = tree()
     path = create_config_search_path(f"file://{root / 'conf'}")
     # The group `sweeps` lies beside conf/, where somebody looks who wants a table of the paper.
-    path.append("sweeps", f"file://{root}", SearchPathQuery(provider="main"))
+    SourcesRegistry.instance().register(SweepsSource)
+    path.append("sweeps", f"{SweepsSource.scheme()}://{root}", SearchPathQuery(provider="main"))
     for folder in reversed(extra):
         if not Path(folder).is_dir():
             raise ConfigError(f"--config-dir {folder}: the folder does not exist")

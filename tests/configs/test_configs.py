@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from experiment import tiny
+from experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
 
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.compose import compose, jobs, tree
+from epo_lightning.experiment.compose import compose, hydra, jobs, options_of, tree
 from epo_lightning.experiment.settings import Settings, read
-from tests.experiment import tiny
-from tests.experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
 
 CONF = tree() / "conf"
 
@@ -157,3 +157,11 @@ def test_help_and_configurations_are_printed(epo: Epo, capsys: pytest.CaptureFix
 
 def test_folders_of_ones_own_come_first() -> None:
     assert compose("train", ["data=tiny"], [str(tiny.CONF)])["data"]["name"] == "tiny"
+
+
+def test_folders_beside_the_tree_are_no_groups() -> None:
+    with hydra() as instance:
+        groups = instance.config_loader.list_groups("")
+        known = {folder.name for folder in CONF.iterdir() if folder.is_dir()} | {"sweeps", "hydra"}
+        assert set(groups) <= known
+        assert set(options_of(instance, "sweeps")) == set(names(tree() / "sweeps"))

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from experiment import tiny
 
 from epo_lightning import cli
-from tests.experiment import tiny
 
 TINY = ("data=tiny", "budget=smoke", "callbacks.progress=none")
 """The paper's rows in a second."""

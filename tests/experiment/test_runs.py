@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from experiment import tiny
+from experiment.conftest import TINY, Epo
 
 import epo_lightning
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.callbacks import RandomStates
 from epo_lightning.experiment.run_folder import RunFolder, write_json
 from epo_lightning.registry import ConfigError
-from tests.experiment import tiny
-from tests.experiment.conftest import TINY, Epo
 
 ROW = "experiment=rpi/v_lstm_sc"
 
