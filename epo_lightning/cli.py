@@ -203,7 +203,7 @@ def _resume(folder: str, others: Sequence[str]) -> None:
             f"leave it out, or begin a new run"
         )
     from epo_lightning.experiment import verbs
-    from epo_lightning.experiment.run_folder import RunFolder
+    from epo_lightning.run_folder import RunFolder
 
     verbs.resume(RunFolder.open(folder))
 

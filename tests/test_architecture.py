@@ -11,6 +11,7 @@ ROOT = Path(epo_lightning.__file__).parent
 FLOORS = {
     "scene": set(),
     "registry": set(),
+    "run_folder": {"registry"},
     "optimizers": {"registry"},
     "losses": set(),
     "game": {"scene", "registry"},
@@ -31,7 +32,7 @@ FLOORS = {
         "losses",
         "optimizers",
     },
-    "report": {"scene", "registry", "metrics"},
+    "report": {"scene", "registry", "metrics", "run_folder"},
 }
 """What each room may import, besides itself; `experiment` and `cli` stand on top of everything."""
 

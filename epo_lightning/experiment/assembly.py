@@ -12,10 +12,10 @@ from lightning.pytorch import Callback, LightningDataModule, LightningModule, Tr
 from lightning.pytorch.loggers import Logger
 
 import epo_lightning.data  # noqa: F401 - registers the data parts
-from epo_lightning.experiment.run_folder import RunFolder
 from epo_lightning.experiment.settings import PARTS, Settings, TrainerSettings, check_part, check_types
 from epo_lightning.forecasters import build_forecaster, check_model
 from epo_lightning.registry import ConfigError, build
+from epo_lightning.run_folder import RunFolder
 
 
 def build_data(section: Mapping[str, Any]) -> Any:

@@ -20,8 +20,8 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 
-from epo_lightning.experiment.run_folder import RunFolder
 from epo_lightning.experiment.settings import CallbackSettings, CSVSettings, LoggerSettings, WandbSettings
+from epo_lightning.run_folder import RunFolder
 
 
 class RandomStates(Callback):

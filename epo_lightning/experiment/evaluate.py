@@ -10,9 +10,9 @@ from lightning.pytorch import Trainer, seed_everything
 
 import epo_lightning
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.run_folder import RunFolder, discover, write_json
 from epo_lightning.experiment.settings import EvaluateSettings, Settings, read
 from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder, discover, write_json
 
 
 def evaluate(config: dict[str, Any]) -> list[tuple[RunFolder, dict[str, float]]]:

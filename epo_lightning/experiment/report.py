@@ -8,10 +8,10 @@ from pathlib import Path
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.evaluate import open_checkpoint, open_data, split_of
 from epo_lightning.experiment.predict import examples, forecast_of, gather, spread
-from epo_lightning.experiment.run_folder import RunFolder, discover
 from epo_lightning.experiment.settings import ReportSettings, Settings, read
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import build_tables, collect, write_report
+from epo_lightning.run_folder import RunFolder, discover
 
 SCENES, GAMES = 4, 512
 """How many scenes are drawn, and over how many the distribution of learned weights is taken."""

@@ -19,9 +19,9 @@ from lightning.pytorch import LightningModule, Trainer, seed_everything
 
 from epo_lightning.experiment import assembly, callbacks
 from epo_lightning.experiment.compose import PACKAGE
-from epo_lightning.experiment.run_folder import FINISHED, RunFolder
 from epo_lightning.experiment.settings import Settings, read
 from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import FINISHED, RunFolder
 
 # What does not make it another run: these are in the folder's name, or do not touch the result.
 NOT_HASHED = ("experiment", "seed", "budget", "sweeps", "runs", "run_dir", "existing", "logger", "hydra", "title")

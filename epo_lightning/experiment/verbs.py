@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from epo_lightning.experiment.run_folder import RunFolder
 from epo_lightning.experiment.settings import (
     EvaluateSettings,
     GenerateSettings,
@@ -15,6 +14,7 @@ from epo_lightning.experiment.settings import (
     check_part,
     read,
 )
+from epo_lightning.run_folder import RunFolder
 
 SCHEMAS: dict[str, type] = {
     "generate": GenerateSettings,

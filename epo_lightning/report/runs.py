@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from epo_lightning.experiment.run_folder import RunFolder, discover, read_json
 from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder, discover, read_json
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from epo_lightning.experiment.run_folder import write_text
 from epo_lightning.report.render import LEGEND, to_csv, to_markdown, to_rich
 from epo_lightning.report.runs import EvaluatedRun, collect, not_evaluated
 from epo_lightning.report.tables import Table, build_tables
+from epo_lightning.run_folder import write_text
 
 
 def write_report(

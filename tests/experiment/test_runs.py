@@ -20,8 +20,8 @@ from experiment.conftest import TINY, Epo
 import epo_lightning
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.callbacks import RandomStates
-from epo_lightning.experiment.run_folder import RunFolder, write_json
 from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder, write_json
 
 ROW = "experiment=rpi/v_lstm_sc"
 
