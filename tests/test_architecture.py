@@ -54,8 +54,8 @@ def test_no_room_imports_from_a_higher_floor():
     for room, allowed in FLOORS.items():
         home = ROOT / room
         for path in home.rglob("*.py") if home.is_dir() else [home.with_suffix(".py")]:
-            for other in imported_rooms(path) - allowed - {room}:
-                wrong.append(f"{path.relative_to(ROOT)} imports {other}")
+            higher = imported_rooms(path) - allowed - {room}
+            wrong += [f"{path.relative_to(ROOT)} imports {other}" for other in higher]
     assert not wrong, "\n".join(wrong)
 
 

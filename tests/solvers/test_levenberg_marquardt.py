@@ -110,7 +110,7 @@ def test_a_linear_quadratic_game_is_solved_in_one_full_step():
     parameters = random_game(scene, horizon=6)
     energy = Energy(["vel", "acc", "turnr"], pair=[])
     solution = LevenbergMarquardt(1, 1.0, 0.0)(energy, scene, parameters)
-    # Without turning costs pulling anywhere else, turn rates vanish; accelerations solve (w_v^2 S^T S + w_a^2 I) a = -w_v^2 S^T v0.
+    # Nothing pulls on turn rates, so they vanish; accelerations solve (w_v^2 S^T S + w_a^2 I) a = -w_v^2 S^T v0.
     sums = 0.1 * torch.ones(6, 6, dtype=torch.float64).tril()
     for b in range(2):
         for m in range(2):
