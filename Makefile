@@ -29,7 +29,7 @@ run: $(STAMP)
 	$(EPO) evaluate runs=$(RUNS)
 	$(EPO) report runs=$(RUNS) out=$(OUT)
 	@echo
-	@echo "This was the REDUCED budget: a fifth of the data and a few epochs, so the numbers show the direction only."
+	@echo "This was the REDUCED budget: a fifth of the data and a few epochs, so the numbers show that everything works, not which row is best."
 	@echo "The paper's settings, on all data (a day on 2 cores; with budget=long about an hour per run):"
 	@echo "  $(EPO) generate"
 	@echo "  $(EPO) train -m sweeps=rpi_main"
