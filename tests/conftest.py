@@ -22,7 +22,7 @@ CHECKED = (
     "metrics",
     "optimizers",
 )
-install_import_hook([f"epo_lightning.{name}" for name in CHECKED], "beartype.beartype")
+install_import_hook([f"epo_lightning.{name}" for name in CHECKED], "typechecker.check")
 
 import pytest
 import torch
