@@ -2,9 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """A share of the imitation loss that goes to the mean over modes instead of the closest one, fading out.
+
+    The paper's loss trains only the closest mode, so a mode that starts out far from the data in some scenes is never
+    taught there: it stays dead. A small share early on draws every mode to where the data are, and then lets go.
+
+    Attributes:
+        share: of the mean, at the first step; 0 is the paper's loss.
+        steps: optimisation steps after which it has faded, linearly, to zero.
+    """
+
+    share: float = 0.0
+    steps: int = 1000
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1 or self.steps < 1:
+            raise ValueError(f"relaxation must be in [0, 1] over 1 step or more, not {self.share} over {self.steps}")
+
+    def at(self, step: int) -> float:
+        """The share at an optimisation step."""
+        return self.share * max(0.0, 1.0 - step / self.steps)
 
 
 def distances(
@@ -24,11 +50,12 @@ def _mean_over_agents(values: Tensor, mask: Bool[Tensor, "B N K"]) -> Tensor:
 
 
 def scene_imitation(
-    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"]
+    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0
 ) -> tuple[Float[Tensor, ""], Int[Tensor, " B"]]:
     """L_imit, the minSADE: distance of the joint future closest to the observed one, and which that is."""
-    closest, mode = _mean_over_agents(distance, mask).min(1)
-    return closest.mean(), mode
+    joint = _mean_over_agents(distance, mask)
+    closest, mode = joint.min(1)
+    return torch.lerp(closest, joint.mean(1), relaxation).mean(), mode
 
 
 def scene_probability(probabilities: Float[Tensor, "B M"], mode: Int[Tensor, " B"]) -> Float[Tensor, ""]:
@@ -37,11 +64,11 @@ def scene_probability(probabilities: Float[Tensor, "B M"], mode: Int[Tensor, " B
 
 
 def marginal_imitation(
-    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"]
+    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0
 ) -> tuple[Float[Tensor, ""], Int[Tensor, "B N"]]:
     """The minADE: each agent's distance to its own closest future, averaged, and which future that is."""
     closest, mode = distance.min(1)
-    return _mean_over_agents(closest, mask).mean(), mode
+    return _mean_over_agents(torch.lerp(closest, distance.mean(1), relaxation), mask).mean(), mode
 
 
 def marginal_probability(

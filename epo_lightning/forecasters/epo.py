@@ -15,6 +15,7 @@ from epo_lightning.decoders.weights import OwnWeights, PairWeights
 from epo_lightning.forecasters.base import Forecaster, Task, weights_of
 from epo_lightning.forecasters.scene_consistent import joint_losses
 from epo_lightning.game.energy import Energy
+from epo_lightning.losses import Relaxation
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
 from epo_lightning.scene import GameParameters, JointForecast, Scene
@@ -33,6 +34,7 @@ class EPO(Forecaster):
         loss_weights: lambda of ``imitation`` and ``probability``; the goal is given, so L_goal has no term here.
         own_start, pair_start: weights that a network output of zero stands for.
         control_scale: initial control that a network output of one stands for.
+        relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
     """
 
     def __init__(
@@ -47,10 +49,13 @@ class EPO(Forecaster):
         own_start: float = 1.0,
         pair_start: float = 3.0,
         control_scale: float = 0.3,
+        relaxation: float = 0.0,
+        relaxation_steps: int = 1000,
     ) -> None:
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver, modes
         self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))
+        self.relaxation = Relaxation(relaxation, relaxation_steps)
         self.own_weights = OwnWeights(backbone.width, modes, energy.own, own_start)
         self.pair_weights = PairWeights(backbone.width, modes, energy.pair, pair_start)
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
@@ -95,4 +100,4 @@ class EPO(Forecaster):
         )
 
     def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
-        return joint_losses(scene, forecast, self.loss_weights)
+        return joint_losses(scene, forecast, self.loss_weights, self.relaxation.at(self.global_step))

@@ -27,14 +27,23 @@ class Marginal(Forecaster):
         backbone: the observation encoder.
         modes: number M of modes.
         loss_weights: lambda of ``imitation`` and ``probability``.
+        relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
     """
 
     def __init__(
-        self, task: Task, optimizer: Adam, backbone: Backbone, modes: int, loss_weights: Mapping[str, float]
+        self,
+        task: Task,
+        optimizer: Adam,
+        backbone: Backbone,
+        modes: int,
+        loss_weights: Mapping[str, float],
+        relaxation: float = 0.0,
+        relaxation_steps: int = 1000,
     ) -> None:
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))
+        self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.decoder = Trajectories(backbone.width, modes, task.horizon)
 
     def forward(self, scene: Scene) -> JointForecast:
@@ -51,7 +60,7 @@ class Marginal(Forecaster):
     def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
         future, mask = observed_future(scene)
         distance = losses.distances(forecast.states[..., :2], future, mask)
-        imitation, mode = losses.marginal_imitation(distance, mask)
+        imitation, mode = losses.marginal_imitation(distance, mask, self.relaxation.at(self.global_step))
         assert forecast.agent_probabilities is not None
         probability = losses.marginal_probability(forecast.agent_probabilities, mode, mask)
         return {

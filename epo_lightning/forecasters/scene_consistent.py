@@ -27,6 +27,7 @@ class SceneConsistent(Forecaster):
         modes: number M of joint modes.
         loss_weights: lambda of ``imitation`` and ``probability``.
         control_scale: control that a network output of one stands for.
+        relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
     """
 
     def __init__(
@@ -38,11 +39,14 @@ class SceneConsistent(Forecaster):
         modes: int,
         loss_weights: Mapping[str, float],
         control_scale: float = 0.3,
+        relaxation: float = 0.0,
+        relaxation_steps: int = 1000,
     ) -> None:
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.dynamics = dynamics
         self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))
+        self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
         self.probabilities = SceneProbabilities(backbone.width, modes, task.horizon)
 
@@ -58,14 +62,15 @@ class SceneConsistent(Forecaster):
         )
 
     def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
-        return joint_losses(scene, forecast, self.loss_weights)
+        return joint_losses(scene, forecast, self.loss_weights, self.relaxation.at(self.global_step))
 
 
 def joint_losses(
-    scene: Scene, forecast: JointForecast, weights: Mapping[str, float]
+    scene: Scene, forecast: JointForecast, weights: Mapping[str, float], relaxation: float
 ) -> dict[str, tuple[float, Tensor]]:
     """Imitation of the closest joint future, and the probability that it was given."""
     future, mask = observed_future(scene)
-    imitation, mode = losses.scene_imitation(losses.distances(forecast.states[..., :2], future, mask), mask)
+    distance = losses.distances(forecast.states[..., :2], future, mask)
+    imitation, mode = losses.scene_imitation(distance, mask, relaxation)
     probability = losses.scene_probability(forecast.probabilities, mode)
     return {"imitation": (weights["imitation"], imitation), "probability": (weights["probability"], probability)}

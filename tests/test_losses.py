@@ -1,0 +1,54 @@
+"""Losses against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from epo_lightning import losses
+
+MASK = torch.ones(1, 2, 1, dtype=torch.bool)
+DISTANCE = torch.tensor([[[1.0, 5.0], [3.0, 1.0]]])  # [B=1, M=2, N=2]
+
+
+def test_distances_are_means_over_observed_steps():
+    positions = torch.zeros(1, 1, 2, 2, 2)
+    future = torch.zeros(1, 2, 2, 4)
+    future[0, 0, :, 0] = torch.tensor([3.0, 5.0])
+    future[0, 1, 1, :2] = torch.nan
+    mask = torch.tensor([[[True, True], [True, False]]])
+    assert losses.distances(positions, future, mask).tolist() == [[[4.0, 0.0]]]
+
+
+def test_joint_and_marginal_imitation_choose_their_own_modes():
+    joint, mode = losses.scene_imitation(DISTANCE, MASK)
+    assert (joint.item(), mode.item()) == (2.0, 1)
+    marginal, modes = losses.marginal_imitation(DISTANCE, MASK)
+    assert (marginal.item(), modes.tolist()) == (1.0, [[0, 1]])
+
+
+def test_agents_without_a_future_do_not_count():
+    mask = torch.tensor([[[True], [False]]])
+    joint, mode = losses.scene_imitation(DISTANCE, mask)
+    assert (joint.item(), mode.item()) == (1.0, 0)
+
+
+def test_relaxation_adds_the_mean_over_modes_and_fades():
+    relaxation = losses.Relaxation(share=0.5, steps=10)
+    assert [relaxation.at(step) for step in (0, 5, 10, 99)] == [0.5, 0.25, 0.0, 0.0]
+    joint, mode = losses.scene_imitation(DISTANCE, MASK, 0.5)  # modes are at 3 and 2
+    assert (joint.item(), mode.item()) == (2.25, 1)
+    marginal, _ = losses.marginal_imitation(DISTANCE, MASK, 0.5)  # closest 1 and 1, means 2 and 3
+    assert marginal.item() == 1.75
+    with pytest.raises(ValueError, match="relaxation"):
+        losses.Relaxation(share=2.0)
+
+
+def test_probabilities_are_scored_at_the_closest_mode():
+    probabilities = torch.tensor([[0.25, 0.75]])
+    assert losses.scene_probability(probabilities, torch.tensor([1])).item() == pytest.approx(0.2877, abs=1e-4)
+    agents = torch.tensor([[[0.25, 0.5], [0.75, 0.5]]])
+    value = losses.marginal_probability(agents, torch.tensor([[1, 0]]), MASK)
+    assert value.item() == pytest.approx((0.2877 + 0.6931) / 2, abs=1e-4)
+    certain = torch.tensor([[1.0, 0.0]], requires_grad=True)
+    assert losses.scene_probability(certain, torch.tensor([1])).isfinite()
