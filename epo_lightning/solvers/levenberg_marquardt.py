@@ -70,8 +70,9 @@ class LevenbergMarquardt:
         Raises:
             ValueError: scene and parameters do not fit together; the message names the tensor and its expected shape.
         """
-        controls = parameters.initial_controls
-        energy.validate(scene, parameters, controls)
+        energy.validate(scene, parameters, parameters.initial_controls)
+        present = scene.agent_mask[:, None, :, None, None]
+        initial_controls = controls = torch.where(present, parameters.initial_controls, 0.0)
         tensors, rebuild = _flatten(parameters)
         status = torch.full(controls.shape[:2], Status.SOLVED, device=controls.device)
         iterates = [controls]
@@ -80,11 +81,11 @@ class LevenbergMarquardt:
             status = torch.maximum(status, outcome)
             iterates.append(controls)
         with torch.no_grad():
-            initial_energy = energy(scene, parameters, parameters.initial_controls)
+            initial_energy = energy(scene, parameters, initial_controls)
         final_energy, gradient_norm = _energy_and_gradient_norm(energy, scene, parameters, controls)
         return Solution(
             controls=controls,
-            states=energy.dynamics.rollout(scene.current[:, None], controls, scene.dt),
+            states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt),
             initial_energy=initial_energy,
             energy=final_energy,
             gradient_norm=gradient_norm,

@@ -146,13 +146,14 @@ def test_absent_agents_and_their_padding_change_nothing():
     wide = GameParameters(
         own_weights={name: torch.cat((w, nan), -1) for name, w in parameters.own_weights.items()},
         pair_weights={"proximity": pair},
-        initial_controls=torch.cat((parameters.initial_controls, torch.zeros(3, 2, 2, 7, 2)), 2),
+        initial_controls=torch.cat((parameters.initial_controls, torch.full((3, 2, 2, 7, 2), torch.nan)), 2),
         goals=torch.cat((parameters.goals, nan[..., None].expand(3, 2, 2, 2)), 2),
     )
     alone, padded = solve(energy, scene, parameters), solve(energy, pad(scene), wide)
     torch.testing.assert_close(padded.controls[:, :, :2], alone.controls, rtol=0, atol=1e-5)
     assert (padded.status == Status.SOLVED).all()
     assert padded.gradient_norm.isfinite().all()
+    assert padded.states.isfinite().all()
 
 
 def poison(kind, scene, parameters):
