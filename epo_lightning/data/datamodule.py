@@ -101,6 +101,7 @@ class SceneDataModule(LightningDataModule):
         dt: time step [s].
         horizon: future steps K.
         num_agents: agents per scene N.
+        order_seed: of the order of the batches; the data's own seed unless a run sets its own.
     """
 
     subsets: tuple[str, ...] = ()
@@ -117,6 +118,7 @@ class SceneDataModule(LightningDataModule):
         if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**31:
             raise ConfigError(f"seed is {seed!r}, expected a whole number from 0 to 2^31 - 1")
         self.batch_size, self.seed = batch_size, seed
+        self.order_seed = seed
         self._opened: dict[str, SceneDataset] = {}
 
     def open(self, split: str) -> SceneDataset:
@@ -142,7 +144,7 @@ class SceneDataModule(LightningDataModule):
 
     def _loader(self, split: str, shuffle: bool) -> DataLoader:
         data = self.dataset(split)
-        sampler = BatchSampler(data, self.batch_size, shuffle, self.seed)
+        sampler = BatchSampler(data, self.batch_size, shuffle, self.order_seed)
         if not len(sampler):
             raise ConfigError(
                 f"batch_size is {self.batch_size}, but the split {split!r} has only {len(data)} samples: not one full batch"

@@ -153,6 +153,7 @@ def _check_learned(run: RunFolder, trainer: Trainer) -> None:
 def _ready(settings: Settings) -> Any:
     """The data module with its training data found and verified."""
     data = assembly.build_data(settings.data)
+    data.order_seed = settings.seed
     data.setup("fit")
     return data
 

@@ -94,6 +94,8 @@ def test_training_is_shuffled_by_seed_and_epoch_and_drops_the_rest(data):
     other = data(targets="executed", seed=1)
     other.setup("fit")
     assert order(other.train_dataloader(), 0) != first
+    module.order_seed = 1  # a run's seed: the same data in another order
+    assert order(module.train_dataloader(), 0) != first
 
 
 def test_validation_keeps_everything_in_order_and_does_not_change(data):

@@ -88,7 +88,7 @@ class RPIData(SceneDataModule):
 
     Args:
         root: folder of the cache; None for $EPO_CACHE or ``cache``.
-        seed: of the games and of the order of the batches.
+        seed: of the games, and of the batches' order where a run sets no other.
         games: main games; one draw of w each. A tenth each, at least one, becomes validation and test.
         placements: starts of the pedestrian per main game.
         solver: ``potential`` (open-loop Nash) or ``feedback`` (iterative LQ game).
