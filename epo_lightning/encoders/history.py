@@ -29,7 +29,13 @@ class LSTMHistory(nn.Module):
         self.lstm = nn.LSTM(VECTOR, width, num_layers=depth, batch_first=True)
 
     def forward(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
-        """The feature of every agent; what it holds for absent agents is of no meaning."""
+        """The feature of every agent; what it holds for absent agents is of no meaning.
+
+        Raises:
+            ValueError: a history of a single state, which shows no motion.
+        """
+        if scene.history.shape[2] < 2:
+            raise ValueError("scene.history holds H = 1 state per agent; reading a motion takes at least 2")
         observed = scene.history_mask & scene.agent_mask[..., None]
         position = torch.where(observed[..., None], scene.history[..., :2], 0.0)
         batch, agents, steps = observed.shape
