@@ -80,6 +80,9 @@ class Scene(_Batch):
         size: length and width [m].
         subset: index of the named subset of the data that the future belongs to (RPI: executed 0, alternative 1).
         id: which record of its data set a scene is.
+
+    Raises:
+        ValueError: a shape that does not fit the history, or a time step that is not positive.
     """
 
     history: Float[Tensor, "B N H 4"]
@@ -95,6 +98,22 @@ class Scene(_Batch):
     id: Int[Tensor, " B"] | None = None
 
     def __post_init__(self) -> None:
+        if self.history.dim() != 4 or self.history.shape[-1] != 4:
+            raise ValueError(
+                f"scene.history has shape {list(self.history.shape)}; it takes [B, N, H, 4]: x, y, heading, speed"
+            )
+        if not self.dt > 0:
+            raise ValueError(f"scene.dt must be positive, not {self.dt}")
+        batch, agents, steps, _ = self.history.shape
+        for name, shape in (
+            ("history_mask", (batch, agents, steps)),
+            ("agent_mask", (batch, agents)),
+            ("size", (batch, agents, 2)),
+        ):
+            given = getattr(self, name)
+            if given is not None and given.shape != shape:
+                raise ValueError(f"scene.{name} has shape {list(given.shape)}; this history takes {list(shape)}")
+
         def default(name: str, shape: torch.Size) -> None:
             if getattr(self, name) is None:
                 object.__setattr__(self, name, torch.ones(shape, dtype=torch.bool, device=self.history.device))

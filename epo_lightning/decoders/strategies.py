@@ -20,6 +20,8 @@ class InitialStrategies(nn.Module):
 
     def __init__(self, width: int, modes: int, horizon: int, scale: float = 0.3) -> None:
         super().__init__()
+        if modes < 1:
+            raise ValueError(f"modes must be 1 or more, not {modes}")
         self.modes, self.horizon, self.scale = modes, horizon, scale
         self.mlp = MLP(width, 64, modes * horizon * 2, norm="layer")
 

@@ -19,6 +19,8 @@ class Trajectories(nn.Module):
 
     def __init__(self, width: int, modes: int, horizon: int) -> None:
         super().__init__()
+        if modes < 1:
+            raise ValueError(f"modes must be 1 or more, not {modes}")
         self.modes, self.horizon = modes, horizon
         self.positions = MLP(width, 64, modes * horizon * 2, norm="layer")
         self.logits = MLP(width, 64, modes, norm="layer")

@@ -96,6 +96,7 @@ EPO = TestEPO.config
         ({"optimizer": {"name": "adam", "lr": -1.0}}, "optimizer.lr must be positive"),
         ({"optimizer": {"name": "adam", "schedule": "cosin"}}, "did you mean 'cosine'"),
         ({"forecaster": {**EPO, "loss_weights": {"imitation": 1.0}}}, "loss_weights must name"),
+        ({"forecaster": {**EPO, "modes": 0}}, "modes must be 1 or more"),
         ({"speed": 1}, "unknown key 'speed'"),
     ],
 )

@@ -1,0 +1,45 @@
+"""Scenes: what they refuse, and that their tensors move together."""
+
+from __future__ import annotations
+
+import jaxtyping
+import pytest
+import torch
+from games import random_scene
+
+from epo_lightning.scene import Scene
+
+
+@pytest.fixture(autouse=True)
+def as_users_run_it(monkeypatch):
+    """Without the tests' own checks of annotations, which would come first."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+def test_what_does_not_fit_is_refused_by_name():
+    history = torch.zeros(2, 3, 5, 4)
+    with pytest.raises(ValueError, match=r"scene\.dt must be positive"):
+        Scene(history, 0.0)
+    with pytest.raises(ValueError, match=r"scene\.size has shape \[2, 2, 2\]; this history takes \[2, 3, 2\]"):
+        Scene(history, 0.1, size=torch.ones(2, 2, 2))
+    with pytest.raises(ValueError, match=r"scene\.agent_mask has shape \[2, 4\]"):
+        Scene(history, 0.1, agent_mask=torch.ones(2, 4, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"scene\.history has shape \[2, 3, 5, 3\]"):
+        Scene(history[..., :3], 0.1)
+
+
+def test_scenes_are_chosen_and_converted_as_a_whole():
+    scene = random_scene(4, 2)
+    chosen = scene[[2, 0]].to(torch.float64)
+    assert torch.equal(chosen.id, torch.tensor([2, 0]))
+    assert chosen.history.dtype == chosen.size.dtype == torch.float64
+    assert torch.equal(chosen.history.float(), scene.history[[2, 0]])
+    assert scene[1].history.shape == (1, 2, 19, 4)
+
+
+def test_only_what_is_real_has_to_be_finite():
+    scene = random_scene(3, 2)
+    scene.history[1, 0, 4] = torch.nan
+    assert scene.finite.tolist() == [True, False, True]
+    scene.history_mask[1, 0, 4] = False
+    assert scene.finite.all()
