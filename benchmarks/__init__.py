@@ -1,0 +1,1 @@
+"""What the layer costs, measured: ``python -m benchmarks.epo_layer`` and ``python -m benchmarks.training_step``."""

@@ -1,0 +1,66 @@
+"""Theseus 0.2.3 on the same problems, in its fastest mode and written as favourably as we know.
+
+One vector of all unknowns, one cost function with all residuals, Jacobians by ``vmap``, fixed damping, no convergence test
+to fail, unrolled differentiation, B M problems in one batch, and of its dense linear solvers the one that is faster here.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from benchmarks.games import Game
+from benchmarks.residuals import problem
+from epo_lightning.scene import GameParameters
+
+LINEAR_SOLVERS = ("CholeskyDenseSolver", "LUDenseSolver")
+
+
+def prepare(game: Game, linear_solver: str) -> Callable[[GameParameters], Tensor]:
+    """A function from parameters to controls [B, M, N, K, 2].
+
+    Raises:
+        ImportError: Theseus is not installed.
+    """
+    with warnings.catch_warnings(action="ignore"):  # sparse solvers that are not there, and not wanted
+        import theseus
+
+    plain = problem(game)
+    start = plain.unknowns(game.parameters.initial_controls)
+    unknowns = theseus.Vector(start.shape[1], name="unknowns", dtype=start.dtype)
+    given = plain.tensors(game.parameters)
+    auxiliary = [theseus.Variable(value, name=name) for name, value in given.items()]
+
+    def residuals(optim_vars: tuple, aux_vars: tuple) -> Tensor:
+        tensors = dict(zip(given, (variable.tensor for variable in aux_vars), strict=True))
+        return plain.residuals(optim_vars[0].tensor, tensors)
+
+    with torch.no_grad():
+        rows = plain.residuals(start, given).shape[1]
+    unit = theseus.ScaleCostWeight(theseus.Variable(torch.ones(1, 1, dtype=start.dtype), name="unit"))
+    cost = theseus.AutoDiffCostFunction(
+        [unknowns], residuals, rows, cost_weight=unit, aux_vars=auxiliary, autograd_mode="vmap"
+    )
+    objective = theseus.Objective(dtype=start.dtype)
+    objective.add(cost)
+    optimizer = theseus.LevenbergMarquardt(
+        objective,
+        linear_solver_cls=getattr(theseus, linear_solver),
+        max_iterations=game.steps,
+        step_size=game.step_size,
+        abs_err_tolerance=0.0,
+        rel_err_tolerance=0.0,
+    )
+    layer = theseus.TheseusLayer(optimizer, vectorize=False)
+    options = {"damping": game.damping, "adaptive_damping": False, "backward_mode": "unroll"}
+
+    def solve(parameters: GameParameters) -> Tensor:
+        inputs = {"unknowns": plain.unknowns(parameters.initial_controls), **plain.tensors(parameters)}
+        found, _ = layer.forward(inputs, optimizer_kwargs=dict(options))
+        return plain.controls(found["unknowns"])
+
+    return solve

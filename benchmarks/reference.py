@@ -1,0 +1,38 @@
+"""The plain way to write the layer: a dense Jacobian by automatic differentiation, a general solver, and autograd through all.
+
+Nothing in it is clever, which is why the others are compared with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.func import jacfwd, vmap
+
+from benchmarks.games import Game
+from benchmarks.residuals import problem
+from epo_lightning.scene import GameParameters
+
+
+def prepare(game: Game) -> Callable[[GameParameters], Tensor]:
+    """A function from parameters to controls [B, M, N, K, 2]."""
+    plain = problem(game)
+
+    def residuals(unknowns: Tensor, tensors: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        found = plain.residuals(unknowns[None], {name: value[None] for name, value in tensors.items()})[0]
+        return found, found
+
+    def solve(parameters: GameParameters) -> Tensor:
+        tensors = plain.tensors(parameters)
+        unknowns = plain.unknowns(parameters.initial_controls)
+        for _ in range(game.steps):
+            jacobian, residual = vmap(jacfwd(residuals, has_aux=True))(unknowns, tensors)
+            matrix = jacobian.mT @ jacobian
+            matrix = matrix + game.damping * torch.eye(matrix.shape[-1]).to(matrix)
+            gradient = jacobian.mT @ residual[..., None]
+            unknowns = unknowns - game.step_size * torch.linalg.solve(matrix, gradient)[..., 0]
+        return plain.controls(unknowns)
+
+    return solve
