@@ -8,6 +8,7 @@ M     joint modes                G       goal candidates of an agent
 N     agents                     X = 4   state: x, y [m], heading [rad], speed [m/s]
 H     history steps              U = 2   control: acceleration [m/s^2], turn rate [rad/s]
 K     future steps               S       optimisation steps
+R     reference lines, residuals Q       points of a reference line
 ====  =========================  ======  ================================================================
 """
 
@@ -78,6 +79,10 @@ class Scene(_Batch):
         goal_candidates: positions [m] that an agent may be heading for; G = 1 where the goal is given (RPI).
         goal_mask: which candidates exist.
         size: length and width [m].
+        references: lines that an agent may follow, as points [m] (lane centres); a line with fewer points repeats its
+            last one.
+        reference_mask: which of these lines exist.
+        reference_speed: the speed at which an agent would like to travel [m/s].
         subset: index of the named subset of the data that the future belongs to (RPI: executed 0, alternative 1).
         id: which record of its data set a scene is.
 
@@ -94,6 +99,9 @@ class Scene(_Batch):
     goal_candidates: Float[Tensor, "B N G 2"] | None = None
     goal_mask: Bool[Tensor, "B N G"] | None = None
     size: Float[Tensor, "B N 2"] | None = None
+    references: Float[Tensor, "B N R Q 2"] | None = None
+    reference_mask: Bool[Tensor, "B N R"] | None = None
+    reference_speed: Float[Tensor, "B N"] | None = None
     subset: Int[Tensor, " B"] | None = None
     id: Int[Tensor, " B"] | None = None
 
@@ -109,10 +117,25 @@ class Scene(_Batch):
             ("history_mask", (batch, agents, steps)),
             ("agent_mask", (batch, agents)),
             ("size", (batch, agents, 2)),
+            ("reference_speed", (batch, agents)),
         ):
             given = getattr(self, name)
             if given is not None and given.shape != shape:
                 raise ValueError(f"scene.{name} has shape {list(given.shape)}; this history takes {list(shape)}")
+        lines = self.references
+        if lines is not None and (
+            lines.dim() != 5 or lines.shape[:2] != (batch, agents) or lines.shape[3] < 2 or lines.shape[4] != 2
+        ):
+            expected = f"[{batch}, {agents}, R, Q, 2] with Q of at least 2 points"
+            raise ValueError(f"scene.references has shape {list(lines.shape)}; this history takes {expected}")
+        if self.reference_mask is not None:
+            if lines is None:
+                raise ValueError("scene.reference_mask says which of scene.references exist, which is None")
+            if self.reference_mask.shape != lines.shape[:3]:
+                given = list(self.reference_mask.shape)
+                raise ValueError(
+                    f"scene.reference_mask has shape {given}; these references take {list(lines.shape[:3])}"
+                )
 
         def default(name: str, shape: torch.Size) -> None:
             if getattr(self, name) is None:
@@ -124,6 +147,8 @@ class Scene(_Batch):
             default("future_mask", self.future.shape[:-1])
         if self.goal_candidates is not None:
             default("goal_mask", self.goal_candidates.shape[:-1])
+        if lines is not None:
+            default("reference_mask", lines.shape[:-2])
 
     @property
     def current(self) -> Float[Tensor, "B N 4"]:
@@ -146,6 +171,8 @@ class Scene(_Batch):
             & sound(self.future, self.future_mask)
             & sound(self.goal_candidates, self.goal_mask)
             & sound(self.size, None)
+            & sound(None if self.references is None else self.references.flatten(3), self.reference_mask)
+            & sound(None if self.reference_speed is None else self.reference_speed[..., None], None)
         )
 
 
@@ -158,12 +185,15 @@ class GameParameters(_Batch):
         pair_weights: weight of each named feature of a pair i < j, in the order of ``torch.triu_indices(N, N, 1)``.
         goals: where each agent is heading [m]; None for energies without a goal feature.
         initial_controls: the strategies from which the solver starts.
+        reference: index of the reference line that an agent follows, the one its goal lies on; None for energies without a
+            lane feature.
     """
 
     own_weights: Mapping[str, Float[Tensor, "B M N"]]
     pair_weights: Mapping[str, Float[Tensor, "B M P"]]
     initial_controls: Float[Tensor, "B M N K 2"]
     goals: Float[Tensor, "B M N 2"] | None = None
+    reference: Int[Tensor, "B M N"] | None = None
 
 
 class Status(IntEnum):

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 
+from epo_lightning.game import features
 from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.scene import GameParameters, Scene
 
 BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}
 """Narrow enough for random controls to leave them."""
 ALL = tuple(OWN_FEATURES)
+"""Every built-in own feature."""
+EXID = ("goal", "lane", "velref", "vel", "acc", "jerk", "steer", "turnr", "turnacc")
+"""The own features of conf/energy/exid.yaml."""
 
 
 def random_scene(
@@ -19,17 +26,22 @@ def random_scene(
     history: int = 19,
     horizon: int = 40,
     size: float = 0.5,
+    references: bool = True,
     dtype: torch.dtype = torch.float32,
 ) -> Scene:
-    """Agents within a few metres of each other, moving."""
+    """Agents within a few metres of each other, moving, each with two wiggly lines to follow."""
     state = torch.randn(scenes, agents, history, 4, dtype=dtype)
     state[..., 3].abs_()
+    way = torch.linspace(-4.0, 4.0, 6, dtype=dtype)
+    lines = torch.stack((way.expand(scenes, agents, 2, 6), torch.randn(scenes, agents, 2, 6, dtype=dtype)), -1)
     return Scene(
         history=state,
         dt=0.1,
         future=torch.randn(scenes, agents, horizon, 4, dtype=dtype),
         goal_candidates=torch.randn(scenes, agents, 1, 2, dtype=dtype),
         size=torch.full((scenes, agents, 2), size, dtype=dtype),
+        references=lines if references else None,
+        reference_speed=2.0 * torch.rand(scenes, agents, dtype=dtype) if references else None,
         subset=torch.arange(scenes) % 2,
         id=torch.arange(scenes),
     )
@@ -47,6 +59,38 @@ def random_game(
         pair_weights={"proximity": 0.5 + 3.0 * torch.rand(scenes, modes, pairs, dtype=dtype)},
         initial_controls=spread * torch.randn(scenes, modes, agents, horizon, 2, dtype=dtype),
         goals=torch.randn(scenes, modes, agents, 2, dtype=dtype),
+        reference=None if scene.references is None else torch.randint(2, (scenes, modes, agents)),
+    )
+
+
+def leaves_of(parameters: GameParameters) -> GameParameters:
+    """The same game as leaves of a graph: everything that a solution is differentiated by requires its gradient."""
+    return parameters.map(lambda tensor: tensor.clone().requires_grad_() if tensor.is_floating_point() else tensor)
+
+
+def widen(parameters: GameParameters, agents: int = 2, filling: float = float("nan")) -> GameParameters:
+    """The game of a scene that :func:`pad` gave absent agents, all of them holding ``filling``."""
+    scenes, modes, given = parameters.initial_controls.shape[:3]
+    first, second = torch.triu_indices(given + agents, given + agents, 1)
+    real = second < given
+
+    def grow(tensor: torch.Tensor) -> torch.Tensor:
+        wide = tensor.new_full((scenes, modes, given + agents, *tensor.shape[3:]), 0)
+        wide[:, :, :given] = tensor
+        wide[:, :, given:] = filling if tensor.is_floating_point() else -99
+        return wide
+
+    def grow_pairs(weight: torch.Tensor) -> torch.Tensor:
+        wide = torch.full((scenes, modes, len(first)), filling, dtype=weight.dtype)
+        wide[:, :, real] = weight
+        return wide
+
+    return GameParameters(
+        own_weights={name: grow(weight) for name, weight in parameters.own_weights.items()},
+        pair_weights={name: grow_pairs(weight) for name, weight in parameters.pair_weights.items()},
+        initial_controls=grow(parameters.initial_controls),
+        goals=None if parameters.goals is None else grow(parameters.goals),
+        reference=None if parameters.reference is None else grow(parameters.reference),
     )
 
 
@@ -73,6 +117,20 @@ def pad(scene: Scene, agents: int = 2, steps: int = 0, filling: float = float("n
         goal_candidates=grow(scene.goal_candidates, 1, agents, filling),
         goal_mask=grow(scene.goal_mask, 1, agents, False),
         size=grow(scene.size, 1, agents, filling),
+        references=grow(scene.references, 1, agents, filling),
+        reference_mask=grow(scene.reference_mask, 1, agents, True),
+        reference_speed=grow(scene.reference_speed, 1, agents, filling),
         subset=scene.subset,
         id=scene.id,
     )
+
+
+@contextmanager
+def feet_held() -> Iterator[None]:
+    """The nearest points of reference lines stay where they are under differentiation, as in the Gauss-Newton model."""
+    sliding = features.foot
+    features.foot = lambda position, line: tuple(part.detach() for part in sliding(position, line))
+    try:
+        yield
+    finally:
+        features.foot = sliding

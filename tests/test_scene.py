@@ -24,6 +24,15 @@ def test_what_does_not_fit_is_refused_by_name():
         Scene(history, 0.1, size=torch.ones(2, 2, 2))
     with pytest.raises(ValueError, match=r"scene\.agent_mask has shape \[2, 4\]"):
         Scene(history, 0.1, agent_mask=torch.ones(2, 4, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"scene\.reference_speed has shape \[2\]; this history takes \[2, 3\]"):
+        Scene(history, 0.1, reference_speed=torch.ones(2))
+    with pytest.raises(ValueError, match=r"scene\.references has shape \[2, 3, 4, 1, 2\]"):
+        Scene(history, 0.1, references=torch.zeros(2, 3, 4, 1, 2))
+    with pytest.raises(ValueError, match=r"scene\.reference_mask has shape \[2, 3, 1\]; these references take"):
+        mask = torch.ones(2, 3, 1, dtype=torch.bool)
+        Scene(history, 0.1, references=torch.zeros(2, 3, 4, 6, 2), reference_mask=mask)
+    with pytest.raises(ValueError, match=r"scene\.reference_mask says which"):
+        Scene(history, 0.1, reference_mask=mask)
     with pytest.raises(ValueError, match=r"scene\.history has shape \[2, 3, 5, 3\]"):
         Scene(history[..., :3], 0.1)
 
@@ -42,4 +51,10 @@ def test_only_what_is_real_has_to_be_finite():
     scene.history[1, 0, 4] = torch.nan
     assert scene.finite.tolist() == [True, False, True]
     scene.history_mask[1, 0, 4] = False
+    assert scene.finite.all()
+    scene.references[2, 1, 1] = torch.inf
+    scene.reference_speed[0, 0] = torch.nan
+    assert scene.finite.tolist() == [False, True, False]
+    scene.reference_mask[2, 1, 1] = False
+    scene.agent_mask[0, 0] = False
     assert scene.finite.all()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -10,7 +10,21 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, OwnFeature, proximity, signal, violation
+from epo_lightning.game.features import (
+    OWN_FEATURES,
+    PAIR_FEATURES,
+    WHEELBASE,
+    OwnFeature,
+    PairFeature,
+    Source,
+    Surroundings,
+    overlap,
+    separation,
+    signal,
+    signal_change,
+    slope,
+    violation,
+)
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene
 
@@ -30,6 +44,9 @@ class Energy:
     no consequence. Because the pair terms are symmetric, a minimiser of E is an open-loop Nash equilibrium in which agent
     i minimises its own terms plus the pair terms it takes part in (Theorem 1).
 
+    A pair whose weight is exactly zero is no edge of the game: it costs nothing to solve, and because weights enter squared
+    its weight has no gradient either. Setting weights to zero is thus how a game is told which pairs interact.
+
     Example::
 
         energy = Energy(own=["goal", "vel", "acc", "turnr"], pair=["proximity"])
@@ -37,16 +54,19 @@ class Energy:
         energy.residuals(scene, parameters, controls)  # {"goal": [B, M, N, 2], ..., "proximity": [B, M, P, K]}
 
     Attributes:
-        own: names out of :data:`~epo_lightning.game.features.OWN_FEATURES`.
+        own: names out of :data:`~epo_lightning.game.features.OWN_FEATURES`, where one's own are found too
+            (:func:`~epo_lightning.game.features.own_feature`).
         pair: names out of :data:`~epo_lightning.game.features.PAIR_FEATURES`. Discs have half an agent's length as radius.
         bounds: lowest and highest value of a signal, for features whose name ends in ``b``: ``{"vel": (-0.05, 2.0)}``.
         dynamics: what turns controls into states.
+        pair_stride: pairs are looked at in every step (1), every second step (2), ...: k = stride, 2 stride, ...
     """
 
     own: Sequence[str]
     pair: Sequence[str] = ("proximity",)
     bounds: Mapping[str, Sequence[float]] = field(default_factory=dict)
     dynamics: Unicycle = field(default_factory=Unicycle)
+    pair_stride: int = 1
 
     def __post_init__(self) -> None:
         for kind, names, known in (("own", self.own, OWN_FEATURES), ("pair", self.pair, PAIR_FEATURES)):
@@ -62,6 +82,8 @@ class Energy:
         for name, feature in self.own_features.items():
             if feature.bounded and feature.signal not in self.bounds:
                 raise ConfigError(f"feature {name!r} needs energy.bounds.{feature.signal}: [lowest, highest]")
+        if not self.pair_stride >= 1:
+            raise ConfigError(f"energy.pair_stride must be 1 or more, not {self.pair_stride}")
         signals = {feature.signal for feature in OWN_FEATURES.values() if feature.bounded}
         for name, bound in self.bounds.items():
             if name not in signals:
@@ -75,32 +97,39 @@ class Energy:
         return {name: OWN_FEATURES[name] for name in self.own}
 
     @property
+    def pair_features(self) -> dict[str, PairFeature]:
+        """The pair features by name."""
+        return {name: PAIR_FEATURES[name] for name in self.pair}
+
+    @property
+    def needs(self) -> set[str]:
+        """What the own features refer to: some of ``goals``, ``reference``, ``reference_speed``, ``size``."""
+        return {feature.needs for feature in self.own_features.values() if feature.needs}
+
+    @property
     def needs_goals(self) -> bool:
         """Whether a feature asks where agents are heading."""
-        return "goal" in self.own
+        return "goals" in self.needs
+
+    @property
+    def needs_reach(self) -> bool:
+        """Whether a pair feature asks for the agents' radii."""
+        return any(feature.source is Source.DISTANCE for feature in self.pair_features.values())
 
     def residuals(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> dict[str, Float[Tensor, "B M _ _"]]:
-        """Weighted residuals w c by feature: [B, M, N, R] for own features and [B, M, P, K] for pairs.
+        """Weighted residuals w c by feature: [B, M, N, R] for own features and [B, M, P, R] for pairs.
 
-        R is K, K - 1 for jerk and turnacc, 2 for the goal. Absent agents have residuals of zero.
+        R is K, K - 1 for jerk and turnacc, 2 for the goal, 2 K for the lane, the number of evaluated steps for pairs, and
+        what the function returns for undeclared features. Absent agents have residuals of zero.
 
         Raises:
             ValueError: shapes or names of scene, parameters and controls that do not fit together.
         """
         self.validate(scene, parameters, controls)
-        controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
-        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
-        residuals = {}
-        for name, feature in self.own_features.items():
-            weight = self.own_weight(scene, parameters, name)
-            value, _ = self.shape(feature, signal(feature, states, controls, self.goals(scene, parameters), scene.dt))
-            residuals[name] = weight[..., None] * value
-        for name in self.pair:
-            depth, _, _ = self.closeness(scene, states)
-            residuals[name] = self.pair_weight(scene, parameters, name)[..., None] * depth
-        return residuals
+        still = controls.new_zeros(0, *controls.shape)
+        return {name: residual for name, residual, _ in self._features(scene, parameters, controls, still)}
 
     def linearisation(
         self,
@@ -113,27 +142,44 @@ class Energy:
 
         Both are differentiable with respect to controls and parameters; hinges keep their side.
         """
-        controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
-        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
-        moved = self.dynamics.tangent(states, directions, scene.dt)
-        goals = self.goals(scene, parameters)
-        still = None if goals is None else torch.zeros_like(goals)
-        residuals, changes = [], []
-        for name, feature in self.own_features.items():
-            weight = self.own_weight(scene, parameters, name)[..., None]
-            value, slope = self.shape(feature, signal(feature, states, controls, goals, scene.dt))
-            residuals.append(weight * value)
-            changes.append(weight * slope * signal(feature, moved, directions, still, scene.dt))
-        if self.pair:
-            first, second = pairs(controls.shape[2], controls.device)
-            depth, normal, active = self.closeness(scene, states)
-            apart = moved[..., first, :, :2] - moved[..., second, :, :2]
-            closing = -torch.where(active, (normal * apart).sum(-1), 0.0)
-            for name in self.pair:
-                weight = self.pair_weight(scene, parameters, name)[..., None]
-                residuals.append(weight * depth)
-                changes.append(weight * closing)
+        _, residuals, changes = zip(*self._features(scene, parameters, controls, directions), strict=True)
         return torch.cat([r.flatten(2) for r in residuals], -1), torch.cat([c.flatten(3) for c in changes], -1)
+
+    def _features(
+        self, scene: Scene, parameters: GameParameters, controls: Tensor, directions: Tensor
+    ) -> Iterator[tuple[str, Tensor, Tensor]]:
+        """Name, weighted residual and its change along every direction of one feature after the other."""
+        controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
+        around = self.surroundings(scene, parameters)
+        states = self.dynamics.rollout(around.initial, controls, scene.dt)
+        moved = self.dynamics.tangent(states, directions, scene.dt)
+        for name, feature in self.own_features.items():
+            if feature.source is Source.TRAJECTORY:
+                assert feature.function is not None
+                value, change = along(feature.function, (states, controls), (moved, directions))
+                present = scene.agent_mask[:, None, :, None]
+                value, change = torch.where(present, value, 0.0), torch.where(present, change, 0.0)
+            else:
+                value, steepness = self.shape(feature, signal(feature, states, controls, around))
+                change = steepness * signal_change(feature, states, controls, moved, directions, around)
+            weight = self.own_weight(scene, parameters, name)[..., None]
+            yield name, weight * value, weight * change
+        if not self.pair:
+            return
+        first, second = pairs(controls.shape[2], controls.device)
+        states, moved = self.at_pair_steps(states), self.at_pair_steps(moved)
+        both, apart = (states[:, :, first], states[:, :, second]), (moved[:, :, :, first], moved[:, :, :, second])
+        distance, normal = separation(both[0][..., :2], both[1][..., :2])
+        closing = (normal * (apart[0] - apart[1])[..., :2]).sum(-1)
+        for name, pair in self.pair_features.items():
+            if pair.source is Source.TRAJECTORY:
+                value, change = along(pair.function, both, apart)
+            else:
+                value, steepness = self.pair_shape(pair, distance, self.reach(scene)[:, None, :, None])
+                change = steepness * closing
+            exists = self.pair_mask(scene)[:, None, :, None]
+            weight = self.pair_weight(scene, parameters, name)[..., None]
+            yield name, weight * torch.where(exists, value, 0.0), weight * torch.where(exists, change, 0.0)
 
     def terms(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
@@ -152,7 +198,7 @@ class Energy:
         """Refuse tensors that do not fit together, naming the one that does not and the shape it should have.
 
         Raises:
-            ValueError: a wrong shape, a missing weight, missing goals or sizes.
+            ValueError: a wrong shape, a missing weight, missing goals, references, reference speeds or sizes.
         """
         batch, agents = scene.agent_mask.shape
         if controls.dim() != 5 or controls.shape[0] != batch or controls.shape[2] != agents or controls.shape[4] != 2:
@@ -171,30 +217,72 @@ class Energy:
                 if given[name].shape != (batch, modes, count):
                     shape = list(given[name].shape)
                     raise ValueError(f"{kind}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}")
-        if self.needs_goals:
-            if parameters.goals is None:
-                raise ValueError("the energy has the feature 'goal', but parameters.goals is None")
-            if parameters.goals.shape != (batch, modes, agents, 2):
-                shape = list(parameters.goals.shape)
-                raise ValueError(f"goals have shape {shape}; these controls take {[batch, modes, agents, 2]}")
-        if self.pair and scene.size is None:
+        needed: dict[str, tuple[tuple[str, Tensor | None], ...]] = {
+            "goals": (("parameters.goals", parameters.goals),),
+            "reference": (("scene.references", scene.references), ("parameters.reference", parameters.reference)),
+            "reference_speed": (("scene.reference_speed", scene.reference_speed),),
+            "size": (("scene.size", scene.size),),
+        }
+        for name, feature in self.own_features.items():
+            for what, value in needed[feature.needs] if feature.needs else ():
+                if value is None:
+                    raise ValueError(f"the energy has the feature {name!r}, but {what} is None")
+                takes = (batch, modes, agents, 2)[: value.dim()]
+                if what in ("parameters.goals", "parameters.reference") and value.shape != takes:
+                    raise ValueError(f"{what} has shape {list(value.shape)}; these controls take {list(takes)}")
+        if "reference" in self.needs and controls.device.type == "cpu":  # elsewhere, looking would make the host wait
+            assert scene.references is not None
+            assert parameters.reference is not None
+            lines = scene.references.shape[2]
+            index = torch.where(scene.agent_mask[:, None], parameters.reference, 0)
+            if ((index < 0) | (index >= lines)).any():
+                raise ValueError(
+                    f"parameters.reference chooses among the R = {lines} lines of scene.references by 0 .. R-1"
+                )
+        if self.needs_reach and scene.size is None:
             raise ValueError("pair features take the agents' radii from scene.size [B, N, 2], which is None")
 
-    # What the Gauss-Newton assembly shares with the residuals: absent agents are silenced here, once.
+    # What solvers share with the residuals: absent agents are silenced here, once.
+
+    def surroundings(self, scene: Scene, parameters: GameParameters) -> Surroundings:
+        """What own features refer to besides the trajectory."""
+        present, needs = scene.agent_mask, self.needs
+        goals = line = reference_speed = wheelbase = None
+        if "goals" in needs:
+            assert parameters.goals is not None
+            goals = torch.where(present[:, None, :, None], parameters.goals, 0.0)
+        if "reference" in needs:
+            assert scene.references is not None
+            followed, on_line = self._followed(scene, parameters)
+            line = torch.where(on_line[..., None, None], scene.references[followed], 0.0)
+        if "reference_speed" in needs:
+            assert scene.reference_speed is not None
+            reference_speed = torch.where(present, scene.reference_speed, 0.0)[:, None]
+        if "size" in needs:
+            assert scene.size is not None
+            wheelbase = WHEELBASE * torch.where(present, scene.size[..., 0], 0.0)[:, None]
+        return Surroundings(self.initial(scene), scene.dt, goals, line, reference_speed, wheelbase)
+
+    def _followed(self, scene: Scene, parameters: GameParameters) -> tuple[tuple[Tensor, ...], Bool[Tensor, "B M N"]]:
+        """Where in ``scene.references`` the lines are that agents follow, and which of them exist."""
+        assert scene.reference_mask is not None
+        assert parameters.reference is not None
+        present = scene.agent_mask[:, None]
+        scenes = torch.arange(len(present), device=present.device)[:, None, None]
+        agents = torch.arange(present.shape[2], device=present.device)
+        index = scenes, agents, torch.where(present, parameters.reference, 0).long()
+        return index, scene.reference_mask[index] & present
 
     def initial(self, scene: Scene) -> Float[Tensor, "B 1 N 4"]:
         """The states x_0, zero for absent agents."""
         return torch.where(scene.agent_mask[..., None], scene.current, 0.0)[:, None]
 
-    def goals(self, scene: Scene, parameters: GameParameters) -> Float[Tensor, "B M N 2"] | None:
-        """Where agents are heading, zero for absent agents."""
-        if parameters.goals is None:
-            return None
-        return torch.where(scene.agent_mask[:, None, :, None], parameters.goals, 0.0)
-
     def own_weight(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B M N"]:
-        """Weights of an own feature, zero for absent agents."""
-        return torch.where(scene.agent_mask[:, None], parameters.own_weights[name], 0.0)
+        """Weights of an own feature, zero for absent agents and where the line to follow does not exist."""
+        active = scene.agent_mask[:, None]
+        if OWN_FEATURES[name].source is Source.POSITION:
+            _, active = self._followed(scene, parameters)
+        return torch.where(active, parameters.own_weights[name], 0.0)
 
     def pair_mask(self, scene: Scene) -> Bool[Tensor, "B P"]:
         """Pairs of which both agents exist."""
@@ -205,17 +293,41 @@ class Energy:
         """Weights of a pair feature, zero for pairs with an absent agent."""
         return torch.where(self.pair_mask(scene)[:, None], parameters.pair_weights[name], 0.0)
 
+    def radius(self, scene: Scene) -> Float[Tensor, "B N"]:
+        """Radii of the agents' discs, zero for absent agents."""
+        assert scene.size is not None
+        return torch.where(scene.agent_mask, scene.size[..., 0] / 2, 0.0)
+
+    def reach(self, scene: Scene) -> Float[Tensor, "B P"]:
+        """The distance at which the discs of two agents touch."""
+        radius = self.radius(scene)
+        first, second = pairs(scene.agent_mask.shape[1], radius.device)
+        return radius[:, first] + radius[:, second]
+
+    def at_pair_steps(self, states: Float[Tensor, "*batch K X"]) -> Float[Tensor, "*batch L X"]:
+        """The steps k = stride, 2 stride, ... at which pairs are looked at."""
+        return states[..., self.pair_stride - 1 :: self.pair_stride, :]
+
     def shape(self, feature: OwnFeature, value: Float[Tensor, "*shape"]) -> tuple[Tensor, Tensor]:
-        """A feature's value c(z) for its signal z, and the slope dc/dz."""
+        """A declared own feature's value c(z) for its signal z, and the slope dc/dz."""
         if feature.bounded:
             lower, upper = self.bounds[feature.signal]
             return violation(value, lower, upper)
+        if feature.function is not None:
+            return slope(feature.function, value)
         return value, torch.ones_like(value)
 
-    def closeness(self, scene: Scene, states: Float[Tensor, "B M N K 4"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Depth [B, M, P, K], normal [B, M, P, K, 2] and activity [B, M, P, K] of the pairs' overlaps."""
-        first, second = pairs(scene.agent_mask.shape[1], states.device)
-        assert scene.size is not None
-        radius = torch.where(scene.agent_mask, scene.size[..., 0] / 2, 0.0)
-        reach = (radius[:, first] + radius[:, second])[:, None, :, None]
-        return proximity(states[:, :, first, :, :2], states[:, :, second, :, :2], reach)
+    def pair_shape(self, feature: PairFeature, distance: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        """A declared pair feature's value for a distance, and its slope."""
+        if feature.function is overlap:
+            return overlap(distance, reach), -(distance < reach).to(distance.dtype)
+        return slope(feature.function, distance, reach)
+
+
+def along(
+    function: Callable[..., Tensor], at: tuple[Tensor, Tensor], directions: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Value of an undeclared feature, and its change along every one of D directions (their first dimension)."""
+    value = function(*at)
+    changes = [torch.func.jvp(function, at, direction)[1] for direction in zip(*directions, strict=True)]
+    return value, torch.stack(changes) if changes else value.new_zeros(0, *value.shape)

@@ -1,21 +1,45 @@
 """The named features of an energy: what an agent, or a pair of agents, would rather keep small.
 
-An own feature is a *signal* of the trajectory (a control, its rate of change, the speed, the distance left to the goal),
-taken either as it is or, for names that end in ``b``, as the amount by which it leaves its bounds (the paper's soft
-constraints max(0, g(z))). How a signal depends on the controls is all that the Gauss-Newton assembly has to know.
+An own feature is a *signal* of the trajectory (a control, its rate of change, the speed, the steering angle, the way to a
+line or a goal), taken as it is, or as the amount by which it leaves its bounds (names that end in ``b``: the paper's soft
+constraints max(0, g(z))), or through an elementwise function of one's own. A pair feature is such a function of the
+distance between two agents. Where a signal comes from is *declared*, and is all that a solver has to know of its Jacobian.
+
+A feature of one's own needs no declaration: any differentiable function of the trajectory will do, at lower speed::
+
+    @own_feature("lateral")                                   # [.., K, 4], [.., K, 2] -> [.., R]
+    def lateral(states, controls):
+        return states[..., SPEED] * controls[..., TURN_RATE]
+
+    @own_feature("hard_braking", Source.CONTROL, channel=ACCELERATION)   # declared: of the signal alone, elementwise
+    def hard_braking(acceleration):
+        return torch.relu(-3.0 - acceleration)
+
+    @pair_feature("gap", Source.DISTANCE)                     # declared: of distance and reach, elementwise
+    def gap(distance, reach):
+        return torch.exp(reach - distance)
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from epo_lightning.registry import ConfigError
 from epo_lightning.scene import ACCELERATION, SPEED, TURN_RATE
+
+Function = TypeVar("Function", bound=Callable[..., Tensor])
+
+WHEELBASE = 0.6
+"""Distance between the axles, as a share of a vehicle's length."""
+SLOWEST_STEERING = 1.0
+"""Speed [m/s] below which steering angles are those of this speed: a standing vehicle turns at no angle at all."""
 
 
 class Source(Enum):
@@ -27,25 +51,50 @@ class Source(Enum):
     """The rate of change of a control: bidiagonal."""
     SPEED = "speed"
     """The speed: every acceleration before it counts the same."""
+    STEERING = "steering"
+    """The turn rate and the speed before the step at which it acts."""
+    POSITION = "position"
+    """All positions: all controls before them count."""
     FINAL_POSITION = "final_position"
     """The last position: all controls of the agent count."""
+    DISTANCE = "distance"
+    """How far two agents are apart: the positions of both."""
+    TRAJECTORY = "trajectory"
+    """Undeclared: automatic differentiation finds out."""
 
 
 @dataclass(frozen=True)
 class OwnFeature:
-    """One entry of c(u_i, g_i) in Eq. 10: a signal, and whether only its violation of bounds counts.
+    """One entry of c(u_i, g_i) in Eq. 10: a signal, and what is made of it.
 
     Attributes:
         source: where the signal comes from.
-        channel: index of the control, for signals of controls.
         signal: name of the signal, by which its bounds are given.
+        channel: index of the control, for signals of controls.
         bounded: whether the feature is zero within the bounds.
+        needs: what of scene and game the signal refers to: ``goals``, ``reference``, ``reference_speed``, ``size``.
+        function: of the signal, elementwise; of states and controls where the source is TRAJECTORY.
     """
 
     source: Source
     signal: str
     channel: int = 0
     bounded: bool = False
+    needs: str | None = None
+    function: Callable[..., Tensor] | None = None
+
+
+@dataclass(frozen=True)
+class PairFeature:
+    """One entry of d(u_i, u_j) in Eq. 11.
+
+    Attributes:
+        source: DISTANCE or TRAJECTORY.
+        function: of distance and reach, elementwise; of the states of both agents where the source is TRAJECTORY.
+    """
+
+    source: Source
+    function: Callable[..., Tensor]
 
 
 def _with_bounds(features: Mapping[str, OwnFeature]) -> dict[str, OwnFeature]:
@@ -57,7 +106,10 @@ def _with_bounds(features: Mapping[str, OwnFeature]) -> dict[str, OwnFeature]:
 
 
 OWN_FEATURES: dict[str, OwnFeature] = {
-    "goal": OwnFeature(Source.FINAL_POSITION, "goal"),
+    "goal": OwnFeature(Source.FINAL_POSITION, "goal", needs="goals"),
+    "lane": OwnFeature(Source.POSITION, "lane", needs="reference"),
+    "velref": OwnFeature(Source.SPEED, "velref", needs="reference_speed"),
+    "steer": OwnFeature(Source.STEERING, "steer", needs="size"),
     **_with_bounds(
         {
             "vel": OwnFeature(Source.SPEED, "vel"),
@@ -68,30 +120,208 @@ OWN_FEATURES: dict[str, OwnFeature] = {
         }
     ),
 }
-"""Name to feature: goal [m]; vel [m/s]; acc [m/s^2]; turnr [rad/s]; jerk [m/s^3]; turnacc [rad/s^2]; ``...b`` for bounds."""
+"""Name to feature: goal [m]; lane, the way from the followed reference line [m]; vel, velref, the speed and what it exceeds
+the reference speed by [m/s]; acc [m/s^2]; turnr [rad/s]; jerk [m/s^3]; turnacc [rad/s^2]; steer, the steering angle of a
+vehicle that turns like this [rad]; ``...b`` for what bounds are exceeded by."""
 
-PAIR_FEATURES = ("proximity",)
+
+def overlap(distance: Float[Tensor, "*shape"], reach: Float[Tensor, "*#shape"]) -> Float[Tensor, "*shape"]:
+    """How deep two discs overlap; touching is not overlapping."""
+    return torch.relu(reach - distance)
+
+
+PAIR_FEATURES: dict[str, PairFeature] = {"proximity": PairFeature(Source.DISTANCE, overlap)}
 """``proximity``: max(0, r_i + r_j - |p_i - p_j|) [m], how deep two discs overlap."""
+
+_BUILT_IN = {*OWN_FEATURES, *PAIR_FEATURES}
+
+
+def _refuse(name: str, source: Source, sources: tuple[Source, ...]) -> None:
+    if name in _BUILT_IN:
+        raise ConfigError(f"{name!r} is a built-in feature; choose another name")
+    if source not in sources:
+        raise ConfigError(
+            f"feature {name!r} can be declared as one of {[s.name for s in sources]}, not as {source.name}"
+        )
+
+
+def own_feature(
+    name: str, source: Source = Source.TRAJECTORY, channel: int = ACCELERATION
+) -> Callable[[Function], Function]:
+    """Make a function an own feature that energies can name.
+
+    Args:
+        name: how energies call it.
+        source: CONTROL, RATE or SPEED for an elementwise function of that one signal; TRAJECTORY for any differentiable
+            function of an agent's states [.., K, 4] and controls [.., K, 2], elementwise over all leading dimensions,
+            that returns residuals [.., R].
+        channel: ``ACCELERATION`` or ``TURN_RATE``, for signals of controls.
+
+    Raises:
+        ConfigError: the name of a built-in feature, or a source that functions cannot be declared with.
+    """
+    _refuse(name, source, (Source.CONTROL, Source.RATE, Source.SPEED, Source.TRAJECTORY))
+
+    def add(function: Function) -> Function:
+        OWN_FEATURES[name] = OwnFeature(source, name, channel, function=function)
+        return function
+
+    return add
+
+
+def pair_feature(name: str, source: Source = Source.TRAJECTORY) -> Callable[[Function], Function]:
+    """Make a function a pair feature that energies can name.
+
+    Args:
+        name: how energies call it.
+        source: DISTANCE for an elementwise function of distance [.., K] and reach [.., 1], the sum of both radii;
+            TRAJECTORY for any differentiable function of the states [.., K, 4] of the first and of the second agent,
+            elementwise over all leading dimensions, that returns residuals [.., R]. Either sees only the steps at which
+            the energy evaluates pairs.
+
+    Raises:
+        ConfigError: the name of a built-in feature, or a source that functions cannot be declared with.
+    """
+    _refuse(name, source, (Source.DISTANCE, Source.TRAJECTORY))
+
+    def add(function: Function) -> Function:
+        PAIR_FEATURES[name] = PairFeature(source, function)
+        return function
+
+    return add
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What own features refer to besides the trajectory; zero where an agent is absent, None where nothing is known.
+
+    Attributes:
+        initial: the states x_0.
+        goals: where agents are heading.
+        line: the reference lines that they follow.
+        reference_speed: how fast they would like to be.
+        wheelbase: distance between their axles.
+    """
+
+    initial: Float[Tensor, "B 1 N 4"]
+    dt: float
+    goals: Float[Tensor, "B M N 2"] | None = None
+    line: Float[Tensor, "B M N Q 2"] | None = None
+    reference_speed: Float[Tensor, "B 1 N"] | None = None
+    wheelbase: Float[Tensor, "B 1 N"] | None = None
+
+
+def foot(
+    position: Float[Tensor, "*batch K 2"], line: Float[Tensor, "*batch Q 2"]
+) -> tuple[Float[Tensor, "*batch K 2"], Float[Tensor, "*batch K 2"]]:
+    """The nearest point of a polyline, and how it slides: the segment's unit tangent, zero at the end of a segment.
+
+    Differentiable with respect to the position; which segment is nearest is a constant, the first one on a tie.
+    """
+    start, along = line[..., None, :-1, :], line.diff(dim=-2)[..., None, :, :]
+    squared = along.square().sum(-1)
+    squared = torch.where(squared > 0, squared, 1.0)
+    with torch.no_grad():
+        offset = position.detach()[..., None, :] - start
+        share = ((offset * along).sum(-1) / squared).clamp_(0.0, 1.0)
+        segment = (offset - share[..., None] * along).square().sum(-1).argmin(-1, keepdim=True)  # [.. K 1]
+    index = segment[..., None].expand(*segment.shape, 2)
+    start = start.expand(*index.shape[:-2], *start.shape[-2:]).gather(-2, index)[..., 0, :]
+    along = along.expand(*index.shape[:-2], *along.shape[-2:]).gather(-2, index)[..., 0, :]
+    squared = squared.expand(*segment.shape[:-1], squared.shape[-1]).gather(-1, segment)
+    share = ((position - start) * along).sum(-1, keepdim=True) / squared
+    slides = (share > 0) & (share < 1)
+    tangent = torch.where(slides, along / squared.sqrt(), 0.0)
+    return start + share.clamp(0.0, 1.0) * along, tangent
+
+
+def steering(
+    turn_rate: Float[Tensor, "*batch K"], speed: Float[Tensor, "*batch K"], wheelbase: Float[Tensor, "*#batch 1"]
+) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K"], Float[Tensor, "*batch K"]]:
+    """The steering angle atan(L omega / max(v, 1 m/s)) [rad], and its slopes in omega and v."""
+    floored = speed.clamp_min(SLOWEST_STEERING)
+    curvature = wheelbase / floored
+    tangent = curvature * turn_rate
+    by_turn_rate = curvature / (1.0 + tangent.square())
+    by_speed = torch.where(speed < SLOWEST_STEERING, 0.0, -by_turn_rate * turn_rate / floored)
+    return tangent.atan(), by_turn_rate, by_speed
+
+
+def speed_before(states: Float[Tensor, "*batch K 4"], initial: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*batch K"]:
+    """The speeds v_0 .. v_{K-1} at which the controls of every step begin to act."""
+    start = initial[..., SPEED, None].expand(*states.shape[:-2], 1)
+    return torch.cat((start, states[..., :-1, SPEED]), -1)
 
 
 def signal(
     feature: OwnFeature,
     states: Float[Tensor, "*batch K 4"],
     controls: Float[Tensor, "*batch K 2"],
-    goals: Float[Tensor, "... 2"] | None,
-    dt: float,
+    around: Surroundings,
 ) -> Float[Tensor, "*batch R"]:
-    """The signal of a feature over time: R = K, K - 1 for rates, 2 (x and y) for the goal."""
+    """The declared signal of a feature over time: R = K, K - 1 for rates, 2 K (x and y) for lines, 2 for goals."""
     match feature.source:
         case Source.CONTROL:
             return controls[..., feature.channel]
         case Source.RATE:
-            return controls[..., feature.channel].diff(dim=-1) / dt
+            return controls[..., feature.channel].diff(dim=-1) / around.dt
+        case Source.SPEED if feature.needs:
+            assert around.reference_speed is not None
+            return states[..., SPEED] - around.reference_speed[..., None]
         case Source.SPEED:
             return states[..., SPEED]
+        case Source.STEERING:
+            assert around.wheelbase is not None
+            before = speed_before(states, around.initial)
+            return steering(controls[..., TURN_RATE], before, around.wheelbase[..., None])[0]
+        case Source.POSITION:
+            assert around.line is not None
+            position = states[..., :2]
+            return (position - foot(position, around.line)[0]).flatten(-2)
         case Source.FINAL_POSITION:
-            assert goals is not None
-            return states[..., -1, :2] - goals
+            assert around.goals is not None
+            return states[..., -1, :2] - around.goals
+    raise AssertionError(feature)
+
+
+def signal_change(
+    feature: OwnFeature,
+    states: Float[Tensor, "*batch K 4"],
+    controls: Float[Tensor, "*batch K 2"],
+    moved: Float[Tensor, "D *batch K 4"],
+    directions: Float[Tensor, "D *batch K 2"],
+    around: Surroundings,
+) -> Float[Tensor, "D *batch R"]:
+    """How a declared signal changes as controls move along D directions and states therefore along ``moved``.
+
+    The nearest point of a line stays where it is while an agent moves: a line pulls as stiffly along as across.
+    """
+    match feature.source:
+        case Source.CONTROL:
+            return directions[..., feature.channel]
+        case Source.RATE:
+            return directions[..., feature.channel].diff(dim=-1) / around.dt
+        case Source.SPEED:
+            return moved[..., SPEED]
+        case Source.STEERING:
+            assert around.wheelbase is not None
+            before = speed_before(states, around.initial)
+            _, by_turn_rate, by_speed = steering(controls[..., TURN_RATE], before, around.wheelbase[..., None])
+            faster = speed_before(moved, torch.zeros_like(around.initial))
+            return by_turn_rate * directions[..., TURN_RATE] + by_speed * faster
+        case Source.POSITION:
+            return moved[..., :2].flatten(-2)
+        case Source.FINAL_POSITION:
+            return moved[..., -1, :2]
+    raise AssertionError(feature)
+
+
+def slope(function: Callable[..., Tensor], value: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+    """An elementwise function's value and its derivative with respect to the first argument, itself differentiable."""
+    shaped, steepness = torch.func.jvp(
+        lambda argument: function(argument, *others), (value,), (torch.ones_like(value),)
+    )[:2]
+    return shaped, steepness
 
 
 def violation(
@@ -103,18 +333,16 @@ def violation(
     return excess, slope
 
 
-def proximity(
-    first: Float[Tensor, "*batch K 2"], second: Float[Tensor, "*batch K 2"], reach: Float[Tensor, "*#batch 1"]
-) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 2"], Bool[Tensor, "*batch K"]]:
-    """How far two agents come closer than ``reach`` [m], the unit vector from the second to the first, and where.
+def separation(
+    first: Float[Tensor, "*batch K 2"], second: Float[Tensor, "*batch K 2"]
+) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 2"]]:
+    """How far two agents are apart, and the unit vector from the second to the first.
 
-    Agents at one and the same point have no direction between them: the feature is then at its largest and flat, so its
-    gradient is zero instead of undefined.
+    Agents at one and the same point have no direction between them: the vector is then zero, and so is every gradient,
+    instead of undefined.
     """
     offset = first - second
     squared = offset.square().sum(-1)
     apart = squared > 0
-    distance = torch.where(apart, squared, 1.0).sqrt()
-    normal = torch.where(apart[..., None], offset / distance[..., None], 0.0)
-    depth = reach - torch.where(apart, distance, 0.0)
-    return depth.clamp_min(0.0), normal, depth > 0
+    root = torch.where(apart, squared, 1.0).sqrt()
+    return torch.where(apart, root, 0.0), torch.where(apart[..., None], offset / root[..., None], 0.0)

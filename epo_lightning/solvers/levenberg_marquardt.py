@@ -108,6 +108,7 @@ def _flatten(parameters: GameParameters) -> tuple[list[Tensor], Callable[[Sequen
             pair_weights=dict(zip(pair, weights[len(own) :], strict=True)),
             initial_controls=parameters.initial_controls.detach(),
             goals=goals[0] if goals else None,
+            reference=parameters.reference,
         )
 
     return tensors, rebuild

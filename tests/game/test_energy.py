@@ -6,18 +6,27 @@ import dataclasses
 import math
 from itertools import pairwise
 
+import jaxtyping
 import pytest
 import torch
-from games import ALL, BOUNDS, pad, random_game, random_scene
+from games import ALL, BOUNDS, feet_held, leaves_of, pad, random_game, random_scene, widen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import Energy
-from epo_lightning.game.features import proximity
+from epo_lightning.game.features import (
+    OWN_FEATURES,
+    PAIR_FEATURES,
+    Source,
+    foot,
+    overlap,
+    own_feature,
+    pair_feature,
+    separation,
+)
 from epo_lightning.game.normal_equations import normal_equations
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Scene
 
 
 def stacked(energy, scene, parameters, controls):
@@ -26,11 +35,20 @@ def stacked(energy, scene, parameters, controls):
 
 def dense_jacobian(energy, scene, parameters, controls):
     """[B, M, R, n] by forward-mode automatic differentiation; samples are independent, so one sum serves all."""
-    jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
+    with feet_held():
+        jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
     return jacobian.permute(1, 2, 0, 3, 4, 5).flatten(3)
 
 
-def slow_energy(scene, parameters, controls, b, m):
+def distance_to_segment(point, start, end):
+    along = [e - s for s, e in zip(start, end, strict=True)]
+    length = sum(c * c for c in along)
+    way = sum((p - s) * c for p, s, c in zip(point, start, along, strict=True))
+    share = min(1.0, max(0.0, way / length)) if length else 0.0
+    return math.dist(point, [s + share * c for s, c in zip(start, along, strict=True)])
+
+
+def slow_energy(scene, parameters, controls, b, m, stride=1):
     """Eqs. 10 and 11 for one scene and mode with every feature, written out."""
     own, dt, total = parameters.own_weights, scene.dt, 0.0
     paths = []
@@ -42,11 +60,21 @@ def slow_energy(scene, parameters, controls, b, m):
             x, y, theta, v = x + v * math.cos(theta) * dt, y + v * math.sin(theta) * dt, theta + w * dt, v + a * dt
             path.append((x, y))
             signals["vel"].append(v)
+        start = scene.current[b, i, 3].item()
+        wheelbase = 0.6 * scene.size[b, i, 0].item()
+        before = [start, *signals["vel"][:-1]]
+        signals["steer"] = [math.atan(wheelbase * c[1] / max(z, 1.0)) for c, z in zip(u, before, strict=True)]
+        wished = scene.reference_speed[b, i].item()
+        signals["velref"] = [z - wished for z in signals["vel"]]
+        line = scene.references[b, i, parameters.reference[b, m, i]].tolist()
+        signals["lane"] = [min(distance_to_segment(p, *ends) for ends in pairwise(line)) for p in path]
         signals["jerk"] = [(b[0] - a[0]) / dt for a, b in pairwise(u)]
         signals["turnacc"] = [(b[1] - a[1]) / dt for a, b in pairwise(u)]
         for name, values in signals.items():
-            low, high = BOUNDS[name]
             total += 0.5 * sum((own[name][b, m, i].item() * z) ** 2 for z in values)
+            if name + "b" not in own:
+                continue
+            low, high = BOUNDS[name]
             total += 0.5 * sum((own[name + "b"][b, m, i].item() * max(0, z - high, low - z)) ** 2 for z in values)
         goal = parameters.goals[b, m, i].tolist()
         total += 0.5 * own["goal"][b, m, i].item() ** 2 * ((x - goal[0]) ** 2 + (y - goal[1]) ** 2)
@@ -56,21 +84,22 @@ def slow_energy(scene, parameters, controls, b, m):
         for j in range(i + 1, len(paths)):
             reach = (scene.size[b, i, 0] + scene.size[b, j, 0]).item() / 2
             w = parameters.pair_weights["proximity"][b, m, pair].item()
-            total += 0.5 * sum(
-                (w * max(0.0, reach - math.dist(p, q))) ** 2 for p, q in zip(paths[i], paths[j], strict=True)
-            )
+            steps = list(zip(paths[i], paths[j], strict=True))[stride - 1 :: stride]
+            total += 0.5 * sum((w * max(0.0, reach - math.dist(p, q))) ** 2 for p, q in steps)
             pair += 1
     return total
 
 
-def test_energy_equals_plain_arithmetic():
+@pytest.mark.parametrize("stride", [1, 3])
+def test_energy_equals_plain_arithmetic(stride):
     scene = random_scene(2, 3, size=2.0, dtype=torch.float64)
     parameters = random_game(scene)
-    energy = Energy(ALL, bounds=BOUNDS)
+    scene.references[0, :, :, 3:] = scene.references[0, :, :, 2:3]  # a line with fewer points repeats its last one
+    energy = Energy(ALL, bounds=BOUNDS, pair_stride=stride)
     value = energy(scene, parameters, parameters.initial_controls)
     for b in range(2):
         for m in range(2):
-            expected = slow_energy(scene, parameters, parameters.initial_controls, b, m)
+            expected = slow_energy(scene, parameters, parameters.initial_controls, b, m, stride)
             assert value[b, m].item() == pytest.approx(expected, rel=1e-12)
     residuals = energy.residuals(scene, parameters, parameters.initial_controls)
     assert all((residuals[name] != 0).any() for name in (*ALL, "proximity")), "every hinge should be active somewhere"
@@ -84,13 +113,14 @@ def test_energy_equals_plain_arithmetic():
     own=st.sets(st.sampled_from(ALL), min_size=1),
     size=st.sampled_from([0.01, 2.0]),
     integrator=st.sampled_from(["euler", "semi_implicit", "heun"]),
+    stride=st.sampled_from([1, 3]),
     seed=st.integers(0, 1000),
 )
-def test_normal_equations_equal_automatic_differentiation(agents, modes, horizon, own, size, integrator, seed):
+def test_normal_equations_equal_automatic_differentiation(agents, modes, horizon, own, size, integrator, stride, seed):
     torch.manual_seed(seed)
     scene = random_scene(2, agents, history=2, size=size, dtype=torch.float64)
     parameters = random_game(scene, modes, horizon)
-    energy = Energy(sorted(own), bounds=BOUNDS, dynamics=Unicycle(integrator))
+    energy = Energy(sorted(own), bounds=BOUNDS, dynamics=Unicycle(integrator), pair_stride=stride)
     controls = parameters.initial_controls
     jacobian = dense_jacobian(energy, scene, parameters, controls)
     residual = stacked(energy, scene, parameters, controls)[..., None]
@@ -110,16 +140,7 @@ def test_absent_agents_change_nothing_whatever_they_hold():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, own=ALL)
     energy = Energy(ALL, bounds=BOUNDS)
-    padded = pad(scene, agents=2)
-    nan = torch.full((2, 2, 2), torch.nan, dtype=torch.float64)
-    pair = torch.full((2, 2, 6), torch.nan, dtype=torch.float64)
-    pair[..., 0] = parameters.pair_weights["proximity"][..., 0]  # the pair (0, 1) comes first
-    wide = GameParameters(
-        own_weights={name: torch.cat((w, nan), -1) for name, w in parameters.own_weights.items()},
-        pair_weights={"proximity": pair},
-        initial_controls=torch.cat((parameters.initial_controls, nan[..., None, None].expand(2, 2, 2, 7, 2)), 2),
-        goals=torch.cat((parameters.goals, nan[..., None].expand(2, 2, 2, 2)), 2),
-    )
+    padded, wide = pad(scene, agents=2), widen(parameters)
     alone = energy(scene, parameters, parameters.initial_controls)
     together = energy(padded, wide, wide.initial_controls)
     torch.testing.assert_close(together, alone, rtol=0, atol=1e-12)
@@ -127,19 +148,127 @@ def test_absent_agents_change_nothing_whatever_they_hold():
 
 def test_coincident_agents_have_a_finite_energy_and_a_gradient_of_zero():
     point = torch.zeros(1, 3, 2, dtype=torch.float64, requires_grad=True)
-    depth, normal, active = proximity(point, point.detach(), torch.tensor([[0.5]], dtype=torch.float64))
+    distance, normal = separation(point, point.detach())
+    depth = overlap(distance, torch.tensor([[0.5]], dtype=torch.float64))
     assert (depth == 0.5).all()
     assert (normal == 0).all()
-    assert active.all()
     depth.sum().backward()
     assert (point.grad == 0).all()
 
 
 def test_touching_is_not_active():
-    apart = torch.tensor([[[0.5, 0.0]]])
-    depth, _, active = proximity(apart, torch.zeros(1, 1, 2), torch.tensor([[0.5]]))
-    assert depth.item() == 0
-    assert not active.any()
+    energy, touching = Energy(["goal"]), torch.tensor([0.5])
+    depth, slope = energy.pair_shape(PAIR_FEATURES["proximity"], touching, touching)
+    assert depth.item() == slope.item() == 0
+
+
+def test_the_foot_is_the_nearest_point_and_slides_along_its_segment():
+    line = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
+    points = torch.tensor([[1.0, 1.0], [-1.0, 1.0], [3.0, 1.5], [0.5, -1.0]], dtype=torch.float64)
+    nearest, tangent = foot(points, line)
+    # The first point is as near to the first segment as to the last one, and the first one counts.
+    expected = torch.tensor([[1.0, 0.0], [0.0, 0.0], [2.0, 1.5], [0.5, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(nearest, expected, rtol=0, atol=0)
+    slides = torch.tensor([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0], [1.0, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(tangent, slides, rtol=0, atol=0)
+    jacobian = torch.func.jacfwd(lambda p: foot(p, line)[0].sum(0))(points).transpose(0, 1)
+    torch.testing.assert_close(jacobian, slides[..., :, None] * slides[..., None, :], rtol=0, atol=1e-15)
+
+
+def test_who_follows_a_line_that_does_not_exist_is_not_drawn_to_it():
+    scene = random_scene(2, 2, history=2)
+    parameters = random_game(scene)
+    scene.reference_mask[:] = False
+    scene.references[:] = torch.nan
+    residuals = Energy(["lane", "acc"]).residuals(scene, parameters, parameters.initial_controls)
+    assert (residuals["lane"] == 0).all()
+
+
+@pytest.fixture
+def registry():
+    """Features registered in a test are gone after it."""
+    own, pair = dict(OWN_FEATURES), dict(PAIR_FEATURES)
+    yield
+    for known, before in ((OWN_FEATURES, own), (PAIR_FEATURES, pair)):
+        for name in set(known) - set(before):
+            del known[name]
+
+
+def wave(value):
+    return torch.sin(2.0 * value) + 0.3 * value.square()
+
+
+def gap(distance, reach):
+    return torch.exp(0.5 * (reach - distance))
+
+
+def register_twins():
+    """The same functions once with and once without a declaration of their structure: reach is 2 m for all."""
+    for source, channel in (
+        (Source.CONTROL, 0),
+        (Source.CONTROL, 1),
+        (Source.RATE, 0),
+        (Source.RATE, 1),
+        (Source.SPEED, 0),
+    ):
+        name = f"{source.value}{channel}"
+        declared = own_feature(name, source, channel)(lambda z: wave(z))
+
+        @own_feature(f"{name}_undeclared")
+        def undeclared(states, controls, source=source, channel=channel, declared=declared):
+            read = {
+                Source.CONTROL: controls[..., channel],
+                Source.RATE: controls[..., channel].diff(dim=-1) / 0.1,
+                Source.SPEED: states[..., 3],
+            }
+            return declared(read[source])
+
+    pair_feature("gap", Source.DISTANCE)(gap)
+
+    @pair_feature("gap_undeclared")
+    def gap_undeclared(first, second):
+        return gap((first[..., :2] - second[..., :2]).norm(dim=-1), 2.0)
+
+    return [name for name in OWN_FEATURES if name[-1] in "01" and not name.endswith("undeclared")]
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_a_declared_feature_equals_the_same_function_undeclared(registry, stride):
+    own = register_twins()
+    scene = random_scene(2, 3, history=2, size=2.0, dtype=torch.float64)
+    parameters = random_game(scene, own=tuple(own), horizon=6)
+    weights, pair_weights = parameters.own_weights, {"gap": parameters.pair_weights["proximity"]}
+    results = []
+    for suffix in ("", "_undeclared"):
+        energy = Energy([name + suffix for name in own], ["gap" + suffix], pair_stride=stride)
+        twin = leaves_of(
+            replaced(
+                parameters,
+                own_weights={name + suffix: weight for name, weight in weights.items()},
+                pair_weights={name + suffix: weight for name, weight in pair_weights.items()},
+            )
+        )
+        residuals = stacked(energy, scene, twin, twin.initial_controls)
+        gradient, matrix = normal_equations(energy, scene, twin, twin.initial_controls)
+        directions = torch.ones(2, *twin.initial_controls.shape, dtype=torch.float64)
+        directions[1, ..., 0] = -0.5
+        values, (one, other) = energy.linearisation(scene, twin, twin.initial_controls, directions)
+        (one * (values + other)).sum().backward()
+        by = [*twin.own_weights.values(), *twin.pair_weights.values(), twin.initial_controls]
+        results.append([residuals, gradient, matrix, *(tensor.grad for tensor in by)])
+    for declared, undeclared in zip(*results, strict=True):
+        torch.testing.assert_close(declared, undeclared, rtol=0, atol=1e-12 * declared.abs().max().item())
+
+
+def test_bad_declarations_are_refused(registry):
+    with pytest.raises(ConfigError, match="built-in"):
+        own_feature("acc")
+    with pytest.raises(ConfigError, match="built-in"):
+        pair_feature("proximity")
+    with pytest.raises(ConfigError, match="not as POSITION"):
+        own_feature("mine", Source.POSITION)
+    with pytest.raises(ConfigError, match="not as SPEED"):
+        pair_feature("ours", Source.SPEED)
 
 
 def test_the_potential_is_each_agents_own_cost_up_to_what_the_agent_cannot_change():
@@ -168,6 +297,7 @@ def test_the_potential_is_each_agents_own_cost_up_to_what_the_agent_cannot_chang
         ({"own": [], "pair": []}, "at least one feature"),
         ({"own": ["velb"]}, "needs energy.bounds.vel"),
         ({"own": ["vel"], "bounds": {"velocity": (0.0, 1.0)}}, "unknown signal energy.bounds.velocity"),
+        ({"own": ["acc"], "pair_stride": 0}, "energy.pair_stride must be 1 or more"),
         ({"own": ["velb"], "bounds": {"vel": (1.0, 0.0)}}, r"must be \[lowest, highest\]"),
     ],
 )
@@ -180,7 +310,8 @@ def replaced(parameters, **changes):
     return dataclasses.replace(parameters, **changes)
 
 
-def test_shapes_that_do_not_fit_are_refused_by_name():
+def test_shapes_that_do_not_fit_are_refused_by_name(monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checks would come first
     scene = random_scene(2, 2)
     parameters = random_game(scene)
     energy = Energy(ALL, bounds=BOUNDS)
@@ -197,5 +328,18 @@ def test_shapes_that_do_not_fit_are_refused_by_name():
         energy.validate(scene, replaced(parameters, own_weights=weights), controls)
     with pytest.raises(ValueError, match=r"parameters\.goals is None"):
         energy.validate(scene, replaced(parameters, goals=None), controls)
-    with pytest.raises(ValueError, match=r"scene\.size"):
-        energy.validate(Scene(scene.history, scene.dt), parameters, controls)
+    with pytest.raises(ValueError, match=r"'lane', but parameters\.reference is None"):
+        energy.validate(scene, replaced(parameters, reference=None), controls)
+    with pytest.raises(ValueError, match=r"parameters\.reference has shape \[2, 1, 2\]"):
+        energy.validate(scene, replaced(parameters, reference=parameters.reference[:, :1]), controls)
+    with pytest.raises(ValueError, match=r"R = 2 lines"):
+        energy.validate(scene, replaced(parameters, reference=parameters.reference - 2), controls)
+    with pytest.raises(ValueError, match=r"'lane', but scene\.references is None"):
+        energy.validate(replaced(scene, references=None, reference_mask=None), parameters, controls)
+    with pytest.raises(ValueError, match=r"'velref', but scene\.reference_speed is None"):
+        energy.validate(replaced(scene, reference_speed=None), parameters, controls)
+    with pytest.raises(ValueError, match=r"'steer', but scene\.size is None"):
+        energy.validate(replaced(scene, size=None), parameters, controls)
+    energy = Energy(["goal"])
+    with pytest.raises(ValueError, match=r"radii from scene\.size"):
+        energy.validate(replaced(scene, size=None), parameters, controls)

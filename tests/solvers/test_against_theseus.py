@@ -15,7 +15,8 @@ theseus = pytest.importorskip("theseus", reason="the peer is not installed: see 
 def test_steps_equal_theseus():
     scene = random_scene(3, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, modes=1, horizon=6)
-    energy = Energy(ALL, bounds=BOUNDS)
+    # Automatic differentiation lets the nearest point of a lane slide along it, where our model holds it.
+    energy = Energy([name for name in ALL if name != "lane"], bounds=BOUNDS)
     shape = parameters.initial_controls.shape
 
     def residuals(optim_vars, aux_vars):

@@ -6,13 +6,13 @@ import dataclasses
 
 import pytest
 import torch
-from games import ALL, BOUNDS, pad, random_game, random_scene
+from games import ALL, BOUNDS, feet_held, leaves_of, pad, random_game, random_scene, widen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Status
+from epo_lightning.scene import Status
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
 
@@ -24,7 +24,8 @@ def reference(energy, scene, parameters, steps, step_size, damping):
     """Damped Gauss-Newton with a dense Jacobian from forward-mode differentiation and a general linear solver."""
     controls = parameters.initial_controls
     for _ in range(steps):
-        jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
+        with feet_held():
+            jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
         jacobian = jacobian.permute(1, 2, 0, 3, 4, 5).flatten(3)
         residual = stacked(energy, scene, parameters, controls)[..., None]
         matrix = jacobian.mT @ jacobian + damping * torch.eye(jacobian.shape[-1], dtype=controls.dtype)
@@ -78,12 +79,12 @@ def test_unrolled_gradients_equal_central_differences(size, bounds, agents):
     solve = LevenbergMarquardt(2, 0.3, 10.0)
     cotangent = torch.randn_like(parameters.initial_controls)
 
-    leaves = parameters.map(lambda tensor: tensor.clone().requires_grad_())
+    leaves = leaves_of(parameters)
     (solve(energy, scene, leaves).controls * cotangent).sum().backward()
 
     def compare(analytic, replace, tensor):
         numeric = central_differences(lambda t: solve(energy, scene, replace(t)).controls, tensor, cotangent)
-        error = (analytic - numeric).norm() / numeric.norm().clamp_min(1e-3)
+        error = (analytic - numeric).norm() / numeric.norm().clamp_min(1e-2)  # rounding of the differences themselves: 1e-9
         assert error < 1e-6
 
     compare(leaves.goals.grad, lambda t: dataclasses.replace(parameters, goals=t), parameters.goals)
@@ -140,16 +141,7 @@ def test_absent_agents_and_their_padding_change_nothing():
     scene = random_scene(3, 2, history=2, size=2.0)
     parameters = random_game(scene)
     solve, energy = LevenbergMarquardt(2, 0.3, 0.0), Energy(ALL, bounds=BOUNDS)
-    nan = torch.full((3, 2, 2), torch.nan)
-    pair = torch.full((3, 2, 6), torch.nan)
-    pair[..., 0] = parameters.pair_weights["proximity"][..., 0]
-    wide = GameParameters(
-        own_weights={name: torch.cat((w, nan), -1) for name, w in parameters.own_weights.items()},
-        pair_weights={"proximity": pair},
-        initial_controls=torch.cat((parameters.initial_controls, torch.full((3, 2, 2, 7, 2), torch.nan)), 2),
-        goals=torch.cat((parameters.goals, nan[..., None].expand(3, 2, 2, 2)), 2),
-    )
-    alone, padded = solve(energy, scene, parameters), solve(energy, pad(scene), wide)
+    alone, padded = solve(energy, scene, parameters), solve(energy, pad(scene), widen(parameters))
     torch.testing.assert_close(padded.controls[:, :, :2], alone.controls, rtol=0, atol=1e-5)
     assert (padded.status == Status.SOLVED).all()
     assert padded.gradient_norm.isfinite().all()
@@ -182,7 +174,7 @@ def test_a_poisoned_sample_leaves_the_others_bit_identical(kind):
     energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt(2, 0.3, 0.0 if kind == "singular" else 10.0)
     sound = solve(energy, scene, parameters)
     scene, parameters = poison(kind, scene, parameters)
-    leaves = parameters.map(lambda tensor: tensor.clone().requires_grad_())
+    leaves = leaves_of(parameters)
     poisoned = solve(energy, scene, leaves)
     others = [0, 2, 3]
     assert torch.equal(poisoned.controls[others], sound.controls[others])
@@ -236,7 +228,7 @@ def test_the_gradient_of_a_float32_layer_is_close_to_float64():
     energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt()
 
     def gradient(dtype):
-        leaves = parameters.to(dtype).map(lambda tensor: tensor.clone().requires_grad_())
+        leaves = leaves_of(parameters.to(dtype))
         solve(energy, scene.to(dtype), leaves).states.sum().backward()
         return leaves.initial_controls.grad.double()
 
