@@ -1,0 +1,104 @@
+"""Build the compiled layer: `python -m epo_lightning.solvers.kernel.build`; installing the package does the same.
+
+It takes a C++17 compiler (GCC or Clang: `$CXX`, or the first of c++, g++, clang++) and nothing else, no PyTorch and no Python
+headers. On x86-64 the sources are compiled for three levels of instructions, and the library chooses when it is loaded, so
+that a wheel built on one machine runs on all of them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+HERE = Path(__file__).parent
+LIBRARY = HERE / "epo_kernel.so"
+_LEVELS = {"epo_plain": [], "epo_v3": ["-march=x86-64-v3"], "epo_v4": ["-march=x86-64-v4"]}
+# Contraction to fused multiply-adds is the only liberty that the compiler may take with the arithmetic.
+_FLAGS = ["-std=c++17", "-O3", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-Wno-psabi"]
+
+
+def fingerprint() -> int:
+    """A number that changes with the sources: a library of other sources is not used."""
+    digest = hashlib.sha256()
+    for path in sorted([*HERE.glob("*.hpp"), *HERE.glob("*.cpp")]):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return int.from_bytes(digest.digest()[:7], "big")
+
+
+def load() -> ctypes.CDLL:
+    """The library.
+
+    Raises:
+        OSError: there is none, it does not load, or it was built from other sources.
+    """
+    if not LIBRARY.exists():
+        raise OSError(f"{LIBRARY.name} was not built when the package was installed (it is not in {HERE})")
+    library = ctypes.CDLL(str(LIBRARY))
+    if not hasattr(library, "epo_fingerprint"):
+        raise OSError(f"{LIBRARY} is not the compiled EPO layer")
+    library.epo_fingerprint.restype = ctypes.c_int64
+    if library.epo_fingerprint() != fingerprint():
+        raise OSError(f"{LIBRARY} was built from other sources than those beside it")
+    return library
+
+
+def _compiler() -> list[str]:
+    if os.environ.get("CXX"):
+        return os.environ["CXX"].split()
+    found = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+    if found is None:
+        raise OSError("no C++ compiler: neither $CXX nor c++, g++ or clang++ was found")
+    return [found]
+
+
+def _run(commands: list[list[str]]) -> None:
+    # Side by side: each takes a core for half a minute.
+    running = [subprocess.Popen(c, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) for c in commands]
+    said = [process.communicate()[0] for process in running]
+    for process, command, words in zip(running, commands, said, strict=True):
+        if process.returncode != 0:
+            raise OSError(f"{' '.join(command)}\n{words[-2000:]}")
+
+
+def build() -> None:
+    """Compile and link, unless the library is up to date.
+
+    Raises:
+        OSError: no compiler, or it refuses; the message holds what it said.
+    """
+    try:
+        load()
+    except OSError:
+        LIBRARY.unlink(missing_ok=True)
+    else:
+        return
+    compiler = _compiler()
+    x86 = platform.machine().lower() in ("x86_64", "amd64")
+    levels = _LEVELS if x86 else {"epo_plain": []}
+    with tempfile.TemporaryDirectory() as folder:
+        compile_ = [*compiler, *_FLAGS, f"-DEPO_FINGERPRINT={fingerprint()}", *(["-DEPO_X86"] if x86 else []), "-c"]
+        objects = {f"{folder}/{level}.o": [*flags, f"-DEPO_LEVEL={level}"] for level, flags in levels.items()}
+        commands = [[*compile_, *flags, str(HERE / "solve.cpp"), "-o", target] for target, flags in objects.items()]
+        commands.append([*compile_, str(HERE / "dispatch.cpp"), "-o", f"{folder}/dispatch.o"])
+        _run(commands)
+        linked = Path(folder) / LIBRARY.name
+        _run([[*compiler, "-shared", *objects, f"{folder}/dispatch.o", "-o", str(linked)]])
+        # Whoever imports at this moment sees the whole library or none.
+        partial = LIBRARY.with_suffix(f".{os.getpid()}")
+        shutil.copyfile(linked, partial)
+        partial.replace(LIBRARY)
+    load()
+
+
+if __name__ == "__main__":
+    try:
+        build()
+    except OSError as error:
+        sys.exit(f"the compiled layer was not built: {error}")

@@ -1,0 +1,76 @@
+// What the caller hands over: plain pointers and strides (in elements), so that no array is copied on the way in.
+#pragma once
+
+#include <cstdint>
+
+/// Weighted own features, in the order in which weights and their gradients are passed.
+enum Own { GOAL, LANE, VELREF, VEL, ACC, TURNR, JERK, TURNACC, STEER, VELB, ACCB, TURNRB, JERKB, TURNACCB, OWN_COUNT };
+
+/// Index of a control, as in the arrays of the caller.
+enum Control { ACCELERATION, TURN_RATE };
+
+/// Signals that can have bounds.
+enum Bounded { BOUND_VEL, BOUND_ACC, BOUND_TURNR, BOUND_JERK, BOUND_TURNACC, BOUND_COUNT };
+
+extern "C" {
+
+/// B scenes with M modes each: B * M problems of N agents over K steps. A null pointer is a feature that is not there.
+struct EpoGame {
+    int64_t B, M, N, K;
+    int64_t lines, points;     // reference lines R of an agent and their points Q
+    int64_t pair_stride;       // pairs count at states pair_stride, 2 pair_stride, ...
+    double dt;
+    double bounds[BOUND_COUNT][2];
+    const void* initial;       // [B, N, 4] x, y, heading, speed
+    int64_t initial_b, initial_n;
+    const uint8_t* present;    // [B, N]
+    const void* size;          // [B, N, 2] length, width
+    const void* own[OWN_COUNT];  // [B, M, N] each
+    int64_t own_b[OWN_COUNT], own_m[OWN_COUNT], own_n[OWN_COUNT];
+    const void* pair;          // [B, M, P]
+    int64_t pair_b, pair_m, pair_p;
+    const void* goals;         // [B, M, N, 2]
+    int64_t goals_b, goals_m, goals_n, goals_x;
+    const void* references;    // [B, N, R, Q, 2]
+    const int64_t* reference;  // [B, M, N]
+    const void* reference_speed;  // [B, N]
+};
+
+/// S steps from `start`, with absent agents' controls at zero. All arrays of controls are [B, M, N, K, 2]: acceleration, turn rate.
+struct EpoRun {
+    int64_t steps;
+    double step_size;
+    const void* damping;       // [B, M]
+    int64_t record;            // whether to keep what the adjoint needs
+    const void* start;
+    void* iterates;            // [S + 1, ...], or one array that is overwritten where iterate_stride is 0
+    int64_t iterate_stride;
+    void* directions;          // [S, ...] if record, else one array of scratch
+    void* states;              // [B, M, N, K, 4]
+    void* initial_energy;      // [B, M]
+    void* energy;              // [B, M]
+    void* gradient_norm;       // [B, M]
+    int64_t* status;           // [B, M] 0 solved, 1 damped, 2 stopped
+};
+
+/// Cotangents in, gradients out. `controls` is the cotangent of u_S on entry and of u_0 on return.
+struct EpoGradients {
+    void* controls;            // [B, M, N, K, 2]
+    const void* iterates;      // [S + 1, B, M, N, K, 2] further cotangents of u_0 .. u_S, or null
+    const void* states;        // [B, M, N, K, 4] or null
+    void* own[OWN_COUNT];      // [B, M, N] each, zero on entry
+    void* pair;                // [B, M, P], zero on entry
+    void* goals;               // [B, M, N, 2], zero on entry
+};
+}
+
+/// The functions of one level of instructions; float first.
+struct EpoLevel {
+    void* (*solve_float)(const EpoGame*, const EpoRun*, int64_t first, int64_t last);
+    void* (*solve_double)(const EpoGame*, const EpoRun*, int64_t first, int64_t last);
+    void (*differentiate_float)(const void* tape, const EpoGame*, const EpoRun*, const EpoGradients*);
+    void (*differentiate_double)(const void* tape, const EpoGame*, const EpoRun*, const EpoGradients*);
+    void (*release_float)(void* tape);
+    void (*release_double)(void* tape);
+    int64_t lanes;
+};

@@ -1,0 +1,360 @@
+// W independent games of n agents side by side: what they hold, where they move, and their features, step by step.
+#pragma once
+
+#include <cstddef>
+#include <vector>
+
+#include "buffers.hpp"
+#include "game.hpp"
+#include "lanes.hpp"
+#include "riccati.hpp"
+
+namespace EPO_LEVEL {
+
+/// A trajectory: heading, speed, sine and cosine of the heading, position, at steps 0 .. K.
+template <class T>
+struct Path {
+    Vec<T>*heading, *speed, *sine, *cosine, *x, *y;
+};
+
+/// How a trajectory changes along a direction of its controls.
+template <class T>
+struct Tangent {
+    Vec<T>*turn, *thrust;                // the direction [K]
+    Vec<T>*heading, *speed, *x, *y;      // [K + 1]
+};
+
+/// A feature's value and slope for a bounded signal: how far it leaves [low, high], and 1 above, -1 below, 0 within.
+template <class T>
+INLINE void violation(Vec<T> value, const double* bound, Vec<T>& excess, Vec<T>& slope) {
+    const T low = T(bound[0]), high = T(bound[1]);
+    const Vec<T> zero{}, one = splat<T>(1);
+    excess = most<T>(value - high, zero) + most<T>(low - value, zero);
+    slope = (value > high ? one : zero) - (value < low ? one : zero);
+}
+
+/// Where a control of agent i stands among the m unknowns of a step, which follow the order (heading, speed).
+INLINE int unknown(int i, int channel) { return 2 * i + (channel == ACCELERATION); }
+
+/// A sum of squared residuals around one signal: energy, pull (its derivative) and stiffness.
+template <class T>
+struct Model {
+    Vec<T> energy{}, pull{}, stiffness{};
+    INLINE void add(Vec<T> weight, Vec<T> value) {
+        const Vec<T> w = weight * weight;
+        energy += T(0.5) * w * value * value;
+        pull += w * value;
+        stiffness += w;
+    }
+    INLINE void add_bounded(Vec<T> weight, Vec<T> value, const double* bound) {
+        Vec<T> excess, slope;
+        violation<T>(value, bound, excess, slope);
+        const Vec<T> w = weight * weight;
+        energy += T(0.5) * w * excess * excess;
+        pull += w * slope * excess;
+        stiffness += w * slope * slope;
+    }
+};
+
+/// What phi = -<J mu, r + J d> asks of one signal: cotangent of the signal; weights' gradients are added on the way.
+template <class T>
+struct Adjoint {
+    Vec<T> along_mu, along_d, cotangent{};
+    INLINE void add(Vec<T> weight, Vec<T> value, Vec<T>& by_weight) {
+        cotangent -= weight * weight * along_mu;
+        by_weight -= T(2) * weight * along_mu * (value + along_d);
+    }
+    INLINE void add_bounded(Vec<T> weight, Vec<T> value, const double* bound, Vec<T>& by_weight) {
+        Vec<T> excess, slope;
+        violation<T>(value, bound, excess, slope);
+        cotangent -= weight * weight * slope * slope * along_mu;
+        by_weight -= T(2) * weight * slope * along_mu * (excess + slope * along_d);
+    }
+};
+
+/// Equivalent steering angle atan(q omega), q = wheelbase / max(v, 1), with its first two derivatives.
+template <class T>
+struct Steering {
+    Vec<T> value, by_turn, by_speed, turn_turn, turn_speed, speed_speed;
+    INLINE Steering(Vec<T> wheelbase, Vec<T> turn, Vec<T> speed) {
+        const Vec<T> one = splat<T>(1), zero{};
+        const Mask<T> moving = speed > one;
+        const Vec<T> inverse = one / (moving ? speed : one), q = wheelbase * inverse, t = q * turn;
+        const Vec<T> d = one / (one + t * t);
+        value = arctan<T>(t);
+        by_turn = q * d;
+        turn_turn = T(-2) * q * q * t * d * d;
+        by_speed = moving ? -t * d * inverse : zero;
+        turn_speed = moving ? q * d * inverse * (T(2) * t * t * d - one) : zero;
+        speed_speed = moving ? T(2) * t * d * d * inverse * inverse : zero;
+    }
+};
+
+/// Two agents at one step: how deep they overlap and in which direction they part.
+template <class T>
+struct Contact {
+    Mask<T> active;
+    Vec<T> distance, depth, x, y;
+    INLINE Contact(Vec<T> dx, Vec<T> dy, Vec<T> reach) {
+        const Vec<T> zero{}, one = splat<T>(1);
+        const Vec<T> squared = dx * dx + dy * dy;
+        const Mask<T> apart = squared > 0;
+        const Vec<T> safe = root<T>(apart ? squared : one);
+        distance = apart ? safe : zero;
+        active = reach > distance;
+        // Agents at one and the same point have no direction between them: the feature is flat there.
+        const Vec<T> inverse = apart && active ? one / safe : zero;
+        depth = active ? reach - distance : zero;
+        x = dx * inverse;
+        y = dy * inverse;
+    }
+};
+
+template <class T, int N>
+struct Group {
+    static constexpr int W = Lanes<T>::W;
+    const EpoGame& game;
+    const Count<N> count;
+    const int K, pairs;
+    const T dt;
+    Arena<T>& arena;
+    int problem[W], *agent;               // agent[i * W + lane]
+    Vec<T>*weight;                        // [OWN_COUNT, n]
+    Vec<T>*pair_weight, *reach;           // [pairs]
+    Vec<T>*goal_x, *goal_y, *reference_speed, *wheelbase;  // [n]
+    Vec<T>*segments;                      // [n, Q - 1, 5]: start, direction, 1 / length^2
+    Vec<T>*turn, *thrust;                 // controls [n, K]
+    std::vector<Path<T>> path;
+
+    Vec<T> own(int feature, int i) const { return weight[feature * count.agents() + i]; }
+    bool has(int feature) const { return game.own[feature] != nullptr; }
+
+    /// Lane `lane` holds items[lane * (n + 1)]: the problem, then its agents. The last item fills what is left.
+    Group(const EpoGame& game, Arena<T>& arena, Count<N> count, const int32_t* items, int filled, const T* controls)
+        : game(game), count(count), K(int(game.K)), pairs(count.agents() * (count.agents() - 1) / 2), dt(T(game.dt)), arena(arena) {
+        const int n = count.agents();
+        owners_.resize(n * W);
+        agent = owners_.data();
+        for (int lane = 0; lane < W; ++lane) {
+            const int32_t* item = items + (lane < filled ? lane : filled - 1) * (n + 1);
+            problem[lane] = item[0];
+            for (int i = 0; i < n; ++i) agent[i * W + lane] = item[1 + i];
+        }
+        turn = arena.take(n * K);
+        thrust = arena.take(n * K);
+        load(controls, turn, thrust);
+        for (int i = 0; i < n; ++i) path.push_back(new_path());
+        roll();
+    }
+
+    /// Read [B, M, N, K, 2] into [n, K] vectors.
+    void load(const T* from, Vec<T>* turns, Vec<T>* thrusts) const {
+        for (int i = 0; i < count.agents(); ++i)
+            for (int lane = 0; lane < W; ++lane) {
+                const T* row = from + row_of(i, lane) * K * 2;
+                for (int k = 0; k < K; ++k) {
+                    thrusts[i * K + k][lane] = row[2 * k];
+                    turns[i * K + k][lane] = row[2 * k + 1];
+                }
+            }
+    }
+
+    /// Write [n, K] vectors of the first lanes, where `chosen`, to [B, M, N, K, 2].
+    template <class Chosen>
+    void store(const Vec<T>* turns, const Vec<T>* thrusts, int filled, T* to, const Chosen& chosen) const {
+        for (int i = 0; i < count.agents(); ++i)
+            for (int lane = 0; lane < filled; ++lane) {
+                if (!chosen(lane)) continue;
+                T* row = to + row_of(i, lane) * K * 2;
+                for (int k = 0; k < K; ++k) {
+                    row[2 * k] = thrusts[i * K + k][lane];
+                    row[2 * k + 1] = turns[i * K + k][lane];
+                }
+            }
+    }
+
+    int64_t row_of(int i, int lane) const { return int64_t(problem[lane]) * game.N + agent[i * W + lane]; }
+
+    Path<T> new_path() const {
+        const int steps = K + 1;
+        return {arena.take(steps), arena.take(steps), arena.take(steps), arena.take(steps), arena.take(steps), arena.take(steps)};
+    }
+
+    Tangent<T> new_tangent(Vec<T>* turns, Vec<T>* thrusts) const {
+        const int steps = K + 1;
+        return {turns, thrusts, arena.take(steps), arena.take(steps), arena.take(steps), arena.take(steps)};
+    }
+
+    void roll() {
+        for (int i = 0; i < count.agents(); ++i) {
+            Path<T>& p = path[i];
+            for (int lane = 0; lane < W; ++lane) {
+                const T* start = static_cast<const T*>(game.initial) + (problem[lane] / game.M) * game.initial_b + agent[i * W + lane] * game.initial_n;
+                p.x[0][lane] = start[0];
+                p.y[0][lane] = start[1];
+                p.heading[0][lane] = start[2];
+                p.speed[0][lane] = start[3];
+            }
+            for (int k = 0; k < K; ++k) {
+                sincos<T>(p.heading[k], p.sine[k], p.cosine[k]);
+                p.x[k + 1] = p.x[k] + dt * p.speed[k] * p.cosine[k];
+                p.y[k + 1] = p.y[k] + dt * p.speed[k] * p.sine[k];
+                p.heading[k + 1] = p.heading[k] + dt * turn[i * K + k];
+                p.speed[k + 1] = p.speed[k] + dt * thrust[i * K + k];
+            }
+        }
+    }
+
+    /// How agent i moves along a direction, and the matrix Z of step k.
+    void roll_tangent(int i, const Tangent<T>& t) const {
+        const Path<T>& p = path[i];
+        t.heading[0] = t.speed[0] = t.x[0] = t.y[0] = Vec<T>{};
+        for (int k = 0; k < K; ++k) {
+            const Vec<T> across = p.speed[k] * t.heading[k];
+            t.x[k + 1] = t.x[k] + dt * (t.speed[k] * p.cosine[k] - across * p.sine[k]);
+            t.y[k + 1] = t.y[k] + dt * (t.speed[k] * p.sine[k] + across * p.cosine[k]);
+            t.heading[k + 1] = t.heading[k] + dt * t.turn[k];
+            t.speed[k + 1] = t.speed[k] + dt * t.thrust[k];
+        }
+    }
+
+    void motions(int k, Motion<T>* Z) const {
+        for (int i = 0; i < count.agents(); ++i) {
+            const Path<T>& p = path[i];
+            const Vec<T> along = dt * p.speed[k];
+            Z[i] = {-along * p.sine[k], along * p.cosine[k], dt * p.cosine[k], dt * p.sine[k]};
+        }
+    }
+
+    /// Nearest point of agent i's reference line, and the direction in which it slides (zero at the line's corners).
+    template <bool SLIDES>
+    INLINE void foot(int i, Vec<T> x, Vec<T> y, Vec<T>& foot_x, Vec<T>& foot_y, Vec<T>& slide_x, Vec<T>& slide_y) const {
+        const int parts = int(game.points) - 1;
+        const Vec<T> zero{}, one = splat<T>(1);
+        const Vec<T>* s = segments + i * parts * 5;
+        Vec<T> best = splat<T>(T(INFINITY)), inside = zero;
+        foot_x = s[0];
+        foot_y = s[1];
+        slide_x = slide_y = zero;
+        for (int part = 0; part < parts; ++part, s += 5) {
+            const Vec<T> raw = ((x - s[0]) * s[2] + (y - s[1]) * s[3]) * s[4];
+            const Vec<T> along = raw > zero ? (raw < one ? raw : one) : zero;
+            const Vec<T> at_x = s[0] + along * s[2], at_y = s[1] + along * s[3];
+            const Vec<T> dx = x - at_x, dy = y - at_y, squared = dx * dx + dy * dy;
+            const Mask<T> nearer = squared < best;
+            best = nearer ? squared : best;
+            foot_x = nearer ? at_x : foot_x;
+            foot_y = nearer ? at_y : foot_y;
+            if (SLIDES) {
+                inside = nearer ? (along == raw ? s[4] : zero) : inside;
+                slide_x = nearer ? s[2] : slide_x;
+                slide_y = nearer ? s[3] : slide_y;
+            }
+        }
+        if (SLIDES) {
+            const Vec<T> scale = root<T>(inside);
+            slide_x *= scale;
+            slide_y *= scale;
+        }
+    }
+
+    bool pairs_count_at(int state) const { return game.pair != nullptr && state % game.pair_stride == 0; }
+
+    INLINE Vec<T> rate(const Vec<T>* control, int k) const { return (control[k] - control[k - 1]) * (T(1) / dt); }
+
+    INLINE Model<T> control_model(int channel, int i, int k) const {
+        Model<T> model;
+        const Vec<T> value = channel ? turn[i * K + k] : thrust[i * K + k];
+        const int plain = channel ? TURNR : ACC, bounded = channel ? TURNRB : ACCB;
+        if (has(plain)) model.add(own(plain, i), value);
+        if (has(bounded)) model.add_bounded(own(bounded, i), value, game.bounds[channel ? BOUND_TURNR : BOUND_ACC]);
+        return model;
+    }
+
+    INLINE Model<T> rate_model(int channel, int i, int k) const {
+        Model<T> model;
+        const int plain = channel ? TURNACC : JERK, bounded = channel ? TURNACCB : JERKB;
+        if (k > 0) {
+            const Vec<T> value = rate((channel ? turn : thrust) + i * K, k);
+            if (has(plain)) model.add(own(plain, i), value);
+            if (has(bounded)) model.add_bounded(own(bounded, i), value, game.bounds[channel ? BOUND_TURNACC : BOUND_JERK]);
+        }
+        model.pull *= T(1) / dt;
+        model.stiffness *= T(1) / (dt * dt);
+        return model;
+    }
+
+    INLINE Model<T> speed_model(int i, int state) const {
+        Model<T> model;
+        const Vec<T> value = path[i].speed[state];
+        if (has(VEL)) model.add(own(VEL, i), value);
+        if (has(VELREF)) model.add(own(VELREF, i), value - reference_speed[i]);
+        if (has(VELB)) model.add_bounded(own(VELB, i), value, game.bounds[BOUND_VEL]);
+        return model;
+    }
+
+    /// Weights, goals, lines and radii: what features need, and a bare rollout does not.
+    void load_parameters() {
+        const int n = count.agents(), Q = int(game.points);
+        weight = arena.take(OWN_COUNT * n);
+        for (int f = 0; f < OWN_COUNT; ++f) {
+            if (!game.own[f]) continue;
+            for (int i = 0; i < n; ++i)
+                for (int lane = 0; lane < W; ++lane) {
+                    const int64_t b = problem[lane] / game.M, m = problem[lane] % game.M;
+                    weight[f * n + i][lane] = static_cast<const T*>(
+                        game.own[f])[b * game.own_b[f] + m * game.own_m[f] + agent[i * W + lane] * game.own_n[f]];
+                }
+        }
+        goal_x = arena.take(n);
+        goal_y = arena.take(n);
+        reference_speed = arena.take(n);
+        wheelbase = arena.take(n);
+        pair_weight = arena.take(pairs);
+        reach = arena.take(pairs);
+        segments = arena.take(has(LANE) ? n * (Q - 1) * 5 : 0);
+        for (int lane = 0; lane < W; ++lane) {
+            const int64_t b = problem[lane] / game.M, m = problem[lane] % game.M;
+            const T* size = static_cast<const T*>(game.size);
+            for (int i = 0; i < n; ++i) {
+                const int64_t a = agent[i * W + lane], row = b * game.N + a;
+                if (has(GOAL)) {
+                    const T* goal = static_cast<const T*>(game.goals) + b * game.goals_b + m * game.goals_m + a * game.goals_n;
+                    goal_x[i][lane] = goal[0];
+                    goal_y[i][lane] = goal[game.goals_x];
+                }
+                if (has(VELREF)) reference_speed[i][lane] = static_cast<const T*>(game.reference_speed)[row];
+                if (has(STEER)) wheelbase[i][lane] = T(0.6) * size[2 * row];
+                if (has(LANE)) load_line(i, lane, row, game.reference[problem[lane] * game.N + a]);
+            }
+            if (!game.pair) continue;
+            int p = 0;
+            for (int i = 0; i < n; ++i)
+                for (int j = i + 1; j < n; ++j, ++p) {
+                    const int64_t a = agent[i * W + lane], c = agent[j * W + lane];
+                    const int64_t pair = a * game.N - a * (a + 1) / 2 + c - a - 1;  // a < c, as in the item
+                    pair_weight[p][lane] = static_cast<const T*>(game.pair)[b * game.pair_b + m * game.pair_m + pair * game.pair_p];
+                    reach[p][lane] = T(0.5) * size[2 * (b * game.N + a)] + T(0.5) * size[2 * (b * game.N + c)];
+                }
+        }
+    }
+
+  private:
+    std::vector<int> owners_;
+
+    void load_line(int i, int lane, int64_t row, int64_t line) {
+        const int parts = int(game.points) - 1;
+        const T* points = static_cast<const T*>(game.references) + (row * game.lines + line) * game.points * 2;
+        for (int part = 0; part < parts; ++part, points += 2) {
+            Vec<T>* s = segments + (i * parts + part) * 5;
+            const T dx = points[2] - points[0], dy = points[3] - points[1], squared = dx * dx + dy * dy;
+            s[0][lane] = points[0];
+            s[1][lane] = points[1];
+            s[2][lane] = dx;
+            s[3][lane] = dy;
+            s[4][lane] = squared > 0 ? T(1) / squared : T(0);
+        }
+    }
+};
+
+}  // namespace EPO_LEVEL

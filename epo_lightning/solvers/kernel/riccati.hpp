@@ -1,0 +1,250 @@
+// The damped Gauss-Newton step as a linear-quadratic problem, solved by one backward and one forward recursion over time.
+//
+// For n agents with m = 2n controls, the state holds the changes of positions p, of z = (heading, speed), and of the controls
+// c of the step before, which rates couple with the present ones:
+//
+//     p+ = p + Z z,   z+ = z + dt c,   c+ = c,   Z = dt [v e', e] per agent,   e = (cos, sin), e' = (-sin, cos).
+//
+// The transition only adds rows and columns, so a step costs the elimination of its controls and little else:
+//
+//     L L' = H_cc,   G = L^-1 H_cx,   P = H_xx - G' G.
+//
+// P is the lower triangle of a [3m, 3m] array in the order (p, z, c). L [m, m] holds reciprocals on its diagonal. The last m
+// columns of G [m, 3m] are lower triangular, because only a control's own rate couples it with the step before.
+#pragma once
+
+#include "lanes.hpp"
+
+namespace EPO_LEVEL {
+
+/// Number of agents: known when compiled where N > 0, else when run.
+template <int N>
+struct Count {
+    int dynamic;
+    INLINE int agents() const { return N ? N : dynamic; }
+    INLINE int controls() const { return 2 * agents(); }
+};
+
+/// C[R x S] -= sum_k A[k][0..R) B[k][0..S), held in registers. `at` and `bt` step from one k to the next.
+template <class T, int R, int S>
+INLINE void subtract_products(Vec<T>* C, int ldc, const Vec<T>* A, int astep, int arow, const Vec<T>* B, int bstep, int depth) {
+    Vec<T> sum[R][S];
+    for (int i = 0; i < R; ++i)
+        for (int j = 0; j < S; ++j) sum[i][j] = C[i * ldc + j];
+    for (int k = 0; k < depth; ++k) {
+        Vec<T> b[S];
+        for (int j = 0; j < S; ++j) b[j] = B[k * bstep + j];
+        for (int i = 0; i < R; ++i) {
+            const Vec<T> a = A[k * astep + i * arow];
+            for (int j = 0; j < S; ++j) sum[i][j] -= a * b[j];
+        }
+    }
+    for (int i = 0; i < R; ++i)
+        for (int j = 0; j < S; ++j) C[i * ldc + j] = sum[i][j];
+}
+
+/// Overwrite the lower triangle of H [m, m] with its Cholesky factor, reciprocals on the diagonal.
+/// Lanes of `sound` turn false where a pivot is not positive.
+template <class T, int N>
+INLINE void factorise(Count<N> count, Vec<T>* H, Mask<T>& sound) {
+    const int m = count.controls();
+    for (int j = 0; j < m; ++j) {
+        Vec<T> pivot = H[j * m + j];
+        for (int k = 0; k < j; ++k) pivot -= H[j * m + k] * H[j * m + k];
+        sound &= pivot > 0;
+        const Vec<T> inverse = T(1) / root<T>(pivot);
+        H[j * m + j] = inverse;
+        for (int i = j + 1; i < m; ++i) {
+            Vec<T> entry = H[i * m + j];
+            for (int k = 0; k < j; ++k) entry -= H[i * m + k] * H[j * m + k];
+            H[i * m + j] = entry * inverse;
+        }
+    }
+}
+
+/// X [m, columns] <- L^-1 X, two columns blocks at a time; rows in pairs, m is even.
+template <class T, int N, int S>
+INLINE void eliminate(Count<N> count, const Vec<T>* L, Vec<T>* X, int ldx) {
+    const int m = count.controls();
+    for (int r = 0; r < m; r += 2) {
+        subtract_products<T, 2, S>(X + r * ldx, ldx, L + r * m, 1, m, X, ldx, r);
+        for (int j = 0; j < S; ++j) {
+            const Vec<T> first = X[r * ldx + j] * L[r * m + r];
+            X[r * ldx + j] = first;
+            X[(r + 1) * ldx + j] = (X[(r + 1) * ldx + j] - L[(r + 1) * m + r] * first) * L[(r + 1) * m + r + 1];
+        }
+    }
+}
+
+/// Entry (i, j) of a symmetric array of which the lower triangle is kept.
+template <class T>
+INLINE Vec<T>& mirrored(Vec<T>* A, int lda, int i, int j) {
+    return i >= j ? A[i * lda + j] : A[j * lda + i];
+}
+
+/// Columns of Z for agent i at step k: motion (x, y) by heading and by speed.
+template <class T>
+struct Motion {
+    Vec<T> x_heading, y_heading, x_speed, y_speed;
+};
+
+/// H_cc, with the curvature of controls on its diagonal, out of P+ = P of the next state with its stage costs.
+template <class T, int N>
+INLINE void control_block(Count<N> count, Vec<T>* P, T dt, const Vec<T>* curvature, Vec<T>* H) {
+    const int m = count.controls(), ld = 3 * m;
+    for (int r = 0; r < m; ++r) {
+        for (int s = 0; s <= r; ++s)
+            H[r * m + s] = dt * (dt * P[(m + r) * ld + m + s] + P[(2 * m + r) * ld + m + s] + P[(2 * m + s) * ld + m + r]) +
+                           P[(2 * m + r) * ld + 2 * m + s];
+        H[r * m + r] += curvature[r];
+    }
+}
+
+/// P <- A' P A, except for the controls' part, and G <- H_cx before its elimination.
+/// `coupling` [n] couples turn rates with their agents' speeds; `rates` [m] couples controls with those before.
+template <class T, int N>
+INLINE void transition(
+    Count<N> count, Vec<T>* P, T dt, const Motion<T>* Z, const Vec<T>* coupling, const Vec<T>* rates, Vec<T>* G) {
+    const int n = count.agents(), m = count.controls(), ld = 3 * m;
+    for (int r = 0; r < m; ++r) {
+        Vec<T>* row = G + r * ld;
+        for (int j = 0; j < m; ++j) row[j] = dt * P[(m + r) * ld + j] + P[(2 * m + r) * ld + j];
+        for (int a = 0; a < n; ++a) {
+            const Vec<T> by_x = row[2 * a], by_y = row[2 * a + 1];
+            const int h = m + 2 * a, v = h + 1;
+            row[h] = dt * mirrored<T>(P, ld, m + r, h) + P[(2 * m + r) * ld + h] + by_x * Z[a].x_heading + by_y * Z[a].y_heading;
+            row[v] = dt * mirrored<T>(P, ld, m + r, v) + P[(2 * m + r) * ld + v] + by_x * Z[a].x_speed + by_y * Z[a].y_speed;
+        }
+        for (int j = 2 * m; j < ld; ++j) row[j] = Vec<T>{};
+        row[2 * m + r] = -rates[r];
+    }
+    for (int a = 0; a < n; ++a) G[2 * a * ld + m + 2 * a + 1] += coupling[a];
+    // Rows z of P, all columns p first: H_zp = P_zp + Z' P_pp; then H_zz = P_zz + Z' P_pz + H_zp Z with the old P_zp.
+    for (int a = 0; a < n; ++a) {
+        Vec<T>* heading = P + (m + 2 * a) * ld;
+        Vec<T>* speed = heading + ld;
+        for (int b = 0; b <= a; ++b) {
+            // Z' P_pz: column block b of rows z needs the old P_zp of agent b against positions of agent a.
+            const Vec<T>* heading_b = P + (m + 2 * b) * ld + 2 * a;
+            const Vec<T>* speed_b = heading_b + ld;
+            heading[m + 2 * b] += Z[a].x_heading * heading_b[0] + Z[a].y_heading * heading_b[1];
+            speed[m + 2 * b] += Z[a].x_speed * heading_b[0] + Z[a].y_speed * heading_b[1];
+            speed[m + 2 * b + 1] += Z[a].x_speed * speed_b[0] + Z[a].y_speed * speed_b[1];
+            if (b < a) heading[m + 2 * b + 1] += Z[a].x_heading * speed_b[0] + Z[a].y_heading * speed_b[1];
+        }
+    }
+    for (int a = 0; a < n; ++a) {
+        Vec<T>* heading = P + (m + 2 * a) * ld;
+        Vec<T>* speed = heading + ld;
+        for (int j = 0; j < m; ++j) {
+            const Vec<T> x = mirrored<T>(P, ld, 2 * a, j), y = mirrored<T>(P, ld, 2 * a + 1, j);
+            heading[j] += Z[a].x_heading * x + Z[a].y_heading * y;
+            speed[j] += Z[a].x_speed * x + Z[a].y_speed * y;
+        }
+        for (int b = 0; b <= a; ++b) {
+            heading[m + 2 * b] += heading[2 * b] * Z[b].x_heading + heading[2 * b + 1] * Z[b].y_heading;
+            speed[m + 2 * b] += speed[2 * b] * Z[b].x_heading + speed[2 * b + 1] * Z[b].y_heading;
+            speed[m + 2 * b + 1] += speed[2 * b] * Z[b].x_speed + speed[2 * b + 1] * Z[b].y_speed;
+            if (b < a) heading[m + 2 * b + 1] += heading[2 * b] * Z[b].x_speed + heading[2 * b + 1] * Z[b].y_speed;
+        }
+    }
+    for (int r = 0; r < m; ++r) {
+        Vec<T>* row = P + (2 * m + r) * ld;
+        for (int j = 0; j < 2 * m + r; ++j) row[j] = Vec<T>{};
+        row[2 * m + r] = rates[r];
+    }
+}
+
+/// Columns [from, from + S) of P -= G' G, from the diagonal down.
+template <class T, int N, int S>
+INLINE void subtract_square(Count<N> count, Vec<T>* P, const Vec<T>* G, int from) {
+    const int m = count.controls(), ld = 3 * m;
+    int i = from;
+    // G's last columns are lower triangular: rows above the diagonal are zero.
+    for (; i + 4 <= ld; i += 4) {
+        const int top = i >= 2 * m ? i - 2 * m : 0;
+        subtract_products<T, 4, S>(P + i * ld + from, ld, G + top * ld + i, ld, 1, G + top * ld + from, ld, m - top);
+    }
+    for (; i + 2 <= ld; i += 2) {
+        const int top = i >= 2 * m ? i - 2 * m : 0;
+        subtract_products<T, 2, S>(P + i * ld + from, ld, G + top * ld + i, ld, 1, G + top * ld + from, ld, m - top);
+    }
+}
+
+/// G <- L^-1 G and P <- P - G' G.
+template <class T, int N>
+INLINE void eliminate_controls(Count<N> count, const Vec<T>* L, Vec<T>* G, Vec<T>* P) {
+    const int m = count.controls(), ld = 3 * m;
+    int j = 0;
+    for (; j + 8 <= 2 * m; j += 8) eliminate<T, N, 8>(count, L, G + j, ld);
+    for (; j + 4 <= 2 * m; j += 4) eliminate<T, N, 4>(count, L, G + j, ld);
+    for (int c = 0; c < m; ++c) {
+        Vec<T>* column = G + 2 * m + c;
+        column[c * ld] *= L[c * m + c];
+        for (int r = c + 1; r < m; ++r) {
+            Vec<T> entry{};
+            for (int k = c; k < r; ++k) entry -= L[r * m + k] * column[k * ld];
+            column[r * ld] = entry * L[r * m + r];
+        }
+    }
+    int from = 0;
+    for (; from + 4 <= ld; from += 4) subtract_square<T, N, 4>(count, P, G, from);
+    for (; from + 2 <= ld; from += 2) subtract_square<T, N, 2>(count, P, G, from);
+}
+
+/// One step back of the linear terms: y of the next state, with its stage costs, and h of the controls, to y of this state.
+/// `h` becomes L^-1 h, which the way forward needs; `first` is the step whose state is given.
+template <class T, int N>
+INLINE void pull_linear(
+    Count<N> count, const Vec<T>* L, const Vec<T>* G, T dt, const Motion<T>* Z, bool first, Vec<T>* y, Vec<T>* h) {
+    const int n = count.agents(), m = count.controls(), ld = 3 * m;
+    for (int r = 0; r < m; ++r) {
+        Vec<T> entry = h[r] + dt * y[m + r] + y[2 * m + r];
+        for (int k = 0; k < r; ++k) entry -= L[r * m + k] * h[k];
+        h[r] = entry * L[r * m + r];
+    }
+    if (first) return;
+    for (int a = 0; a < n; ++a) {
+        y[m + 2 * a] += Z[a].x_heading * y[2 * a] + Z[a].y_heading * y[2 * a + 1];
+        y[m + 2 * a + 1] += Z[a].x_speed * y[2 * a] + Z[a].y_speed * y[2 * a + 1];
+    }
+    for (int j = 2 * m; j < ld; ++j) y[j] = Vec<T>{};
+    int j = 0;
+    for (; j < 2 * m; j += 4) subtract_products<T, 1, 4>(y + j, 0, h, 1, 0, G + j, ld, m);
+    for (; j < ld; ++j)
+        for (int r = j - 2 * m; r < m; ++r) y[j] -= G[r * ld + j] * h[r];
+}
+
+/// One step forward: the change of the controls, -L^-T (h + G x), written to `c`, and the state that follows.
+template <class T, int N>
+INLINE void push_state(
+    Count<N> count, const Vec<T>* L, const Vec<T>* G, T dt, const Motion<T>* Z, bool first, const Vec<T>* h, Vec<T>* x, Vec<T>* c) {
+    const int n = count.agents(), m = count.controls(), ld = 3 * m;
+    for (int r = 0; r < m; ++r) {
+        Vec<T> entry = h[r], other{};
+        if (!first) {
+            for (int j = 0; j < 2 * m; j += 2) {
+                entry += G[r * ld + j] * x[j];
+                other += G[r * ld + j + 1] * x[j + 1];
+            }
+            for (int j = 2 * m; j <= 2 * m + r; ++j) entry += G[r * ld + j] * x[j];
+        }
+        c[r] = -(entry + other);
+    }
+    for (int r = m - 1; r >= 0; --r) {
+        Vec<T> entry = c[r];
+        for (int k = r + 1; k < m; ++k) entry -= L[k * m + r] * c[k];
+        c[r] = entry * L[r * m + r];
+    }
+    for (int a = 0; a < n; ++a) {
+        const Vec<T> heading = x[m + 2 * a], speed = x[m + 2 * a + 1];
+        x[2 * a] += Z[a].x_heading * heading + Z[a].x_speed * speed;
+        x[2 * a + 1] += Z[a].y_heading * heading + Z[a].y_speed * speed;
+    }
+    for (int r = 0; r < m; ++r) {
+        x[m + r] += dt * c[r];
+        x[2 * m + r] = c[r];
+    }
+}
+
+}  // namespace EPO_LEVEL

@@ -1,0 +1,399 @@
+// S steps for a range of problems, and their adjoint. Compiled once for every level of instructions; see dispatch.cpp.
+//
+// Each step splits every problem into groups of agents that presently touch each other (the connected components of the graph
+// of active pairs), because only those share a factorisation; groups of one size are solved side by side, a lane each.
+
+#include <algorithm>
+#include <cstring>
+#include <memory>
+
+#include "step.hpp"
+
+namespace EPO_LEVEL {
+namespace {
+
+/// Groups of touching agents by size: items[n] holds rows of the problem and its n agents, in ascending order.
+struct Plan {
+    std::vector<std::vector<int32_t>> items;
+    int64_t groups(int n, int lanes) const { return (int64_t(items[n].size()) / (n + 1) + lanes - 1) / lanes; }
+};
+
+/// Which agents of W problems touch each other: bit j of touching[i * W + lane].
+template <class T>
+void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, const T* controls, uint64_t* touching) {
+    constexpr int W = Lanes<T>::W;
+    const int N = int(game.N), K = int(game.K);
+    // Only states at which pairs count are kept.
+    const int stride = int(game.pair_stride), kept = K / stride;
+    Vec<T>*x = arena.take(N * kept), *y = arena.take(N * kept), *box = arena.take(4 * N), *radius = arena.take(N);
+    const T dt = T(game.dt);
+    Mask<T>* present = reinterpret_cast<Mask<T>*>(arena.take(N));
+    for (int i = 0; i < N; ++i) {
+        Vec<T> px, py, heading, speed;
+        const T* rows[W];
+        for (int lane = 0; lane < W; ++lane) {
+            const int64_t b = problems[lane] / game.M;
+            const T* start = static_cast<const T*>(game.initial) + b * game.initial_b + i * game.initial_n;
+            px[lane] = start[0];
+            py[lane] = start[1];
+            heading[lane] = start[2];
+            speed[lane] = start[3];
+            radius[i][lane] = T(0.5) * static_cast<const T*>(game.size)[2 * (b * N + i)];
+            present[i][lane] = game.present[b * N + i] ? -1 : 0;
+            rows[lane] = controls + (int64_t(problems[lane]) * N + i) * K * 2;
+        }
+        Vec<T>*low_x = box + 4 * i, *low_y = low_x + 1, *high_x = low_x + 2, *high_y = low_x + 3;
+        *low_x = *low_y = splat<T>(T(INFINITY));
+        *high_x = *high_y = splat<T>(-T(INFINITY));
+        for (int k = 0; k < K; ++k) {
+            Vec<T> sine, cosine, thrust, turn;
+            for (int lane = 0; lane < W; ++lane) thrust[lane] = rows[lane][2 * k], turn[lane] = rows[lane][2 * k + 1];
+            sincos<T>(heading, sine, cosine);
+            px += dt * speed * cosine;
+            py += dt * speed * sine;
+            heading += dt * turn;
+            speed += dt * thrust;
+            if ((k + 1) % stride) continue;
+            const int at = i * kept + (k + 1) / stride - 1;
+            x[at] = px;
+            y[at] = py;
+            *low_x = least<T>(*low_x, px);
+            *low_y = least<T>(*low_y, py);
+            *high_x = most<T>(*high_x, px);
+            *high_y = most<T>(*high_y, py);
+        }
+    }
+    std::memset(touching, 0, sizeof(uint64_t) * N * W);
+    int pair = 0;
+    for (int i = 0; i < N; ++i)
+        for (int j = i + 1; j < N; ++j, ++pair) {
+            const Vec<T> reach = radius[i] + radius[j], *a = box + 4 * i, *c = box + 4 * j;
+            const Mask<T> near = present[i] && present[j] && a[0] - c[2] < reach && c[0] - a[2] < reach &&
+                                 a[1] - c[3] < reach && c[1] - a[3] < reach;
+            if (!any<T>(near)) continue;
+            const Vec<T> squared = reach * reach;
+            Mask<T> touch{};
+            for (int k = 0; k < kept; ++k) {
+                const Vec<T> dx = x[i * kept + k] - x[j * kept + k], dy = y[i * kept + k] - y[j * kept + k];
+                touch |= dx * dx + dy * dy < squared;
+            }
+            touch &= near;
+            for (int lane = 0; lane < W; ++lane) {
+                if (!touch[lane]) continue;
+                const int64_t b = problems[lane] / game.M, m = problems[lane] % game.M;
+                if (static_cast<const T*>(game.pair)[b * game.pair_b + m * game.pair_m + pair * game.pair_p] == 0) continue;
+                touching[i * W + lane] |= uint64_t(1) << j;
+                touching[j * W + lane] |= uint64_t(1) << i;
+            }
+        }
+}
+
+template <class T>
+Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last, const T* controls) {
+    constexpr int W = Lanes<T>::W;
+    const int N = int(game.N);
+    Plan plan;
+    plan.items.resize(N + 1);
+    std::vector<uint64_t> touching(std::size_t(N) * W, 0);
+    for (int64_t start = first; start < last; start += W) {
+        const int filled = int(std::min<int64_t>(W, last - start));
+        if (game.pair) {
+            int problems[W];
+            for (int lane = 0; lane < W; ++lane) problems[lane] = int(start + std::min(lane, filled - 1));
+            arena.clear();
+            find_contacts<T>(game, arena, problems, controls, touching.data());
+        }
+        for (int lane = 0; lane < filled; ++lane) {
+            uint64_t left = 0;
+            for (int i = 0; i < N; ++i) left |= uint64_t(game.present[(start + lane) / game.M * N + i] != 0) << i;
+            while (left) {
+                uint64_t group = left & -left, border = group;
+                while (border) {
+                    const int i = __builtin_ctzll(border);
+                    border &= border - 1;
+                    const uint64_t fresh = touching[std::size_t(i) * W + lane] & ~group;
+                    group |= fresh;
+                    border |= fresh;
+                }
+                left &= ~group;
+                auto& items = plan.items[__builtin_popcountll(group)];
+                items.push_back(int32_t(start + lane));
+                for (uint64_t rest = group; rest; rest &= rest - 1) items.push_back(__builtin_ctzll(rest));
+            }
+        }
+    }
+    return plan;
+}
+
+/// What one step leaves for its adjoint.
+template <class T>
+struct StepTape {
+    Plan plan;
+    std::vector<Buffer<T>> factors;  // by group size, group after group
+    std::vector<char> sound;                         // by problem of the range
+};
+
+template <class T>
+struct Tape {
+    int64_t first, last;
+    std::vector<StepTape<T>> steps;
+};
+
+/// Calls `body(Group, group's index, items, lanes in use)` for every group of a plan, with the size known when compiled up to 4.
+template <class T, class Body>
+void for_each_group(const EpoGame& game, Arena<T>& arena, const Plan& plan, const T* controls, const Body& body) {
+    constexpr int W = Lanes<T>::W;
+    for (int n = 1; n < int(plan.items.size()); ++n) {
+        const auto& items = plan.items[n];
+        const int64_t count = int64_t(items.size()) / (n + 1);
+        for (int64_t start = 0; start < count; start += W) {
+            const int32_t* rows = items.data() + start * (n + 1);
+            const int filled = int(std::min<int64_t>(W, count - start));
+            arena.clear();
+            const auto call = [&](auto size) {
+                using Size = decltype(size);
+                auto group = Group<T, Size::value>(game, arena, Count<Size::value>{n}, rows, filled, controls);
+                body(group, start / W, filled);
+            };
+            switch (n) {
+                case 1: call(std::integral_constant<int, 1>{}); break;
+                case 2: call(std::integral_constant<int, 2>{}); break;
+                case 3: call(std::integral_constant<int, 3>{}); break;
+                case 4: call(std::integral_constant<int, 4>{}); break;
+                default: call(std::integral_constant<int, 0>{});
+            }
+        }
+    }
+}
+
+template <class T>
+INLINE bool finite(T value) {
+    return value - value == 0;
+}
+
+constexpr int kRetries = 4;            // how often the damping of a group without factors is raised tenfold
+constexpr double kLeastRaised = 1e-3;  // where raising starts from when the damping is smaller
+
+template <class T>
+std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t first, int64_t last) {
+    constexpr int W = Lanes<T>::W;
+    const int64_t row = game.K * 2, size = game.N * row;
+    const bool record = run.record != 0;
+    auto tape = std::make_unique<Tape<T>>(Tape<T>{first, last, {}});
+    T* const energies[2] = {static_cast<T*>(run.initial_energy), static_cast<T*>(run.energy)};
+    T* const norm = static_cast<T*>(run.gradient_norm);
+    Arena<T> arena;
+    std::vector<Buffer<T>> reused(game.N + 1);
+    std::fill(run.status + first, run.status + last, 0);
+    for (int64_t problem = first; problem < last; ++problem)
+        for (int64_t i = 0; i < game.N; ++i) {
+            const T* from = static_cast<const T*>(run.start) + problem * size + i * row;
+            T* to = static_cast<T*>(run.iterates) + problem * size + i * row;
+            if (game.present[problem / game.M * game.N + i])
+                std::copy(from, from + row, to);
+            else
+                std::fill(to, to + row, T(0));
+        }
+    for (int64_t s = 0; s < run.steps; ++s) {
+        T* const controls = static_cast<T*>(run.iterates) + s * run.iterate_stride;
+        T* const next = controls + run.iterate_stride;
+        T* const directions = static_cast<T*>(run.directions) + (record ? s * game.B * game.M * size : 0);
+        StepTape<T> step;
+        step.plan = make_plan<T>(game, arena, first, last, controls);
+        step.factors.resize(game.N + 1);
+        step.sound.assign(last - first, 1);
+        for (int n = 1; n <= game.N; ++n) {
+            const std::size_t groups = step.plan.groups(n, W);
+            if (groups && (record || !reused[n]))
+                (record ? step.factors : reused)[n] = Buffer<T>((record ? groups : 1) * Factors<T>::size(n, game.K));
+        }
+        if (s == 0) std::fill(energies[0] + first, energies[0] + last, T(0));
+        for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
+            group.load_parameters();
+            const int n = group.count.agents();
+            Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game.K) : reused[n].data();
+            const auto factors = Factors<T>::at(memory, n, game.K);
+            Vec<T>*turn = arena.take(n * game.K), *thrust = arena.take(n * game.K), energy, given;
+            for (int lane = 0; lane < W; ++lane) given[lane] = static_cast<const T*>(run.damping)[group.problem[lane]];
+            Vec<T> damping = given, raised = most<T>(given, splat<T>(T(kLeastRaised)));
+            Mask<T> sound, failed{};
+            for (int attempt = 0;; ++attempt) {
+                solve_step(group, damping, factors, turn, thrust, energy, sound);
+                if (attempt == kRetries || !any<T>(~sound)) break;
+                failed |= ~sound;
+                raised *= T(10);
+                damping = sound ? damping : given + raised;
+            }
+            for (int lane = 0; lane < filled; ++lane) {
+                const int problem = group.problem[lane];
+                if (failed[lane]) run.status[problem] = std::max<int64_t>(run.status[problem], 1);
+                if (!sound[lane]) step.sound[problem - first] = 0;
+                if (s == 0) energies[0][problem] += energy[lane];
+            }
+            group.store(turn, thrust, filled, directions, [](int) { return true; });
+        });
+        for (int64_t problem = first; problem < last; ++problem) {
+            T *d = directions + problem * size, *from = controls + problem * size, *to = next + problem * size;
+            const T alpha = T(run.step_size);
+            // Absent agents have no direction: nobody stored one.
+            const uint8_t* present = game.present + problem / game.M * game.N;
+            for (int64_t i = 0; i < game.N; ++i)
+                if (!present[i]) std::fill(d + i * row, d + (i + 1) * row, T(0));
+            bool sound = step.sound[problem - first];
+            for (int64_t e = 0; e < size; ++e) sound &= finite(from[e] + alpha * d[e]);
+            step.sound[problem - first] = sound;
+            if (!sound) run.status[problem] = 2;
+            for (int64_t e = 0; e < size; ++e) to[e] = sound ? from[e] + alpha * d[e] : from[e];
+        }
+        if (record) tape->steps.push_back(std::move(step));
+    }
+    T* const controls = static_cast<T*>(run.iterates) + run.steps * run.iterate_stride;
+    std::fill(energies[1] + first, energies[1] + last, T(0));
+    std::fill(norm + first, norm + last, T(0));
+    std::memset(static_cast<T*>(run.states) + first * size * 2, 0, sizeof(T) * (last - first) * size * 2);
+    for_each_group<T>(game, arena, make_plan<T>(game, arena, first, last, controls), controls, [&](auto& group, int64_t, int filled) {
+        group.load_parameters();
+        Vec<T> energy, squared;
+        evaluate(group, energy, squared);
+        for (int lane = 0; lane < filled; ++lane) {
+            energies[1][group.problem[lane]] += energy[lane];
+            norm[group.problem[lane]] += squared[lane];
+            for (int i = 0; i < group.count.agents(); ++i) {
+                T* states = static_cast<T*>(run.states) + group.row_of(i, lane) * game.K * 4;
+                const auto& path = group.path[i];
+                for (int k = 1; k <= game.K; ++k, states += 4) {
+                    states[0] = path.x[k][lane];
+                    states[1] = path.y[k][lane];
+                    states[2] = path.heading[k][lane];
+                    states[3] = path.speed[k][lane];
+                }
+            }
+        }
+    });
+    for (int64_t problem = first; problem < last; ++problem) norm[problem] = std::sqrt(norm[problem]);
+    if (run.steps == 0) std::copy(energies[1] + first, energies[1] + last, energies[0] + first);
+    return record ? std::move(tape) : nullptr;
+}
+
+/// Adds to the cotangent of the controls what a cotangent of the states x_1 .. x_K makes of it.
+template <class T>
+void pull_states(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last, const T* controls, const T* states, T* bar) {
+    Plan single;
+    single.items.resize(2);
+    for (int64_t problem = first; problem < last; ++problem)
+        for (int64_t i = 0; i < game.N; ++i)
+            if (game.present[problem / game.M * game.N + i]) single.items[1].insert(single.items[1].end(), {int32_t(problem), int32_t(i)});
+    for_each_group<T>(game, arena, single, controls, [&](auto& group, int64_t, int filled) {
+        const int K = group.K;
+        const auto& path = group.path[0];
+        Vec<T>*turn = arena.take(K), *thrust = arena.take(K), x{}, y{}, heading{}, speed{};
+        group.load(bar, turn, thrust);
+        for (int k = K - 1; k >= 0; --k) {
+            const Vec<T> c = path.cosine[k + 1], s = path.sine[k + 1];
+            if (k + 1 < K) {
+                heading += group.dt * path.speed[k + 1] * (c * y - s * x);
+                speed += group.dt * (c * x + s * y);
+            }
+            for (int lane = 0; lane < Lanes<T>::W; ++lane) {
+                const T* given = states + (group.row_of(0, lane) * K + k) * 4;
+                x[lane] += given[0];
+                y[lane] += given[1];
+                heading[lane] += given[2];
+                speed[lane] += given[3];
+            }
+            turn[k] += group.dt * heading;
+            thrust[k] += group.dt * speed;
+        }
+        group.store(turn, thrust, filled, bar, [](int) { return true; });
+    });
+}
+
+/// The adjoint of `solve`: from the last step to the first.
+template <class T>
+void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& run, const EpoGradients& gradients) {
+    const int64_t first = tape.first, last = tape.last, size = game.N * game.K * 2, all = game.B * game.M * size;
+    const int64_t P = game.N * (game.N - 1) / 2;
+    T* const bar = static_cast<T*>(gradients.controls);
+    Arena<T> arena;
+    const auto add_iterate = [&](int64_t s) {
+        if (!gradients.iterates) return;
+        const T* given = static_cast<const T*>(gradients.iterates) + s * all;
+        for (int64_t e = first * size; e < last * size; ++e) bar[e] += given[e];
+    };
+    if (gradients.states)
+        pull_states<T>(
+            game, arena, first, last, static_cast<const T*>(run.iterates) + run.steps * run.iterate_stride,
+            static_cast<const T*>(gradients.states), bar);
+    add_iterate(run.steps);
+    for (int64_t s = run.steps - 1; s >= 0; --s) {
+        const StepTape<T>& step = tape.steps[s];
+        const T* controls = static_cast<const T*>(run.iterates) + s * run.iterate_stride;
+        for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
+            group.load_parameters();
+            const int n = group.count.agents(), K = group.K;
+            const auto factors = Factors<T>::at(step.factors[n].data() + index * Factors<T>::size(n, K), n, K);
+            Vec<T>*bar_turn = arena.take(n * K), *bar_thrust = arena.take(n * K);
+            Vec<T>*mu_turn = arena.take(n * K), *mu_thrust = arena.take(n * K);
+            Vec<T>*d_turn = arena.take(n * K), *d_thrust = arena.take(n * K);
+            group.load(bar, bar_turn, bar_thrust);
+            group.load(static_cast<const T*>(run.directions) + s * all, d_turn, d_thrust);
+            for (int e = 0; e < n * K; ++e) {
+                mu_turn[e] = T(run.step_size) * bar_turn[e];
+                mu_thrust[e] = T(run.step_size) * bar_thrust[e];
+            }
+            solve_adjoint(group, factors, mu_turn, mu_thrust);
+            const ParameterGradients<T> by{arena.take(OWN_COUNT * n), arena.take(group.pairs), arena.take(n), arena.take(n)};
+            for (int e = 0; e < OWN_COUNT * n; ++e) by.own[e] = Vec<T>{};
+            for (int e = 0; e < group.pairs; ++e) by.pair[e] = Vec<T>{};
+            for (int e = 0; e < n; ++e) by.goal_x[e] = by.goal_y[e] = Vec<T>{};
+            differentiate(group, mu_turn, mu_thrust, d_turn, d_thrust, bar_turn, bar_thrust, by);
+            // A step that was not taken passes its cotangent on as it is.
+            const auto taken = [&](int lane) { return step.sound[group.problem[lane] - first] != 0; };
+            group.store(bar_turn, bar_thrust, filled, bar, taken);
+            for (int lane = 0; lane < filled; ++lane) {
+                if (!taken(lane)) continue;
+                int pair = 0;
+                for (int i = 0; i < n; ++i) {
+                    const int64_t row = group.row_of(i, lane);
+                    for (int f = 0; f < OWN_COUNT; ++f)
+                        if (game.own[f]) static_cast<T*>(gradients.own[f])[row] += by.own[f * n + i][lane];
+                    if (game.own[GOAL]) {
+                        static_cast<T*>(gradients.goals)[2 * row] += by.goal_x[i][lane];
+                        static_cast<T*>(gradients.goals)[2 * row + 1] += by.goal_y[i][lane];
+                    }
+                    for (int j = i + 1; game.pair && j < n; ++j, ++pair) {
+                        const int64_t a = group.agent[i * Lanes<T>::W + lane], c = group.agent[j * Lanes<T>::W + lane];
+                        static_cast<T*>(gradients.pair)[group.problem[lane] * P + a * game.N - a * (a + 1) / 2 + c - a - 1] +=
+                            by.pair[pair][lane];
+                    }
+                }
+            }
+        });
+        add_iterate(s);
+    }
+}
+
+}  // namespace
+
+const EpoLevel& level() {
+    static const EpoLevel functions = {
+        [](const EpoGame* game, const EpoRun* run, int64_t first, int64_t last) -> void* {
+            return solve<float>(*game, *run, first, last).release();
+        },
+        [](const EpoGame* game, const EpoRun* run, int64_t first, int64_t last) -> void* {
+            return solve<double>(*game, *run, first, last).release();
+        },
+        [](const void* tape, const EpoGame* game, const EpoRun* run, const EpoGradients* gradients) {
+            differentiate_all(*static_cast<const Tape<float>*>(tape), *game, *run, *gradients);
+        },
+        [](const void* tape, const EpoGame* game, const EpoRun* run, const EpoGradients* gradients) {
+            differentiate_all(*static_cast<const Tape<double>*>(tape), *game, *run, *gradients);
+        },
+        [](void* tape) { delete static_cast<Tape<float>*>(tape); },
+        [](void* tape) { delete static_cast<Tape<double>*>(tape); },
+        Lanes<float>::W,
+    };
+    return functions;
+}
+
+}  // namespace EPO_LEVEL

@@ -1,0 +1,364 @@
+// One Levenberg-Marquardt step of a group, what it leaves behind for its adjoint, and that adjoint.
+#pragma once
+
+#include "group.hpp"
+
+namespace EPO_LEVEL {
+
+/// Factors of one group and step: L [K, m, m] and G [K, m, 3m], of which G[0] is never used.
+template <class T>
+struct Factors {
+    Vec<T>*L, *G;
+    static std::size_t size(int n, int64_t K) { return std::size_t(K) * (4 * n * n + 12 * n * n); }
+    static Factors at(Vec<T>* memory, int n, int64_t K) { return {memory, memory + std::size_t(K) * 4 * n * n}; }
+};
+
+/// Stage costs of state k + 1, as they enter P [3m, 3m] and y [3m] (either may be null), and their energy.
+template <class T, int N>
+INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>* y) {
+    const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
+    Vec<T> energy{};
+    for (int i = 0; i < n; ++i) {
+        const Model<T> speed = g.speed_model(i, state);
+        energy += speed.energy;
+        y[m + 2 * i + 1] += speed.pull;
+        if (P) P[(m + 2 * i + 1) * ld + m + 2 * i + 1] += speed.stiffness;
+        Model<T> in_x, in_y;
+        if (g.has(LANE)) {
+            Vec<T> at_x, at_y, slide_x, slide_y;
+            g.template foot<false>(i, g.path[i].x[state], g.path[i].y[state], at_x, at_y, slide_x, slide_y);
+            in_x.add(g.own(LANE, i), g.path[i].x[state] - at_x);
+            in_y.add(g.own(LANE, i), g.path[i].y[state] - at_y);
+        }
+        if (g.has(GOAL) && state == g.K) {
+            in_x.add(g.own(GOAL, i), g.path[i].x[state] - g.goal_x[i]);
+            in_y.add(g.own(GOAL, i), g.path[i].y[state] - g.goal_y[i]);
+        }
+        energy += in_x.energy + in_y.energy;
+        y[2 * i] += in_x.pull;
+        y[2 * i + 1] += in_y.pull;
+        if (P) {
+            P[2 * i * ld + 2 * i] += in_x.stiffness;
+            P[(2 * i + 1) * ld + 2 * i + 1] += in_y.stiffness;
+        }
+    }
+    if (!g.pairs_count_at(state)) return energy;
+    int pair = 0;
+    for (int i = 0; i < n; ++i)
+        for (int j = i + 1; j < n; ++j, ++pair) {
+            const Vec<T> dx = g.path[i].x[state] - g.path[j].x[state], dy = g.path[i].y[state] - g.path[j].y[state];
+            const Vec<T> reach = g.reach[pair];
+            if (!any<T>(dx * dx + dy * dy < reach * reach)) continue;
+            const Contact<T> contact(dx, dy, reach);
+            const Vec<T> weight = g.pair_weight[pair], pushed = weight * weight * contact.depth;
+            energy += T(0.5) * pushed * contact.depth;
+            const Vec<T> push_x = pushed * contact.x, push_y = pushed * contact.y;
+            y[2 * i] -= push_x;
+            y[2 * i + 1] -= push_y;
+            y[2 * j] += push_x;
+            y[2 * j + 1] += push_y;
+            if (!P) continue;
+            const Vec<T> nx = weight * contact.x, ny = weight * contact.y;
+            const Vec<T> xx = nx * nx, xy = nx * ny, yy = ny * ny;
+            for (const int a : {i, j}) {
+                P[2 * a * ld + 2 * a] += xx;
+                P[(2 * a + 1) * ld + 2 * a] += xy;
+                P[(2 * a + 1) * ld + 2 * a + 1] += yy;
+            }
+            P[2 * j * ld + 2 * i] -= xx;
+            P[2 * j * ld + 2 * i + 1] -= xy;
+            P[(2 * j + 1) * ld + 2 * i] -= xy;
+            P[(2 * j + 1) * ld + 2 * i + 1] -= yy;
+        }
+    return energy;
+}
+
+/// Costs of control step k: of the controls, of their change since the step before, and of steering at the speed before.
+template <class T>
+struct ControlCosts {
+    Vec<T>*pull, *rate_pull, *stiffness, *rate_stiffness;  // [m]; the first one holds both kinds of pull
+    Vec<T>*speed_pull, *speed_stiffness, *coupling;        // [n], by steering
+    Vec<T> energy;
+
+    ControlCosts(Arena<T>& arena, int n)
+        : pull(arena.take(2 * n)), rate_pull(arena.take(2 * n)), stiffness(arena.take(2 * n)), rate_stiffness(arena.take(2 * n)),
+          speed_pull(arena.take(n)), speed_stiffness(arena.take(n)), coupling(arena.take(n)) {}
+
+    template <int N>
+    INLINE void set(const Group<T, N>& g, int k) {
+        energy = Vec<T>{};
+        for (int i = 0; i < g.count.agents(); ++i) {
+            for (const int channel : {ACCELERATION, TURN_RATE}) {
+                const int r = unknown(i, channel);
+                const Model<T> control = g.control_model(channel, i, k), rate = g.rate_model(channel, i, k);
+                energy += control.energy + rate.energy;
+                pull[r] = control.pull + rate.pull;
+                rate_pull[r] = rate.pull;
+                stiffness[r] = control.stiffness + rate.stiffness;
+                rate_stiffness[r] = rate.stiffness;
+            }
+            speed_pull[i] = speed_stiffness[i] = coupling[i] = Vec<T>{};
+            if (!g.has(STEER)) continue;
+            const Steering<T> steer(g.wheelbase[i], g.turn[i * g.K + k], g.path[i].speed[k]);
+            const Vec<T> squared = g.own(STEER, i) * g.own(STEER, i), value = squared * steer.value;
+            energy += T(0.5) * value * steer.value;
+            pull[unknown(i, TURN_RATE)] += value * steer.by_turn;
+            stiffness[unknown(i, TURN_RATE)] += squared * steer.by_turn * steer.by_turn;
+            speed_pull[i] = value * steer.by_speed;
+            speed_stiffness[i] = squared * steer.by_speed * steer.by_speed;
+            coupling[i] = squared * steer.by_turn * steer.by_speed;
+        }
+    }
+};
+
+/// The way forward: from L^-1 h [K, m] to the direction [n, K].
+template <class T, int N>
+INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* h, Vec<T>* turn, Vec<T>* thrust) {
+    const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
+    Vec<T>*x = g.arena.take(ld), *c = g.arena.take(m);
+    Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
+    for (int e = 0; e < ld; ++e) x[e] = Vec<T>{};
+    for (int k = 0; k < g.K; ++k) {
+        g.motions(k, Z);
+        push_state(g.count, factors.L + std::size_t(k) * m * m, factors.G + std::size_t(k) * m * ld, g.dt, Z, k == 0, h + k * m, x, c);
+        for (int i = 0; i < n; ++i) {
+            turn[i * g.K + k] = c[2 * i];
+            thrust[i * g.K + k] = c[2 * i + 1];
+        }
+    }
+}
+
+/// The damped Gauss-Newton direction of every lane, [n, K] turn rates and accelerations; its factors; the energy.
+template <class T, int N>
+void solve_step(
+    const Group<T, N>& g, Vec<T> damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust, Vec<T>& energy, Mask<T>& sound) {
+    const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
+    Vec<T>*P = g.arena.take(ld * ld), *y = g.arena.take(ld), *h = g.arena.take(g.K * m), *damped = g.arena.take(m);
+    Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
+    ControlCosts<T> costs(g.arena, n);
+    for (int e = 0; e < ld * ld; ++e) P[e] = Vec<T>{};
+    for (int e = 0; e < ld; ++e) y[e] = Vec<T>{};
+    energy = Vec<T>{};
+    sound = ~Mask<T>{};
+    for (int k = g.K - 1; k >= 0; --k) {
+        Vec<T>*L = factors.L + std::size_t(k) * m * m, *G = factors.G + std::size_t(k) * m * ld, *linear = h + k * m;
+        energy += add_state_costs(g, k + 1, P, y);
+        costs.set(g, k);
+        energy += costs.energy;
+        g.motions(k, Z);
+        for (int r = 0; r < m; ++r) damped[r] = costs.stiffness[r] + damping;
+        control_block(g.count, P, g.dt, damped, L);
+        factorise<T>(g.count, L, sound);
+        if (k > 0) {
+            transition(g.count, P, g.dt, Z, costs.coupling, costs.rate_stiffness, G);
+            eliminate_controls<T>(g.count, L, G, P);
+        }
+        for (int r = 0; r < m; ++r) linear[r] = costs.pull[r];
+        pull_linear(g.count, L, G, g.dt, Z, k == 0, y, linear);
+        for (int r = 0; r < m; ++r) y[2 * m + r] -= costs.rate_pull[r];
+        for (int i = 0; i < n; ++i) {
+            const int v = m + 2 * i + 1;
+            y[v] += costs.speed_pull[i];
+            P[v * ld + v] += costs.speed_stiffness[i];
+        }
+    }
+    push(g, factors, h, turn, thrust);
+}
+
+/// mu = H^-1 v for a cotangent v [n, K] of turn rates and accelerations, in place.
+template <class T, int N>
+void solve_adjoint(const Group<T, N>& g, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust) {
+    const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
+    Vec<T>*y = g.arena.take(ld), *h = g.arena.take(g.K * m);
+    Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
+    for (int e = 0; e < ld; ++e) y[e] = Vec<T>{};
+    for (int k = g.K - 1; k >= 0; --k) {
+        g.motions(k, Z);
+        for (int i = 0; i < n; ++i) {
+            h[k * m + 2 * i] = -turn[i * g.K + k];
+            h[k * m + 2 * i + 1] = -thrust[i * g.K + k];
+        }
+        pull_linear(
+            g.count, factors.L + std::size_t(k) * m * m, factors.G + std::size_t(k) * m * ld, g.dt, Z, k == 0, y, h + k * m);
+    }
+    push(g, factors, h, turn, thrust);
+}
+
+/// Energy and squared norm of its gradient.
+template <class T, int N>
+void evaluate(const Group<T, N>& g, Vec<T>& energy, Vec<T>& squared_norm) {
+    const int n = g.count.agents(), m = 2 * n;
+    Vec<T>* y = g.arena.take(3 * m);  // costates of positions and of (heading, speed); pulls of the rates one step later
+    Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
+    ControlCosts<T> costs(g.arena, n);
+    for (int e = 0; e < 3 * m; ++e) y[e] = Vec<T>{};
+    energy = squared_norm = Vec<T>{};
+    for (int k = g.K - 1; k >= 0; --k) {
+        energy += add_state_costs<T, N>(g, k + 1, nullptr, y);
+        costs.set(g, k);
+        energy += costs.energy;
+        g.motions(k, Z);
+        for (int r = 0; r < m; ++r) {
+            const Vec<T> slope = costs.pull[r] - y[2 * m + r] + g.dt * y[m + r];
+            squared_norm += slope * slope;
+            y[2 * m + r] = costs.rate_pull[r];
+        }
+        for (int i = 0; i < n; ++i) {
+            y[m + 2 * i] += Z[i].x_heading * y[2 * i] + Z[i].y_heading * y[2 * i + 1];
+            y[m + 2 * i + 1] += Z[i].x_speed * y[2 * i] + Z[i].y_speed * y[2 * i + 1] + costs.speed_pull[i];
+        }
+    }
+}
+
+/// Gradients of one group with respect to its parameters.
+template <class T>
+struct ParameterGradients {
+    Vec<T>*own, *pair, *goal_x, *goal_y;  // [OWN_COUNT, n], [pairs], [n], [n]
+};
+
+/// The pairs' part of `differentiate` at one state: adds to the position cotangents [n, 6] and to the pairs' weights.
+template <class T, int N>
+INLINE void differentiate_pairs(
+    const Group<T, N>& g, int state, const std::vector<Tangent<T>>& first, const std::vector<Tangent<T>>& second, Vec<T>* sums,
+    Vec<T>* by_pair) {
+    const int n = g.count.agents();
+    int pair = 0;
+    for (int i = 0; i < n; ++i)
+        for (int j = i + 1; j < n; ++j, ++pair) {
+            const Vec<T> dx = g.path[i].x[state] - g.path[j].x[state], dy = g.path[i].y[state] - g.path[j].y[state];
+            const Vec<T> reach = g.reach[pair];
+            if (!any<T>(dx * dx + dy * dy < reach * reach)) continue;
+            const Contact<T> contact(dx, dy, reach);
+            const Vec<T> nx = contact.x, ny = contact.y, zero{};
+            const Vec<T> inverse = contact.active && contact.distance > 0 ? T(1) / contact.distance : zero;
+            const Vec<T> q1x = first[i].x[state] - first[j].x[state], q1y = first[i].y[state] - first[j].y[state];
+            const Vec<T> q2x = second[i].x[state] - second[j].x[state], q2y = second[i].y[state] - second[j].y[state];
+            const Vec<T> t1 = nx * q1x + ny * q1y, t2 = nx * q2x + ny * q2y;
+            const Vec<T> w = g.pair_weight[pair], squared = w * w, h = contact.active ? contact.depth - t2 : zero;
+            const Vec<T> turn1 = squared * h * inverse, turn2 = squared * t1 * inverse, push = squared * t1;
+            const Vec<T> P[6] = {
+                turn1 * (q1x - t1 * nx) - turn2 * (q2x - t2 * nx) - push * nx,
+                turn1 * (q1y - t1 * ny) - turn2 * (q2y - t2 * ny) - push * ny,
+                squared * h * nx, squared * h * ny, -push * nx, -push * ny};
+            for (int e = 0; e < 6; ++e) {
+                sums[6 * i + e] += P[e];
+                sums[6 * j + e] -= P[e];
+            }
+            by_pair[pair] += T(2) * w * t1 * h;
+        }
+}
+
+/// Adds d phi / d u to the cotangent [n, K] and d phi / d parameters to `by`, phi = -<J mu, r + J d> with mu and d constant.
+///
+/// Cotangents of positions (P), of their tangents along mu (P1) and d (P2), and of speeds are gathered backwards in time and
+/// go back through the rollout as suffix sums.
+template <class T, int N>
+void differentiate(
+    const Group<T, N>& g, Vec<T>* mu_turn, Vec<T>* mu_thrust, Vec<T>* d_turn, Vec<T>* d_thrust, Vec<T>* bar_turn,
+    Vec<T>* bar_thrust, const ParameterGradients<T>& by) {
+    const int n = g.count.agents(), K = g.K;
+    const T dt = g.dt, per_dt = T(1) / dt;
+    std::vector<Tangent<T>> first, second;  // along mu, along d
+    for (int i = 0; i < n; ++i) {
+        first.push_back(g.new_tangent(mu_turn + i * K, mu_thrust + i * K));
+        second.push_back(g.new_tangent(d_turn + i * K, d_thrust + i * K));
+        g.roll_tangent(i, first[i]);
+        g.roll_tangent(i, second[i]);
+    }
+    Vec<T>* sums = g.arena.take(6 * n);  // suffix sums of P, P1, P2 (x, y)
+    Vec<T>* nodes = g.arena.take(2 * n);  // suffix sums of the cotangents of headings and speeds
+    for (int e = 0; e < 6 * n; ++e) sums[e] = Vec<T>{};
+    for (int e = 0; e < 2 * n; ++e) nodes[e] = Vec<T>{};
+    for (int k = K - 1; k >= 0; --k) {
+        const int state = k + 1;
+        for (int i = 0; i < n; ++i) {
+            const Path<T>& p = g.path[i];
+            const Tangent<T>&t1 = first[i], &t2 = second[i];
+            Vec<T>* s = sums + 6 * i;
+            const auto weigh = [&](int feature) -> Vec<T>& { return by.own[feature * n + i]; };
+            if (state < K) {
+                // Node `state` moved all later positions.
+                const Vec<T> c = p.cosine[state], si = p.sine[state], v = p.speed[state];
+                const Vec<T> along0 = c * s[0] + si * s[1], across0 = c * s[1] - si * s[0];
+                const Vec<T> along1 = c * s[2] + si * s[3], across1 = c * s[3] - si * s[2];
+                const Vec<T> along2 = c * s[4] + si * s[5], across2 = c * s[5] - si * s[4];
+                nodes[2 * i] += dt * (v * (across0 - along1 * t1.heading[state] - along2 * t2.heading[state]) +
+                                      across1 * t1.speed[state] + across2 * t2.speed[state]);
+                nodes[2 * i + 1] += dt * (along0 + across1 * t1.heading[state] + across2 * t2.heading[state]);
+            }
+            Adjoint<T> speed{t1.speed[state], t2.speed[state]};
+            if (g.has(VEL)) speed.add(g.own(VEL, i), p.speed[state], weigh(VEL));
+            if (g.has(VELREF)) speed.add(g.own(VELREF, i), p.speed[state] - g.reference_speed[i], weigh(VELREF));
+            if (g.has(VELB)) speed.add_bounded(g.own(VELB, i), p.speed[state], g.game.bounds[BOUND_VEL], weigh(VELB));
+            nodes[2 * i + 1] += speed.cotangent;
+            const auto pull_to = [&](int feature, Vec<T> x, Vec<T> y, Vec<T> slide_x, Vec<T> slide_y) {
+                // The foot of a lane slides along it with the position: that part of the first tangent does not count.
+                const Vec<T> w = g.own(feature, i), squared = w * w;
+                const Vec<T> gap_x = p.x[state] - x + t2.x[state], gap_y = p.y[state] - y + t2.y[state];
+                const Vec<T> slid = t1.x[state] * slide_x + t1.y[state] * slide_y;
+                s[0] -= squared * (t1.x[state] - slid * slide_x);
+                s[1] -= squared * (t1.y[state] - slid * slide_y);
+                s[2] -= squared * gap_x;
+                s[3] -= squared * gap_y;
+                s[4] -= squared * t1.x[state];
+                s[5] -= squared * t1.y[state];
+                weigh(feature) -= T(2) * w * (t1.x[state] * gap_x + t1.y[state] * gap_y);
+            };
+            if (g.has(LANE)) {
+                Vec<T> x, y, slide_x, slide_y;
+                g.template foot<true>(i, p.x[state], p.y[state], x, y, slide_x, slide_y);
+                pull_to(LANE, x, y, slide_x, slide_y);
+            }
+            if (g.has(GOAL) && state == K) {
+                pull_to(GOAL, g.goal_x[i], g.goal_y[i], Vec<T>{}, Vec<T>{});
+                const Vec<T> squared = g.own(GOAL, i) * g.own(GOAL, i);
+                by.goal_x[i] += squared * t1.x[state];
+                by.goal_y[i] += squared * t1.y[state];
+            }
+        }
+        if (g.pairs_count_at(state)) differentiate_pairs(g, state, first, second, sums, by.pair);
+        for (int i = 0; i < n; ++i) {
+            const Tangent<T>&t1 = first[i], &t2 = second[i];
+            const auto weigh = [&](int feature) -> Vec<T>& { return by.own[feature * n + i]; };
+            bar_turn[i * K + k] += dt * nodes[2 * i];
+            bar_thrust[i * K + k] += dt * nodes[2 * i + 1];
+            for (const int channel : {ACCELERATION, TURN_RATE}) {
+                const Vec<T>* control = (channel ? g.turn : g.thrust) + i * K;
+                const Vec<T>*along_mu = channel ? t1.turn : t1.thrust, *along_d = channel ? t2.turn : t2.thrust;
+                Vec<T>* bar = (channel ? bar_turn : bar_thrust) + i * K;
+                const int plain = channel ? TURNR : ACC, bounded = channel ? TURNRB : ACCB;
+                Adjoint<T> own{along_mu[k], along_d[k]};
+                if (g.has(plain)) own.add(g.own(plain, i), control[k], weigh(plain));
+                if (g.has(bounded))
+                    own.add_bounded(g.own(bounded, i), control[k], g.game.bounds[channel ? BOUND_TURNR : BOUND_ACC], weigh(bounded));
+                bar[k] += own.cotangent;
+                if (k == 0) continue;
+                const int rate = channel ? TURNACC : JERK, rate_bounded = channel ? TURNACCB : JERKB;
+                const Vec<T> value = g.rate(control, k);
+                Adjoint<T> change{(along_mu[k] - along_mu[k - 1]) * per_dt, (along_d[k] - along_d[k - 1]) * per_dt};
+                if (g.has(rate)) change.add(g.own(rate, i), value, weigh(rate));
+                if (g.has(rate_bounded))
+                    change.add_bounded(g.own(rate_bounded, i), value, g.game.bounds[channel ? BOUND_TURNACC : BOUND_JERK], weigh(rate_bounded));
+                bar[k] += per_dt * change.cotangent;
+                bar[k - 1] -= per_dt * change.cotangent;
+            }
+            if (!g.has(STEER)) continue;
+            const Steering<T> steer(g.wheelbase[i], g.turn[i * K + k], g.path[i].speed[k]);
+            const Vec<T> w = g.own(STEER, i), squared = w * w;
+            const Vec<T> s1 = steer.by_turn * t1.turn[k] + steer.by_speed * t1.speed[k];
+            const Vec<T> s2 = steer.by_turn * t2.turn[k] + steer.by_speed * t2.speed[k];
+            const Vec<T> value = steer.value + s2;
+            const auto slope = [&](Vec<T> by_self, Vec<T> by_turn, Vec<T> by_speed) {
+                const Vec<T> s1_moves = by_turn * t1.turn[k] + by_speed * t1.speed[k];
+                const Vec<T> s2_moves = by_turn * t2.turn[k] + by_speed * t2.speed[k];
+                return -squared * (s1_moves * value + s1 * (by_self + s2_moves));
+            };
+            bar_turn[i * K + k] += slope(steer.by_turn, steer.turn_turn, steer.turn_speed);
+            // The speed before this step is a node that the next pass through the loop sums up; the first one is given.
+            if (k > 0) nodes[2 * i + 1] += slope(steer.by_speed, steer.turn_speed, steer.speed_speed);
+            weigh(STEER) -= T(2) * w * s1 * value;
+        }
+    }
+}
+
+}  // namespace EPO_LEVEL
