@@ -6,7 +6,6 @@ to fail, unrolled differentiation, B M problems in one batch, and of its dense l
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable
 
@@ -17,6 +16,7 @@ from benchmarks.games import Game
 from benchmarks.residuals import problem
 from epo_lightning.scene import GameParameters
 
+PARTS = lambda g: [g]
 LINEAR_SOLVERS = ("CholeskyDenseSolver", "LUDenseSolver")
 
 
@@ -34,19 +34,21 @@ def prepare(game: Game, linear_solver: str) -> Callable[[GameParameters], Tensor
     unknowns = theseus.Vector(start.shape[1], name="unknowns", dtype=start.dtype)
     given = plain.tensors(game.parameters)
     auxiliary = [theseus.Variable(value, name=name) for name, value in given.items()]
-
-    def residuals(optim_vars: tuple, aux_vars: tuple) -> Tensor:
-        tensors = dict(zip(given, (variable.tensor for variable in aux_vars), strict=True))
-        return plain.residuals(optim_vars[0].tensor, tensors)
-
-    with torch.no_grad():
-        rows = plain.residuals(start, given).shape[1]
     unit = theseus.ScaleCostWeight(theseus.Variable(torch.ones(1, 1, dtype=start.dtype), name="unit"))
-    cost = theseus.AutoDiffCostFunction(
-        [unknowns], residuals, rows, cost_weight=unit, aux_vars=auxiliary, autograd_mode="vmap"
-    )
     objective = theseus.Objective(dtype=start.dtype)
-    objective.add(cost)
+    for part in (PARTS(plain.groups)):
+
+        def residuals(optim_vars: tuple, aux_vars: tuple, part: tuple[str, ...] = part) -> Tensor:
+            tensors = dict(zip(given, (variable.tensor for variable in aux_vars), strict=True))
+            return plain.residuals(optim_vars[0].tensor, tensors, part)
+
+        with torch.no_grad():
+            rows = plain.residuals(start, given, part).shape[1]
+        objective.add(
+            theseus.AutoDiffCostFunction(
+                [unknowns], residuals, rows, cost_weight=unit, aux_vars=auxiliary, autograd_mode="vmap"
+            )
+        )
     optimizer = theseus.LevenbergMarquardt(
         objective,
         linear_solver_cls=getattr(theseus, linear_solver),

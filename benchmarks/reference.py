@@ -1,4 +1,4 @@
-"""The plain way to write the layer: a dense Jacobian by automatic differentiation, a general solver, and autograd through all.
+"""The plain way to write the layer: a dense Jacobian by automatic differentiation, a general solver, autograd through all.
 
 Nothing in it is clever, which is why the others are compared with it.
 """
@@ -21,7 +21,7 @@ def prepare(game: Game) -> Callable[[GameParameters], Tensor]:
     plain = problem(game)
 
     def residuals(unknowns: Tensor, tensors: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        found = plain.residuals(unknowns[None], {name: value[None] for name, value in tensors.items()})[0]
+        found = plain.residuals(unknowns[None], {name: value[None] for name, value in tensors.items()}, plain.groups)[0]
         return found, found
 
     def solve(parameters: GameParameters) -> Tensor:

@@ -31,6 +31,8 @@ CHANNELS = {
     "steer": ("steer",),
 }
 """Features that are computed together; an energy has all features of a group, or none, but for ``speed``."""
+EXCESSES = {"control_excess": ("acc", "turnr"), "rate_excess": ("jerk", "turnacc"), "speed_excess": ("vel",)}
+"""Signals whose violation of bounds counts."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class Problem:
         game: where the problems come from.
     """
 
-    residuals: Callable[[Tensor, dict[str, Tensor]], Tensor]
+    residuals: Callable[[Tensor, dict[str, Tensor], tuple[str, ...]], Tensor]
+    groups: tuple[str, ...]
     constants: dict[str, Float[Tensor, "b ..."]]
     game: Game
 
@@ -86,19 +89,11 @@ def problem(game: Game) -> Problem:
     def per_mode(tensor: Tensor) -> Tensor:
         return tensor[:, None].expand(-1, modes, *tensor.shape[1:]).flatten(0, 1)
 
-    def bounds(*signals: str) -> tuple[Tensor, Tensor]:
-        lower, upper = torch.tensor([energy.bounds[name] for name in signals], dtype=torch.float64).to(scene.history).T
-        return lower[:, None, None], upper[:, None, None]
-
-    excesses = {
-        group: (source, *bounds(*signals))
-        for group, source, signals in (
-            ("control_excess", "control", ("acc", "turnr")),
-            ("rate_excess", "rate", ("jerk", "turnacc")),
-            ("speed_excess", "after", ("vel",)),
-        )
-        if group in groups
-    }
+    limits = {}
+    for group, signals in EXCESSES.items():
+        if group in groups:
+            bounds = torch.tensor([energy.bounds[name] for name in signals], dtype=torch.float64)
+            limits[group] = bounds.to(scene.history).T[..., None, None]
     first, second = torch.triu_indices(agents, agents, 1, device=scene.history.device)
     difference = torch.eye(agents).to(scene.history)[first] - torch.eye(agents).to(scene.history)[second]
     radius = scene.size[..., 0] / 2
@@ -114,40 +109,45 @@ def problem(game: Game) -> Problem:
         )
     if "steer" in groups:
         constants["base"] = per_mode(STEER_BASE * scene.size[..., 0])
-    if "velref" in energy.own:
-        constants["reference_speed"] = per_mode(scene.reference_speed)
+    if "speed" in groups:
+        wanted = [scene.reference_speed if name == "velref" else 0.0 * radius for name in groups["speed"]]
+        constants["wanted"] = per_mode(torch.stack(wanted, 1))
 
-    def residuals(unknowns: Tensor, given: dict[str, Tensor]) -> Tensor:
+    def residuals(unknowns: Tensor, given: dict[str, Tensor], chosen: tuple[str, ...]) -> Tensor:
         controls = unknowns.view(-1, 2, agents, horizon)
         x0, y0, heading0, speed0 = given["initial"][..., None].unbind(1)
-        motion0 = torch.stack((speed0, heading0), 1)
-        after = motion0 + dt * controls.cumsum(-1)
+        after = torch.stack((speed0, heading0), 1) + dt * controls.cumsum(-1)
         before = after - dt * controls
         speed, heading = before.unbind(1)
         velocity = speed[:, None] * torch.stack((heading.cos(), heading.sin()), 1)
         position = torch.stack((x0, y0), 1) + dt * velocity.cumsum(-1)  # [b, 2, N, K]
-        offset = difference @ position
-        depth = (given["reach"][..., None] - offset.square().sum(1).sqrt()).relu()
-        found = [given["proximity"][..., None] * depth]
-        signals = {"control": controls, "rate": controls.diff(dim=-1) / dt, "after": after[:, :1]}
-        if "velref" in groups.get("speed", ()):
-            wanted = given["reference_speed"][..., None]
-            shifts = [wanted if name == "velref" else torch.zeros_like(wanted) for name in groups["speed"]]
-            signals["speed"] = after[:, :1] - torch.stack(shifts, 1)
-        else:
-            signals["speed"] = after[:, :1]
-        for group, (source, lower, upper) in excesses.items():
-            signals[group] = signals[source] - signals[source].clamp(lower, upper)
-        if "goal" in groups:
-            signals["goal"] = position[..., -1:] - given["goals"][..., None]
-        if "lane" in groups:
-            signals["lane"] = position - _foot(position.detach(), given["lanes"])
-        if "steer" in groups:
-            signals["steer"] = (given["base"][..., None] * controls[:, 1] / speed.clamp_min(1.0)).atan()[:, None]
-        found += [given[group][..., None] * signals[group] for group in groups]
-        return torch.cat([part.flatten(1) for part in found], 1)
+        rate = controls.diff(dim=-1) / dt
+        sources = {"control_excess": controls, "rate_excess": rate, "speed_excess": after[:, :1]}
+        found = []
+        for group in chosen:
+            match group:
+                case "proximity":
+                    distance = (difference @ position).square().sum(1).sqrt()
+                    value = (given["reach"][..., None] - distance).relu()
+                case "control":
+                    value = controls
+                case "rate":
+                    value = rate
+                case "speed":
+                    value = after[:, :1] - given["wanted"][..., None]
+                case "goal":
+                    value = position[..., -1:] - given["goals"][..., None]
+                case "lane":
+                    value = position - _foot(position.detach(), given["lanes"])
+                case "steer":
+                    value = (given["base"][..., None] * controls[:, 1] / speed.clamp_min(1.0)).atan()[:, None]
+                case _:
+                    lower, upper = limits[group]
+                    value = sources[group] - sources[group].clamp(lower, upper)
+            found.append((given[group][..., None] * value).flatten(1))
+        return torch.cat(found, 1)
 
-    return Problem(residuals, constants, game)
+    return Problem(residuals, (*groups, *("proximity",) * bool(energy.pair)), constants, game)
 
 
 def _foot(position: Float[Tensor, "b 2 N K"], lanes: Float[Tensor, "b N Q 2"]) -> Float[Tensor, "b 2 N K"]:
