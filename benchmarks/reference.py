@@ -20,15 +20,17 @@ def prepare(game: Game) -> Callable[[GameParameters], Tensor]:
     """A function from parameters to controls [B, M, N, K, 2]."""
     plain = problem(game)
 
-    def residuals(unknowns: Tensor, tensors: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        found = plain.residuals(unknowns[None], {name: value[None] for name, value in tensors.items()}, plain.groups)[0]
-        return found, found
+    def residuals(unknowns: Tensor, tensors: dict[str, Tensor]) -> Tensor:
+        return plain.residuals(
+            unknowns[None], {name: value[None] for name, value in tensors.items()}, plain.groups, True
+        )[0]
 
     def solve(parameters: GameParameters) -> Tensor:
         tensors = plain.tensors(parameters)
         unknowns = plain.unknowns(parameters.initial_controls)
         for _ in range(game.steps):
-            jacobian, residual = vmap(jacfwd(residuals, has_aux=True))(unknowns, tensors)
+            jacobian = vmap(jacfwd(residuals))(unknowns, tensors)
+            residual = plain.residuals(unknowns, tensors, plain.groups, False)
             matrix = jacobian.mT @ jacobian
             matrix = matrix + game.damping * torch.eye(matrix.shape[-1]).to(matrix)
             gradient = jacobian.mT @ residual[..., None]

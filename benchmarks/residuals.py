@@ -40,12 +40,15 @@ class Problem:
     """B M problems in a row: a function and the tensors it takes besides the controls.
 
     Attributes:
-        residuals: from unknowns [b, 2 N K] and ``tensors`` to weighted residuals [b, R], for any b.
+        residuals: from unknowns [b, 2 N K], ``tensors``, names of groups and ``still`` to the groups' weighted residuals
+            [b, R], for any b. ``still`` holds the closest points of lanes: so they enter the Jacobian J of a step, while the
+            gradient of a step lets them slide along.
+        groups: all groups of the energy.
         constants: what nobody differentiates: initial states, lanes, sizes.
         game: where the problems come from.
     """
 
-    residuals: Callable[[Tensor, dict[str, Tensor], tuple[str, ...]], Tensor]
+    residuals: Callable[[Tensor, dict[str, Tensor], tuple[str, ...], bool], Tensor]
     groups: tuple[str, ...]
     constants: dict[str, Float[Tensor, "b ..."]]
     game: Game
@@ -113,7 +116,7 @@ def problem(game: Game) -> Problem:
         wanted = [scene.reference_speed if name == "velref" else 0.0 * radius for name in groups["speed"]]
         constants["wanted"] = per_mode(torch.stack(wanted, 1))
 
-    def residuals(unknowns: Tensor, given: dict[str, Tensor], chosen: tuple[str, ...]) -> Tensor:
+    def residuals(unknowns: Tensor, given: dict[str, Tensor], chosen: tuple[str, ...], still: bool) -> Tensor:
         controls = unknowns.view(-1, 2, agents, horizon)
         x0, y0, heading0, speed0 = given["initial"][..., None].unbind(1)
         after = torch.stack((speed0, heading0), 1) + dt * controls.cumsum(-1)
@@ -138,7 +141,7 @@ def problem(game: Game) -> Problem:
                 case "goal":
                     value = position[..., -1:] - given["goals"][..., None]
                 case "lane":
-                    value = position - _foot(position.detach(), given["lanes"])
+                    value = position - _foot(position.detach() if still else position, given["lanes"])
                 case "steer":
                     value = (given["base"][..., None] * controls[:, 1] / speed.clamp_min(1.0)).atan()[:, None]
                 case _:
@@ -151,11 +154,11 @@ def problem(game: Game) -> Problem:
 
 
 def _foot(position: Float[Tensor, "b 2 N K"], lanes: Float[Tensor, "b N Q 2"]) -> Float[Tensor, "b 2 N K"]:
-    """The closest point of every agent's polyline."""
-    start, end = lanes[:, :, None, :-1], lanes[:, :, None, 1:]
-    point = position.permute(0, 2, 3, 1)[..., None, :]
-    along = end - start
+    """The closest point of every agent's polyline; which segment it lies on is a constant."""
+    point = position.permute(0, 2, 3, 1)[..., None, :]  # [b, N, K, 1, 2]
+    start, along = lanes[:, :, None, :-1], lanes.diff(dim=2)[:, :, None]
+    share = (((point.detach() - start) * along).sum(-1) / along.square().sum(-1)).clamp(0.0, 1.0)
+    nearest = (point.detach() - start - share[..., None] * along).square().sum(-1).argmin(-1)[..., None, None]
+    start, along = start.take_along_dim(nearest, 3), along.take_along_dim(nearest, 3)
     share = (((point - start) * along).sum(-1) / along.square().sum(-1)).clamp(0.0, 1.0)
-    foot = start + share[..., None] * along
-    nearest = (point - foot).square().sum(-1).argmin(-1)
-    return foot.take_along_dim(nearest[..., None, None], 3).squeeze(3).permute(0, 3, 1, 2)
+    return (start + share[..., None] * along).squeeze(3).permute(0, 3, 1, 2)
