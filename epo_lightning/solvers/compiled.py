@@ -1,4 +1,4 @@
-"""The layer as compiled code for CPUs: all steps and their adjoint in one call each, a problem per lane of a vector register.
+"""The layer as compiled code for CPUs: all steps in one call, their adjoint in another, a problem per vector lane.
 
 Every step is a linear-quadratic problem that one backward and one forward recursion over time solve in O(K N^3); see
 `docs/solver.md` and `kernel/`. The library has a plain C interface, so that building it needs a C++ compiler and nothing
@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -359,7 +360,7 @@ def _parts(problems: int, lanes: int) -> list[tuple[int, int]]:
     registers = -(-problems // lanes)
     threads = max(1, min(torch.get_num_threads(), registers))
     edges = [min(problems, lanes * (registers * t // threads)) for t in range(threads + 1)]
-    return list(zip(edges, edges[1:], strict=False))
+    return list(pairwise(edges))
 
 
 @functools.cache

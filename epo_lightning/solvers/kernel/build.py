@@ -1,8 +1,8 @@
 """Build the compiled layer: `python -m epo_lightning.solvers.kernel.build`; installing the package does the same.
 
-It takes a C++17 compiler (GCC or Clang: `$CXX`, or the first of c++, g++, clang++) and nothing else, no PyTorch and no Python
-headers. On x86-64 the sources are compiled for three levels of instructions, and the library chooses when it is loaded, so
-that a wheel built on one machine runs on all of them.
+It takes a C++17 compiler (GCC or Clang: `$CXX`, or the first of c++, g++, clang++) and nothing else, no PyTorch and no
+headers of Python's. On x86-64 the sources are compiled for three levels of instructions, and the library chooses when it is
+loaded, so that a wheel built on one machine runs on all of them.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ def fingerprint() -> int:
     return int.from_bytes(digest.digest()[:7], "big")
 
 
-def load() -> ctypes.CDLL:
+def load(path: Path = LIBRARY) -> ctypes.CDLL:
     """The library.
 
     Raises:
         OSError: there is none, it does not load, or it was built from other sources.
     """
-    if not LIBRARY.exists():
-        raise OSError(f"{LIBRARY.name} was not built when the package was installed (it is not in {HERE})")
-    library = ctypes.CDLL(str(LIBRARY))
+    if not path.exists():
+        raise OSError(f"{path.name} was not built when the package was installed (it is not in {path.parent})")
+    library = ctypes.CDLL(str(path))
     if not hasattr(library, "epo_fingerprint"):
-        raise OSError(f"{LIBRARY} is not the compiled EPO layer")
+        raise OSError(f"{path} is not the compiled EPO layer")
     library.epo_fingerprint.restype = ctypes.c_int64
     if library.epo_fingerprint() != fingerprint():
-        raise OSError(f"{LIBRARY} was built from other sources than those beside it")
+        raise OSError(f"{path} was built from other sources than those beside it")
     return library
 
 
@@ -90,11 +90,11 @@ def build() -> None:
         _run(commands)
         linked = Path(folder) / LIBRARY.name
         _run([[*compiler, "-shared", *objects, f"{folder}/dispatch.o", "-o", str(linked)]])
+        load(linked)
         # Whoever imports at this moment sees the whole library or none.
         partial = LIBRARY.with_suffix(f".{os.getpid()}")
         shutil.copyfile(linked, partial)
         partial.replace(LIBRARY)
-    load()
 
 
 if __name__ == "__main__":

@@ -344,6 +344,7 @@ struct Group {
 
     void load_line(int i, int lane, int64_t row, int64_t line) {
         const int parts = int(game.points) - 1;
+        if (line < 0 || line >= game.lines) line = 0;  // the sample is stopped anyway
         const T* points = static_cast<const T*>(game.references) + (row * game.lines + line) * game.points * 2;
         for (int part = 0; part < parts; ++part, points += 2) {
             Vec<T>* s = segments + (i * parts + part) * 5;

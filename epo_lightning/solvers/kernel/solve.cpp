@@ -171,6 +171,25 @@ INLINE bool finite(T value) {
     return value - value == 0;
 }
 
+/// Whether a problem's pair weights are finite and its reference lines exist: what may otherwise go unnoticed.
+template <class T>
+bool complete(const EpoGame& game, int64_t problem) {
+    const int64_t b = problem / game.M, m = problem % game.M;
+    const uint8_t* present = game.present + b * game.N;
+    int64_t pair = 0;
+    for (int64_t i = 0; i < game.N; ++i) {
+        if (game.reference && present[i]) {
+            const int64_t line = game.reference[problem * game.N + i];
+            if (line < 0 || line >= game.lines) return false;
+        }
+        for (int64_t j = i + 1; game.pair && j < game.N; ++j, ++pair)
+            if (present[i] && present[j] &&
+                !finite(static_cast<const T*>(game.pair)[b * game.pair_b + m * game.pair_m + pair * game.pair_p]))
+                return false;
+    }
+    return true;
+}
+
 constexpr int kRetries = 4;            // how often the damping of a group without factors is raised tenfold
 constexpr double kLeastRaised = 1e-3;  // where raising starts from when the damping is smaller
 
@@ -184,7 +203,11 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
     T* const norm = static_cast<T*>(run.gradient_norm);
     Arena<T> arena;
     std::vector<Buffer<T>> reused(game.N + 1);
-    std::fill(run.status + first, run.status + last, 0);
+    std::vector<char> whole(last - first);
+    for (int64_t problem = first; problem < last; ++problem) {
+        whole[problem - first] = complete<T>(game, problem);
+        run.status[problem] = whole[problem - first] ? 0 : 2;
+    }
     for (int64_t problem = first; problem < last; ++problem)
         for (int64_t i = 0; i < game.N; ++i) {
             const T* from = static_cast<const T*>(run.start) + problem * size + i * row;
@@ -201,7 +224,7 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
         StepTape<T> step;
         step.plan = make_plan<T>(game, arena, first, last, controls);
         step.factors.resize(game.N + 1);
-        step.sound.assign(last - first, 1);
+        step.sound = whole;
         for (int n = 1; n <= game.N; ++n) {
             const std::size_t groups = step.plan.groups(n, W);
             if (groups && (record || !reused[n]))
@@ -371,6 +394,9 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
         });
         add_iterate(s);
     }
+    for (int64_t row = first * game.N; row < last * game.N; ++row)
+        if (!game.present[row / (game.M * game.N) * game.N + row % game.N])
+            std::fill(bar + row * game.K * 2, bar + (row + 1) * game.K * 2, T(0));
 }
 
 }  // namespace

@@ -1,0 +1,137 @@
+"""The compiled layer: the suite of all backends, and what only it has: threads, a library that may be missing."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+from backends import BackendSuite, gradients
+from games import ALL, BOUNDS, leaves_of, random_game, random_scene
+
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.energy import Energy
+from epo_lightning.scene import Status
+from epo_lightning.solvers import compiled
+from epo_lightning.solvers.kernel import build
+
+if isinstance(compiled._library(), str) and shutil.which("c++") is None:
+    pytest.skip("there is no C++ compiler on this machine, so the kernel was not built", allow_module_level=True)
+
+
+class TestCompiled(BackendSuite):
+    solve = staticmethod(compiled.solve)
+
+
+def test_the_kernel_was_built_from_these_sources():
+    assert compiled.available()
+
+
+def test_threads_change_no_bit():
+    scene, energy = random_scene(23, 3, history=2, size=1.0), Energy(ALL, bounds=BOUNDS)
+    parameters = random_game(scene, modes=3, horizon=9)
+    results = []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        leaves = leaves_of(parameters)
+        solution = compiled.solve(energy, scene, leaves, 2, 0.3, torch.full((23, 3), 10.0))
+        solution.states.square().sum().backward()
+        results.append((solution, gradients(leaves)))
+    torch.set_num_threads(1)
+    (one, by_one), (three, by_three) = results
+    assert torch.equal(one.controls, three.controls)
+    assert torch.equal(one.energy, three.energy)
+    assert all(torch.equal(by_one[name], by_three[name]) for name in by_one)
+
+
+def test_memory_goes_back_when_a_solution_is_dropped():
+    """Without waiting for the garbage collector: a cycle would keep the factors of every past step."""
+    released = []
+
+    class Watched(compiled._Tape):
+        def __del__(self):
+            released.append(self.address)
+            super().__del__()
+
+    scene, energy = random_scene(3, 2, history=2), Energy(["acc", "turnr"])
+    original, compiled._Tape = compiled._Tape, Watched
+    try:
+        for keep in (False, True):
+            leaves = leaves_of(random_game(scene, own=("acc", "turnr")))
+            solution = compiled.solve(energy, scene, leaves, 2, 0.3, torch.full((3, 2), 10.0), keep_iterates=keep)
+            del solution
+    finally:
+        compiled._Tape = original
+    assert len(released) == 2
+
+
+def test_a_reference_line_that_does_not_exist_stops_that_sample():
+    scene, energy = random_scene(3, 2, history=2), Energy(["lane", "acc", "turnr"])
+    parameters = random_game(scene)
+    parameters.reference[1, 0, 1] = 99
+    solution = compiled.solve(energy, scene, parameters, 2, 0.3, torch.full((3, 2), 10.0))
+    assert solution.status.tolist() == [[0, 0], [Status.STOPPED, 0], [0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("energy", "agents", "dtype", "reason"),
+    [
+        (Energy(["acc"], dynamics=Unicycle("heun")), 2, torch.float32, "integrates by euler, not heun"),
+        (Energy(["acc"]), 65, torch.float32, "up to 64 agents, not 65"),
+        (Energy(["acc"]), 2, torch.float16, "not torch.float16"),
+    ],
+)
+def test_what_it_cannot_solve_it_says(energy, agents, dtype, reason):
+    scene = random_scene(1, agents, history=2)
+    parameters = random_game(scene, own=("acc",))
+    assert compiled.obstacle(energy, scene, parameters) is None or dtype == torch.float32
+    assert reason in compiled.obstacle(energy, scene, parameters.to(dtype))
+
+
+def test_sixty_four_agents():
+    scene, energy = random_scene(1, 64, history=2, size=0.7, dtype=torch.float64), Energy(["acc", "turnr", "goal"])
+    parameters = random_game(scene, modes=1, horizon=3)
+    damping = torch.ones(1, 1, dtype=torch.float64)
+    solution = compiled.solve(energy, scene, parameters, 200, 1.0, damping)
+    assert solution.gradient_norm.item() < 1e-6
+    assert (energy.terms(scene, parameters, parameters.initial_controls)["proximity"] > 0).sum() > 64
+
+
+def test_a_missing_library_is_one_visible_notice(monkeypatch):
+    monkeypatch.setattr(compiled, "_library", lambda: "it was not built")
+    compiled._complain.cache_clear()
+    with pytest.warns(UserWarning, match=r"compiled EPO layer is missing: it was not built.*C\+\+ compiler"):
+        assert not compiled.available()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not compiled.available()
+
+
+def test_other_sources_are_noticed(tmp_path, monkeypatch):
+    monkeypatch.setattr(build, "fingerprint", lambda: 1)
+    with pytest.raises(OSError, match="built from other sources"):
+        build.load()
+    (tmp_path / "empty.so").write_bytes(b"")
+    with pytest.raises(OSError, match=r"empty\.so"):
+        build.load(tmp_path / "empty.so")
+
+
+def test_a_machine_without_a_compiler_is_told_so(tmp_path):
+    """What the installation prints, and goes on."""
+    for path in build.HERE.iterdir():
+        if path.suffix in (".py", ".hpp", ".cpp"):
+            shutil.copy(path, tmp_path)
+    found = subprocess.run(
+        [sys.executable, tmp_path / "build.py"],
+        env={"CXX": "no-such-compiler"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 1
+    assert "the compiled layer was not built" in found.stderr
+    assert "no-such-compiler" in found.stderr
+    assert not list(tmp_path.glob("epo_kernel*"))
