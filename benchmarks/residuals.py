@@ -88,6 +88,7 @@ def problem(game: Game) -> Problem:
     sizes, scene, energy = game.sizes, game.scene, game.energy
     agents, horizon, modes, dt = sizes["N"], sizes["K"], sizes["M"], scene.dt
     groups = _groups(game)
+    assert scene.size is not None
 
     def per_mode(tensor: Tensor) -> Tensor:
         return tensor[:, None].expand(-1, modes, *tensor.shape[1:]).flatten(0, 1)
@@ -102,19 +103,20 @@ def problem(game: Game) -> Problem:
     radius = scene.size[..., 0] / 2
     constants = {"initial": per_mode(scene.current.mT), "reach": per_mode(radius[:, first] + radius[:, second])}
     if "lane" in groups:
-        chosen = game.parameters.reference
+        assert scene.references is not None
+        assert game.parameters.reference is not None
         constants["lanes"] = (
             scene.references[:, None]
             .expand(-1, modes, -1, -1, -1, -1)
-            .take_along_dim(chosen[..., None, None, None], 3)
+            .take_along_dim(game.parameters.reference[..., None, None, None], 3)
             .squeeze(3)
             .flatten(0, 1)
         )
     if "steer" in groups:
         constants["base"] = per_mode(STEER_BASE * scene.size[..., 0])
     if "speed" in groups:
-        wanted = [scene.reference_speed if name == "velref" else 0.0 * radius for name in groups["speed"]]
-        constants["wanted"] = per_mode(torch.stack(wanted, 1))
+        wanted = {"vel": torch.zeros_like(radius), "velref": scene.reference_speed}
+        constants["wanted"] = per_mode(torch.stack([wanted[name] for name in groups["speed"]], 1))  # type: ignore[misc]
 
     def residuals(unknowns: Tensor, given: dict[str, Tensor], chosen: tuple[str, ...], still: bool) -> Tensor:
         controls = unknowns.view(-1, 2, agents, horizon)
