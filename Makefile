@@ -1,5 +1,6 @@
 # make run     from a bare machine to the paper's table and figures, at a reduced budget (a quarter of an hour on 2 cores)
 # make test    the tests          make test-slow   those that take minutes          make lint   style and types
+# make wheel   a package for this platform, with the compiled layer, in dist/
 # make clean   remove what these made, but for the data in cache/
 #
 # TORCH_INDEX=<address of a package index> make install   chooses another build of PyTorch (CPU only, another CUDA)
@@ -13,11 +14,13 @@ EPO := $(BIN)/epo
 STAMP := $(VENV)/.installed
 ROWS := const_vel v_lstm_epo v_lstm v_lstm_sc
 
-.PHONY: run install test test-slow lint clean data rows $(ROWS:%=row-%)
+.PHONY: run install test test-slow lint wheel clean data rows $(ROWS:%=row-%)
 
 install: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
+KERNEL := $(wildcard epo_lightning/solvers/kernel/*.?pp)
+
+$(STAMP): pyproject.toml constraints.txt $(KERNEL)
 	$(PYTHON) -m venv $(VENV)
 	$(if $(TORCH_INDEX),$(BIN)/pip install -q --index-url $(TORCH_INDEX) -c constraints.txt torch)
 	$(BIN)/pip install -q -c constraints.txt -e '.[dev]'
@@ -56,5 +59,8 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+wheel: $(STAMP)
+	$(BIN)/pip wheel -q --no-deps -w dist .
+
 clean:
-	rm -rf runs/reduced figures results.md results.csv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf epo_lightning/solvers/kernel/epo_kernel.* runs/reduced figures results.md results.csv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,4 +1,4 @@
-"""The wheel brings its configuration tree along."""
+"""The wheel brings its configuration tree and the compiled layer along."""
 
 from __future__ import annotations
 
@@ -10,6 +10,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+
+_SOLVE = """
+import sys
+sys.path.insert(0, {site!r})
+from pathlib import Path
+from epo_lightning.solvers import compiled
+print(Path(compiled.__file__).parents[2], compiled.available())
+"""
 
 
 @pytest.mark.slow
@@ -29,6 +37,13 @@ def test_an_installed_wheel_works_from_any_folder(tmp_path: Path) -> None:
             [sys.executable, "-P", "-c", program, *words], cwd=elsewhere, check=True, capture_output=True, text=True
         )
         return done.stdout
+
+    # One wheel per platform, for every version of Python and PyTorch.
+    assert "-py3-none-" in wheel.name
+    solved = subprocess.run(
+        [sys.executable, "-P", "-c", _SOLVE.format(site=str(site))], cwd=elsewhere, check=True, capture_output=True, text=True
+    )
+    assert solved.stdout.split() == [str(site), "True"]
 
     assert "title: V-LSTM + EPO" in epo("config", "experiment=rpi/v_lstm_epo")
     assert "is sound" in epo("config", "check", "experiment=rpi/v_lstm_epo_goal", "budget=reduced")
