@@ -109,7 +109,9 @@ def _library() -> ctypes.CDLL | str:
     library.epo_differentiate.restype = None
     library.epo_release.argtypes = (_Integer, _Address)
     library.epo_release.restype = None
-    library.epo_lanes.restype = _Integer
+    for name in ("epo_lanes", "epo_levels"):
+        getattr(library, name).restype = _Integer
+    library.epo_choose.argtypes, library.epo_choose.restype = (_Integer,), None
     return library
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import shutil
 import subprocess
 import sys
@@ -28,6 +29,27 @@ class TestCompiled(BackendSuite):
 
 def test_the_kernel_was_built_from_these_sources():
     assert compiled.available()
+
+
+def test_all_levels_of_instructions_agree():
+    scene, energy = random_scene(9, 3, history=2, size=1.5, dtype=torch.float64), Energy(ALL, bounds=BOUNDS)
+    parameters = random_game(scene, modes=3, horizon=9)
+    library = compiled._library()
+    count = library.epo_levels()
+    results = []
+    try:
+        for level in range(count):
+            library.epo_choose(level)
+            leaves = leaves_of(parameters)
+            solution = compiled.solve(energy, scene, leaves, 2, 0.3, torch.full((9, 3), 10.0))
+            solution.states.square().sum().backward()
+            results.append({"controls": solution.controls.detach(), **gradients(leaves)})
+    finally:
+        library.epo_choose(count - 1)
+    assert count > 1 or platform.machine() != "x86_64", "any x86-64 of the last ten years has AVX2"
+    for result in results[:-1]:
+        for name, value in result.items():
+            torch.testing.assert_close(value, results[-1][name], rtol=1e-10, atol=1e-10, msg=name)
 
 
 def test_threads_change_no_bit():
