@@ -108,7 +108,7 @@ def main(given: Sequence[str] | None = None) -> None:
     torch.set_num_threads(arguments.threads)
     measure.keep_freed_memory()
     warnings.filterwarnings("ignore", message=".*sparse.*|.*cholmod.*|.*baspacho.*")
-    console = Console()
+    console = Console(width=max(Console().width, 128))
     sizes: dict[str, Any] = {name: getattr(arguments, name) for name in "BMNKS"}
     if arguments.scaling:
         lines = scaling.run(arguments.implementations, sizes, arguments.repeats, arguments.threads, console)
