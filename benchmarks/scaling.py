@@ -67,7 +67,7 @@ def curves(found: Sequence[Measurement], axis: str) -> dict[str, dict[int, float
 
 def table(found: Mapping[str, Sequence[Measurement]]) -> Table:
     """Milliseconds of forward and backward, one row per axis and size."""
-    result = Table(title="forward and backward [ms]")
+    result = Table(title="forward and backward, in ms")
     names = [name for name in NAMES if any(m.implementation == name for line in found.values() for m in line)]
     for column in ("", "size", *names):
         result.add_column(column, justify="right" if column else "left")
