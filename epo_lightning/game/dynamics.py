@@ -46,6 +46,11 @@ class Unicycle:
         if self.integrator not in _BETA:
             raise ConfigError(f"unknown integrator {self.integrator!r}: {nearest(str(self.integrator), _BETA)}")
 
+    @property
+    def beta(self) -> float:
+        """The share of the velocity before a step in the way that the step covers."""
+        return _BETA[self.integrator]
+
     def rollout(
         self, initial: Float[Tensor, "*#batch 4"], controls: Float[Tensor, "*batch K 2"], dt: float
     ) -> Float[Tensor, "*batch K 4"]:
@@ -73,27 +78,6 @@ class Unicycle:
 
     def _travel(self, velocity: Float[Tensor, "*batch nodes 2"], dt: float) -> Float[Tensor, "*batch nodes-1 2"]:
         """Way covered up to every step, from the velocities at the nodes."""
-        beta = _BETA[self.integrator]
-        return dt * (beta * velocity[..., :-1, :] + (1.0 - beta) * velocity[..., 1:, :]).cumsum(-2)
-
-    def anchors(
-        self, states: Float[Tensor, "*batch K 4"], initial: Float[Tensor, "*#batch 4"], dt: float
-    ) -> tuple[Float[Tensor, "*batch K 2 2"], Float[Tensor, "*batch K 2 2"]]:
-        """Sensitivities of positions in closed form: d p_k / d u_j = tip_k - root_j for j < k, zero otherwise.
-
-        A turn rate at step j rotates all that is travelled after node j + 1 about that node, and an acceleration stretches
-        it along the headings: with q_k = dt sum_l e_l weighted as the positions are,
-
-            d p_k / d omega_j = dt [R90 (p_k - p_{j+1}) + (1 - beta) dt v_{j+1} R90 e_{j+1}],
-            d p_k / d a_j     = dt [     q_k - q_{j+1}  + (1 - beta) dt           e_{j+1}].
-
-        Returns:
-            tips of positions k = 1 .. K and roots of controls j = 0 .. K-1; the last dimensions are control and x, y.
-        """
-        ahead = _direction(states[..., HEADING])
-        before = _direction(initial[..., None, HEADING]).expand_as(ahead[..., :1, :])
-        position, distance = states[..., :2], self._travel(torch.cat((before, ahead), -2), dt)
-        edge = (1.0 - _BETA[self.integrator]) * dt * ahead
-        tip = torch.stack((distance, _turn_left(position)), -2)
-        root = torch.stack((distance - edge, _turn_left(position - states[..., SPEED, None] * edge)), -2)
-        return dt * tip, dt * root
+        if self.beta == 1.0:
+            return dt * velocity[..., :-1, :].cumsum(-2)
+        return dt * (self.beta * velocity[..., :-1, :] + (1.0 - self.beta) * velocity[..., 1:, :]).cumsum(-2)

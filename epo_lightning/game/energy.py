@@ -329,5 +329,6 @@ def along(
 ) -> tuple[Tensor, Tensor]:
     """Value of an undeclared feature, and its change along every one of D directions (their first dimension)."""
     value = function(*at)
-    changes = [torch.func.jvp(function, at, direction)[1] for direction in zip(*directions, strict=True)]
-    return value, torch.stack(changes) if changes else value.new_zeros(0, *value.shape)
+    if len(directions[0]) == 0:
+        return value, value.new_zeros(0, *value.shape)
+    return value, torch.func.vmap(lambda *moved: torch.func.jvp(function, at, moved)[1])(*directions)

@@ -247,6 +247,21 @@ def steering(
     return tangent.atan(), by_turn_rate, by_speed
 
 
+def steering_curvatures(
+    turn_rate: Float[Tensor, "*batch K"], speed: Float[Tensor, "*batch K"], wheelbase: Float[Tensor, "*#batch 1"]
+) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K"], Float[Tensor, "*batch K"]]:
+    """Second derivatives of the steering angle: twice in omega, in omega and v, twice in v."""
+    floored = speed.clamp_min(SLOWEST_STEERING)
+    curvature = wheelbase / floored
+    tangent = curvature * turn_rate
+    square = (1.0 + tangent.square()).square()
+    slow = speed < SLOWEST_STEERING
+    twice = -2.0 * curvature.square() * tangent / square
+    mixed = torch.where(slow, 0.0, curvature * (tangent.square() - 1.0) / (floored * square))
+    by_speed = torch.where(slow, 0.0, 2.0 * tangent / (floored.square() * square))
+    return twice, mixed, by_speed
+
+
 def speed_before(states: Float[Tensor, "*batch K 4"], initial: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*batch K"]:
     """The speeds v_0 .. v_{K-1} at which the controls of every step begin to act."""
     start = initial[..., SPEED, None].expand(*states.shape[:-2], 1)

@@ -1,0 +1,332 @@
+"""Damped Gauss-Newton steps in PyTorch, on any device: one structured assembly and one batched factorisation per step.
+
+One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Two things happen around it.
+
+*Splitting.* Agents that no active pair connects do not know of each other: on a CPU every sample falls apart into the
+connected components of its active pairs, and components of one size are factorised together. What is solved for an agent then
+depends on nothing but its component, to the last bit, and a scene with few active pairs costs little more than its agents
+alone. Other devices would have to wait for the host to learn the components; there every sample is one matrix, and no
+operation asks the device for a number.
+
+*Differentiation* does not tape the factorisation. For a cotangent v of u + alpha d, one more solve with the same factor gives
+mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
+
+    phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
+
+in closed form (:meth:`~epo_lightning.game.normal_equations.Model.pullback`), to which v itself is added for u.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from epo_lightning.game.energy import Energy
+from epo_lightning.game.features import Source
+from epo_lightning.game.normal_equations import Group, Model
+from epo_lightning.scene import GameParameters, Scene, Solution, Status
+
+_RETRIES = 4
+"""How often the damping of a sample that cannot be factorised is raised tenfold."""
+_LEAST_RAISED_DAMPING = 1e-3
+"""Where raising starts from when the damping is smaller."""
+
+
+def solve(
+    energy: Energy,
+    scene: Scene,
+    parameters: GameParameters,
+    steps: int,
+    step_size: float,
+    damping: Float[Tensor, "B M"],
+    keep_iterates: bool = False,
+    split: bool | None = None,
+) -> Solution:
+    """Take ``steps`` steps from ``parameters.initial_controls``.
+
+    The controls and states of the solution are differentiable with respect to weights, goals and initial controls, by
+    unrolling.
+
+    Args:
+        energy, scene, parameters: what to minimise; they fit together.
+        steps: number S of steps.
+        step_size: alpha.
+        damping: lambda of every sample.
+        keep_iterates: whether the solution carries u_0 .. u_S.
+        split: whether samples fall apart into components; by default, on a CPU.
+    """
+    controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
+    split = controls.device.type == "cpu" if split is None else split
+    game = _Game(energy, scene, parameters, step_size, damping.detach().flatten(), split)
+    tensors = game.tensors(parameters)
+    status = torch.full(controls.shape[:2], Status.SOLVED, device=controls.device)
+    iterates = [controls]
+    initial_energy = None
+    for _ in range(steps):
+        controls, outcome, value = _Step.apply(game, controls, *tensors)
+        initial_energy = value if initial_energy is None else initial_energy
+        status = torch.maximum(status, outcome)
+        iterates.append(controls)
+    with torch.no_grad():
+        last = Model(energy, scene, parameters, controls, not split)
+        gradient_norm = last.gradient.square().flatten(2).sum(-1).cumsum(1)[:, -1].sqrt().view_as(status)
+        final_energy = last.value.view_as(status)
+    return Solution(
+        controls=controls,
+        states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
+        if controls.requires_grad
+        else last.states,
+        initial_energy=final_energy if initial_energy is None else initial_energy,
+        energy=final_energy,
+        gradient_norm=gradient_norm,
+        status=status,
+        iterates=tuple(iterates) if keep_iterates else None,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Game:
+    """What stays the same from step to step."""
+
+    energy: Energy
+    scene: Scene
+    parameters: GameParameters
+    step_size: float
+    damping: Float[Tensor, " S"]
+    split: bool
+
+    def tensors(self, parameters: GameParameters) -> list[Tensor]:
+        """The tensors of a game that an iterate is differentiated by."""
+        tensors = [parameters.own_weights[name] for name in self.energy.own]
+        tensors += [parameters.pair_weights[name] for name in self.energy.pair]
+        if self.energy.needs_goals:
+            assert parameters.goals is not None
+            tensors.append(parameters.goals)
+        return tensors
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> GameParameters:
+        """The game with these tensors instead."""
+        own, pair = list(self.energy.own), list(self.energy.pair)
+        goals = tensors[len(own) + len(pair) :]
+        return dataclasses.replace(
+            self.parameters,
+            own_weights=dict(zip(own, tensors[: len(own)], strict=True)),
+            pair_weights=dict(zip(pair, tensors[len(own) : len(own) + len(pair)], strict=True)),
+            goals=goals[0] if goals else self.parameters.goals,
+        )
+
+    @property
+    def undeclared(self) -> Energy | None:
+        """The features that only automatic differentiation knows about."""
+        own = [name for name, feature in self.energy.own_features.items() if feature.source is Source.TRAJECTORY]
+        pair = [name for name, feature in self.energy.pair_features.items() if feature.source is Source.TRAJECTORY]
+        return dataclasses.replace(self.energy, own=own, pair=pair) if own or pair else None
+
+
+def _components(model: Model) -> list[Group]:
+    """The agents of every sample, grouped by the active pairs that connect them; absent agents are in no group."""
+    edges, mask = model.edges, model.scene.agent_mask
+    samples, agents = edges.samples, edges.agents
+    linked = bool(model.linked.all())
+    if edges.every and linked and bool(mask.all()) and agents > 0:
+        return [Group.whole(edges)]
+    chosen = None if linked else model.linked.nonzero()[:, 0]
+    first, second = edges.first, edges.second
+    if chosen is not None:
+        first, second = first[chosen], second[chosen]
+    # Every agent takes the lowest number among those that it is connected with.
+    label = torch.arange(samples * agents)
+    while True:
+        lowest = torch.minimum(label[first], label[second])
+        lower = label.scatter_reduce(0, first, lowest, "amin").scatter_reduce(0, second, lowest, "amin")
+        lower = lower[lower]
+        if torch.equal(lower, label):
+            break
+        label = lower
+    present = mask[:, None].expand(-1, samples // len(mask), -1).flatten()
+    size_of = torch.bincount(label, minlength=len(label))[label] * present
+    order = label.argsort(stable=True)
+    sizes = size_of[order]
+    groups = []
+    component, place = torch.empty_like(label), torch.empty_like(label)
+    for size in sizes.unique().tolist():
+        if size == 0:
+            continue
+        members = order[sizes == size].view(-1, size)
+        count = len(members)
+        component[members] = torch.arange(count)[:, None]
+        place[members] = torch.arange(size)
+        within = (size_of[first] == size).nonzero()[:, 0]
+        one, other = first[within], second[within]
+        whole = size == agents and count == samples
+        groups.append(
+            Group(
+                None if whole else members,
+                count,
+                size,
+                within if chosen is None else chosen[within],
+                component[one],
+                place[one],
+                place[other],
+            )
+        )
+    return groups
+
+
+def _solve(factor: Float[Tensor, "C n n"], right: Float[Tensor, "C n"]) -> Float[Tensor, "C n"]:
+    # Two triangular solves: `cholesky_solve` would copy the factors first.
+    half = torch.linalg.solve_triangular(factor, right[..., None], upper=False)
+    return torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0]
+
+
+def _step(
+    model: Model, damping: Float[Tensor, " S"], group: Group, factors: Tensor | None, retry: bool
+) -> tuple[Float[Tensor, "C n"], Int[Tensor, " C"]]:
+    """The steps -(J^T J + lambda I)^-1 dE/dz of a group's agents, and a :class:`Status` each.
+
+    Where retrying is allowed, a matrix without a factor gets ten, a hundred, ... times the damping, and the others keep
+    every bit. One that has no factor at any damping gets the identity.
+
+    Args:
+        factors: where the Cholesky factors stay, if they are needed again.
+    """
+    steps, outcomes = [], []
+    for chosen, matrix, gradient in model.systems(damping, group, factors):
+        info = torch.empty(len(matrix), dtype=torch.int32, device=matrix.device)
+        torch.linalg.cholesky_ex(matrix, out=(matrix, info))
+        failed = info != 0
+        status = torch.where(failed, Status.STOPPED, Status.SOLVED)
+        if retry and failed.any():
+            _retry(model, damping, group, chosen, matrix, status)
+        steps.append(-_solve(matrix, gradient))
+        outcomes.append(status)
+    return torch.cat(steps), torch.cat(outcomes)
+
+
+def _retry(
+    model: Model, damping: Float[Tensor, " S"], group: Group, chosen: slice, factor: Tensor, status: Tensor
+) -> None:
+    """Factorise again, with more and more damping, what has no factor; writes factors and status."""
+    raised = damping.clamp_min(_LEAST_RAISED_DAMPING)
+    for _ in range(_RETRIES):
+        raised = 10.0 * raised
+        where = (status == Status.STOPPED).nonzero()[:, 0]
+        if len(where) == 0:
+            return
+        for part, matrix, _ in model.systems(damping + raised, group.subset(where + chosen.start)):
+            again, info = torch.linalg.cholesky_ex(matrix)
+            solved = where[part][info == 0]
+            factor[solved] = again[info == 0]
+            status[solved] = Status.DAMPED
+    factor[status == Status.STOPPED] = torch.eye(factor.shape[-1], dtype=factor.dtype)
+
+
+def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tensor, "S N 2 K"]) -> Tensor:
+    """Vectors [C, n] of groups back in their samples, zero for agents that are in no group."""
+    steps = like.shape[-1]
+    rows = torch.zeros_like(like).flatten(0, 1)
+    for group, part in zip(groups, parts, strict=True):
+        by_agent = part.view(group.count, steps, 2, group.size).permute(0, 3, 2, 1)
+        if group.agents is None:
+            return by_agent.reshape(like.shape)
+        rows[group.agents] = by_agent
+    return rows.view_as(like)
+
+
+def _gather(group: Group, values: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "C n"]:
+    """Vectors of samples as a group orders its unknowns."""
+    by_agent = values if group.agents is None else values.flatten(0, 1)[group.agents]
+    return by_agent.permute(0, 3, 2, 1).reshape(group.count, -1)
+
+
+class _Step(torch.autograd.Function):
+    """u -> u + alpha d with its adjoint; see the module's docstring."""
+
+    @staticmethod
+    def forward(ctx: Any, game: _Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        parameters = game.with_tensors(tensors)
+        model = Model(game.energy, game.scene, parameters, controls, not game.split)
+        groups = _components(model) if game.split else [Group.whole(model.edges)]
+        factors, steps = [], []
+        status = torch.zeros(model.samples, dtype=torch.long, device=controls.device)
+        for group in groups:
+            factor = None
+            if any(ctx.needs_input_grad):
+                n = 2 * group.size * model.steps
+                factor = controls.new_empty(group.count, n, n).mT
+                factors.append(factor)
+            step, outcome = _step(model, game.damping, group, factor, retry=game.split)
+            steps.append(step)
+            if group.agents is None:
+                status = outcome
+            else:  # of a sample, the worst one of its components
+                status = status.scatter_reduce(0, group.agents[:, 0] // model.agents, outcome, "amax")
+        step = model.to_controls(_scatter(groups, steps, model.u)).transpose(-1, -2).reshape(controls.shape)
+        status = status.view(controls.shape[:2])
+        moved = controls + game.step_size * step
+        sound = (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
+        keep = sound[..., None, None, None]
+        status = torch.where(sound, status, Status.STOPPED)
+        value = model.value.view(controls.shape[:2])
+        if any(ctx.needs_input_grad):
+            ctx.game, ctx.model, ctx.groups = game, model, groups
+            ctx.save_for_backward(torch.where(keep, step, 0.0), sound, *tensors, *factors)
+        ctx.mark_non_differentiable(status, value)
+        return torch.where(keep, moved, controls), status, value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        game, model, groups = ctx.game, ctx.model, ctx.groups
+        step, sound, *saved = ctx.saved_tensors
+        tensors, factors = saved[: -len(groups) or None], saved[len(saved) - len(groups) :]
+        shape = cotangent.shape
+
+        def planar(values: Tensor) -> Tensor:
+            return values.flatten(0, 1).transpose(-1, -2).contiguous()
+
+        right = model.to_nodes(game.step_size * planar(cotangent))
+        adjoint = _scatter(
+            groups, [_solve(f, _gather(g, right)) for f, g in zip(factors, groups, strict=True)], model.u
+        )
+        keep = sound.flatten()[:, None, None, None]
+        adjoint = torch.where(keep, model.to_controls(adjoint), 0.0)
+        by_controls, own, pair, goals = model.pullback(adjoint, planar(step))
+        by_controls = by_controls.transpose(-1, -2).reshape(shape)
+        gradients = [own.get(name) for name in game.energy.own] + [pair.get(name) for name in game.energy.pair]
+        if game.energy.needs_goals:
+            gradients.append(goals)
+        by = [
+            torch.zeros_like(tensor) if gradient is None else gradient.reshape(tensor.shape)
+            for tensor, gradient in zip(tensors, gradients, strict=True)
+        ]
+        if game.undeclared is not None:
+            directions = torch.stack((adjoint.transpose(-1, -2).reshape(shape), step))
+            extra, rest = _undeclared(game, model.controls, tensors, directions)
+            by_controls = by_controls + extra
+            by = [one + other for one, other in zip(by, rest, strict=True)]
+        by_controls = torch.where(sound[..., None, None, None], by_controls, 0.0)
+        by = [torch.where(sound.view(*shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
+        return None, cotangent + by_controls, *by
+
+
+def _undeclared(
+    game: _Game, controls: Tensor, tensors: Sequence[Tensor], directions: Tensor
+) -> tuple[Tensor, list[Tensor]]:
+    """phi's gradient for undeclared features, by automatic differentiation."""
+    assert game.undeclared is not None
+    with torch.enable_grad():
+        controls = controls.detach().requires_grad_()
+        leaves = [tensor.detach().requires_grad_() for tensor in tensors]
+        residuals, (along_adjoint, along_step) = game.undeclared.linearisation(
+            game.scene, game.with_tensors(leaves), controls, directions
+        )
+        phi = -(along_adjoint * (residuals + along_step)).sum()
+        by_controls, *by = torch.autograd.grad(phi, [controls, *leaves], allow_unused=True, materialize_grads=True)
+    return by_controls, list(by)
