@@ -96,8 +96,8 @@ class _Gradients(ctypes.Structure):
 
 
 @functools.cache
-def _library() -> ctypes.CDLL | str:
-    """The kernel, or why there is none."""
+def _find() -> ctypes.CDLL | str:
+    """The library, or why there is none."""
     try:
         library = load()
     except OSError as error:
@@ -115,9 +115,16 @@ def _library() -> ctypes.CDLL | str:
     return library
 
 
+def _library() -> ctypes.CDLL:
+    library = _find()
+    if isinstance(library, str):
+        raise RuntimeError(f"the compiled EPO layer is missing: {library}")
+    return library
+
+
 def available() -> bool:
     """Whether the kernel was built and can be loaded; says once, visibly, where it cannot."""
-    library = _library()
+    library = _find()
     if isinstance(library, str):
         _complain(library)
     return not isinstance(library, str)
@@ -188,9 +195,7 @@ class _Tape:
     address: int
 
     def __del__(self) -> None:
-        library = _library()
-        assert not isinstance(library, str)
-        library.epo_release(self.doubles, self.address)
+        _library().epo_release(self.doubles, self.address)
 
 
 class _Call:
@@ -286,7 +291,6 @@ class _Call:
 
     def run(self) -> None:
         library = _library()
-        assert not isinstance(library, str)
         problems = self.controls.shape[0] * self.controls.shape[1]
 
         def part(bounds: tuple[int, int]) -> None:
@@ -298,7 +302,6 @@ class _Call:
 
     def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor | None]:
         library = _library()
-        assert not isinstance(library, str)
         batch, modes, agents = self.controls.shape[:3]
         new = self.controls.new_zeros
         own = new((len(self.own), batch, modes, agents))

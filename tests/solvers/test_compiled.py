@@ -19,7 +19,7 @@ from epo_lightning.scene import Status
 from epo_lightning.solvers import compiled
 from epo_lightning.solvers.kernel import build
 
-if isinstance(compiled._library(), str) and shutil.which("c++") is None:
+if isinstance(compiled._find(), str) and shutil.which("c++") is None:
     pytest.skip("there is no C++ compiler on this machine, so the kernel was not built", allow_module_level=True)
 
 
@@ -123,13 +123,15 @@ def test_sixty_four_agents():
 
 
 def test_a_missing_library_is_one_visible_notice(monkeypatch):
-    monkeypatch.setattr(compiled, "_library", lambda: "it was not built")
+    monkeypatch.setattr(compiled, "_find", lambda: "it was not built")
     compiled._complain.cache_clear()
     with pytest.warns(UserWarning, match=r"compiled EPO layer is missing: it was not built.*C\+\+ compiler"):
         assert not compiled.available()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not compiled.available()
+    with pytest.raises(RuntimeError, match="it was not built"):
+        compiled._library()
 
 
 def test_other_sources_are_noticed(tmp_path, monkeypatch):

@@ -123,6 +123,7 @@ struct Group {
     Vec<T>*pair_weight, *reach;           // [pairs]
     Vec<T>*goal_x, *goal_y, *reference_speed, *wheelbase;  // [n]
     Vec<T>*segments;                      // [n, Q - 1, 5]: start, direction, 1 / length^2
+    Vec<T>*foot_x, *foot_y, *slide_x, *slide_y;  // [n, K + 1], by `find_feet`
     Vec<T>*turn, *thrust;                 // controls [n, K]
     std::vector<Path<T>> path;
 
@@ -226,35 +227,19 @@ struct Group {
         }
     }
 
-    /// Nearest point of agent i's reference line, and the direction in which it slides (zero at the line's corners).
+    /// Nearest points of the reference lines at states 1 .. K, and the directions in which they slide (zero at corners).
     template <bool SLIDES>
-    INLINE void foot(int i, Vec<T> x, Vec<T> y, Vec<T>& foot_x, Vec<T>& foot_y, Vec<T>& slide_x, Vec<T>& slide_y) const {
-        const int parts = int(game.points) - 1;
-        const Vec<T> zero{}, one = splat<T>(1);
-        const Vec<T>* s = segments + i * parts * 5;
-        Vec<T> best = splat<T>(T(INFINITY)), inside = zero;
-        foot_x = s[0];
-        foot_y = s[1];
-        slide_x = slide_y = zero;
-        for (int part = 0; part < parts; ++part, s += 5) {
-            const Vec<T> raw = ((x - s[0]) * s[2] + (y - s[1]) * s[3]) * s[4];
-            const Vec<T> along = raw > zero ? (raw < one ? raw : one) : zero;
-            const Vec<T> at_x = s[0] + along * s[2], at_y = s[1] + along * s[3];
-            const Vec<T> dx = x - at_x, dy = y - at_y, squared = dx * dx + dy * dy;
-            const Mask<T> nearer = squared < best;
-            best = nearer ? squared : best;
-            foot_x = nearer ? at_x : foot_x;
-            foot_y = nearer ? at_y : foot_y;
-            if (SLIDES) {
-                inside = nearer ? (along == raw ? s[4] : zero) : inside;
-                slide_x = nearer ? s[2] : slide_x;
-                slide_y = nearer ? s[3] : slide_y;
-            }
-        }
-        if (SLIDES) {
-            const Vec<T> scale = root<T>(inside);
-            slide_x *= scale;
-            slide_y *= scale;
+    void find_feet() {
+        if (!has(LANE)) return;
+        foot_x = arena.take(count.agents() * (K + 1));
+        foot_y = arena.take(count.agents() * (K + 1));
+        slide_x = SLIDES ? arena.take(count.agents() * (K + 1)) : nullptr;
+        slide_y = SLIDES ? arena.take(count.agents() * (K + 1)) : nullptr;
+        // Four states share every segment that is loaded, and their chains of comparisons run side by side.
+        for (int i = 0; i < count.agents(); ++i) {
+            int k = 1;
+            for (; k + 4 <= K + 1; k += 4) find_feet_at<SLIDES, 4>(i, k);
+            for (; k <= K; ++k) find_feet_at<SLIDES, 1>(i, k);
         }
     }
 
@@ -341,6 +326,45 @@ struct Group {
 
   private:
     std::vector<int> owners_;
+
+    template <bool SLIDES, int STATES>
+    INLINE void find_feet_at(int i, int k) {
+        const Vec<T> zero{}, one = splat<T>(1);
+        const Vec<T>*x = path[i].x + k, *y = path[i].y + k, *s = segments + i * (game.points - 1) * 5;
+        const int at = i * (K + 1) + k;
+        Vec<T> best[STATES], near_x[STATES], near_y[STATES], inside[STATES], ahead_x[STATES], ahead_y[STATES];
+        for (int q = 0; q < STATES; ++q) {
+            best[q] = splat<T>(T(INFINITY));
+            // Where nothing is nearest, there is something that is not a number, and it should show.
+            near_x[q] = near_y[q] = splat<T>(T(NAN));
+            inside[q] = ahead_x[q] = ahead_y[q] = zero;
+        }
+        for (int64_t part = 0; part + 1 < game.points; ++part, s += 5)
+            for (int q = 0; q < STATES; ++q) {
+                const Vec<T> raw = ((x[q] - s[0]) * s[2] + (y[q] - s[1]) * s[3]) * s[4];
+                const Vec<T> along = least<T>(most<T>(raw, zero), one);
+                const Vec<T> at_x = s[0] + along * s[2], at_y = s[1] + along * s[3];
+                const Vec<T> dx = x[q] - at_x, dy = y[q] - at_y, squared = dx * dx + dy * dy;
+                const Mask<T> nearer = squared < best[q];
+                best[q] = nearer ? squared : best[q];
+                near_x[q] = nearer ? at_x : near_x[q];
+                near_y[q] = nearer ? at_y : near_y[q];
+                if (SLIDES) {
+                    inside[q] = nearer ? (along == raw ? s[4] : zero) : inside[q];
+                    ahead_x[q] = nearer ? s[2] : ahead_x[q];
+                    ahead_y[q] = nearer ? s[3] : ahead_y[q];
+                }
+            }
+        for (int q = 0; q < STATES; ++q) {
+            foot_x[at + q] = near_x[q];
+            foot_y[at + q] = near_y[q];
+            if (SLIDES) {
+                const Vec<T> scale = root<T>(inside[q]);
+                slide_x[at + q] = ahead_x[q] * scale;
+                slide_y[at + q] = ahead_y[q] * scale;
+            }
+        }
+    }
 
     void load_line(int i, int lane, int64_t row, int64_t line) {
         const int parts = int(game.points) - 1;

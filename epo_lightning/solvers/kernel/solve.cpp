@@ -233,6 +233,7 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
         if (s == 0) std::fill(energies[0] + first, energies[0] + last, T(0));
         for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
             group.load_parameters();
+            group.template find_feet<false>();
             const int n = group.count.agents();
             Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game.K) : reused[n].data();
             const auto factors = Factors<T>::at(memory, n, game.K);
@@ -276,6 +277,7 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
     std::memset(static_cast<T*>(run.states) + first * size * 2, 0, sizeof(T) * (last - first) * size * 2);
     for_each_group<T>(game, arena, make_plan<T>(game, arena, first, last, controls), controls, [&](auto& group, int64_t, int filled) {
         group.load_parameters();
+        group.template find_feet<false>();
         Vec<T> energy, squared;
         evaluate(group, energy, squared);
         for (int lane = 0; lane < filled; ++lane) {
@@ -353,6 +355,7 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
         const T* controls = static_cast<const T*>(run.iterates) + s * run.iterate_stride;
         for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
             group.load_parameters();
+            group.template find_feet<true>();
             const int n = group.count.agents(), K = group.K;
             const auto factors = Factors<T>::at(step.factors[n].data() + index * Factors<T>::size(n, K), n, K);
             Vec<T>*bar_turn = arena.take(n * K), *bar_thrust = arena.take(n * K);

@@ -25,10 +25,8 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>
         if (P) P[(m + 2 * i + 1) * ld + m + 2 * i + 1] += speed.stiffness;
         Model<T> in_x, in_y;
         if (g.has(LANE)) {
-            Vec<T> at_x, at_y, slide_x, slide_y;
-            g.template foot<false>(i, g.path[i].x[state], g.path[i].y[state], at_x, at_y, slide_x, slide_y);
-            in_x.add(g.own(LANE, i), g.path[i].x[state] - at_x);
-            in_y.add(g.own(LANE, i), g.path[i].y[state] - at_y);
+            in_x.add(g.own(LANE, i), g.path[i].x[state] - g.foot_x[i * (g.K + 1) + state]);
+            in_y.add(g.own(LANE, i), g.path[i].y[state] - g.foot_y[i * (g.K + 1) + state]);
         }
         if (g.has(GOAL) && state == g.K) {
             in_x.add(g.own(GOAL, i), g.path[i].x[state] - g.goal_x[i]);
@@ -305,9 +303,8 @@ void differentiate(
                 weigh(feature) -= T(2) * w * (t1.x[state] * gap_x + t1.y[state] * gap_y);
             };
             if (g.has(LANE)) {
-                Vec<T> x, y, slide_x, slide_y;
-                g.template foot<true>(i, p.x[state], p.y[state], x, y, slide_x, slide_y);
-                pull_to(LANE, x, y, slide_x, slide_y);
+                const int at = i * (K + 1) + state;
+                pull_to(LANE, g.foot_x[at], g.foot_y[at], g.slide_x[at], g.slide_y[at]);
             }
             if (g.has(GOAL) && state == K) {
                 pull_to(GOAL, g.goal_x[i], g.goal_y[i], Vec<T>{}, Vec<T>{});
