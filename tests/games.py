@@ -8,7 +8,9 @@ from contextlib import contextmanager
 import torch
 
 from epo_lightning.game import features
+from epo_lightning.game.energy import Energy
 from epo_lightning.game.features import OWN_FEATURES
+from epo_lightning.game.normal_equations import Group, Model
 from epo_lightning.scene import GameParameters, Scene
 
 BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}
@@ -134,3 +136,17 @@ def feet_held() -> Iterator[None]:
         yield
     finally:
         features.foot = sliding
+
+
+def normal_equations(energy: Energy, scene: Scene, parameters: GameParameters, controls: torch.Tensor, exact=False):
+    """The model's gradient [B, M, N, K, 2] and matrix [B, M, n, n] in the controls, in the order of ``controls``."""
+    model = Model(energy, scene, parameters, controls, every_pair=True, exact=exact)
+    none = controls.new_zeros(model.samples)
+    lower = torch.cat([matrix.tril() for _, matrix, _ in model.systems(none, Group.whole(model.edges))])
+    steps, agents = model.steps, model.agents
+    matrix = (lower + lower.tril(-1).mT).view(-1, steps, 2, agents, steps, 2, agents)
+    # A node's speed and heading are dt times the sums of the controls before it.
+    sums = scene.dt * torch.ones(steps, steps, dtype=controls.dtype).tril()
+    matrix = torch.einsum("slcimdj,lk,mn->sikcjnd", matrix, sums, sums)
+    shape = *controls.shape[:2], 2 * steps * agents, 2 * steps * agents
+    return model.gradient.transpose(-1, -2).reshape(controls.shape), matrix.reshape(shape)

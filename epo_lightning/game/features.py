@@ -218,21 +218,28 @@ def foot(
 
     Differentiable with respect to the position; which segment is nearest is a constant, the first one on a tie.
     """
-    start, along = line[..., None, :-1, :], line.diff(dim=-2)[..., None, :, :]
-    squared = along.square().sum(-1)
-    squared = torch.where(squared > 0, squared, 1.0)
+    x, y = position.unbind(-1)
+    start_x, start_y = (line[..., :-1, axis].contiguous() for axis in range(2))  # [.. Q-1]
+    along_x, along_y = (line[..., axis].diff(dim=-1) for axis in range(2))
+    squared = along_x.square() + along_y.square()
+    inverse = torch.where(squared > 0, 1.0 / squared, 0.0)
     with torch.no_grad():
-        offset = position.detach()[..., None, :] - start
-        share = ((offset * along).sum(-1) / squared).clamp_(0.0, 1.0)
-        segment = (offset - share[..., None] * along).square().sum(-1).argmin(-1, keepdim=True)  # [.. K 1]
-    index = segment[..., None].expand(*segment.shape, 2)
-    start = start.expand(*index.shape[:-2], *start.shape[-2:]).gather(-2, index)[..., 0, :]
-    along = along.expand(*index.shape[:-2], *along.shape[-2:]).gather(-2, index)[..., 0, :]
-    squared = squared.expand(*segment.shape[:-1], squared.shape[-1]).gather(-1, segment)
-    share = ((position - start) * along).sum(-1, keepdim=True) / squared
-    slides = (share > 0) & (share < 1)
-    tangent = torch.where(slides, along / squared.sqrt(), 0.0)
-    return start + share.clamp(0.0, 1.0) * along, tangent
+        off_x = x.detach()[..., None, :] - start_x[..., None]  # [.. Q-1 K]
+        off_y = y.detach()[..., None, :] - start_y[..., None]
+        share = (off_x * along_x[..., None]).addcmul_(off_y, along_y[..., None])
+        share = share.mul_(inverse[..., None]).clamp_(0.0, 1.0)
+        off_x = off_x - share * along_x[..., None]
+        off_y = off_y - share * along_y[..., None]
+        segment = off_x.square().add_(off_y.square()).min(-2).indices  # [.. K], the first one on a tie
+    start_x, start_y, along_x, along_y, inverse = (
+        values.expand(*segment.shape[:-1], -1).gather(-1, segment)
+        for values in (start_x, start_y, along_x, along_y, inverse)
+    )
+    share = ((x - start_x) * along_x + (y - start_y) * along_y) * inverse
+    length = torch.where((share > 0) & (share < 1), inverse.sqrt(), 0.0)
+    share = share.clamp(0.0, 1.0)
+    nearest = torch.stack((start_x + share * along_x, start_y + share * along_y), -1)
+    return nearest, torch.stack((length * along_x, length * along_y), -1)
 
 
 def steering(

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from epo_lightning.game.energy import Energy, along, pairs
@@ -27,16 +27,13 @@ from epo_lightning.game.features import (
     OwnFeature,
     PairFeature,
     Source,
-    Surroundings,
     foot,
     overlap,
-    separation,
     slope,
-    speed_before,
     steering,
     steering_curvatures,
 )
-from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE, GameParameters, Scene
+from epo_lightning.scene import HEADING, SPEED, TURN_RATE, GameParameters, Scene
 
 _CACHED = 2**20
 """Bytes of matrices that are worked on at a time: what a processor core keeps close."""
@@ -167,6 +164,7 @@ class Model:
         linked: which of them couple their agents at all.
     """
 
+    @torch.no_grad()
     def __init__(
         self,
         energy: Energy,
@@ -570,7 +568,11 @@ class Model:
                 after_next = matrix.as_strided((len(matrix), steps - 1, size), strides, start + 3 * size)
                 after_next.add_(following[chosen, :-1])
             if rest or self.blocks is not None or self.pair_blocks is not None:
-                part = group if len(matrix) == count else group.subset(torch.arange(begin, chosen.stop, device=matrix.device))
+                part = (
+                    group
+                    if len(matrix) == count
+                    else group.subset(torch.arange(begin, chosen.stop, device=matrix.device))
+                )
                 self._add_blocks(matrix.view(-1, steps, 2, size, steps, 2, size), moves[chosen], rest, part, chosen)
             yield chosen, matrix.mT, gradient[chosen]
 
@@ -592,6 +594,43 @@ class Model:
             shared = group.of_edges(self.pair_blocks).view(-1, 2, steps, 2, steps)
             matrix[group.component, :, :, group.second, :, :, group.first] += shared.permute(0, 4, 3, 2, 1)
             matrix[group.component, :, :, group.first, :, :, group.second] += shared.permute(0, 2, 1, 4, 3)
+
+    def times(self, change: Float[Tensor, "S N 2 K"], damping: Float[Tensor, " S"]) -> Float[Tensor, "S N 2 K"]:
+        """(J^T J + damping) times a change of the controls, through the trajectory and without the matrix.
+
+        The matrix in the nodes' unknowns is worse conditioned than the one in the controls, by 1 / dt^2; this is not.
+        """
+        nodes = self.dt * change.cumsum(-1)
+        moved = self._travel((self.moves * nodes[:, :, :, None]).sum(2))
+        control = (self.control_stiffness + damping[:, None, None, None]) * change
+        if self.rate_stiffness is not None:
+            rate = self.rate_stiffness * (_ahead(change) - change) / self.dt**2
+            control -= rate - torch.nn.functional.pad(rate[..., :-1], (1, 0))
+        node = self.node_stiffness * nodes
+        if self.cross is not None:
+            same, following = self.cross.unbind(2)
+            node[:, :, 0] += same * nodes[:, :, 1] + following * _ahead(nodes[:, :, 1])
+            node[:, :, 1] += same * nodes[:, :, 0]
+            node[:, :, 1, 1:] += (following * nodes[:, :, 0])[..., :-1]
+        x, y = moved.unbind(2)
+        xx, xy, yy = self.pull[:, :, 2:].unbind(2)
+        force = torch.stack((xx * x + xy * y, xy * x + yy * y), 2)
+        if self.pair_curvature is not None:
+            first, second = self.edges.ends(moved)
+            xx, xy, yy = (-self.pair_curvature).unbind(1)
+            by_second, by_first = (
+                torch.stack((xx * x + xy * y, xy * x + yy * y), 1) for x, y in (second.unbind(1), first.unbind(1))
+            )
+            self.edges.spread_(force, by_second, by_first)
+        node += (self.moves * self._after(force)[:, :, None]).sum(3)
+        flat = nodes.flatten(2)[..., None]
+        if self.blocks is not None:
+            node += (self.blocks @ flat).view_as(node)
+        if self.pair_blocks is not None:
+            first, second = self.edges.ends(flat)
+            by_second, by_first = self.pair_blocks @ second, self.pair_blocks.mT @ first
+            self.edges.spread_(node, *(part.view(-1, 2, self.steps) for part in (by_second, by_first)))
+        return control + self.dt * _suffix(node)
 
     # --- differentiation ----------------------------------------------------------------------------------------------
 

@@ -4,12 +4,12 @@ One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Two th
 
 *Splitting.* Agents that no active pair connects do not know of each other: on a CPU every sample falls apart into the
 connected components of its active pairs, and components of one size are factorised together. What is solved for an agent then
-depends on nothing but its component, to the last bit, and a scene with few active pairs costs little more than its agents
-alone. Other devices would have to wait for the host to learn the components; there every sample is one matrix, and no
-operation asks the device for a number.
+depends on nothing but its component, to the last bit, and a scene with few active pairs costs little more than its
+agents alone. Other devices would have to wait for the host to learn the components; there every sample is one matrix, and
+no operation asks the device for a number.
 
-*Differentiation* does not tape the factorisation. For a cotangent v of u + alpha d, one more solve with the same factor gives
-mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
+*Differentiation* does not tape the factorisation. For a cotangent v of u + alpha d, one more solve with the same factor
+gives mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
 
     phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
 
@@ -185,8 +185,20 @@ def _solve(factor: Float[Tensor, "C n n"], right: Float[Tensor, "C n"]) -> Float
     return torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0]
 
 
+def _solve_all(
+    model: Model, groups: Sequence[Group], factors: Sequence[Tensor], right: Float[Tensor, "S N 2 K"]
+) -> Float[Tensor, "S N 2 K"]:
+    """(J^T J + lambda I)^-1 times a vector in the controls, a few factors at a time as they were made."""
+    at_nodes, solved = model.to_nodes(right), []
+    for factor, group in zip(factors, groups, strict=True):
+        few = group.at_a_time(factor, model.steps)
+        parts = zip(factor.split(few), _gather(group, at_nodes).split(few), strict=True)
+        solved.append(torch.cat([_solve(*part) for part in parts]))
+    return model.to_controls(_scatter(groups, solved, model.u))
+
+
 def _step(
-    model: Model, damping: Float[Tensor, " S"], group: Group, factors: Tensor | None, retry: bool
+    model: Model, damping: Float[Tensor, " S"], group: Group, factors: Tensor, retry: bool
 ) -> tuple[Float[Tensor, "C n"], Int[Tensor, " C"]]:
     """The steps -(J^T J + lambda I)^-1 dE/dz of a group's agents, and a :class:`Status` each.
 
@@ -194,7 +206,7 @@ def _step(
     every bit. One that has no factor at any damping gets the identity.
 
     Args:
-        factors: where the Cholesky factors stay, if they are needed again.
+        factors: where the Cholesky factors go.
     """
     steps, outcomes = [], []
     for chosen, matrix, gradient in model.systems(damping, group, factors):
@@ -255,19 +267,26 @@ class _Step(torch.autograd.Function):
         groups = _components(model) if game.split else [Group.whole(model.edges)]
         factors, steps = [], []
         status = torch.zeros(model.samples, dtype=torch.long, device=controls.device)
+        solved = torch.zeros(model.samples, model.agents, dtype=torch.bool, device=controls.device)
         for group in groups:
-            factor = None
-            if any(ctx.needs_input_grad):
-                n = 2 * group.size * model.steps
-                factor = controls.new_empty(group.count, n, n).mT
-                factors.append(factor)
-            step, outcome = _step(model, game.damping, group, factor, retry=game.split)
+            n = 2 * group.size * model.steps
+            factors.append(controls.new_empty(group.count, n, n).mT)
+            step, outcome = _step(model, game.damping, group, factors[-1], retry=game.split)
             steps.append(step)
             if group.agents is None:
                 status = outcome
+                solved |= (outcome == Status.SOLVED)[:, None]
             else:  # of a sample, the worst one of its components
                 status = status.scatter_reduce(0, group.agents[:, 0] // model.agents, outcome, "amax")
-        step = model.to_controls(_scatter(groups, steps, model.u)).transpose(-1, -2).reshape(controls.shape)
+                solved.flatten()[group.agents] = (outcome == Status.SOLVED)[:, None]
+        step = model.to_controls(_scatter(groups, steps, model.u))
+        exactly = None
+        if controls.dtype != torch.float64:
+            # Once more for what is left: the matrix is worse conditioned than the problem. Not where its damping was raised.
+            exactly = solved[..., None, None]
+            residual = -model.gradient - model.times(step, game.damping)
+            step = step + torch.where(exactly, _solve_all(model, groups, factors, residual), 0.0)
+        step = step.transpose(-1, -2).reshape(controls.shape)
         status = status.view(controls.shape[:2])
         moved = controls + game.step_size * step
         sound = (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
@@ -276,6 +295,7 @@ class _Step(torch.autograd.Function):
         value = model.value.view(controls.shape[:2])
         if any(ctx.needs_input_grad):
             ctx.game, ctx.model, ctx.groups = game, model, groups
+            ctx.exactly = exactly
             ctx.save_for_backward(torch.where(keep, step, 0.0), sound, *tensors, *factors)
         ctx.mark_non_differentiable(status, value)
         return torch.where(keep, moved, controls), status, value
@@ -283,7 +303,7 @@ class _Step(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        game, model, groups = ctx.game, ctx.model, ctx.groups
+        game, model, groups, exactly = ctx.game, ctx.model, ctx.groups, ctx.exactly
         step, sound, *saved = ctx.saved_tensors
         tensors, factors = saved[: -len(groups) or None], saved[len(saved) - len(groups) :]
         shape = cotangent.shape
@@ -291,12 +311,12 @@ class _Step(torch.autograd.Function):
         def planar(values: Tensor) -> Tensor:
             return values.flatten(0, 1).transpose(-1, -2).contiguous()
 
-        right = model.to_nodes(game.step_size * planar(cotangent))
-        adjoint = _scatter(
-            groups, [_solve(f, _gather(g, right)) for f, g in zip(factors, groups, strict=True)], model.u
-        )
-        keep = sound.flatten()[:, None, None, None]
-        adjoint = torch.where(keep, model.to_controls(adjoint), 0.0)
+        right = game.step_size * planar(cotangent)
+        adjoint = _solve_all(model, groups, factors, right)
+        if exactly is not None:
+            residual = right - model.times(adjoint, game.damping)
+            adjoint = adjoint + torch.where(exactly, _solve_all(model, groups, factors, residual), 0.0)
+        adjoint = torch.where(sound.flatten()[:, None, None, None], adjoint, 0.0)
         by_controls, own, pair, goals = model.pullback(adjoint, planar(step))
         by_controls = by_controls.transpose(-1, -2).reshape(shape)
         gradients = [own.get(name) for name in game.energy.own] + [pair.get(name) for name in game.energy.pair]

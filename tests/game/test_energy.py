@@ -9,7 +9,7 @@ from itertools import pairwise
 import jaxtyping
 import pytest
 import torch
-from games import ALL, BOUNDS, feet_held, leaves_of, pad, random_game, random_scene, widen
+from games import ALL, BOUNDS, feet_held, leaves_of, normal_equations, pad, random_game, random_scene, widen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +25,6 @@ from epo_lightning.game.features import (
     pair_feature,
     separation,
 )
-from epo_lightning.game.normal_equations import normal_equations
 from epo_lightning.registry import ConfigError
 
 
