@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from benchmarks import measure
+from benchmarks import measure, peer
 from benchmarks.games import Game, make
 from benchmarks.implementations import Implementation, Missing, disagreement, faster_linear_solver, prepare
 
@@ -43,13 +43,14 @@ def measurements(
     """Measure those implementations of a game that can run here.
 
     Args:
-        thorough: refuse what does not agree with the reference, and measure memory as well.
+        thorough: refuse what does not agree with the reference, let the peer try all its linear solvers, and measure memory
+            as well.
     """
     ready: dict[str, Implementation] = {}
-    linear_solver = ""
+    linear_solver = peer.LINEAR_SOLVERS[0]
     for name in names:
         try:
-            if name == "peer":
+            if name == "peer" and thorough:
                 linear_solver = faster_linear_solver(game)
                 console.print(f"peer: {linear_solver} is the faster one here")
             implementation = prepare(name, game, linear_solver)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from benchmarks import peer, reference
 from benchmarks.games import Game
+from benchmarks.measure import interleaved
 from epo_lightning.scene import GameParameters
 from epo_lightning.solvers import compiled
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -109,14 +109,9 @@ def faster_linear_solver(game: Game) -> str:
     Raises:
         Missing: the peer is not installed.
     """
-    times = {}
-    for linear_solver in peer.LINEAR_SOLVERS:
-        candidate = prepare("peer", game, linear_solver)
-        for _ in range(2):  # the second time counts
-            start = time.process_time()
-            candidate.forward_backward()
-            times[linear_solver] = time.process_time() - start
-    return min(times, key=lambda linear_solver: times[linear_solver])
+    candidates = {name: prepare("peer", game, name).forward_backward for name in peer.LINEAR_SOLVERS}
+    times = interleaved(candidates, 3)
+    return min(times, key=lambda linear_solver: times[linear_solver].cpu)
 
 
 def disagreement(implementation: Implementation, tolerance: float = 1e-5) -> str | None:

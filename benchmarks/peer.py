@@ -17,7 +17,8 @@ from benchmarks.games import Game
 from benchmarks.residuals import problem
 from epo_lightning.scene import GameParameters
 
-LINEAR_SOLVERS = ("CholeskyDenseSolver", "LUDenseSolver")
+LINEAR_SOLVERS = ("LUDenseSolver", "CholeskyDenseSolver")
+"""What usually is the faster one comes first."""
 
 
 def prepare(game: Game, linear_solver: str) -> Callable[[GameParameters], Tensor]:

@@ -25,7 +25,7 @@ AXES = (
 """Title, setting, what grows and how."""
 SIZES = {"B": 8, "M": 2, "N": 4, "K": 20, "S": 2}
 """What does not grow."""
-LONGEST = 10e3
+LONGEST = 1e3
 """Nobody is asked for more after having taken this long [ms]."""
 ARRAYS = 12
 """Dense Jacobians of which the memory of automatic differentiation consists, per step; measured."""
