@@ -64,7 +64,8 @@ class EPO(Forecaster):
     def forward(self, scene: Scene) -> JointForecast:
         z = self.backbone(scene)
         parameters = self.infer(scene, z)
-        solution = self.solver(self.energy, scene, parameters)
+        solver = self.solver if self.training else self.solver.for_test()
+        solution = solver(self.energy, scene, parameters)
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
         initial_states = self.energy.dynamics.rollout(current[:, None], parameters.initial_controls, scene.dt)
         return JointForecast(

@@ -15,6 +15,7 @@ turn rate. Pairs are a list of E edges between agents, numbered s N + i through 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -201,6 +202,8 @@ class Model:
         self.agent_value = controls.new_zeros(rows)
         self.reads = [self._read(name, feature) for name, feature in energy.own_features.items()]
         self._read_pairs(every_pair)
+        if exact:
+            self._bend_undeclared()
         after = self._after(self.pull)
         if exact:
             # A force on later positions bends with the heading: e'' = -e.
@@ -362,7 +365,7 @@ class Model:
         assert feature.function is not None
         turned = self._node_directions()
         moved = self.of.dynamics.tangent(self.states, turned, self.dt)
-        value, change = along(feature.function, (self.states, self.controls), (moved, turned.expand_as(moved[..., :2])))
+        value, change = along(feature.function, (self.states, self.controls), (moved, turned))
         present = self.scene.agent_mask[:, None, :, None]
         value = weight * torch.where(present, value, 0.0).flatten(0, 1)
         change = weight * torch.where(present, change, 0.0).flatten(1, 2)  # [2 K, S, N, R]
@@ -373,10 +376,11 @@ class Model:
             block = jacobian @ jacobian.mT
             self.blocks = block if self.blocks is None else self.blocks + block
 
-    def _node_directions(self) -> Float[Tensor, "D 1 1 1 K 2"]:
+    def _node_directions(self) -> Float[Tensor, "D B M N K 2"]:
         """The controls that move one node alone, component after component."""
         unit = torch.eye(2 * self.steps, dtype=self.u.dtype, device=self.u.device)
-        return self.to_controls(unit.view(-1, 1, 1, 1, 2, self.steps)).transpose(-1, -2)
+        unit = self.to_controls(unit.view(-1, 1, 1, 1, 2, self.steps)).transpose(-1, -2)
+        return unit.expand(-1, *self.controls.shape)
 
     def _read_pairs(self, every_pair: bool) -> None:
         energy = self.of
@@ -444,6 +448,35 @@ class Model:
             edges.spread_(self.pull, torch.cat((pulled, curvature), 1), torch.cat((-pulled, curvature), 1))
             sample = edges.first // self.agents * self.agents  # an energy of pairs is put down to the first agent
             self.agent_value.flatten().index_add_(0, sample, 0.5 * value.sum(-1))
+
+    def _bend_undeclared(self) -> None:
+        """Second derivatives of undeclared features, by automatic differentiation of their gradient, entry by entry."""
+        own = [read.name for read in self.reads if read.feature.source is Source.TRAJECTORY]
+        pair = [name for name, feature, _, _ in self.pair_reads if feature.source is Source.TRAJECTORY]
+        if not own and not pair:
+            return
+        part = dataclasses.replace(self.of, own=own, pair=pair)
+        with torch.enable_grad():
+            controls = self.controls.detach().requires_grad_()
+            energy = part(self.scene, self.parameters.map(Tensor.detach), controls).sum()
+            (gradient,) = torch.autograd.grad(energy, controls, create_graph=True)
+            rows = []
+            for unit in torch.eye(controls[0, 0].numel(), dtype=controls.dtype, device=controls.device):
+                along_unit = (gradient * unit.view(controls.shape[2:])).sum()
+                rows.append(
+                    torch.autograd.grad(along_unit, controls, retain_graph=True, allow_unused=True)[0]
+                    if along_unit.requires_grad
+                    else None
+                )
+        bends = torch.stack([torch.zeros_like(controls) if row is None else row for row in rows])
+        bends = bends.flatten(1, 2).view(self.agents, self.steps, 2, self.samples, self.agents, self.steps, 2)
+        at_nodes = self.to_nodes(self.to_nodes(bends.permute(3, 0, 2, 4, 6, 5, 1)).transpose(-1, -2))  # [S i c j d k l]
+        at_nodes = at_nodes.permute(0, 1, 3, 2, 5, 4, 6)
+        at_nodes = at_nodes.reshape(self.samples, self.agents, self.agents, 2 * self.steps, 2 * self.steps)
+        self.blocks = at_nodes.diagonal(dim1=1, dim2=2).movedim(-1, 1)
+        if pair:
+            rows_of = self.edges.first * self.agents + self.edges.second % self.agents
+            self.pair_blocks = at_nodes.flatten(0, 2)[rows_of]
 
     def _every_step(self, values: Float[Tensor, "E c L"]) -> Float[Tensor, "E c K"]:
         """Values at the steps at which pairs are looked at, and zeros in between."""

@@ -1,31 +1,52 @@
-"""The energy-based potential game layer (Section 4.3): S damped Gauss-Newton steps, differentiable by unrolling.
+"""The energy-based potential game layer (Section 4.3): S damped Gauss-Newton steps, differentiable in several ways.
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
 modes are solved at once and none of them can disturb another: where a factorisation fails, that sample alone is tried again
-with more damping, and where that fails too it keeps its last good iterate.
-
-Differentiation does not tape the factorisation. For a cotangent v of u + alpha d, one more solve with the same factor gives
-mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
-
-    phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
-
-to which v itself is added for u.
+with more damping, and where that fails too it keeps its last good iterate. How a step is computed is a backend's business
+(:mod:`~epo_lightning.solvers.structured`); what is done with the steps stands here.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 from epo_lightning.game.energy import Energy
-from epo_lightning.registry import ConfigError, register
-from epo_lightning.scene import GameParameters, Scene, Solution
-from epo_lightning.solvers import structured
+from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.solvers import implicit, structured
+
+Backend = Callable[[Energy, Scene, GameParameters, int, float, Tensor, bool], Solution]
+"""(energy, scene, parameters, steps, step size, damping [B, M], keep iterates) -> solution."""
+
+_LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e7
+"""Between which adaptive damping stays."""
+_CHOICES = {
+    "differentiation": ("unrolled", "truncated", "implicit", "detached"),
+    "hessian": ("exact", "gauss_newton"),
+    "backend": ("auto", "pytorch", "compiled"),
+}
 
 
 @register("solver", "levenberg_marquardt")
 @dataclass(frozen=True)
 class LevenbergMarquardt:
-    """S steps of damped Gauss-Newton from the initial strategies, unrolled (Section 4.3, "Differentiable Optimization").
+    """S steps of damped Gauss-Newton from the initial strategies (Section 4.3, "Differentiable Optimization").
+
+    What is learned through the solution depends on ``differentiation``:
+
+    - ``unrolled``, the paper's: the derivative of what was computed, all S steps of it, also by the initial controls.
+    - ``truncated``: that of the last ``truncated_steps`` steps, the iterate before them taken as given.
+    - ``implicit``: that of the minimum which the steps approach (implicit function theorem), whatever led there. It is right
+      only where the solution is a minimum, so take many steps; a sample whose Hessian is not positive definite is no minimum
+      and gets a gradient of zero and the status STOPPED. A minimum does not move when all weights of a game are scaled
+      together, so the gradient has no component along them, w . dL/dw = 0: their overall scale is not learned and drifts.
+      Fix one weight, or normalise.
+    - ``detached``: none.
 
     Example::
 
@@ -38,27 +59,116 @@ class LevenbergMarquardt:
         step_size: alpha, 0 < alpha <= 1.
         damping: lambda >= 0, added to the diagonal of J^T J.
         keep_iterates: whether the solution carries u_0 .. u_S.
+        differentiation: see above.
+        truncated_steps: how many of the last steps are differentiated when truncated.
+        hessian: ``exact``, or ``gauss_newton`` to leave out second derivatives of residuals, when implicit.
+        adaptive: whether every sample rejects steps that do not lower its energy and multiplies its damping by 10 then (at
+            most 1e7), and accepts the others and divides it by 10 (at least 1e-7). Decisions are constants to the gradient.
+        test_steps: the number of steps that forecasters take outside training; None for the same.
+        backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it can serve.
     """
 
     steps: int = 2
     step_size: float = 0.3
     damping: float = 10.0
     keep_iterates: bool = False
+    differentiation: str = "unrolled"
+    truncated_steps: int = 1
+    hessian: str = "exact"
+    adaptive: bool = False
+    test_steps: int | None = None
+    backend: str = "auto"
 
     def __post_init__(self) -> None:
         if self.steps < 0:
             raise ConfigError(f"solver.steps must be 0 or more, not {self.steps}")
+        if self.test_steps is not None and self.test_steps < 0:
+            raise ConfigError(f"solver.test_steps must be 0 or more, not {self.test_steps}")
+        if self.truncated_steps < 1:
+            raise ConfigError(f"solver.truncated_steps must be 1 or more, not {self.truncated_steps}")
         if not 0 < self.step_size <= 1:
             raise ConfigError(f"solver.step_size must be in (0, 1], not {self.step_size}")
         if not self.damping >= 0:
             raise ConfigError(f"solver.damping must be 0 or more, not {self.damping}")
+        for name, choices in _CHOICES.items():
+            chosen = getattr(self, name)
+            if chosen not in choices:
+                raise ConfigError(f"unknown solver.{name} {chosen!r}: {nearest(str(chosen), choices)}")
+
+    def for_test(self) -> LevenbergMarquardt:
+        """The solver to use outside training."""
+        return self if self.test_steps is None else dataclasses.replace(self, steps=self.test_steps)
 
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """Minimise the energy of every scene and mode, starting at ``parameters.initial_controls``.
 
         Raises:
-            ValueError: scene and parameters do not fit together; the message names the tensor and its expected shape.
+            ValueError: scene and parameters do not fit together (the message names the tensor and its expected shape), or
+                the backend asked for cannot solve this game.
         """
-        energy.validate(scene, parameters, parameters.initial_controls)
-        damping = parameters.initial_controls.new_full(parameters.initial_controls.shape[:2], self.damping)
-        return structured.solve(energy, scene, parameters, self.steps, self.step_size, damping, self.keep_iterates)
+        start = parameters.initial_controls
+        energy.validate(scene, parameters, start)
+        damping = start.new_full(start.shape[:2], self.damping)
+        if self.differentiation == "unrolled":
+            return self._run(energy, scene, parameters, self.steps, damping)[0]
+        taught = min(self.truncated_steps, self.steps) if self.differentiation == "truncated" else 0
+        with torch.no_grad():
+            solution, damping = self._run(energy, scene, parameters, self.steps - taught, damping)
+        if taught:
+            onward = dataclasses.replace(parameters, initial_controls=solution.controls)
+            last, _ = self._run(energy, scene, onward, taught, damping)
+            return dataclasses.replace(
+                last,
+                initial_energy=solution.initial_energy,
+                status=torch.maximum(solution.status, last.status),
+                iterates=(*solution.iterates, *last.iterates[1:]) if solution.iterates and last.iterates else None,
+            )
+        if self.differentiation == "implicit" and torch.is_grad_enabled():
+            controls, status = implicit.attach(energy, scene, parameters, solution.controls, self.hessian == "exact")
+            states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
+            status = torch.maximum(solution.status, status)
+            return dataclasses.replace(solution, controls=controls, states=states, status=status)
+        return solution
+
+    def _run(
+        self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, damping: Tensor
+    ) -> tuple[Solution, Tensor]:
+        """Take a number of steps; returns the solution and the damping with which one would go on."""
+        solve = _backend(self.backend, energy, scene, parameters)
+        if not self.adaptive:
+            return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates), damping
+        solution = solve(energy, scene, parameters, 0, self.step_size, damping, True)
+        for _ in range(steps):
+            here = dataclasses.replace(parameters, initial_controls=solution.controls)
+            trial = solve(energy, scene, here, 1, self.step_size, damping, False)
+            better = trial.energy < solution.energy
+            damping = torch.where(
+                better, (damping / 10.0).clamp_min(_LEAST_DAMPING), (damping * 10.0).clamp_max(_MOST_DAMPING)
+            )
+            solution = _chosen(better, trial, solution)
+        return solution if self.keep_iterates else dataclasses.replace(solution, iterates=None), damping
+
+
+def _backend(name: str, energy: Energy, scene: Scene, parameters: GameParameters) -> Backend:
+    """What computes the steps of a game."""
+    if name == "compiled":
+        raise ValueError("solver.backend 'compiled' is not available here; 'auto' and 'pytorch' are")
+    return structured.solve
+
+
+def _chosen(better: Tensor, trial: Solution, before: Solution) -> Solution:
+    """The trial where it is better, and what was before elsewhere."""
+    keep = better[..., None, None, None]
+    controls = torch.where(keep, trial.controls, before.controls)
+    accepted = torch.where(better, trial.status, Status.SOLVED)
+    assert before.iterates is not None
+    return Solution(
+        controls=controls,
+        states=torch.where(keep, trial.states, before.states),
+        initial_energy=before.initial_energy,
+        energy=torch.where(better, trial.energy, before.energy),
+        gradient_norm=torch.where(better, trial.gradient_norm, before.gradient_norm),
+        # A step without a factor is one more that is rejected; a sample whose energy is no number has no steps at all.
+        status=torch.where(before.energy.isfinite(), before.status.maximum(accepted), Status.STOPPED),
+        iterates=(*before.iterates, controls),
+    )

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -63,7 +63,7 @@ def solve(
     """
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
     split = controls.device.type == "cpu" if split is None else split
-    game = _Game(energy, scene, parameters, step_size, damping.detach().flatten(), split)
+    game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(), split)
     tensors = game.tensors(parameters)
     status = torch.full(controls.shape[:2], Status.SOLVED, device=controls.device)
     iterates = [controls]
@@ -91,7 +91,7 @@ def solve(
 
 
 @dataclasses.dataclass(frozen=True)
-class _Game:
+class Game:
     """What stays the same from step to step."""
 
     energy: Energy
@@ -120,6 +120,27 @@ class _Game:
             pair_weights=dict(zip(pair, tensors[len(own) : len(own) + len(pair)], strict=True)),
             goals=goals[0] if goals else self.parameters.goals,
         )
+
+    def pullback(
+        self, model: Model, tensors: Sequence[Tensor], adjoint: Tensor, step: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
+        """phi's gradient by the controls and by the game's tensors."""
+        shape = model.controls.shape
+        by_controls, own, pair, goals = model.pullback(adjoint, step)
+        by_controls = by_controls.transpose(-1, -2).reshape(shape)
+        gradients = [own.get(name) for name in self.energy.own] + [pair.get(name) for name in self.energy.pair]
+        if self.energy.needs_goals:
+            gradients.append(goals)
+        by = [
+            torch.zeros_like(tensor) if gradient is None else gradient.reshape(tensor.shape)
+            for tensor, gradient in zip(tensors, gradients, strict=True)
+        ]
+        if self.undeclared is not None:
+            directions = torch.stack([change.transpose(-1, -2).reshape(shape) for change in (adjoint, step)])
+            extra, rest = _undeclared(self, model.controls, tensors, directions)
+            by_controls = by_controls + extra
+            by = [one + other for one, other in zip(by, rest, strict=True)]
+        return by_controls, by
 
     @property
     def undeclared(self) -> Energy | None:
@@ -185,16 +206,82 @@ def _solve(factor: Float[Tensor, "C n n"], right: Float[Tensor, "C n"]) -> Float
     return torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0]
 
 
-def _solve_all(
-    model: Model, groups: Sequence[Group], factors: Sequence[Tensor], right: Float[Tensor, "S N 2 K"]
-) -> Float[Tensor, "S N 2 K"]:
-    """(J^T J + lambda I)^-1 times a vector in the controls, a few factors at a time as they were made."""
-    at_nodes, solved = model.to_nodes(right), []
-    for factor, group in zip(factors, groups, strict=True):
-        few = group.at_a_time(factor, model.steps)
-        parts = zip(factor.split(few), _gather(group, at_nodes).split(few), strict=True)
-        solved.append(torch.cat([_solve(*part) for part in parts]))
-    return model.to_controls(_scatter(groups, solved, model.u))
+@dataclasses.dataclass(frozen=True)
+class Factors:
+    """J^T J + lambda I of every sample, factorised.
+
+    Attributes:
+        model: whose matrices these are.
+        damping: lambda of every sample.
+        groups: the agents that were factorised together.
+        factors: Cholesky factors of each group.
+        status: a :class:`Status` per sample.
+        solved: whose factors are those of the matrices as they are.
+        step: -(J^T J + lambda I)^-1 dE/du.
+    """
+
+    model: Model
+    damping: Float[Tensor, " S"]
+    groups: list[Group]
+    factors: list[Tensor]
+    status: Int[Tensor, " S"]
+    solved: Bool[Tensor, "S N"]
+    step: Float[Tensor, "S N 2 K"]
+
+    def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
+        """(J^T J + lambda I)^-1 times a vector in the controls."""
+        return self.refined(self._solve(right), right)
+
+    def refined(self, solution: Float[Tensor, "S N 2 K"], right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
+        """In single precision, solve once more for what is left, since the matrix is worse conditioned than the problem.
+
+        Where the damping was raised there is nothing to correct: that solution is one of another problem.
+        """
+        if right.dtype == torch.float64:
+            return solution
+        residual = right - self.model.times(solution, self.damping)
+        return solution + torch.where(self.solved[..., None, None], self._solve(residual), 0.0)
+
+    def _solve(self, right: Tensor) -> Tensor:
+        at_nodes, solved = self.model.to_nodes(right), []
+        for factor, group in zip(self.factors, self.groups, strict=True):
+            few = group.at_a_time(factor, self.model.steps)  # as they were made
+            parts = zip(factor.split(few), _gather(group, at_nodes).split(few), strict=True)
+            solved.append(torch.cat([_solve(*part) for part in parts]))
+        return self.model.to_controls(_scatter(self.groups, solved, self.model.u))
+
+
+def factorise(model: Model, damping: Float[Tensor, " S"], split: bool, retry: bool | None = None) -> Factors:
+    """Factorise the matrices of all samples, of each component on its own where they are split.
+
+    Args:
+        model: the energy around an iterate.
+        damping: lambda of every sample.
+        split: whether samples fall apart into components.
+        retry: whether what has no factor is tried again with more damping; by default, where samples are split.
+    """
+    groups = _components(model) if split else [Group.whole(model.edges)]
+    factors, steps = [], []
+    status = torch.zeros(model.samples, dtype=torch.long, device=damping.device)
+    solved = torch.zeros(model.samples, model.agents, dtype=torch.bool, device=damping.device)
+    for group in groups:
+        n = 2 * group.size * model.steps
+        factors.append(model.u.new_empty(group.count, n, n).mT)
+        step, outcome = _step(model, damping, group, factors[-1], split if retry is None else retry)
+        steps.append(step)
+        if group.agents is None:
+            status = outcome
+            solved |= (outcome == Status.SOLVED)[:, None]
+        else:  # of a sample, the worst one of its components
+            status = status.scatter_reduce(0, group.agents[:, 0] // model.agents, outcome, "amax")
+            solved.flatten()[group.agents] = (outcome == Status.SOLVED)[:, None]
+    step = model.to_controls(_scatter(groups, steps, model.u))
+    return Factors(model, damping, groups, factors, status, solved, step)
+
+
+def planar(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "S N 2 K"]:
+    """Controls as models lay them out."""
+    return controls.flatten(0, 1).transpose(-1, -2).contiguous()
 
 
 def _step(
@@ -261,83 +348,41 @@ class _Step(torch.autograd.Function):
     """u -> u + alpha d with its adjoint; see the module's docstring."""
 
     @staticmethod
-    def forward(ctx: Any, game: _Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, game: Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parameters = game.with_tensors(tensors)
         model = Model(game.energy, game.scene, parameters, controls, not game.split)
-        groups = _components(model) if game.split else [Group.whole(model.edges)]
-        factors, steps = [], []
-        status = torch.zeros(model.samples, dtype=torch.long, device=controls.device)
-        solved = torch.zeros(model.samples, model.agents, dtype=torch.bool, device=controls.device)
-        for group in groups:
-            n = 2 * group.size * model.steps
-            factors.append(controls.new_empty(group.count, n, n).mT)
-            step, outcome = _step(model, game.damping, group, factors[-1], retry=game.split)
-            steps.append(step)
-            if group.agents is None:
-                status = outcome
-                solved |= (outcome == Status.SOLVED)[:, None]
-            else:  # of a sample, the worst one of its components
-                status = status.scatter_reduce(0, group.agents[:, 0] // model.agents, outcome, "amax")
-                solved.flatten()[group.agents] = (outcome == Status.SOLVED)[:, None]
-        step = model.to_controls(_scatter(groups, steps, model.u))
-        exactly = None
-        if controls.dtype != torch.float64:
-            # Once more for what is left: the matrix is worse conditioned than the problem. Not where its damping was raised.
-            exactly = solved[..., None, None]
-            residual = -model.gradient - model.times(step, game.damping)
-            step = step + torch.where(exactly, _solve_all(model, groups, factors, residual), 0.0)
+        factors = factorise(model, game.damping, game.split)
+        step = factors.refined(factors.step, -model.gradient)
         step = step.transpose(-1, -2).reshape(controls.shape)
-        status = status.view(controls.shape[:2])
+        status = factors.status.view(controls.shape[:2])
         moved = controls + game.step_size * step
         sound = (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
         keep = sound[..., None, None, None]
         status = torch.where(sound, status, Status.STOPPED)
         value = model.value.view(controls.shape[:2])
         if any(ctx.needs_input_grad):
-            ctx.game, ctx.model, ctx.groups = game, model, groups
-            ctx.exactly = exactly
-            ctx.save_for_backward(torch.where(keep, step, 0.0), sound, *tensors, *factors)
+            ctx.game, ctx.factors = game, factors
+            ctx.save_for_backward(torch.where(keep, step, 0.0), sound, *tensors)
         ctx.mark_non_differentiable(status, value)
         return torch.where(keep, moved, controls), status, value
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        game, model, groups, exactly = ctx.game, ctx.model, ctx.groups, ctx.exactly
-        step, sound, *saved = ctx.saved_tensors
-        tensors, factors = saved[: -len(groups) or None], saved[len(saved) - len(groups) :]
+        game, factors = ctx.game, ctx.factors
+        model = factors.model
+        step, sound, *tensors = ctx.saved_tensors
         shape = cotangent.shape
-
-        def planar(values: Tensor) -> Tensor:
-            return values.flatten(0, 1).transpose(-1, -2).contiguous()
-
-        right = game.step_size * planar(cotangent)
-        adjoint = _solve_all(model, groups, factors, right)
-        if exactly is not None:
-            residual = right - model.times(adjoint, game.damping)
-            adjoint = adjoint + torch.where(exactly, _solve_all(model, groups, factors, residual), 0.0)
+        adjoint = factors.solve(game.step_size * planar(cotangent))
         adjoint = torch.where(sound.flatten()[:, None, None, None], adjoint, 0.0)
-        by_controls, own, pair, goals = model.pullback(adjoint, planar(step))
-        by_controls = by_controls.transpose(-1, -2).reshape(shape)
-        gradients = [own.get(name) for name in game.energy.own] + [pair.get(name) for name in game.energy.pair]
-        if game.energy.needs_goals:
-            gradients.append(goals)
-        by = [
-            torch.zeros_like(tensor) if gradient is None else gradient.reshape(tensor.shape)
-            for tensor, gradient in zip(tensors, gradients, strict=True)
-        ]
-        if game.undeclared is not None:
-            directions = torch.stack((adjoint.transpose(-1, -2).reshape(shape), step))
-            extra, rest = _undeclared(game, model.controls, tensors, directions)
-            by_controls = by_controls + extra
-            by = [one + other for one, other in zip(by, rest, strict=True)]
+        by_controls, by = game.pullback(model, tensors, adjoint, planar(step))
         by_controls = torch.where(sound[..., None, None, None], by_controls, 0.0)
         by = [torch.where(sound.view(*shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
         return None, cotangent + by_controls, *by
 
 
 def _undeclared(
-    game: _Game, controls: Tensor, tensors: Sequence[Tensor], directions: Tensor
+    game: Game, controls: Tensor, tensors: Sequence[Tensor], directions: Tensor
 ) -> tuple[Tensor, list[Tensor]]:
     """phi's gradient for undeclared features, by automatic differentiation."""
     assert game.undeclared is not None

@@ -217,6 +217,11 @@ def test_samples_do_not_depend_on_their_batch():
         ({"step_size": 1.5}, "solver.step_size"),
         ({"damping": -1.0}, "solver.damping"),
         ({"damping": float("nan")}, "solver.damping"),
+        ({"test_steps": -1}, "solver.test_steps"),
+        ({"truncated_steps": 0}, "solver.truncated_steps"),
+        ({"differentiation": "implict"}, "did you mean 'implicit'"),
+        ({"hessian": "newton"}, "unknown solver.hessian"),
+        ({"backend": "cuda"}, "unknown solver.backend"),
     ],
 )
 def test_bad_settings_are_refused(arguments, message):
@@ -255,3 +260,144 @@ def test_the_ten_line_example_of_the_readme():
     assert gap > 0.4, "they start on a collision course and should pass each other"
     assert solution.energy < solution.initial_energy
     assert isinstance(scene, Scene)
+
+
+SMOOTH = ["goal", "velref", "vel", "acc", "jerk", "steer", "turnr", "turnacc"]
+"""Features whose minimum moves smoothly with the game; a lane has corners."""
+
+
+def solved_game(own, agents=2, horizon=4, scenes=2):
+    """A game whose minimum a full Gauss-Newton method finds to the last digits."""
+    scene = random_scene(scenes, agents, history=2, size=1.0, dtype=torch.float64)
+    scene.history[..., :2] *= 0.3
+    parameters = random_game(scene, 1, horizon, tuple(own), spread=0.1)
+    return scene, parameters, LevenbergMarquardt(300, 1.0, 1e-2, differentiation="implicit")
+
+
+@pytest.mark.parametrize("own", [SMOOTH, [*SMOOTH, "lane"], ["goal", "acc", "turnr", "accb", "velb", "turnrb"]])
+def test_implicit_gradients_equal_central_differences_of_the_minimum(own):
+    scene, parameters, solve = solved_game(own)
+    energy = Energy(own, bounds=BOUNDS)
+    leaves = leaves_of(parameters)
+    solution = solve(energy, scene, leaves)
+    assert solution.gradient_norm.max() < 1e-9
+    assert (energy.residuals(scene, parameters, solution.controls.detach())["proximity"] != 0).any()
+    assert (solution.status == Status.SOLVED).all()
+    cotangent = torch.randn_like(parameters.initial_controls)
+    (solution.controls * cotangent).sum().backward()
+    assert leaves.initial_controls.grad is None
+    for kind, name in [*(("own_weights", name) for name in own), ("pair_weights", "proximity"), ("goals", None)]:
+        given = getattr(parameters, kind)
+        tensor = given if name is None else given[name]
+
+        def replace(t, kind=kind, name=name, given=given):
+            return dataclasses.replace(parameters, **{kind: t if name is None else {**given, name: t}})
+
+        def minimum(t, replace=replace):
+            return solve(energy, scene, replace(t)).controls.detach()
+
+        numeric = central_differences(minimum, tensor, cotangent)
+        analytic = getattr(leaves, kind).grad if name is None else getattr(leaves, kind)[name].grad
+        assert (analytic - numeric).norm() / numeric.norm().clamp_min(1e-2) < 1e-6
+
+    # Scaling all weights together does not move a minimum: the gradient along them vanishes.
+    along = [(w * w.grad).sum((1, 2)) for w in (*leaves.own_weights.values(), *leaves.pair_weights.values())]
+    size = sum(part.abs() for part in along)
+    assert (sum(along).abs() < 1e-9 * size).all()
+
+
+def test_gauss_newton_hessians_give_another_implicit_gradient():
+    scene, parameters, solve = solved_game(SMOOTH)
+    energy, gradients = Energy(SMOOTH), []
+    for hessian in ("exact", "gauss_newton"):
+        leaves = leaves_of(parameters)
+        dataclasses.replace(solve, hessian=hessian)(energy, scene, leaves).controls.sum().backward()
+        gradients.append(leaves.goals.grad.flatten())
+    cosine = torch.nn.functional.cosine_similarity(*gradients, dim=0)
+    assert 0.9 < cosine < 1.0 - 1e-9
+
+
+def test_what_is_no_minimum_has_no_implicit_gradient():
+    scene = random_scene(2, 2, history=2, dtype=torch.float64)
+    parameters = random_game(scene, 1, 4, ("goal",))
+    parameters.own_weights["goal"][1] = 0.0
+    scene.history[0, :, :, 2] = 0.0  # both drive on to goals ahead, which they have yet to reach
+    leaves = leaves_of(parameters)
+    solution = LevenbergMarquardt(2, differentiation="implicit")(Energy(["goal"], []), scene, leaves)
+    assert (solution.status[1] == Status.STOPPED).all()
+    solution.states.sum().backward()
+    assert (leaves.own_weights["goal"].grad[1] == 0).all()
+    assert (leaves.goals.grad[1] == 0).all()
+
+
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_truncated_gradients_are_those_of_the_last_steps(adaptive):
+    scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
+    parameters = random_game(scene, horizon=5)
+    energy = Energy(ALL, bounds=BOUNDS)
+    solve = LevenbergMarquardt(5, 0.3, 10.0, True, "truncated", truncated_steps=2, adaptive=adaptive)
+    leaves = leaves_of(parameters)
+    solution = solve(energy, scene, leaves)
+    full = dataclasses.replace(solve, differentiation="unrolled")(energy, scene, parameters)
+    for name in ("controls", "states", "energy", "initial_energy", "gradient_norm", "status"):
+        torch.testing.assert_close(getattr(solution, name), getattr(full, name), rtol=0, atol=0)
+    assert len(solution.iterates) == 6
+    solution.controls.sum().backward()
+    assert leaves.initial_controls.grad is None
+    if adaptive:
+        return  # the damping of the last steps is what the first ones left
+    again = leaves_of(dataclasses.replace(parameters, initial_controls=full.iterates[3]))
+    LevenbergMarquardt(2, 0.3, 10.0)(energy, scene, again).controls.sum().backward()
+    for truncated, last in zip(leaves.own_weights.values(), again.own_weights.values(), strict=True):
+        torch.testing.assert_close(truncated.grad, last.grad, rtol=0, atol=0)
+    torch.testing.assert_close(leaves.goals.grad, again.goals.grad, rtol=0, atol=0)
+
+
+def test_detached_solutions_teach_nothing():
+    scene = random_scene(2, 2, history=2)
+    solution = LevenbergMarquardt(differentiation="detached")(
+        Energy(ALL, bounds=BOUNDS), scene, leaves_of(random_game(scene))
+    )
+    assert not solution.controls.requires_grad
+    assert not solution.states.requires_grad
+
+
+def test_adaptive_steps_never_raise_an_energy_and_every_sample_decides_for_itself():
+    scene = random_scene(6, 3, history=2, size=2.0, dtype=torch.float64)
+    parameters = random_game(scene, spread=2.0)
+    energy = Energy(ALL, bounds=BOUNDS)
+    solve = LevenbergMarquardt(12, 1.0, 1e-3, keep_iterates=True, adaptive=True)
+    solution = solve(energy, scene, parameters)
+    energies = torch.stack([energy(scene, parameters, controls) for controls in solution.iterates])
+    assert (energies.diff(dim=0) <= 0).all()
+    rejected = (energies.diff(dim=0) == 0) & (solution.gradient_norm > 1e-6)
+    assert rejected.any(), "the problem should be hard enough for steps to be rejected"
+    assert not rejected.all(-1).all(-1).any()
+    torch.testing.assert_close(solution.energy, energies[-1], rtol=1e-12, atol=0)
+    controls = solution.controls.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(energy(scene, parameters, controls).sum(), controls)
+    torch.testing.assert_close(solution.gradient_norm, gradient.flatten(2).norm(dim=-1), rtol=1e-6, atol=1e-9)
+    for index in range(6):
+        alone = solve(energy, scene[index], parameters[index])
+        assert torch.equal(alone.controls[0], solution.controls[index])
+
+
+def test_adaptive_gradients_equal_central_differences():
+    scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
+    parameters = random_game(scene, 1, 5, spread=2.0)
+    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt(6, 1.0, 1e-3, adaptive=True)
+    leaves = leaves_of(parameters)
+    cotangent = torch.randn_like(parameters.initial_controls)
+    (solve(energy, scene, leaves).controls * cotangent).sum().backward()
+    numeric = central_differences(
+        lambda goals: solve(energy, scene, dataclasses.replace(parameters, goals=goals)).controls,
+        parameters.goals,
+        cotangent,
+    )
+    assert (leaves.goals.grad - numeric).norm() / numeric.norm() < 1e-5
+
+
+def test_another_number_of_steps_outside_training():
+    solve = LevenbergMarquardt(2, test_steps=7)
+    assert solve.for_test().steps == 7
+    assert LevenbergMarquardt(2).for_test().steps == 2
