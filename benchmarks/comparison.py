@@ -12,7 +12,7 @@ from rich.console import Console
 
 from benchmarks import measure, peer
 from benchmarks.games import Game, make
-from benchmarks.implementations import Implementation, Missing, disagreement, faster_linear_solver, prepare
+from benchmarks.implementations import Implementation, Missing, disagreement, prepare
 
 
 @dataclass(frozen=True)
@@ -43,31 +43,31 @@ def measurements(
     """Measure those implementations of a game that can run here.
 
     Args:
-        thorough: refuse what does not agree with the reference, let the peer try all its linear solvers, and measure memory
-            as well.
+        thorough: refuse what does not agree with the reference, time the peer with all its linear solvers (the
+            fastest counts), and measure memory as well.
     """
     ready: dict[str, Implementation] = {}
-    linear_solver = peer.LINEAR_SOLVERS[0]
     for name in names:
         try:
-            if name == "peer" and thorough:
-                linear_solver = faster_linear_solver(game)
-                console.print(f"peer: {linear_solver} is the faster one here")
-            implementation = prepare(name, game, linear_solver)
+            implementation = prepare(name, game)
         except Missing as reason:
             console.print(f"{name}: left out, {reason}")
             continue
         if thorough and (trouble := disagreement(implementation)):
             raise SystemExit(f"no times of different things are compared: {trouble}")
         ready[name] = implementation
+    candidates = dict(ready)
+    if "peer" in ready and thorough:
+        candidates |= {solver: prepare("peer", game, solver) for solver in peer.LINEAR_SOLVERS[1:]}
     actions: dict[tuple[str, int], Callable[[], Any]] = {}
-    for name, implementation in ready.items():
+    for name, implementation in candidates.items():
         actions |= {(name, 0): implementation.forward, (name, 1): implementation.forward_backward}
     times = measure.interleaved(actions, repeats)
 
     def of(name: str, backward: int) -> float:
-        found = times[name, backward]
-        return found.cpu if threads == 1 and name != "cuda" else found.wall
+        rivals = [solver for solver in peer.LINEAR_SOLVERS if solver in candidates] if name == "peer" else []
+        found = [times[candidate, backward] for candidate in (name, *rivals)]
+        return min(t.cpu if threads == 1 and name != "cuda" else t.wall for t in found)
 
     def ratio(name: str, backward: int) -> float | None:
         return of("peer", backward) / of(name, backward) if "peer" in ready else None
@@ -80,9 +80,7 @@ def measurements(
             threads=threads,
             forward_ms=of(name, 0),
             forward_backward_ms=of(name, 1),
-            peak_mb=measure.in_fresh_process(_peak, game.setting, game.sizes, name, threads, linear_solver)
-            if thorough
-            else None,
+            peak_mb=measure.in_fresh_process(_peak, game.setting, game.sizes, name, threads) if thorough else None,
             peer_ratio_forward=ratio(name, 0),
             peer_ratio_forward_backward=ratio(name, 1),
         )
@@ -90,12 +88,12 @@ def measurements(
     ]
 
 
-def _peak(setting: str, sizes: dict[str, int], name: str, threads: int, linear_solver: str) -> float | None:
+def _peak(setting: str, sizes: dict[str, int], name: str, threads: int) -> float | None:
     """Peak memory [MB] of forward and backward, in a process that has done nothing but the same for one scene."""
     warnings.simplefilter("ignore")
     torch.set_num_threads(threads)
-    prepare(name, make(setting, **{**sizes, "B": 1, "M": 1}), linear_solver).forward_backward()
-    implementation = prepare(name, make(setting, **sizes), linear_solver)
+    prepare(name, make(setting, **{**sizes, "B": 1, "M": 1})).forward_backward()
+    implementation = prepare(name, make(setting, **sizes))
     if name == "cuda":
         torch.cuda.reset_peak_memory_stats()
         before = torch.cuda.memory_allocated()

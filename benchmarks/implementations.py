@@ -11,9 +11,7 @@ from torch import Tensor
 
 from benchmarks import peer, reference
 from benchmarks.games import Game
-from benchmarks.measure import interleaved
 from epo_lightning.scene import GameParameters
-from epo_lightning.solvers import compiled
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
 NAMES = ("peer", "reference", "pytorch", "compiled", "cuda")
@@ -69,11 +67,11 @@ class Implementation:
             torch.cuda.synchronize()
 
 
-def prepare(name: str, game: Game, linear_solver: str = "LUDenseSolver") -> Implementation:
+def prepare(name: str, game: Game, linear_solver: str = peer.LINEAR_SOLVERS[0]) -> Implementation:
     """The implementation called ``name`` for a game.
 
     Args:
-        linear_solver: the peer's, see :func:`faster_linear_solver`.
+        linear_solver: the peer's, out of :data:`benchmarks.peer.LINEAR_SOLVERS`.
 
     Raises:
         Missing: it cannot run here.
@@ -90,28 +88,13 @@ def prepare(name: str, game: Game, linear_solver: str = "LUDenseSolver") -> Impl
             if not torch.cuda.is_available():
                 raise Missing("no CUDA device")
             game = game.to("cuda")
-        case "compiled":
-            reason = compiled.obstacle(game.energy, game.scene, game.parameters)
-            if reason or not compiled.available():
-                raise Missing(reason or "the kernel was not built: no C++ compiler was found at installation")
-    if "backend" not in LevenbergMarquardt.__dataclass_fields__ and name == "compiled":
-        raise Missing("the solver has no such backend yet")
-    backend = {"backend": "compiled" if name == "compiled" else "pytorch"}
-    if "backend" not in LevenbergMarquardt.__dataclass_fields__:
-        backend = {}
-    layer = LevenbergMarquardt(game.steps, game.step_size, game.damping, **backend)  # type: ignore[arg-type]
+    backend = "compiled" if name == "compiled" else "pytorch"
+    layer = LevenbergMarquardt(game.steps, game.step_size, game.damping, backend=backend)
+    try:
+        layer(game.energy, game.scene[0], game.parameters[0])
+    except ValueError as error:
+        raise Missing(str(error)) from error
     return Implementation(name, game, lambda parameters: layer(game.energy, game.scene, parameters).controls)
-
-
-def faster_linear_solver(game: Game) -> str:
-    """Which of the peer's dense linear solvers takes less time for this game, forward and backward.
-
-    Raises:
-        Missing: the peer is not installed.
-    """
-    candidates = {name: prepare("peer", game, name).forward_backward for name in peer.LINEAR_SOLVERS}
-    times = interleaved(candidates, 3)
-    return min(times, key=lambda linear_solver: times[linear_solver].cpu)
 
 
 def disagreement(implementation: Implementation, tolerance: float = 1e-5) -> str | None:

@@ -1,7 +1,7 @@
 """Theseus 0.2.3 on the same problems, in its fastest mode and written as favourably as we know.
 
 One vector of all unknowns, one cost function per group of residuals, Jacobians by ``vmap``, fixed damping, no tolerance to
-stop at, unrolled differentiation, B M problems in one batch, and of its dense linear solvers the one that is faster here.
+stop at, unrolled differentiation, B M problems in one batch, and of its dense linear solvers whichever takes less time.
 """
 
 from __future__ import annotations

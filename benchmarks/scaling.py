@@ -94,5 +94,5 @@ def draw(found: Mapping[str, Sequence[Measurement]], path: Path) -> Path:
             panel.xaxis.set_major_formatter(ScalarFormatter())
             panel.xaxis.set_minor_formatter(NullFormatter())
         panels[0].set_ylabel("forward and backward [ms]")
-        panels[0].legend()
+        panels[1].legend(loc="upper right")
         return save(figure, path)
