@@ -594,7 +594,7 @@ class Model:
             for offset, values in bands:
                 of_band = (len(matrix), n - offset), (n * n, diagonal_stride), start + offset
                 matrix.as_strided(*of_band).add_(values[chosen, : n - offset])
-            if same is not None:
+            if same is not None and following is not None:
                 # The heading's row and the speed's column, at the same node and at the next one.
                 strides = n * n, 2 * size * diagonal_stride, diagonal_stride
                 matrix.as_strided((len(matrix), steps, size), strides, start + size).add_(same[chosen])

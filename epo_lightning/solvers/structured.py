@@ -3,8 +3,8 @@
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Two things happen around it.
 
 *Splitting.* Agents that no active pair connects do not know of each other: on a CPU every sample falls apart into the
-connected components of its active pairs, and components of one size are factorised together. What is solved for an agent then
-depends on nothing but its component, to the last bit, and a scene with few active pairs costs little more than its
+connected components of its active pairs, and components of one size are factorised together. What is solved for an agent
+then depends on nothing but its component, to the last bit, and a scene with few active pairs costs little more than its
 agents alone. Other devices would have to wait for the host to learn the components; there every sample is one matrix, and
 no operation asks the device for a number.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import pytest
 import torch
@@ -286,6 +287,7 @@ def test_implicit_gradients_equal_central_differences_of_the_minimum(own):
     cotangent = torch.randn_like(parameters.initial_controls)
     (solution.controls * cotangent).sum().backward()
     assert leaves.initial_controls.grad is None
+    again = dataclasses.replace(solve, steps=40, differentiation="detached")
     for kind, name in [*(("own_weights", name) for name in own), ("pair_weights", "proximity"), ("goals", None)]:
         given = getattr(parameters, kind)
         tensor = given if name is None else given[name]
@@ -294,7 +296,8 @@ def test_implicit_gradients_equal_central_differences_of_the_minimum(own):
             return dataclasses.replace(parameters, **{kind: t if name is None else {**given, name: t}})
 
         def minimum(t, replace=replace):
-            return solve(energy, scene, replace(t)).controls.detach()
+            from_there = dataclasses.replace(replace(t), initial_controls=solution.controls.detach())
+            return again(energy, scene, from_there).controls
 
         numeric = central_differences(minimum, tensor, cotangent)
         analytic = getattr(leaves, kind).grad if name is None else getattr(leaves, kind)[name].grad
@@ -364,13 +367,15 @@ def test_detached_solutions_teach_nothing():
 
 def test_adaptive_steps_never_raise_an_energy_and_every_sample_decides_for_itself():
     scene = random_scene(6, 3, history=2, size=2.0, dtype=torch.float64)
-    parameters = random_game(scene, spread=2.0)
-    energy = Energy(ALL, bounds=BOUNDS)
+    scene = dataclasses.replace(scene, dt=0.5)  # long ways, on which a linearised heading is far from the truth
+    parameters = random_game(scene, horizon=10, spread=1.0)
+    energy = Energy(["goal", "vel", "acc", "turnr"])
     solve = LevenbergMarquardt(12, 1.0, 1e-3, keep_iterates=True, adaptive=True)
     solution = solve(energy, scene, parameters)
     energies = torch.stack([energy(scene, parameters, controls) for controls in solution.iterates])
-    assert (energies.diff(dim=0) <= 0).all()
-    rejected = (energies.diff(dim=0) == 0) & (solution.gradient_norm > 1e-6)
+    assert (energies.diff(dim=0) <= 1e-12 * energies[:-1]).all()
+    still = torch.stack([(a == b).flatten(2).all(-1) for a, b in pairwise(solution.iterates)])
+    rejected = still & (solution.gradient_norm > 1e-6)
     assert rejected.any(), "the problem should be hard enough for steps to be rejected"
     assert not rejected.all(-1).all(-1).any()
     torch.testing.assert_close(solution.energy, energies[-1], rtol=1e-12, atol=0)
@@ -385,7 +390,7 @@ def test_adaptive_steps_never_raise_an_energy_and_every_sample_decides_for_itsel
 def test_adaptive_gradients_equal_central_differences():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, 1, 5, spread=2.0)
-    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt(6, 1.0, 1e-3, adaptive=True)
+    energy, solve = Energy(SMOOTH), LevenbergMarquardt(4, 1.0, 1.0, adaptive=True)
     leaves = leaves_of(parameters)
     cotangent = torch.randn_like(parameters.initial_controls)
     (solve(energy, scene, leaves).controls * cotangent).sum().backward()

@@ -92,7 +92,7 @@ def test_steps_and_gradients_equal_a_dense_reference(size, absent, own, pair, le
     controls, gradients = with_gradients(
         lambda leaves: solve(energy, padded, leaves, split=split).controls[:, :, :agents], wide
     )
-    first, second = torch.triu_indices(agents + absent, agents + absent, 1)
+    _, second = torch.triu_indices(agents + absent, agents + absent, 1)
     real = [gradient[:, :, :agents] for gradient in gradients[:-1]] + [gradients[-1][:, :, second < agents]]
     assert_same((controls, real), expected, 1e-9)
     assert all(gradient.isfinite().all() for gradient in gradients)
