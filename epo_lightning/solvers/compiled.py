@@ -101,7 +101,7 @@ def _find() -> ctypes.CDLL | str:
     try:
         library = load()
     except OSError as error:
-        return str(error)
+        return f"{error}; with a C++ compiler on the path, installing epo_lightning again builds it"
     run = (ctypes.POINTER(_Game), ctypes.POINTER(_Run))
     library.epo_solve.argtypes = (_Integer, *run, _Integer, _Integer)
     library.epo_solve.restype = _Address
@@ -118,29 +118,12 @@ def _find() -> ctypes.CDLL | str:
 def _library() -> ctypes.CDLL:
     library = _find()
     if isinstance(library, str):
-        raise RuntimeError(f"the compiled EPO layer is missing: {library}")
+        raise RuntimeError(f"the compiled layer is missing: {library}")
     return library
 
 
-def available() -> bool:
-    """Whether the kernel was built and can be loaded; says once, visibly, where it cannot."""
-    library = _find()
-    if isinstance(library, str):
-        _complain(library)
-    return not isinstance(library, str)
-
-
-@functools.cache
-def _complain(reason: str) -> None:
-    warnings.warn(
-        f"the compiled EPO layer is missing: {reason}. Plain PyTorch does the same at a tenth of the speed or less. "
-        "With a C++ compiler on the path, installing epo_lightning again builds it.",
-        stacklevel=2,
-    )
-
-
 def obstacle(energy: Energy, scene: Scene, parameters: GameParameters) -> str | None:
-    """Why the kernel cannot solve a game; None where it can. Whether it is there at all, :func:`available` says."""
+    """Why the kernel cannot solve a game; None where it can."""
     controls = parameters.initial_controls
     if controls.device.type != "cpu":
         return f"the compiled layer runs on CPUs, and these tensors are on {controls.device}"
@@ -153,7 +136,17 @@ def obstacle(energy: Energy, scene: Scene, parameters: GameParameters) -> str | 
             return f"the compiled layer does not know the feature {name!r}"
     if scene.agent_mask.shape[1] > MOST_AGENTS:
         return f"the compiled layer takes up to {MOST_AGENTS} agents, not {scene.agent_mask.shape[1]}"
-    return None
+    library = _find()
+    return f"the compiled layer is missing: {library}" if isinstance(library, str) else None
+
+
+@functools.cache
+def say_once(reason: str) -> None:
+    """Make it visible that plain PyTorch takes the kernel's place."""
+    warnings.warn(
+        f"{reason}. Plain PyTorch does the same, at a tenth of the speed or less; solver.backend=pytorch asks for it.",
+        stacklevel=2,
+    )
 
 
 def solve(

@@ -3,7 +3,7 @@
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
 modes are solved at once and none of them can disturb another: where a factorisation fails, that sample alone is tried again
 with more damping, and where that fails too it keeps its last good iterate. How a step is computed is a backend's business
-(:mod:`~epo_lightning.solvers.structured`); what is done with the steps stands here.
+(:mod:`~epo_lightning.solvers.compiled`, :mod:`~epo_lightning.solvers.structured`); what is done with the steps stands here.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
-from epo_lightning.solvers import implicit, structured
+from epo_lightning.solvers import compiled, implicit, structured
 
 Backend = Callable[[Energy, Scene, GameParameters, int, float, Tensor, bool], Solution]
 """(energy, scene, parameters, steps, step size, damping [B, M], keep iterates) -> solution."""
@@ -151,8 +151,15 @@ class LevenbergMarquardt:
 
 def _backend(name: str, energy: Energy, scene: Scene, parameters: GameParameters) -> Backend:
     """What computes the steps of a game."""
+    if name == "pytorch":
+        return structured.solve
+    obstacle = compiled.obstacle(energy, scene, parameters)
+    if obstacle is None:
+        return compiled.solve
     if name == "compiled":
-        raise ValueError("solver.backend 'compiled' is not available here; 'auto' and 'pytorch' are")
+        raise ValueError(f"solver.backend is 'compiled', but {obstacle}; 'auto' and 'pytorch' can solve this game")
+    if parameters.initial_controls.device.type == "cpu":
+        compiled.say_once(obstacle)
     return structured.solve
 
 

@@ -18,6 +18,7 @@ from epo_lightning.game.energy import Energy
 from epo_lightning.scene import Status
 from epo_lightning.solvers import compiled
 from epo_lightning.solvers.kernel import build
+from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
 if isinstance(compiled._find(), str) and shutil.which("c++") is None:
     pytest.skip("there is no C++ compiler on this machine, so the kernel was not built", allow_module_level=True)
@@ -28,7 +29,7 @@ class TestCompiled(BackendSuite):
 
 
 def test_the_kernel_was_built_from_these_sources():
-    assert compiled.available()
+    assert compiled._library() is build.load() or compiled._library().epo_fingerprint() == build.fingerprint()
 
 
 def test_all_levels_of_instructions_agree():
@@ -122,14 +123,26 @@ def test_sixty_four_agents():
     assert (energy.terms(scene, parameters, parameters.initial_controls)["proximity"] > 0).sum() > 64
 
 
-def test_a_missing_library_is_one_visible_notice(monkeypatch):
+def test_the_layer_takes_it_where_it_can_and_says_once_where_it_cannot(monkeypatch):
+    scene, energy = random_scene(2, 2, history=2), Energy(ALL, bounds=BOUNDS)
+    parameters = random_game(scene)
+    by_default = LevenbergMarquardt()(energy, scene, parameters).controls
+    assert torch.equal(by_default, LevenbergMarquardt(backend="compiled")(energy, scene, parameters).controls)
+    plain = LevenbergMarquardt(backend="pytorch")(energy, scene, parameters).controls
+    assert not torch.equal(by_default, plain), "two ways to the same numbers differ in the last bits"
+    torch.testing.assert_close(by_default, plain, rtol=0, atol=1e-4)
+
     monkeypatch.setattr(compiled, "_find", lambda: "it was not built")
-    compiled._complain.cache_clear()
-    with pytest.warns(UserWarning, match=r"compiled EPO layer is missing: it was not built.*C\+\+ compiler"):
-        assert not compiled.available()
+    compiled.say_once.cache_clear()
+    with pytest.warns(
+        UserWarning, match="the compiled layer is missing: it was not built.*Plain PyTorch does the same"
+    ):
+        assert torch.equal(LevenbergMarquardt()(energy, scene, parameters).controls, plain)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert not compiled.available()
+        LevenbergMarquardt()(energy, scene, parameters)
+    with pytest.raises(ValueError, match=r"solver\.backend is 'compiled', but the compiled layer is missing"):
+        LevenbergMarquardt(backend="compiled")(energy, scene, parameters)
     with pytest.raises(RuntimeError, match="it was not built"):
         compiled._library()
 

@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).parent
-LIBRARY = HERE / "epo_kernel.so"
+LIBRARY = HERE / "epo_kernel.so.1"  # a plain ".so" would look like a module of Python's
 _LEVELS = {"epo_plain": [], "epo_v3": ["-march=x86-64-v3"], "epo_v4": ["-march=x86-64-v4"]}
 # Contraction to fused multiply-adds is the only liberty that the compiler may take with the arithmetic.
 _FLAGS = ["-std=c++17", "-O3", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-Wno-psabi"]
