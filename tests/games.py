@@ -10,7 +10,7 @@ import torch
 from epo_lightning.game import features
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.features import OWN_FEATURES
-from epo_lightning.game.normal_equations import Group, Model
+from epo_lightning.game.normal_equations import Model
 from epo_lightning.scene import GameParameters, Scene
 
 BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}
@@ -141,12 +141,9 @@ def feet_held() -> Iterator[None]:
 def normal_equations(energy: Energy, scene: Scene, parameters: GameParameters, controls: torch.Tensor, exact=False):
     """The model's gradient [B, M, N, K, 2] and matrix [B, M, n, n] in the controls, in the order of ``controls``."""
     model = Model(energy, scene, parameters, controls, every_pair=True, exact=exact)
-    none = controls.new_zeros(model.samples)
-    lower = torch.cat([matrix.tril() for _, matrix, _ in model.systems(none, Group.whole(model.edges))])
-    steps, agents = model.steps, model.agents
-    matrix = (lower + lower.tril(-1).mT).view(-1, steps, 2, agents, steps, 2, agents)
-    # A node's speed and heading are dt times the sums of the controls before it.
-    sums = scene.dt * torch.ones(steps, steps, dtype=controls.dtype).tril()
-    matrix = torch.einsum("slcimdj,lk,mn->sikcjnd", matrix, sums, sums)
+    none, steps, agents = controls.new_zeros(model.samples), model.steps, model.agents
+    units = torch.eye(2 * steps * agents, dtype=controls.dtype).view(-1, agents, steps, 2).transpose(-1, -2)
+    columns = [model.times(unit.expand(model.samples, -1, -1, -1), none) for unit in units]
+    matrix = torch.stack([column.transpose(-1, -2).flatten(1) for column in columns], -1)
     shape = *controls.shape[:2], 2 * steps * agents, 2 * steps * agents
     return model.gradient.transpose(-1, -2).reshape(controls.shape), matrix.reshape(shape)

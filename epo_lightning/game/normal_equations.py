@@ -7,7 +7,8 @@ them the model is nearly local. With e_l the heading's unit vector and e'_l the 
 
 so what positions contribute to the matrix at (l, l') with l >= l' is M_l^T [dt^2 sum_{k>l} Q_k] M_l', Q_k the curvature in
 p_k: one thin matrix product gives the whole lower triangle. Everything else is a band: controls are first differences of z,
-their rates second ones, speeds stand on the diagonal, and steering angles couple a turn rate with the speed before it.
+their rates second ones, speeds stand on the diagonal, and steering angles couple a turn rate with the speed before it. What
+a model holds are these curvatures; a solver puts them together.
 
 Arrays are laid out [S, N, component, K] with S = B M samples; components of z and u are speed and heading, acceleration and
 turn rate. Pairs are a list of E edges between agents, numbered s N + i through all samples.
@@ -16,11 +17,11 @@ turn rate. Pairs are a list of E edges between agents, numbered s N + i through 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.game.energy import Energy, along, pairs
@@ -36,8 +37,6 @@ from epo_lightning.game.features import (
 )
 from epo_lightning.scene import HEADING, SPEED, TURN_RATE, GameParameters, Scene
 
-_CACHED = 2**20
-"""Bytes of matrices that are worked on at a time: what a processor core keeps close."""
 Shape = tuple[Tensor, Tensor | None, Tensor | None]
 """Value, slope and curvature of an elementwise function; None for a slope of one or a curvature of zero."""
 
@@ -204,15 +203,19 @@ class Model:
         self._read_pairs(every_pair)
         if exact:
             self._bend_undeclared()
-        after = self._after(self.pull)
+        force = self._after(self.pull[:, :, :2])
         if exact:
             # A force on later positions bends with the heading: e'' = -e.
-            force = after[:, :, :2]
             self.node_stiffness[:, :, 1] -= speed * (self.unit * force).sum(2)
             self._crossed()[:, :, 0] += (self.left * force).sum(2)
-        self.after = after[:, :, 2:]
-        self.node_force += (self.moves * after[:, :, None, :2]).sum(3)
+        self.node_force += (self.moves * force[:, :, None]).sum(3)
         self.value = self.agent_value.cumsum(1)[:, -1]  # one after the other: absent agents add an exact zero
+
+    @property
+    def present(self) -> Bool[Tensor, "S N"]:
+        """Which agents exist."""
+        mask = self.scene.agent_mask
+        return mask[:, None].expand(-1, self.samples // len(mask), -1).reshape(self.samples, self.agents)
 
     # --- gradient -----------------------------------------------------------------------------------------------------
 
@@ -220,11 +223,6 @@ class Model:
     def gradient(self) -> Float[Tensor, "S N 2 K"]:
         """dE/du."""
         return self.control_force + self.dt * _suffix(self.node_force)
-
-    @property
-    def node_gradient(self) -> Float[Tensor, "S N 2 K"]:
-        """dE/dz."""
-        return self.node_force + self.to_nodes(self.control_force)
 
     def to_nodes(self, covector: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
         """What a gradient in the controls is in the nodes: u_l = (z_{l+1} - z_l) / dt."""
@@ -516,118 +514,6 @@ class Model:
 
     # --- matrix -------------------------------------------------------------------------------------------------------
 
-    def _bands(self, damping: Float[Tensor, " S"]) -> Float[Tensor, "A F K"]:
-        """Everything that agents bring into the matrix, and dE/dz, agent by agent."""
-        present = self.scene.agent_mask[:, None].expand(-1, self.samples // len(self.scene.agent_mask), -1)
-        present = present.reshape(self.samples, self.agents, 1, 1)
-        # Absent agents get unit matrices of their own, so that they are regular even without damping.
-        control = torch.where(present, self.control_stiffness + damping[:, None, None, None], 1.0) / self.dt**2
-        following = _ahead(control)
-        diagonal, first, second = self.node_stiffness + control + following, -following, None
-        if self.rate_stiffness is not None:
-            rate = self.rate_stiffness / self.dt**4
-            following = _ahead(rate)
-            before = torch.nn.functional.pad(rate[..., :-1], (1, 0))
-            diagonal = diagonal + (before + 4.0 * rate + following)
-            first = first - 2.0 * (rate + following)
-            second = following
-        parts = [self.moves.flatten(2, 3), self.dt * self.after, self.node_gradient, diagonal, first]
-        parts += [part for part in (second, self.cross) if part is not None]
-        if self.beta not in (0.0, 1.0):
-            parts.append(self.pull[:, :, 2:])
-        return torch.cat(parts, 2).flatten(0, 1)
-
-    def systems(
-        self, damping: Float[Tensor, " S"], group: Group, out: Float[Tensor, "C n n"] | None = None
-    ) -> Iterator[tuple[slice, Float[Tensor, "c n n"], Float[Tensor, "c n"]]]:
-        """Lower triangles of J^T J + damping in the nodes' unknowns, in the order node, component, agent; and dE/dz.
-
-        They come a few at a time, so that what is done with a matrix finds it in the processor's cache.
-
-        Args:
-            damping: lambda of every sample, a multiple of the identity in the controls.
-            group: the agents whose matrices are wanted.
-            out: where the matrices stay; without it, the next ones overwrite them.
-
-        Yields:
-            which of the group's sets these are; their matrices, column by column as a factorisation in place takes them,
-            with nothing meaningful above the diagonal; their gradients.
-        """
-        packed = self._bands(damping)
-        if group.agents is not None:
-            packed = packed.index_select(0, group.agents.flatten())
-        count, size, steps = group.count, group.size, self.steps
-        packed = packed.view(count, size, -1, steps).permute(0, 2, 3, 1).contiguous()  # [C, F, K, m]
-        sizes = [4, 3, 2, 2, 2]
-        sizes += [2] * (self.rate_stiffness is not None) + [2] * (self.cross is not None)
-        sizes += [3] * (self.beta not in (0.0, 1.0))
-        moves, after, gradient, diagonal, first, *rest = packed.split(sizes, 1)
-        moves = moves.view(count, 2, 2, steps, size)
-        gradient = gradient.transpose(1, 2).reshape(count, -1)
-        n = gradient.shape[1]
-        bands = [(0, diagonal), (2 * size, first)]
-        if self.rate_stiffness is not None:
-            bands.append((4 * size, rest.pop(0)))
-        bands = [(offset, values.transpose(1, 2).reshape(count, n)) for offset, values in bands if offset < n]
-        same, following = rest.pop(0).unbind(1) if self.cross is not None else (None, None)
-
-        left = packed.new_empty(count, size, 2, steps, 2, size)
-        shared = None if self.pair_curvature is None else self.dt * self._after(self.pair_curvature)
-        coupled = group.coupled(after, shared)
-        for xy, (one, other) in enumerate(((0, 1), (1, 2))):
-            for component in range(2):
-                entry = left[:, :, xy, :, component]
-                torch.mul(coupled[:, one], moves[:, None, component, 0], out=entry)
-                entry.addcmul_(coupled[:, other], moves[:, None, component, 1])
-        left = left.view(count, 2 * size, n)
-        right = packed.new_zeros(count, steps, 2, size, size, 2)
-        right.diagonal(dim1=3, dim2=4).copy_(moves.permute(0, 3, 1, 2, 4))
-        right = right.view(count, n, 2 * size)
-
-        at_a_time = group.at_a_time(packed, steps)
-        buffer = packed.new_empty(min(at_a_time, count), n, n) if out is None else out.mT
-        for begin in range(0, count, at_a_time):
-            chosen = slice(begin, min(begin + at_a_time, count))
-            matrix = buffer[: chosen.stop - begin] if out is None else buffer[chosen]
-            torch.bmm(right[chosen], left[chosen], out=matrix)
-            start, diagonal_stride = matrix.storage_offset(), n + 1
-            for offset, values in bands:
-                of_band = (len(matrix), n - offset), (n * n, diagonal_stride), start + offset
-                matrix.as_strided(*of_band).add_(values[chosen, : n - offset])
-            if same is not None and following is not None:
-                # The heading's row and the speed's column, at the same node and at the next one.
-                strides = n * n, 2 * size * diagonal_stride, diagonal_stride
-                matrix.as_strided((len(matrix), steps, size), strides, start + size).add_(same[chosen])
-                after_next = matrix.as_strided((len(matrix), steps - 1, size), strides, start + 3 * size)
-                after_next.add_(following[chosen, :-1])
-            if rest or self.blocks is not None or self.pair_blocks is not None:
-                part = (
-                    group
-                    if len(matrix) == count
-                    else group.subset(torch.arange(begin, chosen.stop, device=matrix.device))
-                )
-                self._add_blocks(matrix.view(-1, steps, 2, size, steps, 2, size), moves[chosen], rest, part, chosen)
-            yield chosen, matrix.mT, gradient[chosen]
-
-    def _add_blocks(self, matrix: Tensor, moves: Tensor, own: list[Tensor], group: Group, chosen: slice) -> None:
-        """What is neither a product of velocities nor a band: corrections of Heun's method and undeclared features."""
-        steps, size = self.steps, group.size
-        if own:
-            # The position at node l itself counts 1 - beta times for z_l, once where both factors are z_l's.
-            here = group.coupled(own[0][chosen], self.pair_curvature)
-            full = torch.stack((here[:, :2], here[:, 1:]), 1)  # [C, 2, 2, m, K, m]
-            share = -self.beta * (1.0 - self.beta) * self.dt**2
-            same_node = torch.einsum("tcxkj,txyjki,tdyki->tcjdik", moves, full, moves)
-            matrix.diagonal(dim1=1, dim2=4).add_(share * same_node)
-        if self.blocks is not None:
-            blocks = self.blocks if group.agents is None else self.blocks.flatten(0, 1)[group.agents]
-            blocks = blocks.view(-1, size, 2, steps, 2, steps)
-            matrix.diagonal(dim1=3, dim2=6).add_(blocks.permute(0, 3, 2, 5, 4, 1))
-        if self.pair_blocks is not None:
-            shared = group.of_edges(self.pair_blocks).view(-1, 2, steps, 2, steps)
-            matrix[group.component, :, :, group.second, :, :, group.first] += shared.permute(0, 4, 3, 2, 1)
-            matrix[group.component, :, :, group.first, :, :, group.second] += shared.permute(0, 2, 1, 4, 3)
-
     def times(self, change: Float[Tensor, "S N 2 K"], damping: Float[Tensor, " S"]) -> Float[Tensor, "S N 2 K"]:
         """(J^T J + damping) times a change of the controls, through the trajectory and without the matrix.
 
@@ -834,11 +720,6 @@ class Group:
         sample = edges.first // max(edges.agents, 1)
         start = sample * edges.agents
         return cls(None, edges.samples, edges.agents, None, sample, edges.first - start, edges.second - start)
-
-    def at_a_time(self, like: Tensor, steps: int) -> int:
-        """How many of these sets' matrices are worked on together."""
-        n = 2 * self.size * steps
-        return max(1, _CACHED // (n * n * like.element_size())) if like.device.type == "cpu" else max(1, self.count)
 
     def subset(self, chosen: Int[Tensor, " D"]) -> Group:
         """Some of these sets alone."""

@@ -16,13 +16,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.game.normal_equations import Group, Model
 
 _UNKNOWNS = 32
 """Aimed at in every block: fewer are more operations, more are more arithmetic."""
+_ALIGNED = 16
+"""Unknowns are filled up to a multiple of this. Libraries round differently where a matrix starts in the middle of a cache
+line, and a sample must not depend on its place in a batch."""
 
 
 def bounds(steps: int, agents: int) -> list[tuple[int, int]]:
@@ -34,38 +37,49 @@ def bounds(steps: int, agents: int) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Block:
-    """One block's part of the factors, for C sets of m agents, F = 2 m unknowns at each of its T nodes.
+    """One block's part of the factors, for C sets of m agents, F = 2 m unknowns at each of its nodes.
 
     Attributes:
+        unknowns: how many there are; what is beyond them, up to n, fills up the arrays.
         moves: how the nodes move later positions, dt M, component and agent by axis and agent.
         factor: L.
         gain: G^T; None for the first block, whose state is given.
     """
 
+    unknowns: int
     moves: Float[Tensor, "C n F"]
     factor: Float[Tensor, "C n n"]
     gain: Float[Tensor, "C X n"] | None
 
 
 @dataclass(frozen=True)
-class BlockFactors:
+class Factors:
     """J^T J + lambda I of a group of agents, factorised block by block."""
 
     blocks: list[Block]
 
+    def put(self, where: Int[Tensor, " D"], others: Factors, chosen: Bool[Tensor, " D"]) -> None:
+        """Take over, at ``where``, the chosen ones of other factors."""
+        for mine, theirs in zip(self.blocks, others.blocks, strict=True):
+            mine.factor[where[chosen]] = theirs.factor[chosen]
+            if mine.gain is not None and theirs.gain is not None:
+                mine.gain[where[chosen]] = theirs.gain[chosen]
+
     def solve(self, right: Float[Tensor, "C N"]) -> Float[Tensor, "C N"]:
         """(J^T J + lambda I)^-1 times a covector of all nodes, in the order node, component, agent."""
         width = self.blocks[0].moves.shape[-1]
-        parts = list(right[..., None].split([block.factor.shape[-1] for block in self.blocks], 1))
+        parts = list(right[..., None].split([block.unknowns for block in self.blocks], 1))
         carried: Tensor | None = None
         for index in range(len(self.blocks) - 1, -1, -1):
-            block, part = self.blocks[index], parts[index]
+            block = self.blocks[index]
+            part = parts[index].new_zeros(len(right), block.factor.shape[-1], 1)
+            part[:, : block.unknowns] = parts[index]
             if carried is not None:
-                part = torch.baddbmm(part, block.moves, carried[:, :width])
-                part[:, -2 * width :] += carried[:, width:]
+                part += _times(block.moves, carried[:, :width])
+                part[:, block.unknowns - 2 * width : block.unknowns] += carried[:, width:]
             parts[index] = torch.linalg.solve_triangular(block.factor, part, upper=False)
             if block.gain is not None:
-                spread = -(block.gain @ parts[index])
+                spread = -_times(block.gain, parts[index])
                 if carried is not None:
                     spread[:, :width] += carried[:, :width]
                 carried = spread
@@ -75,37 +89,47 @@ class BlockFactors:
             if state is not None:
                 assert block.gain is not None
                 part = torch.baddbmm(part, block.gain.mT, state, alpha=-1)
-            parts[index] = nodes = torch.linalg.solve_triangular(block.factor.mT, part, upper=True)
+            nodes = torch.linalg.solve_triangular(block.factor.mT, part, upper=True)
             moved = block.moves.mT @ nodes
+            parts[index] = nodes = nodes[:, : block.unknowns]
             state = torch.cat((moved if state is None else state[:, :width] + moved, nodes[:, -2 * width :]), 1)
         return torch.cat(parts, 1)[..., 0]
+
+
+def _times(matrix: Float[Tensor, "C a b"], vector: Float[Tensor, "C b 1"]) -> Float[Tensor, "C a 1"]:
+    # Products of rows with vectors round differently in a batch of one: libraries have a routine of its own for it.
+    return (matrix * vector.mT).sum(-1, keepdim=True)
 
 
 def factorise(model: Model, damping: Float[Tensor, " S"], group: Group) -> tuple[BlockFactors, Bool[Tensor, " C"]]:
     """Factors of a group's matrices, and which of them have none.
 
     Args:
-        model: the energy around an iterate, integrated by explicit Euler, of declared features only.
+        model: the energy around an iterate.
         damping: lambda of every sample, a multiple of the identity in the controls.
     """
     parts = _Parts(model, damping, group)
     failed = torch.zeros(group.count, dtype=torch.bool, device=damping.device)
     blocks: list[Block] = []
     cost: Tensor | None = None
-    for start, end in reversed(bounds(model.steps, group.size)):
+    # Undeclared features may couple any two steps: then there is one block of all.
+    whole = model.blocks is not None or model.pair_blocks is not None
+    for start, end in reversed([(0, model.steps)] if whole else bounds(model.steps, group.size)):
         block, cost, info = parts.eliminate(start, end, cost)
         blocks.insert(0, block)
         failed |= info != 0
-    return BlockFactors(blocks), failed
+    return Factors(blocks), failed
 
 
 class _Parts:
     """A model's stiffnesses for one group, laid out [C, .., nodes, .., m]."""
 
     def __init__(self, model: Model, damping: Float[Tensor, " S"], group: Group) -> None:
-        self.size, self.steps, self.dt = group.size, model.steps, model.dt
+        self.model, self.group, self.size = model, group, group.size
         # Absent agents get unit matrices of their own, so that they are regular even without damping.
-        control = torch.where(model.present, model.control_stiffness + damping[:, None, None, None], 1.0)
+        control = torch.where(
+            model.present[..., None, None], model.control_stiffness + damping[:, None, None, None], 1.0
+        )
         rows = [model.dt * model.moves.flatten(2, 3), control / model.dt**2, model.node_stiffness, model.pull[:, :, 2:]]
         sizes = [4, 2, 2, 3]
         for optional, scale in ((model.rate_stiffness, model.dt**-4), (model.cross, 1.0)):
@@ -129,23 +153,29 @@ class _Parts:
         width, count = 2 * self.size, end - start
         batch = len(self.moves)
         moves = self.moves[:, start:end]
-        # Node l moves the positions after l, here up to end + 1; the state moves as many of them as the first node.
-        ahead = self.curvature.new_zeros(batch, count, width, width)
-        inside = self.curvature[:, start + 1 : end + 1]
-        ahead[:, : inside.shape[1]] = inside.flip(1).cumsum(1).flip(1)
+        # The state moves all positions of the block, start + 1 .. end, and node l those after l, and all that follow.
+        ahead = self.curvature.new_zeros(batch, count + 1, width, width)
+        ahead[:, :-1] = self.curvature[:, start:end].flip(1).cumsum(1).flip(1)
         if cost is not None:
             ahead += cost[:, None, :width, :width]
-        by_axis = ahead.view(batch, count, 2, self.size, width)
-        left = moves[:, :, :, 0, :, None] * by_axis[:, :, None, 0]
-        left.addcmul_(moves[:, :, :, 1, :, None], by_axis[:, :, None, 1])
-        left = left.view(batch, -1, width)
-        right = left.new_zeros(batch, count, 2, self.size, 2, self.size)
-        right.diagonal(dim1=3, dim2=5).copy_(moves)
-        right = right.view(batch, -1, width)
+        beta = self.model.beta
+        later = ahead[:, 1:]
+        if beta != 1.0:
+            # Position l itself moves with 1 - beta of node l, which counts twice on the diagonal.
+            later = later + (1.0 - beta) * self.curvature[:, start:end]
+        by_axis = later.view(batch, count, 2, self.size, width)
+        unknowns = count * width
+        filled = -(-unknowns // _ALIGNED) * _ALIGNED
+        left, right = moves.new_zeros(2, batch, filled, width).unbind(0)
+        product = left[:, :unknowns].view(batch, count, 2, self.size, width)
+        torch.mul(moves[:, :, :, 0, :, None], by_axis[:, :, None, 0], out=product)
+        product.addcmul_(moves[:, :, :, 1, :, None], by_axis[:, :, None, 1])
+        apart = right[:, :unknowns].view(batch, count, 2, self.size, 2, self.size)
+        apart.diagonal(dim1=3, dim2=5).copy_(moves)
         # Column by column, as factorisations and triangular solves in place take them.
         matrix = torch.bmm(right, left.mT).mT
         if cost is not None:
-            tail = slice(matrix.shape[1] - 2 * width, None)
+            tail = slice(unknowns - 2 * width, unknowns)
             across = torch.bmm(cost[:, width:, :width], right.mT)
             matrix[:, tail] += across
             matrix[:, tail, tail] += across[:, :, tail].mT
@@ -156,16 +186,25 @@ class _Parts:
             state = left.new_zeros(batch, 3 * width, matrix.shape[1]).mT
             state[:, :, :width] = left
             if cost is not None:
-                state[:, -2 * width :, :width] += cost[:, width:, :width]
-        own = self._bands(matrix, state, start, end)
+                state[:, tail, :width] += cost[:, width:, :width]
+        nodes = matrix[:, :unknowns, :unknowns]
+        own = self._bands(nodes, state, start, end)
+        matrix.diagonal(0, 1, 2)[:, unknowns:] = 1.0
+        if beta not in (0.0, 1.0):
+            diagonal = nodes.unflatten(1, (count, width)).unflatten(3, (count, width)).diagonal(0, 1, 3)
+            by_node = apart.view(batch, count, width, width)
+            at_node = by_node @ (self.curvature[:, start:end] @ by_node.mT)
+            diagonal -= beta * (1.0 - beta) * at_node.permute(0, 2, 3, 1)
+        if start == 0 and end == self.model.steps:
+            self._add_undeclared(nodes)
         info = torch.empty(batch, dtype=torch.int32, device=matrix.device)
         torch.linalg.cholesky_ex(matrix, out=(matrix, info))
         if state is None:
-            return Block(right, matrix, None), None, info
+            return Block(unknowns, right, matrix, None), None, info
         gain = torch.linalg.solve_triangular(matrix, state, upper=False, out=state)
         own[:, :width, :width] += ahead[:, 0]
         own = torch.baddbmm(own, gain.mT, gain, alpha=-1)
-        return Block(right, matrix, gain.mT), own, info
+        return Block(unknowns, right, matrix, gain.mT), own, info
 
     def _bands(self, matrix: Tensor, state: Tensor | None, start: int, end: int) -> Tensor:
         """Add what differences of nodes cost, to the block's own matrix and to its rows against the state.
@@ -200,7 +239,7 @@ class _Parts:
                 matrix.diagonal(-offset * width, 1, 2).add_(inner)
         if self.cross.shape[2]:
             # The speed of a node with its heading (rows of headings, columns of speeds), and with the next heading.
-            nodes = matrix.mT.view(batch, count, 2, self.size, count, 2, self.size)
+            nodes = matrix.mT.unflatten(1, (count, 2, self.size)).unflatten(4, (count, 2, self.size))
             here, following = self.cross[:, start:end].unbind(2)
             heading_by_speed = nodes[:, :, 0, :, :, 1].diagonal(0, 2, 4).transpose(1, 2)  # [C, T, T, m]
             heading_by_speed.diagonal(0, 1, 2).add_(here.transpose(1, 2))
@@ -221,3 +260,18 @@ class _Parts:
             following = self.cross[:, start - 1, 1]
             state[:, self.size : width, 2 * width : 2 * width + self.size].diagonal(0, 1, 2).add_(following)
         return own
+
+    def _add_undeclared(self, matrix: Tensor) -> None:
+        """Add the dense curvatures of undeclared features to the matrix of all nodes."""
+        steps, size = self.model.steps, self.size
+        nodes = matrix.unflatten(1, (steps, 2, size)).unflatten(4, (steps, 2, size))
+        if self.model.blocks is not None:
+            blocks = self.model.blocks
+            blocks = blocks if self.group.agents is None else blocks.flatten(0, 1)[self.group.agents]
+            blocks = blocks.view(-1, size, 2, steps, 2, steps)
+            nodes.diagonal(dim1=3, dim2=6).add_(blocks.permute(0, 3, 2, 5, 4, 1))
+        if self.model.pair_blocks is not None:
+            shared = self.group.of_edges(self.model.pair_blocks).view(-1, 2, steps, 2, steps)
+            of = self.group
+            nodes[of.component, :, :, of.second, :, :, of.first] += shared.permute(0, 4, 3, 2, 1)
+            nodes[of.component, :, :, of.first, :, :, of.second] += shared.permute(0, 2, 1, 4, 3)

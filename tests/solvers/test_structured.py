@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 import torch
+from backends import BackendSuite
 from games import ALL, BOUNDS, leaves_of, pad, random_game, random_scene, widen
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,6 +23,10 @@ from epo_lightning.solvers import structured
 def solve(energy, scene, parameters, steps=2, damping=10.0, **options):
     damping = parameters.initial_controls.new_full(parameters.initial_controls.shape[:2], damping)
     return structured.solve(energy, scene, parameters, steps, 0.3, damping, **options)
+
+
+class TestStructured(BackendSuite):
+    solve = staticmethod(structured.solve)
 
 
 def dense(energy, scene, parameters, steps=2, damping=10.0):
@@ -96,17 +101,6 @@ def test_steps_and_gradients_equal_a_dense_reference(size, absent, own, pair, le
     real = [gradient[:, :, :agents] for gradient in gradients[:-1]] + [gradients[-1][:, :, second < agents]]
     assert_same((controls, real), expected, 1e-9)
     assert all(gradient.isfinite().all() for gradient in gradients)
-
-
-@pytest.mark.parametrize(("agents", "horizon"), [(4, 20), (2, 40)])
-@pytest.mark.parametrize("size", [0.5, 5.0])
-def test_a_step_in_single_precision_is_close_to_double(agents, horizon, size):
-    scene = random_scene(4, agents, history=2, size=size, dtype=torch.float64)
-    parameters = random_game(scene, 2, horizon, spread=0.2)
-    energy = Energy(ALL, bounds=BOUNDS)
-    exact = solve(energy, scene, parameters, 1).controls
-    single = solve(energy, scene.to(torch.float32), parameters.to(torch.float32), 1).controls
-    assert (single - exact).abs().max() < 5e-5
 
 
 def scattered(scenes, agents, dtype=torch.float32):
