@@ -118,7 +118,7 @@ struct Group {
     const int K, pairs;
     const T dt;
     Arena<T>& arena;
-    int problem[W], *agent;               // agent[i * W + lane]
+    int problem[W], scene[W], mode[W], *agent;  // agent[i * W + lane]
     Vec<T>*weight;                        // [OWN_COUNT, n]
     Vec<T>*pair_weight, *reach;           // [pairs]
     Vec<T>*goal_x, *goal_y, *reference_speed, *wheelbase;  // [n]
@@ -139,6 +139,8 @@ struct Group {
         for (int lane = 0; lane < W; ++lane) {
             const int32_t* item = items + (lane < filled ? lane : filled - 1) * (n + 1);
             problem[lane] = item[0];
+            scene[lane] = int(item[0] / game.M);
+            mode[lane] = int(item[0] % game.M);
             for (int i = 0; i < n; ++i) agent[i * W + lane] = item[1 + i];
         }
         turn = arena.take(n * K);
@@ -150,28 +152,22 @@ struct Group {
 
     /// Read [B, M, N, K, 2] into [n, K] vectors.
     void load(const T* from, Vec<T>* turns, Vec<T>* thrusts) const {
-        for (int i = 0; i < count.agents(); ++i)
-            for (int lane = 0; lane < W; ++lane) {
-                const T* row = from + row_of(i, lane) * K * 2;
-                for (int k = 0; k < K; ++k) {
-                    thrusts[i * K + k][lane] = row[2 * k];
-                    turns[i * K + k][lane] = row[2 * k + 1];
-                }
-            }
+        for (int i = 0; i < count.agents(); ++i) {
+            const T* rows[W];
+            for (int lane = 0; lane < W; ++lane) rows[lane] = from + row_of(i, lane) * K * 2;
+            gather<T>(rows, 2 * K, [&](int e, Vec<T> value) { (e % 2 ? turns : thrusts)[i * K + e / 2] = value; });
+        }
     }
 
     /// Write [n, K] vectors of the first lanes, where `chosen`, to [B, M, N, K, 2].
     template <class Chosen>
     void store(const Vec<T>* turns, const Vec<T>* thrusts, int filled, T* to, const Chosen& chosen) const {
-        for (int i = 0; i < count.agents(); ++i)
-            for (int lane = 0; lane < filled; ++lane) {
-                if (!chosen(lane)) continue;
-                T* row = to + row_of(i, lane) * K * 2;
-                for (int k = 0; k < K; ++k) {
-                    row[2 * k] = thrusts[i * K + k][lane];
-                    row[2 * k + 1] = turns[i * K + k][lane];
-                }
-            }
+        for (int i = 0; i < count.agents(); ++i) {
+            T* rows[W];
+            for (int lane = 0; lane < W; ++lane)
+                rows[lane] = lane < filled && chosen(lane) ? to + row_of(i, lane) * K * 2 : nullptr;
+            scatter<T>([&](int e) { return (e % 2 ? turns : thrusts)[i * K + e / 2]; }, 2 * K, rows);
+        }
     }
 
     int64_t row_of(int i, int lane) const { return int64_t(problem[lane]) * game.N + agent[i * W + lane]; }
@@ -190,7 +186,7 @@ struct Group {
         for (int i = 0; i < count.agents(); ++i) {
             Path<T>& p = path[i];
             for (int lane = 0; lane < W; ++lane) {
-                const T* start = static_cast<const T*>(game.initial) + (problem[lane] / game.M) * game.initial_b + agent[i * W + lane] * game.initial_n;
+                const T* start = static_cast<const T*>(game.initial) + scene[lane] * game.initial_b + agent[i * W + lane] * game.initial_n;
                 p.x[0][lane] = start[0];
                 p.y[0][lane] = start[1];
                 p.heading[0][lane] = start[2];
@@ -284,12 +280,10 @@ struct Group {
         weight = arena.take(OWN_COUNT * n);
         for (int f = 0; f < OWN_COUNT; ++f) {
             if (!game.own[f]) continue;
-            for (int i = 0; i < n; ++i)
-                for (int lane = 0; lane < W; ++lane) {
-                    const int64_t b = problem[lane] / game.M, m = problem[lane] % game.M;
-                    weight[f * n + i][lane] = static_cast<const T*>(
-                        game.own[f])[b * game.own_b[f] + m * game.own_m[f] + agent[i * W + lane] * game.own_n[f]];
-                }
+            for (int lane = 0; lane < W; ++lane) {
+                const T* from = static_cast<const T*>(game.own[f]) + scene[lane] * game.own_b[f] + mode[lane] * game.own_m[f];
+                for (int i = 0; i < n; ++i) weight[f * n + i][lane] = from[agent[i * W + lane] * game.own_n[f]];
+            }
         }
         goal_x = arena.take(n);
         goal_y = arena.take(n);
@@ -299,7 +293,7 @@ struct Group {
         reach = arena.take(pairs);
         segments = arena.take(has(LANE) ? n * (Q - 1) * 5 : 0);
         for (int lane = 0; lane < W; ++lane) {
-            const int64_t b = problem[lane] / game.M, m = problem[lane] % game.M;
+            const int64_t b = scene[lane], m = mode[lane];
             const T* size = static_cast<const T*>(game.size);
             for (int i = 0; i < n; ++i) {
                 const int64_t a = agent[i * W + lane], row = b * game.N + a;
@@ -310,7 +304,6 @@ struct Group {
                 }
                 if (has(VELREF)) reference_speed[i][lane] = static_cast<const T*>(game.reference_speed)[row];
                 if (has(STEER)) wheelbase[i][lane] = T(0.6) * size[2 * row];
-                if (has(LANE)) load_line(i, lane, row, game.reference[problem[lane] * game.N + a]);
             }
             if (!game.pair) continue;
             int p = 0;
@@ -322,6 +315,7 @@ struct Group {
                     reach[p][lane] = T(0.5) * size[2 * (b * game.N + a)] + T(0.5) * size[2 * (b * game.N + c)];
                 }
         }
+        for (int i = 0; has(LANE) && i < n; ++i) load_line(i);
     }
 
   private:
@@ -366,18 +360,27 @@ struct Group {
         }
     }
 
-    void load_line(int i, int lane, int64_t row, int64_t line) {
-        const int parts = int(game.points) - 1;
-        if (line < 0 || line >= game.lines) line = 0;  // the sample is stopped anyway
-        const T* points = static_cast<const T*>(game.references) + (row * game.lines + line) * game.points * 2;
-        for (int part = 0; part < parts; ++part, points += 2) {
-            Vec<T>* s = segments + (i * parts + part) * 5;
-            const T dx = points[2] - points[0], dy = points[3] - points[1], squared = dx * dx + dy * dy;
-            s[0][lane] = points[0];
-            s[1][lane] = points[1];
-            s[2][lane] = dx;
-            s[3][lane] = dy;
-            s[4][lane] = squared > 0 ? T(1) / squared : T(0);
+    /// The reference lines of agent i as segments.
+    void load_line(int i) {
+        const int points = int(game.points);
+        const T* rows[W];
+        for (int lane = 0; lane < W; ++lane) {
+            const int a = agent[i * W + lane];
+            const int64_t line = game.reference[int64_t(problem[lane]) * game.N + a];
+            const bool exists = line >= 0 && line < game.lines;  // else the sample is stopped anyway
+            rows[lane] = static_cast<const T*>(game.references) +
+                         ((int64_t(scene[lane]) * game.N + a) * game.lines + (exists ? line : 0)) * points * 2;
+        }
+        Vec<T>* s = segments + i * (points - 1) * 5;
+        Vec<T>* at = arena.take(2 * points);
+        gather<T>(rows, 2 * points, [&](int e, Vec<T> value) { at[e] = value; });
+        for (int part = 0; part + 1 < points; ++part, s += 5, at += 2) {
+            const Vec<T> dx = at[2] - at[0], dy = at[3] - at[1], squared = dx * dx + dy * dy;
+            s[0] = at[0];
+            s[1] = at[1];
+            s[2] = dx;
+            s[3] = dy;
+            s[4] = squared > 0 ? T(1) / squared : Vec<T>{};
         }
     }
 };

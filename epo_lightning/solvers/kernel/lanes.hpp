@@ -4,7 +4,10 @@
 #pragma once
 
 #include <cmath>
+#include <cstddef>
 #include <cstdint>
+#include <cstring>
+#include <utility>
 
 #define INLINE inline __attribute__((always_inline))
 
@@ -104,6 +107,69 @@ INLINE bool any(Mask<T> mask) {
     decltype(mask[0] + 0) seen = 0;
     for (int lane = 0; lane < Lanes<T>::W; ++lane) seen |= mask[lane];
     return seen != 0;
+}
+
+/// Elements of two vectors in turns: of their first halves, or of their second.
+template <class T, bool SECOND, std::size_t... I>
+INLINE Vec<T> zip(Vec<T> a, Vec<T> b, std::index_sequence<I...>) {
+    constexpr int W = Lanes<T>::W, from = SECOND ? W / 2 : 0;
+#ifdef __clang__
+    return __builtin_shufflevector(a, b, (from + int(I) / 2 + int(I) % 2 * W)...);
+#else
+    return __builtin_shuffle(a, b, Mask<T>{(from + int(I) / 2 + int(I) % 2 * W)...});
+#endif
+}
+
+/// Rows become columns: v[i][j] and v[j][i] change places. Every perfect shuffle moves one bit of i to j.
+template <class T>
+INLINE void transpose(Vec<T>* v) {
+    constexpr int W = Lanes<T>::W;
+    const std::make_index_sequence<W> all;
+    for (int bit = 1; bit < W; bit *= 2) {
+        Vec<T> shuffled[W];
+        for (int i = 0; i < W / 2; ++i) {
+            shuffled[2 * i] = zip<T, false>(v[i], v[i + W / 2], all);
+            shuffled[2 * i + 1] = zip<T, true>(v[i], v[i + W / 2], all);
+        }
+        for (int i = 0; i < W; ++i) v[i] = shuffled[i];
+    }
+}
+
+/// Read an array per lane: put(e, v) gets element e of all of them.
+template <class T, class Put>
+INLINE void gather(const T* const* rows, int length, const Put& put) {
+    constexpr int W = Lanes<T>::W;
+    for (int start = 0; start < length; start += W) {
+        Vec<T> block[W];
+        if (length < W) {
+            for (int lane = 0; lane < W; ++lane)
+                for (int e = 0; e < length; ++e) block[e][lane] = rows[lane][e];
+        } else {
+            start = start + W < length ? start : length - W;  // the last block overlaps the one before
+            for (int lane = 0; lane < W; ++lane) std::memcpy(&block[lane], rows[lane] + start, sizeof(Vec<T>));
+            transpose<T>(block);
+        }
+        for (int e = 0; e < W && e < length; ++e) put(start + e, block[e]);
+    }
+}
+
+/// Write an array per lane, except where its address is null: get(e) is element e of all of them.
+template <class T, class Get>
+INLINE void scatter(const Get& get, int length, T* const* rows) {
+    constexpr int W = Lanes<T>::W;
+    for (int start = 0; start < length; start += W) {
+        start = length < W || start + W < length ? start : length - W;  // the last block overlaps the one before
+        Vec<T> block[W];
+        for (int e = 0; e < W && e < length; ++e) block[e] = get(start + e);
+        if (length >= W) transpose<T>(block);
+        for (int lane = 0; lane < W; ++lane) {
+            if (!rows[lane]) continue;
+            if (length >= W)
+                std::memcpy(rows[lane] + start, &block[lane], sizeof(Vec<T>));
+            else
+                for (int e = 0; e < length; ++e) rows[lane][e] = block[e][lane];
+        }
+    }
 }
 
 template <class T>

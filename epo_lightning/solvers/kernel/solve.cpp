@@ -26,6 +26,7 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
     // Only states at which pairs count are kept.
     const int stride = int(game.pair_stride), kept = K / stride;
     Vec<T>*x = arena.take(N * kept), *y = arena.take(N * kept), *box = arena.take(4 * N), *radius = arena.take(N);
+    Vec<T>* given = arena.take(2 * K);
     const T dt = T(game.dt);
     Mask<T>* present = reinterpret_cast<Mask<T>*>(arena.take(N));
     for (int i = 0; i < N; ++i) {
@@ -42,17 +43,17 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
             present[i][lane] = game.present[b * N + i] ? -1 : 0;
             rows[lane] = controls + (int64_t(problems[lane]) * N + i) * K * 2;
         }
+        gather<T>(rows, 2 * K, [&](int e, Vec<T> value) { given[e] = value; });
         Vec<T>*low_x = box + 4 * i, *low_y = low_x + 1, *high_x = low_x + 2, *high_y = low_x + 3;
         *low_x = *low_y = splat<T>(T(INFINITY));
         *high_x = *high_y = splat<T>(-T(INFINITY));
         for (int k = 0; k < K; ++k) {
-            Vec<T> sine, cosine, thrust, turn;
-            for (int lane = 0; lane < W; ++lane) thrust[lane] = rows[lane][2 * k], turn[lane] = rows[lane][2 * k + 1];
+            Vec<T> sine, cosine;
             sincos<T>(heading, sine, cosine);
             px += dt * speed * cosine;
             py += dt * speed * sine;
-            heading += dt * turn;
-            speed += dt * thrust;
+            heading += dt * given[2 * k + 1];
+            speed += dt * given[2 * k];
             if ((k + 1) % stride) continue;
             const int at = i * kept + (k + 1) / stride - 1;
             x[at] = px;
@@ -283,16 +284,14 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
         for (int lane = 0; lane < filled; ++lane) {
             energies[1][group.problem[lane]] += energy[lane];
             norm[group.problem[lane]] += squared[lane];
-            for (int i = 0; i < group.count.agents(); ++i) {
-                T* states = static_cast<T*>(run.states) + group.row_of(i, lane) * game.K * 4;
-                const auto& path = group.path[i];
-                for (int k = 1; k <= game.K; ++k, states += 4) {
-                    states[0] = path.x[k][lane];
-                    states[1] = path.y[k][lane];
-                    states[2] = path.heading[k][lane];
-                    states[3] = path.speed[k][lane];
-                }
-            }
+        }
+        for (int i = 0; i < group.count.agents(); ++i) {
+            const auto& path = group.path[i];
+            const Vec<T>* const entries[4] = {path.x, path.y, path.heading, path.speed};
+            T* rows[W];
+            for (int lane = 0; lane < W; ++lane)
+                rows[lane] = lane < filled ? static_cast<T*>(run.states) + group.row_of(i, lane) * game.K * 4 : nullptr;
+            scatter<T>([&](int e) { return entries[e % 4][e / 4 + 1]; }, 4 * group.K, rows);
         }
     });
     for (int64_t problem = first; problem < last; ++problem) norm[problem] = std::sqrt(norm[problem]);
@@ -311,21 +310,21 @@ void pull_states(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t la
     for_each_group<T>(game, arena, single, controls, [&](auto& group, int64_t, int filled) {
         const int K = group.K;
         const auto& path = group.path[0];
-        Vec<T>*turn = arena.take(K), *thrust = arena.take(K), x{}, y{}, heading{}, speed{};
+        Vec<T>*turn = arena.take(K), *thrust = arena.take(K), *given = arena.take(4 * K), x{}, y{}, heading{}, speed{};
         group.load(bar, turn, thrust);
+        const T* rows[Lanes<T>::W];
+        for (int lane = 0; lane < Lanes<T>::W; ++lane) rows[lane] = states + group.row_of(0, lane) * K * 4;
+        gather<T>(rows, 4 * K, [&](int e, Vec<T> value) { given[e] = value; });
         for (int k = K - 1; k >= 0; --k) {
             const Vec<T> c = path.cosine[k + 1], s = path.sine[k + 1];
             if (k + 1 < K) {
                 heading += group.dt * path.speed[k + 1] * (c * y - s * x);
                 speed += group.dt * (c * x + s * y);
             }
-            for (int lane = 0; lane < Lanes<T>::W; ++lane) {
-                const T* given = states + (group.row_of(0, lane) * K + k) * 4;
-                x[lane] += given[0];
-                y[lane] += given[1];
-                heading[lane] += given[2];
-                speed[lane] += given[3];
-            }
+            x += given[4 * k];
+            y += given[4 * k + 1];
+            heading += given[4 * k + 2];
+            speed += given[4 * k + 3];
             turn[k] += group.dt * heading;
             thrust[k] += group.dt * speed;
         }
