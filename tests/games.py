@@ -10,7 +10,7 @@ import torch
 from epo_lightning.game import features
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.features import OWN_FEATURES
-from epo_lightning.game.normal_equations import Model
+from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import GameParameters, Scene
 
 BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}
@@ -140,7 +140,7 @@ def feet_held() -> Iterator[None]:
 
 def normal_equations(energy: Energy, scene: Scene, parameters: GameParameters, controls: torch.Tensor, exact=False):
     """The model's gradient [B, M, N, K, 2] and matrix [B, M, n, n] in the controls, in the order of ``controls``."""
-    model = Model(energy, scene, parameters, controls, every_pair=True, exact=exact)
+    model = QuadraticModel(energy, scene, parameters, controls, every_pair=True, exact=exact)
     none, steps, agents = controls.new_zeros(model.samples), model.steps, model.agents
     units = torch.eye(2 * steps * agents, dtype=controls.dtype).view(-1, agents, steps, 2).transpose(-1, -2)
     columns = [model.times(unit.expand(model.samples, -1, -1, -1), none) for unit in units]

@@ -19,7 +19,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from epo_lightning.game.normal_equations import Group, Model
+from epo_lightning.game.edges import Group
+from epo_lightning.game.quadratic_model import QuadraticModel
 
 _UNKNOWNS = 32
 """Aimed at in every block: fewer are more operations, more are more arithmetic."""
@@ -101,7 +102,9 @@ def _times(matrix: Float[Tensor, "C a b"], vector: Float[Tensor, "C b 1"]) -> Fl
     return (matrix * vector.mT).sum(-1, keepdim=True)
 
 
-def factorise(model: Model, damping: Float[Tensor, " S"], group: Group) -> tuple[BlockFactors, Bool[Tensor, " C"]]:
+def factorise(
+    model: QuadraticModel, damping: Float[Tensor, " S"], group: Group
+) -> tuple[BlockFactors, Bool[Tensor, " C"]]:
     """Factors of a group's matrices, and which of them have none.
 
     Args:
@@ -124,7 +127,7 @@ def factorise(model: Model, damping: Float[Tensor, " S"], group: Group) -> tuple
 class _Parts:
     """A model's stiffnesses for one group, laid out [C, .., nodes, .., m]."""
 
-    def __init__(self, model: Model, damping: Float[Tensor, " S"], group: Group) -> None:
+    def __init__(self, model: QuadraticModel, damping: Float[Tensor, " S"], group: Group) -> None:
         self.model, self.group, self.size = model, group, group.size
         # Absent agents get unit matrices of their own, so that they are regular even without damping.
         control = torch.where(

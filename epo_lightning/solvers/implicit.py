@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.energy import Energy
-from epo_lightning.game.normal_equations import Model
+from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import GameParameters, Scene, Status
 from epo_lightning.solvers.structured import Game, factorise, planar
 
@@ -42,7 +42,7 @@ def attach(
 class _Attach(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, game: Game, exact: bool, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        model = Model(game.energy, game.scene, game.with_tensors(tensors), controls, not game.split, exact)
+        model = QuadraticModel(game.energy, game.scene, game.with_tensors(tensors), controls, not game.split, exact)
         ctx.factors = factorise(model, game.damping, game.split, retry=False)
         ctx.game = game
         ctx.save_for_backward(*tensors)

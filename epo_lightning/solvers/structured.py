@@ -13,7 +13,7 @@ gives mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scal
 
     phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
 
-in closed form (:meth:`~epo_lightning.game.normal_equations.Model.pullback`), to which v itself is added for u.
+in closed form (:meth:`~epo_lightning.game.quadratic_model.QuadraticModel.pullback`), to which v itself is added for u.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from epo_lightning.game.edges import Group
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.features import Source
-from epo_lightning.game.normal_equations import Group, Model
+from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers import blocks
 
@@ -76,7 +77,7 @@ def solve(
         status = torch.maximum(status, outcome)
         iterates.append(controls)
     with torch.no_grad():
-        last = Model(energy, scene, parameters, controls, not split)
+        last = QuadraticModel(energy, scene, parameters, controls, not split)
         gradient_norm = last.gradient.square().flatten(2).sum(-1).cumsum(1)[:, -1].sqrt().view_as(status)
         final_energy = last.value.view_as(status)
     return Solution(
@@ -132,7 +133,7 @@ class Game:
         )
 
     def pullback(
-        self, model: Model, tensors: Sequence[Tensor], adjoint: Tensor, step: Tensor
+        self, model: QuadraticModel, tensors: Sequence[Tensor], adjoint: Tensor, step: Tensor
     ) -> tuple[Tensor, list[Tensor]]:
         """phi's gradient by the controls and by the game's tensors."""
         shape = model.controls.shape
@@ -160,7 +161,7 @@ class Game:
         return dataclasses.replace(self.energy, own=own, pair=pair) if own or pair else None
 
 
-def _components(model: Model) -> list[Group]:
+def _components(model: QuadraticModel) -> list[Group]:
     """The agents of every sample, grouped by the active pairs that connect them; absent agents are in no group."""
     edges, mask = model.edges, model.scene.agent_mask
     samples, agents = edges.samples, edges.agents
@@ -247,7 +248,7 @@ class Factors:
         return self.model.to_controls(_scatter(self.groups, parts, self.model.u))
 
 
-def factorise(model: Model, damping: Float[Tensor, " S"], split: bool, retry: bool | None = None) -> Factors:
+def factorise(model: QuadraticModel, damping: Float[Tensor, " S"], split: bool, retry: bool | None = None) -> Factors:
     """Factorise the matrices of all samples, of each component on its own where they are split.
 
     Where retrying is allowed, a matrix without a factor gets ten, a hundred, ... times the damping, and the others keep
@@ -276,7 +277,11 @@ def factorise(model: Model, damping: Float[Tensor, " S"], split: bool, retry: bo
 
 
 def _retry(
-    model: Model, damping: Float[Tensor, " S"], group: Group, factors: blocks.Factors, outcome: Int[Tensor, " C"]
+    model: QuadraticModel,
+    damping: Float[Tensor, " S"],
+    group: Group,
+    factors: blocks.Factors,
+    outcome: Int[Tensor, " C"],
 ) -> None:
     """Factorise again, with more and more damping, what has no factor; writes factors and outcome."""
     raised = damping.clamp_min(_LEAST_RAISED_DAMPING)
@@ -319,7 +324,7 @@ class _Step(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, game: Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parameters = game.with_tensors(tensors)
-        model = Model(game.energy, game.scene, parameters, controls, not game.split)
+        model = QuadraticModel(game.energy, game.scene, parameters, controls, not game.split)
         factors = factorise(model, game.damping, game.split)
         step = factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
         status = factors.status.view(controls.shape[:2])

@@ -7,8 +7,9 @@ import torch
 from games import ALL, BOUNDS, normal_equations, random_game, random_scene
 
 from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.edges import Group
 from epo_lightning.game.energy import Energy
-from epo_lightning.game.normal_equations import Group, Model
+from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.solvers import blocks
 
 
@@ -21,7 +22,7 @@ def test_solutions_are_those_of_the_dense_matrix(integrator, agents, horizon, ow
     energy = Energy(own, bounds=BOUNDS, dynamics=Unicycle(integrator), pair_stride=1 + horizon % 2)
     controls = parameters.initial_controls
     damping = torch.tensor([1.0, 20.0], dtype=torch.float64)
-    model = Model(energy, scene, parameters, controls, every_pair=True)
+    model = QuadraticModel(energy, scene, parameters, controls, every_pair=True)
     factors, failed = blocks.factorise(model, damping, Group.whole(model.edges))
     assert not failed.any()
     # From covectors of the controls [S, N, 2, K] to those of the nodes, in the order node, component, agent, and back.

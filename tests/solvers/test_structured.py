@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, SPEED, TURN_RATE, Source, own_feature, pair_feature
-from epo_lightning.game.normal_equations import Model
+from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import Status
 from epo_lightning.solvers import structured
 
@@ -141,7 +141,7 @@ def test_components_are_those_of_the_active_pairs():
     parameters = random_game(scene, 2, 5)
     parameters.pair_weights["proximity"][:, 1] = 0.0  # no weight, no edge
     energy = Energy(["goal"], ["proximity"])
-    model = Model(energy, scene, parameters, parameters.initial_controls, every_pair=False)
+    model = QuadraticModel(energy, scene, parameters, parameters.initial_controls, every_pair=False)
     groups = structured._components(model)
     residuals = energy.residuals(scene, parameters, parameters.initial_controls)["proximity"].flatten(0, 1)
     pairs = torch.triu_indices(6, 6, 1).T.tolist()

@@ -21,10 +21,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.game.energy import Energy, along, pairs
+from epo_lightning.game.edges import Edges
+from epo_lightning.game.energy import Energy, along
 from epo_lightning.game.features import (
     OwnFeature,
     PairFeature,
@@ -39,85 +40,6 @@ from epo_lightning.scene import HEADING, SPEED, TURN_RATE, GameParameters, Scene
 
 Shape = tuple[Tensor, Tensor | None, Tensor | None]
 """Value, slope and curvature of an elementwise function; None for a slope of one or a curvature of zero."""
-
-
-@dataclass(frozen=True)
-class Edges:
-    """Pairs of agents, through all samples.
-
-    Attributes:
-        first, second: the agents i and j as s N + i and s N + j.
-        pair: the pair as s P + p.
-        samples, agents: S and N.
-        every: whether these are all pairs, in order.
-    """
-
-    first: Int[Tensor, " E"]
-    second: Int[Tensor, " E"]
-    pair: Int[Tensor, " E"]
-    samples: int
-    agents: int
-    every: bool
-
-    @classmethod
-    def all(cls, samples: int, agents: int, device: torch.device) -> Edges:
-        """Every pair of every sample."""
-        first, second = pairs(agents, device)
-        start = agents * torch.arange(samples, device=device)[:, None]
-        pair = torch.arange(samples * len(first), device=device)
-        return cls((start + first).flatten(), (start + second).flatten(), pair, samples, agents, every=True)
-
-    @classmethod
-    def none(cls, samples: int, agents: int, device: torch.device) -> Edges:
-        """No pair at all."""
-        empty = torch.zeros(0, dtype=torch.long, device=device)
-        return cls(empty, empty, empty, samples, agents, every=False)
-
-    @classmethod
-    def near(
-        cls, energy: Energy, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B M N K 4"]
-    ) -> Edges:
-        """The pairs that may matter: both agents exist, a weight is not zero, and their ways' boxes come within reach."""
-        batch, modes, agents = states.shape[:3]
-        weights = torch.stack([energy.pair_weight(scene, parameters, name) for name in energy.pair])
-        matters = (weights != 0).any(0)
-        first, second = pairs(agents, states.device)
-        if all(feature.function is overlap for feature in energy.pair_features.values()):
-            position = energy.at_pair_steps(states[..., :2])
-            if position.shape[3]:
-                radius = energy.radius(scene)[:, None, :, None]
-                low, high = position.amin(3) - radius, position.amax(3) + radius
-                matters &= ((low[:, :, first] < high[:, :, second]) & (low[:, :, second] < high[:, :, first])).all(-1)
-        if matters.all():
-            return cls.all(batch * modes, agents, states.device)
-        pair = matters.flatten().nonzero()[:, 0]
-        sample, within = pair // len(first), pair % len(first)
-        start = agents * sample
-        return cls(start + first[within], start + second[within], pair, batch * modes, agents, every=False)
-
-    def ends(self, values: Float[Tensor, "S N *rest"]) -> tuple[Float[Tensor, "E *rest"], Float[Tensor, "E *rest"]]:
-        """What both agents of every pair hold."""
-        flat = values.flatten(0, 1)
-        return flat.index_select(0, self.first), flat.index_select(0, self.second)
-
-    def difference(self, values: Float[Tensor, "S N *rest"]) -> Float[Tensor, "E *rest"]:
-        """How the first agent's value exceeds the second's."""
-        first, second = self.ends(values)
-        return first.sub_(second)
-
-    def spread_(self, onto: Float[Tensor, "S N *rest"], first: Tensor, second: Tensor) -> None:
-        """Add to every agent what its pairs have for it.
-
-        On a CPU one pair after the other, so that sums do not depend on what else is in the batch; elsewhere, where the
-        pairs are complete, as a product with the incidence matrix, which has an order, unlike additions in parallel.
-        """
-        if onto.device.type == "cpu" or not self.every:
-            onto.flatten(0, 1).index_add_(0, self.first, first).index_add_(0, self.second, second)
-            return
-        numbers = torch.arange(self.agents, device=onto.device)[:, None]
-        for index, values in zip(pairs(self.agents, onto.device), (first, second), strict=True):
-            incidence = (index == numbers).to(onto.dtype).expand(self.samples, -1, -1)
-            onto.add_((incidence @ values.reshape(self.samples, incidence.shape[-1], -1)).view_as(onto))
 
 
 def _bend(function: Callable[..., Tensor], value: Tensor, *others: Tensor) -> Shape:
@@ -155,7 +77,7 @@ class _Read:
     shape: Shape
 
 
-class Model:
+class QuadraticModel:
     """The energy around joint strategies u: its value, gradient and Gauss-Newton (or exact) matrix, in the unknowns z.
 
     Attributes:
@@ -693,64 +615,3 @@ class Model:
         forces = self._every_step(forces.flatten(1, 2)).view(-1, 3, 2, self.steps)
         edges.spread_(position, forces, -forces)
         return by_weight
-
-
-@dataclass(frozen=True)
-class Group:
-    """C sets of m agents whose matrices are assembled together.
-
-    Attributes:
-        agents: their numbers s N + i; None for all agents of all samples, in order.
-        count, size: C and m.
-        edges: the edges between them; None for all edges.
-        component, first, second: for each of these edges, the set and the places of both agents in it.
-    """
-
-    agents: Int[Tensor, "C m"] | None
-    count: int
-    size: int
-    edges: Int[Tensor, " e"] | None
-    component: Int[Tensor, " e"]
-    first: Int[Tensor, " e"]
-    second: Int[Tensor, " e"]
-
-    @classmethod
-    def whole(cls, edges: Edges) -> Group:
-        """Every sample as one set."""
-        sample = edges.first // max(edges.agents, 1)
-        start = sample * edges.agents
-        return cls(None, edges.samples, edges.agents, None, sample, edges.first - start, edges.second - start)
-
-    def subset(self, chosen: Int[Tensor, " D"]) -> Group:
-        """Some of these sets alone."""
-        agents = self.agents
-        if agents is None:
-            agents = torch.arange(self.count * self.size, device=chosen.device).view(self.count, self.size)
-        place = torch.full((self.count,), -1, device=chosen.device)
-        place[chosen] = torch.arange(len(chosen), device=chosen.device)
-        kept = (place[self.component] >= 0).nonzero()[:, 0]
-        return Group(
-            agents[chosen],
-            len(chosen),
-            self.size,
-            kept if self.edges is None else self.edges[kept],
-            place[self.component[kept]],
-            self.first[kept],
-            self.second[kept],
-        )
-
-    def of_edges(self, values: Float[Tensor, "E *rest"]) -> Float[Tensor, "e *rest"]:
-        """What the edges of this group hold."""
-        return values if self.edges is None else values.index_select(0, self.edges)
-
-    def coupled(
-        self, own: Float[Tensor, "C 3 K m"], shared: Float[Tensor, "E 3 K"] | None
-    ) -> Float[Tensor, "C 3 m K m"]:
-        """Curvatures between all agents: what they hold themselves, and minus what their pairs share."""
-        full = own.new_zeros(self.count, 3, self.size, own.shape[2], self.size)
-        full.diagonal(dim1=2, dim2=4).copy_(own)
-        if shared is not None:
-            shared = -self.of_edges(shared)
-            full[self.component, :, self.first, :, self.second] = shared
-            full[self.component, :, self.second, :, self.first] = shared
-        return full
