@@ -18,6 +18,7 @@ from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, SPEED, TURN
 from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import Status
 from epo_lightning.solvers import structured
+from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
 
 def solve(energy, scene, parameters, steps=2, damping=10.0, **options):
@@ -240,3 +241,25 @@ def test_undeclared_features_solve_to_what_declared_ones_do(twins, split, stride
         return controls, [by[0], sum(by[2:-1]), by[-1]]
 
     assert_same(run(["both"], "soft_undeclared"), run(["speed", "turn", "goal"], "soft"), 1e-10)
+
+
+def test_undeclared_features_have_the_implicit_gradients_of_declared_ones(twins):
+    """The exact Hessian: closed forms and second derivatives of declared shapes against automatic differentiation."""
+    scene = random_scene(2, 3, history=2, size=1.0, dtype=torch.float64)
+    parameters = random_game(scene, 1, 5, spread=0.1)
+    parameters = dataclasses.replace(parameters, goals=torch.zeros_like(parameters.goals))
+    weight, pair = parameters.own_weights["acc"], parameters.pair_weights["proximity"]
+    minimise = LevenbergMarquardt(300, 1.0, 1e-1, differentiation="implicit", backend="pytorch")
+
+    def run(own, name):
+        own = [*own, "acc"]  # or accelerations would have no minimum
+        game = dataclasses.replace(parameters, own_weights=dict.fromkeys(own, weight), pair_weights={name: pair})
+        leaves = leaves_of(game)
+        solution = minimise(Energy(own, [name]), scene, leaves)
+        assert solution.gradient_norm.max() < 1e-8
+        assert (solution.status == Status.SOLVED).all()
+        solution.states.sum().backward()
+        by_own = [leaves.own_weights[one].grad for one in own]
+        return solution.controls.detach(), [sum(by_own[:-1]), by_own[-1], leaves.pair_weights[name].grad]
+
+    assert_same(run(["both"], "soft_undeclared"), run(["speed", "turn", "goal"], "soft"), 1e-7)
