@@ -25,12 +25,12 @@ struct Count {
     INLINE int controls() const { return 2 * agents(); }
 };
 
-/// C[R x S] -= sum_k A[k][0..R) B[k][0..S), held in registers. `at` and `bt` step from one k to the next.
-template <class T, int R, int S>
+/// C[R x S] -= sum_k A[k][0..R) B[k][0..S), or C = -sum where it is fresh, held in registers.
+template <class T, int R, int S, bool FRESH = false>
 INLINE void subtract_products(Vec<T>* C, int ldc, const Vec<T>* A, int astep, int arow, const Vec<T>* B, int bstep, int depth) {
     Vec<T> sum[R][S];
     for (int i = 0; i < R; ++i)
-        for (int j = 0; j < S; ++j) sum[i][j] = C[i * ldc + j];
+        for (int j = 0; j < S; ++j) sum[i][j] = FRESH ? Vec<T>{} : C[i * ldc + j];
     for (int k = 0; k < depth; ++k) {
         Vec<T> b[S];
         for (int j = 0; j < S; ++j) b[j] = B[k * bstep + j];
@@ -115,8 +115,9 @@ INLINE void transition(
             row[h] = dt * mirrored<T>(P, ld, m + r, h) + P[(2 * m + r) * ld + h] + by_x * Z[a].x_heading + by_y * Z[a].y_heading;
             row[v] = dt * mirrored<T>(P, ld, m + r, v) + P[(2 * m + r) * ld + v] + by_x * Z[a].x_speed + by_y * Z[a].y_speed;
         }
-        for (int j = 2 * m; j < ld; ++j) row[j] = Vec<T>{};
         row[2 * m + r] = -rates[r];
+        // Above the diagonal, only blocks on it are looked at.
+        for (int j = r + 1; j % 4 != 0 && j < m; ++j) row[2 * m + j] = Vec<T>{};
     }
     for (int a = 0; a < n; ++a) G[2 * a * ld + m + 2 * a + 1] += coupling[a];
     // Rows z of P, all columns p first: H_zp = P_zp + Z' P_pp; then H_zz = P_zz + Z' P_pz + H_zp Z with the old P_zp.
@@ -148,32 +149,28 @@ INLINE void transition(
             if (b < a) heading[m + 2 * b + 1] += heading[2 * b] * Z[b].x_speed + heading[2 * b + 1] * Z[b].y_speed;
         }
     }
-    for (int r = 0; r < m; ++r) {
-        Vec<T>* row = P + (2 * m + r) * ld;
-        for (int j = 0; j < 2 * m + r; ++j) row[j] = Vec<T>{};
-        row[2 * m + r] = rates[r];
-    }
 }
 
-/// Columns [from, from + S) of P -= G' G, from the diagonal down.
+/// Columns [from, from + S) of P -= G' G, from the diagonal down; of the controls' rows nothing is left from the step after.
 template <class T, int N, int S>
 INLINE void subtract_square(Count<N> count, Vec<T>* P, const Vec<T>* G, int from) {
     const int m = count.controls(), ld = 3 * m;
     int i = from;
+    for (; i < 2 * m; i += 4) subtract_products<T, 4, S>(P + i * ld + from, ld, G + i, ld, 1, G + from, ld, m);
     // G's last columns are lower triangular: rows above the diagonal are zero.
     for (; i + 4 <= ld; i += 4) {
-        const int top = i >= 2 * m ? i - 2 * m : 0;
-        subtract_products<T, 4, S>(P + i * ld + from, ld, G + top * ld + i, ld, 1, G + top * ld + from, ld, m - top);
+        const Vec<T>* top = G + (i - 2 * m) * ld;
+        subtract_products<T, 4, S, true>(P + i * ld + from, ld, top + i, ld, 1, top + from, ld, ld - i);
     }
-    for (; i + 2 <= ld; i += 2) {
-        const int top = i >= 2 * m ? i - 2 * m : 0;
-        subtract_products<T, 2, S>(P + i * ld + from, ld, G + top * ld + i, ld, 1, G + top * ld + from, ld, m - top);
+    for (; i < ld; i += 2) {
+        const Vec<T>* top = G + (i - 2 * m) * ld;
+        subtract_products<T, 2, S, true>(P + i * ld + from, ld, top + i, ld, 1, top + from, ld, ld - i);
     }
 }
 
-/// G <- L^-1 G and P <- P - G' G.
+/// G <- L^-1 G and P <- P - G' G, with the stiffness of `rates` [m] in the controls' part.
 template <class T, int N>
-INLINE void eliminate_controls(Count<N> count, const Vec<T>* L, Vec<T>* G, Vec<T>* P) {
+INLINE void eliminate_controls(Count<N> count, const Vec<T>* L, const Vec<T>* rates, Vec<T>* G, Vec<T>* P) {
     const int m = count.controls(), ld = 3 * m;
     int j = 0;
     for (; j + 8 <= 2 * m; j += 8) eliminate<T, N, 8>(count, L, G + j, ld);
@@ -190,6 +187,7 @@ INLINE void eliminate_controls(Count<N> count, const Vec<T>* L, Vec<T>* G, Vec<T
     int from = 0;
     for (; from + 4 <= ld; from += 4) subtract_square<T, N, 4>(count, P, G, from);
     for (; from + 2 <= ld; from += 2) subtract_square<T, N, 2>(count, P, G, from);
+    for (int c = 2 * m; c < ld; ++c) P[c * ld + c] += rates[c - 2 * m];
 }
 
 /// One step back of the linear terms: y of the next state, with its stage costs, and h of the controls, to y of this state.

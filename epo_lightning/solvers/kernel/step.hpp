@@ -149,7 +149,7 @@ void solve_step(
         factorise<T>(g.count, L, sound);
         if (k > 0) {
             transition(g.count, P, g.dt, Z, costs.coupling, costs.rate_stiffness, G);
-            eliminate_controls<T>(g.count, L, G, P);
+            eliminate_controls<T>(g.count, L, costs.rate_stiffness, G, P);
         }
         for (int r = 0; r < m; ++r) linear[r] = costs.pull[r];
         pull_linear(g.count, L, G, g.dt, Z, k == 0, y, linear);
