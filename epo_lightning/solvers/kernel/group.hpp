@@ -110,6 +110,17 @@ struct Contact {
     }
 };
 
+/// Nearest points of the agents' reference lines, and the directions in which they slide (zero at corners).
+template <class T>
+struct Feet {
+    Vec<T>*x, *y, *slide_x, *slide_y;  // [n, K + 1], of which states 1 .. K are in use
+    static std::size_t size(int n, int K) { return std::size_t(4) * n * (K + 1); }
+    static Feet at(Vec<T>* memory, int n, int K) {
+        const int each = n * (K + 1);
+        return {memory, memory + each, memory + 2 * each, memory + 3 * each};
+    }
+};
+
 template <class T, int N>
 struct Group {
     static constexpr int W = Lanes<T>::W;
@@ -122,8 +133,7 @@ struct Group {
     Vec<T>*weight;                        // [OWN_COUNT, n]
     Vec<T>*pair_weight, *reach;           // [pairs]
     Vec<T>*goal_x, *goal_y, *reference_speed, *wheelbase;  // [n]
-    Vec<T>*segments;                      // [n, Q - 1, 5]: start, direction, 1 / length^2
-    Vec<T>*foot_x, *foot_y, *slide_x, *slide_y;  // [n, K + 1], by `find_feet`
+    Feet<T> feet;                         // by `find_feet`, or of an earlier call
     Vec<T>*turn, *thrust;                 // controls [n, K]
     std::vector<Path<T>> path;
 
@@ -223,19 +233,17 @@ struct Group {
         }
     }
 
-    /// Nearest points of the reference lines at states 1 .. K, and the directions in which they slide (zero at corners).
+    /// The nearest points of the reference lines, written to `found`; the directions in which they slide only where asked for.
     template <bool SLIDES>
-    void find_feet() {
-        if (!has(LANE)) return;
-        foot_x = arena.take(count.agents() * (K + 1));
-        foot_y = arena.take(count.agents() * (K + 1));
-        slide_x = SLIDES ? arena.take(count.agents() * (K + 1)) : nullptr;
-        slide_y = SLIDES ? arena.take(count.agents() * (K + 1)) : nullptr;
+    void find_feet(const Feet<T>& found) {
+        feet = found;
+        Vec<T>* segments = arena.take((game.points - 1) * 5);
         // Four states share every segment that is loaded, and their chains of comparisons run side by side.
         for (int i = 0; i < count.agents(); ++i) {
+            load_line(i, segments);
             int k = 1;
-            for (; k + 4 <= K + 1; k += 4) find_feet_at<SLIDES, 4>(i, k);
-            for (; k <= K; ++k) find_feet_at<SLIDES, 1>(i, k);
+            for (; k + 4 <= K + 1; k += 4) find_feet_at<SLIDES, 4>(i, k, segments);
+            for (; k <= K; ++k) find_feet_at<SLIDES, 1>(i, k, segments);
         }
     }
 
@@ -274,9 +282,9 @@ struct Group {
         return model;
     }
 
-    /// Weights, goals, lines and radii: what features need, and a bare rollout does not.
+    /// Weights, goals and radii: what features need, and a bare rollout does not.
     void load_parameters() {
-        const int n = count.agents(), Q = int(game.points);
+        const int n = count.agents();
         weight = arena.take(OWN_COUNT * n);
         for (int f = 0; f < OWN_COUNT; ++f) {
             if (!game.own[f]) continue;
@@ -291,7 +299,6 @@ struct Group {
         wheelbase = arena.take(n);
         pair_weight = arena.take(pairs);
         reach = arena.take(pairs);
-        segments = arena.take(has(LANE) ? n * (Q - 1) * 5 : 0);
         for (int lane = 0; lane < W; ++lane) {
             const int64_t b = scene[lane], m = mode[lane];
             const T* size = static_cast<const T*>(game.size);
@@ -315,16 +322,15 @@ struct Group {
                     reach[p][lane] = T(0.5) * size[2 * (b * game.N + a)] + T(0.5) * size[2 * (b * game.N + c)];
                 }
         }
-        for (int i = 0; has(LANE) && i < n; ++i) load_line(i);
     }
 
   private:
     std::vector<int> owners_;
 
     template <bool SLIDES, int STATES>
-    INLINE void find_feet_at(int i, int k) {
+    INLINE void find_feet_at(int i, int k, const Vec<T>* s) {
         const Vec<T> zero{}, one = splat<T>(1);
-        const Vec<T>*x = path[i].x + k, *y = path[i].y + k, *s = segments + i * (game.points - 1) * 5;
+        const Vec<T>*x = path[i].x + k, *y = path[i].y + k;
         const int at = i * (K + 1) + k;
         Vec<T> best[STATES], near_x[STATES], near_y[STATES], inside[STATES], ahead_x[STATES], ahead_y[STATES];
         for (int q = 0; q < STATES; ++q) {
@@ -350,18 +356,18 @@ struct Group {
                 }
             }
         for (int q = 0; q < STATES; ++q) {
-            foot_x[at + q] = near_x[q];
-            foot_y[at + q] = near_y[q];
+            feet.x[at + q] = near_x[q];
+            feet.y[at + q] = near_y[q];
             if (SLIDES) {
                 const Vec<T> scale = root<T>(inside[q]);
-                slide_x[at + q] = ahead_x[q] * scale;
-                slide_y[at + q] = ahead_y[q] * scale;
+                feet.slide_x[at + q] = ahead_x[q] * scale;
+                feet.slide_y[at + q] = ahead_y[q] * scale;
             }
         }
     }
 
-    /// The reference lines of agent i as segments.
-    void load_line(int i) {
+    /// The reference line of agent i as segments [Q - 1, 5]: start, direction, 1 / length^2.
+    void load_line(int i, Vec<T>* s) {
         const int points = int(game.points);
         const T* rows[W];
         for (int lane = 0; lane < W; ++lane) {
@@ -371,7 +377,6 @@ struct Group {
             rows[lane] = static_cast<const T*>(game.references) +
                          ((int64_t(scene[lane]) * game.N + a) * game.lines + (exists ? line : 0)) * points * 2;
         }
-        Vec<T>* s = segments + i * (points - 1) * 5;
         Vec<T>* at = arena.take(2 * points);
         gather<T>(rows, 2 * points, [&](int e, Vec<T> value) { at[e] = value; });
         for (int part = 0; part + 1 < points; ++part, s += 5, at += 2) {

@@ -3,6 +3,7 @@
 // Nothing here, or above it, mixes lanes: what a lane computes depends on that lane alone, bit by bit.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -139,13 +140,13 @@ INLINE void transpose(Vec<T>* v) {
 template <class T, class Put>
 INLINE void gather(const T* const* rows, int length, const Put& put) {
     constexpr int W = Lanes<T>::W;
-    for (int start = 0; start < length; start += W) {
+    for (int next = 0; next < length; next += W) {
+        const int start = length < W ? 0 : std::min(next, length - W);  // the last block overlaps the one before
         Vec<T> block[W];
         if (length < W) {
             for (int lane = 0; lane < W; ++lane)
                 for (int e = 0; e < length; ++e) block[e][lane] = rows[lane][e];
         } else {
-            start = start + W < length ? start : length - W;  // the last block overlaps the one before
             for (int lane = 0; lane < W; ++lane) std::memcpy(&block[lane], rows[lane] + start, sizeof(Vec<T>));
             transpose<T>(block);
         }
@@ -157,8 +158,8 @@ INLINE void gather(const T* const* rows, int length, const Put& put) {
 template <class T, class Get>
 INLINE void scatter(const Get& get, int length, T* const* rows) {
     constexpr int W = Lanes<T>::W;
-    for (int start = 0; start < length; start += W) {
-        start = length < W || start + W < length ? start : length - W;  // the last block overlaps the one before
+    for (int next = 0; next < length; next += W) {
+        const int start = length < W ? 0 : std::min(next, length - W);  // the last block overlaps the one before
         Vec<T> block[W];
         for (int e = 0; e < W && e < length; ++e) block[e] = get(start + e);
         if (length >= W) transpose<T>(block);

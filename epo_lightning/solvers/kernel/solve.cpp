@@ -130,8 +130,8 @@ Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last
 template <class T>
 struct StepTape {
     Plan plan;
-    std::vector<Buffer<T>> factors;  // by group size, group after group
-    std::vector<char> sound;                         // by problem of the range
+    std::vector<Buffer<T>> factors, feet;  // by group size, group after group
+    std::vector<char> sound;               // by problem of the range
 };
 
 template <class T>
@@ -198,7 +198,7 @@ template <class T>
 std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t first, int64_t last) {
     constexpr int W = Lanes<T>::W;
     const int64_t row = game.K * 2, size = game.N * row;
-    const bool record = run.record != 0;
+    const bool record = run.record != 0, lanes = game.own[LANE] != nullptr;
     auto tape = std::make_unique<Tape<T>>(Tape<T>{first, last, {}});
     T* const energies[2] = {static_cast<T*>(run.initial_energy), static_cast<T*>(run.energy)};
     T* const norm = static_cast<T*>(run.gradient_norm);
@@ -225,17 +225,22 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
         StepTape<T> step;
         step.plan = make_plan<T>(game, arena, first, last, controls);
         step.factors.resize(game.N + 1);
+        step.feet.resize(game.N + 1);
         step.sound = whole;
         for (int n = 1; n <= game.N; ++n) {
             const std::size_t groups = step.plan.groups(n, W);
             if (groups && (record || !reused[n]))
                 (record ? step.factors : reused)[n] = Buffer<T>((record ? groups : 1) * Factors<T>::size(n, game.K));
+            if (groups && record && lanes) step.feet[n] = Buffer<T>(groups * Feet<T>::size(n, game.K));
         }
         if (s == 0) std::fill(energies[0] + first, energies[0] + last, T(0));
         for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
-            group.load_parameters();
-            group.template find_feet<false>();
             const int n = group.count.agents();
+            group.load_parameters();
+            if (lanes && record)
+                group.template find_feet<true>(Feet<T>::at(step.feet[n].data() + index * Feet<T>::size(n, game.K), n, game.K));
+            else if (lanes)
+                group.template find_feet<false>(Feet<T>::at(arena.take(Feet<T>::size(n, game.K)), n, game.K));
             Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game.K) : reused[n].data();
             const auto factors = Factors<T>::at(memory, n, game.K);
             Vec<T>*turn = arena.take(n * game.K), *thrust = arena.take(n * game.K), energy, given;
@@ -277,15 +282,16 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
     std::fill(norm + first, norm + last, T(0));
     std::memset(static_cast<T*>(run.states) + first * size * 2, 0, sizeof(T) * (last - first) * size * 2);
     for_each_group<T>(game, arena, make_plan<T>(game, arena, first, last, controls), controls, [&](auto& group, int64_t, int filled) {
+        const int n = group.count.agents();
         group.load_parameters();
-        group.template find_feet<false>();
+        if (lanes) group.template find_feet<false>(Feet<T>::at(arena.take(Feet<T>::size(n, game.K)), n, game.K));
         Vec<T> energy, squared;
         evaluate(group, energy, squared);
         for (int lane = 0; lane < filled; ++lane) {
             energies[1][group.problem[lane]] += energy[lane];
             norm[group.problem[lane]] += squared[lane];
         }
-        for (int i = 0; i < group.count.agents(); ++i) {
+        for (int i = 0; i < n; ++i) {
             const auto& path = group.path[i];
             const Vec<T>* const entries[4] = {path.x, path.y, path.heading, path.speed};
             T* rows[W];
@@ -353,9 +359,9 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
         const StepTape<T>& step = tape.steps[s];
         const T* controls = static_cast<const T*>(run.iterates) + s * run.iterate_stride;
         for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
-            group.load_parameters();
-            group.template find_feet<true>();
             const int n = group.count.agents(), K = group.K;
+            group.load_parameters();
+            if (game.own[LANE]) group.feet = Feet<T>::at(step.feet[n].data() + index * Feet<T>::size(n, K), n, K);
             const auto factors = Factors<T>::at(step.factors[n].data() + index * Factors<T>::size(n, K), n, K);
             Vec<T>*bar_turn = arena.take(n * K), *bar_thrust = arena.take(n * K);
             Vec<T>*mu_turn = arena.take(n * K), *mu_thrust = arena.take(n * K);

@@ -25,8 +25,8 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>
         if (P) P[(m + 2 * i + 1) * ld + m + 2 * i + 1] += speed.stiffness;
         Model<T> in_x, in_y;
         if (g.has(LANE)) {
-            in_x.add(g.own(LANE, i), g.path[i].x[state] - g.foot_x[i * (g.K + 1) + state]);
-            in_y.add(g.own(LANE, i), g.path[i].y[state] - g.foot_y[i * (g.K + 1) + state]);
+            in_x.add(g.own(LANE, i), g.path[i].x[state] - g.feet.x[i * (g.K + 1) + state]);
+            in_y.add(g.own(LANE, i), g.path[i].y[state] - g.feet.y[i * (g.K + 1) + state]);
         }
         if (g.has(GOAL) && state == g.K) {
             in_x.add(g.own(GOAL, i), g.path[i].x[state] - g.goal_x[i]);
@@ -304,7 +304,7 @@ void differentiate(
             };
             if (g.has(LANE)) {
                 const int at = i * (K + 1) + state;
-                pull_to(LANE, g.foot_x[at], g.foot_y[at], g.slide_x[at], g.slide_y[at]);
+                pull_to(LANE, g.feet.x[at], g.feet.y[at], g.feet.slide_x[at], g.feet.slide_y[at]);
             }
             if (g.has(GOAL) && state == K) {
                 pull_to(GOAL, g.goal_x[i], g.goal_y[i], Vec<T>{}, Vec<T>{});
