@@ -60,7 +60,7 @@ class _Game(ctypes.Structure):
         ("present", _Address),
         ("size", _Address),
         ("own", _Address * len(OWN)),
-        ("own_strides", _Integer * len(OWN) * 3),
+        ("own_strides", _Integer * 3 * len(OWN)),
         ("pair", _Address),
         ("pair_strides", _Integer * 3),
         ("goals", _Address),
@@ -168,7 +168,8 @@ def solve(
         controls, states, *iterates = _Unrolled.apply(call, parameters.initial_controls, *call.inputs)
     else:
         call.run()
-        controls, states, iterates = call.iterates[-1], call.states, list(call.iterates.unbind(0))
+        iterates = list(call.iterates.unbind(0))
+        controls, states = iterates[-1], call.states
     return Solution(
         controls=controls,
         states=states,
@@ -207,9 +208,9 @@ class _Call:
         controls = parameters.initial_controls
         self.controls, self.steps, self.keep_iterates = controls, steps, keep_iterates
         self.doubles = controls.dtype == torch.float64
-        self.own = [parameters.own_weights[name].to(controls.dtype) for name in energy.own]
-        self.pair = [parameters.pair_weights[name].to(controls.dtype) for name in energy.pair]
-        self.goals = [parameters.goals.to(controls.dtype)] if energy.needs_goals else []  # type: ignore[union-attr]
+        self.own = [_as(controls.dtype, parameters.own_weights[name]) for name in energy.own]
+        self.pair = [_as(controls.dtype, parameters.pair_weights[name]) for name in energy.pair]
+        self.goals = [_as(controls.dtype, parameters.goals)] if energy.needs_goals else []  # type: ignore[arg-type]
         self.inputs = (*self.own, *self.pair, *self.goals)
         self.slots = [OWN.index(name) for name in energy.own]
         self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs))
@@ -231,16 +232,14 @@ class _Call:
         for index, name in enumerate(SIGNALS):
             if name in energy.bounds:
                 game.bounds[index][:] = energy.bounds[name]
-        initial = scene.history[:, :, -1].to(like)
+        initial = _as(like, scene.current)
         initial = hold(initial if initial.stride(-1) == 1 else initial.contiguous())
         game.initial, game.initial_strides[:] = initial.data_ptr(), initial.stride()[:2]
         game.present = hold(scene.agent_mask.contiguous()).data_ptr()
         if scene.size is not None:
-            game.size = hold(scene.size.to(like).contiguous()).data_ptr()
+            game.size = hold(_as(like, scene.size).contiguous()).data_ptr()
         for slot, weight in zip(self.slots, self.own, strict=True):
-            game.own[slot] = weight.data_ptr()
-            for axis in range(3):
-                game.own_strides[axis][slot] = weight.stride(axis)
+            game.own[slot], game.own_strides[slot][:] = weight.data_ptr(), weight.stride()
         if self.pair and agents > 1:
             game.pair, game.pair_strides[:] = self.pair[0].data_ptr(), self.pair[0].stride()
         if self.goals:
@@ -248,12 +247,12 @@ class _Call:
         if "lane" in energy.own:
             assert scene.references is not None
             assert parameters.reference is not None
-            game.references = hold(scene.references.to(like).contiguous()).data_ptr()
-            game.reference = hold(parameters.reference.to(torch.int64).contiguous()).data_ptr()
+            game.references = hold(_as(like, scene.references).contiguous()).data_ptr()
+            game.reference = hold(_as(torch.int64, parameters.reference).contiguous()).data_ptr()
             game.lines, game.points = scene.references.shape[2:4]
         if "velref" in energy.own:
             assert scene.reference_speed is not None
-            game.reference_speed = hold(scene.reference_speed.to(like).contiguous()).data_ptr()
+            game.reference_speed = hold(_as(like, scene.reference_speed).contiguous()).data_ptr()
         self.kept = kept
 
     def _reserve(self, step_size: float, damping: Tensor) -> None:
@@ -264,7 +263,7 @@ class _Call:
         self.states: Tensor | None = controls.new_empty((*shape[:-1], 4))
         self.initial_energy, self.energy, self.gradient_norm = controls.new_empty((3, *shape[:2])).unbind(0)
         self.status = torch.empty(shape[:2], dtype=torch.int64)
-        self.damping = damping.to(controls.dtype).contiguous()
+        self.damping = _as(controls.dtype, damping).contiguous()
         self.start = controls.detach().contiguous()
         self.arguments = _Run(
             steps=self.steps,
@@ -275,7 +274,7 @@ class _Call:
             iterates=self.iterates.data_ptr(),
             iterate_stride=controls.numel() if stacked else 0,
             directions=self.directions.data_ptr(),
-            states=self.states.data_ptr(),  # type: ignore[union-attr]
+            states=self.states.data_ptr(),
             initial_energy=self.initial_energy.data_ptr(),
             energy=self.energy.data_ptr(),
             gradient_norm=self.gradient_norm.data_ptr(),
@@ -351,6 +350,11 @@ class _Unrolled(torch.autograd.Function):
             states = states.contiguous()
         gradients = call.differentiate(bar, along, states)
         return None, bar, *gradients
+
+
+def _as(dtype: torch.dtype, tensor: Tensor) -> Tensor:
+    # `to` takes a microsecond even where it has nothing to do, and there are twenty tensors.
+    return tensor if tensor.dtype == dtype else tensor.to(dtype)
 
 
 def _parts(problems: int, lanes: int) -> list[tuple[int, int]]:

@@ -26,7 +26,7 @@ struct EpoGame {
     const uint8_t* present;    // [B, N]
     const void* size;          // [B, N, 2] length, width
     const void* own[OWN_COUNT];  // [B, M, N] each
-    int64_t own_b[OWN_COUNT], own_m[OWN_COUNT], own_n[OWN_COUNT];
+    int64_t own_strides[OWN_COUNT][3];
     const void* pair;          // [B, M, P]
     int64_t pair_b, pair_m, pair_p;
     const void* goals;         // [B, M, N, 2]

@@ -289,8 +289,9 @@ struct Group {
         for (int f = 0; f < OWN_COUNT; ++f) {
             if (!game.own[f]) continue;
             for (int lane = 0; lane < W; ++lane) {
-                const T* from = static_cast<const T*>(game.own[f]) + scene[lane] * game.own_b[f] + mode[lane] * game.own_m[f];
-                for (int i = 0; i < n; ++i) weight[f * n + i][lane] = from[agent[i * W + lane] * game.own_n[f]];
+                const int64_t* strides = game.own_strides[f];
+                const T* from = static_cast<const T*>(game.own[f]) + scene[lane] * strides[0] + mode[lane] * strides[1];
+                for (int i = 0; i < n; ++i) weight[f * n + i][lane] = from[agent[i * W + lane] * strides[2]];
             }
         }
         goal_x = arena.take(n);
