@@ -125,7 +125,7 @@ INLINE Vec<T> zip(Vec<T> a, Vec<T> b, std::index_sequence<I...>) {
 template <class T>
 INLINE void transpose(Vec<T>* v) {
     constexpr int W = Lanes<T>::W;
-    const std::make_index_sequence<W> all;
+    constexpr std::make_index_sequence<W> all{};
     for (int bit = 1; bit < W; bit *= 2) {
         Vec<T> shuffled[W];
         for (int i = 0; i < W / 2; ++i) {
