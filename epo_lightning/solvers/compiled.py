@@ -208,7 +208,10 @@ class _Call:
         controls = parameters.initial_controls
         self.controls, self.steps, self.keep_iterates = controls, steps, keep_iterates
         self.doubles = controls.dtype == torch.float64
-        self.own = [_as(controls.dtype, parameters.own_weights[name]) for name in energy.own]
+        weights = parameters.own_weights
+        if _has_gaps(energy, scene):  # a line that does not exist pulls nobody
+            weights = {**weights, "lane": energy.own_weight(scene, parameters, "lane")}
+        self.own = [_as(controls.dtype, weights[name]) for name in energy.own]
         self.pair = [_as(controls.dtype, parameters.pair_weights[name]) for name in energy.pair]
         self.goals = [_as(controls.dtype, parameters.goals)] if energy.needs_goals else []  # type: ignore[arg-type]
         self.inputs = (*self.own, *self.pair, *self.goals)
@@ -247,7 +250,10 @@ class _Call:
         if "lane" in energy.own:
             assert scene.references is not None
             assert parameters.reference is not None
-            game.references = hold(_as(like, scene.references).contiguous()).data_ptr()
+            references = _as(like, scene.references)
+            if _has_gaps(energy, scene):
+                references = torch.where(scene.reference_mask[..., None, None], references, 0.0)  # type: ignore[index]
+            game.references = hold(references.contiguous()).data_ptr()
             game.reference = hold(_as(torch.int64, parameters.reference).contiguous()).data_ptr()
             game.lines, game.points = scene.references.shape[2:4]
         if "velref" in energy.own:
@@ -316,6 +322,11 @@ class _Call:
 
         _in_parallel(part, self.tapes)
         return [*own.unbind(0), *([pair] if pair is not None else []), *([goals] if goals is not None else [])]
+
+
+def _has_gaps(energy: Energy, scene: Scene) -> bool:
+    """Whether there are reference lines that do not exist."""
+    return "lane" in energy.own and scene.reference_mask is not None and not scene.reference_mask.all()
 
 
 class _Unrolled(torch.autograd.Function):

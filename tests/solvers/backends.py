@@ -228,6 +228,25 @@ class BackendSuite:
         assert torch.equal(solution.controls[1], parameters.initial_controls[1]), "nothing pulls anywhere"
         assert (solution.controls[0] - 0.49 * parameters.initial_controls[0]).abs().max() < 1e-5, "two steps of 0.3"
 
+    def test_lines_that_do_not_exist_pull_nobody(self):
+        scene, energy = random_scene(3, 2, history=2, dtype=torch.float64), Energy(["lane", "acc", "turnr"])
+        parameters = random_game(scene)
+        mask = torch.rand(3, 2, 2) < 0.5
+        lines = torch.where(mask[..., None, None], scene.references, torch.nan)
+        leaves = leaves_of(parameters)
+        masked = dataclasses.replace(scene, references=lines, reference_mask=mask)
+        solution = self.damped(energy, masked, leaves)
+        followed = mask[:, None].expand(-1, 2, -1, -1).gather(-1, parameters.reference[..., None])[..., 0]
+        assert followed.any()
+        assert not followed.all()
+        lane = torch.where(followed, parameters.own_weights["lane"], 0.0)
+        without = dataclasses.replace(parameters, own_weights={**parameters.own_weights, "lane": lane})
+        assert (solution.status == Status.SOLVED).all()
+        torch.testing.assert_close(solution.controls, self.damped(energy, scene, without).controls, rtol=0, atol=1e-12)
+        solution.controls.square().sum().backward()
+        assert (leaves.own_weights["lane"].grad[~followed] == 0).all()
+        assert (leaves.own_weights["lane"].grad[followed] != 0).all()
+
     def test_coincident_agents_stay_finite(self):
         scene = random_scene(2, 3, history=2, size=1.0)
         history = scene.history.clone()
