@@ -110,6 +110,14 @@ class Scene(_Batch):
             raise ValueError(
                 f"scene.history has shape {list(self.history.shape)}; it takes [B, N, H, 4]: x, y, heading, speed"
             )
+        if self.history.shape[2] == 0:
+            raise ValueError("scene.history has no step; the last one is the current state, t0")
+        for name in ("history_mask", "agent_mask", "future_mask", "goal_mask", "reference_mask"):
+            mask = getattr(self, name)
+            if mask is not None and mask.dtype != torch.bool:
+                raise ValueError(
+                    f"scene.{name} is of type {mask.dtype}; masks are torch.bool, True where an entry is real"
+                )
         if not self.dt > 0:
             raise ValueError(f"scene.dt must be positive, not {self.dt}")
         batch, agents, steps, _ = self.history.shape

@@ -58,3 +58,15 @@ def test_only_what_is_real_has_to_be_finite():
     scene.reference_mask[2, 1, 1] = False
     scene.agent_mask[0, 0] = False
     assert scene.finite.all()
+
+
+@pytest.mark.parametrize("name", ["agent_mask", "history_mask"])
+def test_masks_are_boolean(name):
+    mask = torch.ones((1, 2) if name == "agent_mask" else (1, 2, 3))
+    with pytest.raises(ValueError, match=rf"scene\.{name} is of type torch\.float32; masks are torch\.bool"):
+        Scene(torch.zeros(1, 2, 3, 4), 0.1, **{name: mask})
+
+
+def test_a_history_has_a_current_state():
+    with pytest.raises(ValueError, match="has no step"):
+        Scene(torch.zeros(1, 2, 0, 4), 0.1)

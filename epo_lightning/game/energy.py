@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -82,8 +83,8 @@ class Energy:
         for name, feature in self.own_features.items():
             if feature.bounded and feature.signal not in self.bounds:
                 raise ConfigError(f"feature {name!r} needs energy.bounds.{feature.signal}: [lowest, highest]")
-        if not self.pair_stride >= 1:
-            raise ConfigError(f"energy.pair_stride must be 1 or more, not {self.pair_stride}")
+        if not isinstance(self.pair_stride, int) or self.pair_stride < 1:
+            raise ConfigError(f"energy.pair_stride must be a whole number, 1 or more, not {self.pair_stride}")
         signals = {feature.signal for feature in OWN_FEATURES.values() if feature.bounded}
         for name, bound in self.bounds.items():
             if name not in signals:
@@ -91,27 +92,27 @@ class Energy:
             if len(bound) != 2 or not bound[0] < bound[1]:
                 raise ConfigError(f"energy.bounds.{name} must be [lowest, highest], not {list(bound)}")
 
-    @property
+    @cached_property
     def own_features(self) -> dict[str, OwnFeature]:
         """The own features by name."""
         return {name: OWN_FEATURES[name] for name in self.own}
 
-    @property
+    @cached_property
     def pair_features(self) -> dict[str, PairFeature]:
         """The pair features by name."""
         return {name: PAIR_FEATURES[name] for name in self.pair}
 
-    @property
+    @cached_property
     def needs(self) -> set[str]:
         """What the own features refer to: some of ``goals``, ``reference``, ``reference_speed``, ``size``."""
         return {feature.needs for feature in self.own_features.values() if feature.needs}
 
-    @property
+    @cached_property
     def needs_goals(self) -> bool:
         """Whether a feature asks where agents are heading."""
         return "goals" in self.needs
 
-    @property
+    @cached_property
     def needs_reach(self) -> bool:
         """Whether a pair feature asks for the agents' radii."""
         return any(feature.source is Source.DISTANCE for feature in self.pair_features.values())
@@ -214,8 +215,8 @@ class Energy:
             for name in names:
                 if name not in given:
                     raise ValueError(f"{kind} lacks the feature {name!r}; it has {sorted(given)}")
-                if given[name].shape != (batch, modes, count):
-                    shape = list(given[name].shape)
+                shape = list(given[name].shape) if isinstance(given[name], Tensor) else given[name]
+                if shape != [batch, modes, count]:
                     raise ValueError(f"{kind}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}")
         needed: dict[str, tuple[tuple[str, Tensor | None], ...]] = {
             "goals": (("parameters.goals", parameters.goals),),
@@ -227,20 +228,40 @@ class Energy:
             for what, value in needed[feature.needs] if feature.needs else ():
                 if value is None:
                     raise ValueError(f"the energy has the feature {name!r}, but {what} is None")
-                takes = (batch, modes, agents, 2)[: value.dim()]
-                if what in ("parameters.goals", "parameters.reference") and value.shape != takes:
-                    raise ValueError(f"{what} has shape {list(value.shape)}; these controls take {list(takes)}")
+                takes = {"parameters.goals": [batch, modes, agents, 2], "parameters.reference": [batch, modes, agents]}
+                if list(value.shape) != takes.get(what, list(value.shape)):
+                    raise ValueError(f"{what} has shape {list(value.shape)}; these controls take {takes[what]}")
         if "reference" in self.needs and controls.device.type == "cpu":  # elsewhere, looking would make the host wait
             assert scene.references is not None
             assert parameters.reference is not None
             lines = scene.references.shape[2]
             index = torch.where(scene.agent_mask[:, None], parameters.reference, 0)
-            if ((index < 0) | (index >= lines)).any():
+            if (scene.agent_mask[:, None] & ((index < 0) | (index >= lines))).any():
                 raise ValueError(
                     f"parameters.reference chooses among the R = {lines} lines of scene.references by 0 .. R-1"
                 )
         if self.needs_reach and scene.size is None:
             raise ValueError("pair features take the agents' radii from scene.size [B, N, 2], which is None")
+
+    def known(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
+        """Whose game is all finite numbers where nothing computed from it would tell otherwise.
+
+        A pair that never touches hides its weight, an agent that no feature places hides where it is, and a reference line
+        hides all its points but the nearest.
+        """
+        present = scene.agent_mask
+        known = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)
+        if self.needs_reach or "size" in self.needs:
+            assert scene.size is not None
+            known = known & torch.where(present, scene.size[..., 0], 0.0).isfinite().all(1)
+        of_modes = known[:, None].expand(-1, parameters.initial_controls.shape[1])
+        for name in self.pair:
+            of_modes = of_modes & self.pair_weight(scene, parameters, name).isfinite().all(-1)
+        if "reference" in self.needs:
+            line = self.surroundings(scene, parameters).line
+            assert line is not None
+            of_modes = of_modes & torch.where(present[:, None, :, None, None], line, 0.0).isfinite().flatten(2).all(2)
+        return of_modes
 
     # What solvers share with the residuals: absent agents are silenced here, once.
 

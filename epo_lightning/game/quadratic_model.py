@@ -434,45 +434,6 @@ class QuadraticModel:
         shared = jacobians[0] @ jacobians[1].mT
         self.pair_blocks = shared if self.pair_blocks is None else self.pair_blocks + shared
 
-    # --- matrix -------------------------------------------------------------------------------------------------------
-
-    def times(self, change: Float[Tensor, "S N 2 K"], damping: Float[Tensor, " S"]) -> Float[Tensor, "S N 2 K"]:
-        """(J^T J + damping) times a change of the controls, through the trajectory and without the matrix.
-
-        The matrix in the nodes' unknowns is worse conditioned than the one in the controls, by 1 / dt^2; this is not.
-        """
-        nodes = self.dt * change.cumsum(-1)
-        moved = self._travel((self.moves * nodes[:, :, :, None]).sum(2))
-        control = (self.control_stiffness + damping[:, None, None, None]) * change
-        if self.rate_stiffness is not None:
-            rate = self.rate_stiffness * (_ahead(change) - change) / self.dt**2
-            control -= rate - torch.nn.functional.pad(rate[..., :-1], (1, 0))
-        node = self.node_stiffness * nodes
-        if self.cross is not None:
-            same, following = self.cross.unbind(2)
-            node[:, :, 0] += same * nodes[:, :, 1] + following * _ahead(nodes[:, :, 1])
-            node[:, :, 1] += same * nodes[:, :, 0]
-            node[:, :, 1, 1:] += (following * nodes[:, :, 0])[..., :-1]
-        x, y = moved.unbind(2)
-        xx, xy, yy = self.pull[:, :, 2:].unbind(2)
-        force = torch.stack((xx * x + xy * y, xy * x + yy * y), 2)
-        if self.pair_curvature is not None:
-            first, second = self.edges.ends(moved)
-            xx, xy, yy = (-self.pair_curvature).unbind(1)
-            by_second, by_first = (
-                torch.stack((xx * x + xy * y, xy * x + yy * y), 1) for x, y in (second.unbind(1), first.unbind(1))
-            )
-            self.edges.spread_(force, by_second, by_first)
-        node += (self.moves * self._after(force)[:, :, None]).sum(3)
-        flat = nodes.flatten(2)[..., None]
-        if self.blocks is not None:
-            node += (self.blocks @ flat).view_as(node)
-        if self.pair_blocks is not None:
-            first, second = self.edges.ends(flat)
-            by_second, by_first = self.pair_blocks @ second, self.pair_blocks.mT @ first
-            self.edges.spread_(node, *(part.view(-1, 2, self.steps) for part in (by_second, by_first)))
-        return control + self.dt * _suffix(node)
-
     # --- differentiation ----------------------------------------------------------------------------------------------
 
     def pullback(

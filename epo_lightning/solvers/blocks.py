@@ -129,15 +129,20 @@ class _Parts:
 
     def __init__(self, model: QuadraticModel, damping: Float[Tensor, " S"], group: Group) -> None:
         self.model, self.group, self.size = model, group, group.size
+
+        # In double precision: nodes see rates of controls divided by dt^4, for which single precision has no digits.
+        def exact(values: Tensor) -> Tensor:
+            return values.to(torch.float64)
+
         # Absent agents get unit matrices of their own, so that they are regular even without damping.
-        control = torch.where(
-            model.present[..., None, None], model.control_stiffness + damping[:, None, None, None], 1.0
-        )
-        rows = [model.dt * model.moves.flatten(2, 3), control / model.dt**2, model.node_stiffness, model.pull[:, :, 2:]]
+        control = exact(model.control_stiffness) + damping[:, None, None, None]
+        control = torch.where(model.present[..., None, None], control, 1.0)
+        moves, node, pull = exact(model.moves), exact(model.node_stiffness), exact(model.pull[:, :, 2:])
+        rows = [model.dt * moves.flatten(2, 3), control / model.dt**2, node, pull]
         sizes = [4, 2, 2, 3]
         for optional, scale in ((model.rate_stiffness, model.dt**-4), (model.cross, 1.0)):
             if optional is not None:
-                rows.append(optional * scale)
+                rows.append(exact(optional) * scale)
             sizes.append(2 * (optional is not None))
         packed = torch.cat(rows, 2).flatten(0, 1)
         if group.agents is not None:
@@ -146,7 +151,8 @@ class _Parts:
         moves, self.control, self.node, pull, self.rate, self.cross = packed.split(sizes, 2)
         self.moves = moves.unflatten(2, (2, 2))  # [C, K, component, axis, m]
         # All curvatures in positions, [C, K, axis m, axis m].
-        xx, xy, yy = group.coupled(pull.transpose(1, 2), model.pair_curvature).movedim(3, 1).unbind(2)  # [C, K, m, m]
+        shared = None if model.pair_curvature is None else exact(model.pair_curvature)
+        xx, xy, yy = group.coupled(pull.transpose(1, 2), shared).movedim(3, 1).unbind(2)  # [C, K, m, m]
         self.curvature = torch.stack((torch.stack((xx, xy), -2), torch.stack((xy, yy), -2)), 2).view(
             group.count, model.steps, 2 * group.size, 2 * group.size
         )
@@ -274,7 +280,7 @@ class _Parts:
             blocks = blocks.view(-1, size, 2, steps, 2, steps)
             nodes.diagonal(dim1=3, dim2=6).add_(blocks.permute(0, 3, 2, 5, 4, 1))
         if self.model.pair_blocks is not None:
-            shared = self.group.of_edges(self.model.pair_blocks).view(-1, 2, steps, 2, steps)
+            shared = self.group.of_edges(self.model.pair_blocks).to(matrix.dtype).view(-1, 2, steps, 2, steps)
             of = self.group
             nodes[of.component, :, :, of.second, :, :, of.first] += shared.permute(0, 4, 3, 2, 1)
             nodes[of.component, :, :, of.first, :, :, of.second] += shared.permute(0, 2, 1, 4, 3)

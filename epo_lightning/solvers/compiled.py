@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import os
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -103,13 +104,10 @@ def _find() -> ctypes.CDLL | str:
     except OSError as error:
         return f"{error}; with a C++ compiler on the path, installing epo_lightning again builds it"
     run = (ctypes.POINTER(_Game), ctypes.POINTER(_Run))
-    library.epo_solve.argtypes = (_Integer, *run, _Integer, _Integer)
-    library.epo_solve.restype = _Address
-    library.epo_differentiate.argtypes = (_Integer, _Address, *run, ctypes.POINTER(_Gradients))
-    library.epo_differentiate.restype = None
-    library.epo_release.argtypes = (_Integer, _Address)
-    library.epo_release.restype = None
-    for name in ("epo_lanes", "epo_levels"):
+    library.epo_solve.argtypes = (_Integer, *run, _Integer, _Integer, ctypes.POINTER(_Address))
+    library.epo_differentiate.argtypes = (_Address, *run, ctypes.POINTER(_Gradients))
+    library.epo_release.argtypes, library.epo_release.restype = (_Address,), None
+    for name in ("epo_solve", "epo_differentiate", "epo_lanes", "epo_levels"):
         getattr(library, name).restype = _Integer
     library.epo_choose.argtypes, library.epo_choose.restype = (_Integer,), None
     return library
@@ -185,11 +183,10 @@ def solve(
 class _Tape:
     """What a range of problems leaves for the adjoint; owned by the library until released."""
 
-    doubles: bool
     address: int
 
     def __del__(self) -> None:
-        _library().epo_release(self.doubles, self.address)
+        _library().epo_release(self.address)
 
 
 class _Call:
@@ -231,7 +228,8 @@ class _Call:
             kept.append(tensor)
             return tensor
 
-        game = self.game = _Game(B=batch, M=modes, N=agents, K=horizon, pair_stride=energy.pair_stride, dt=scene.dt)
+        game = self.game = _Game(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt)
+        game.pair_stride = min(energy.pair_stride, horizon + 1)
         for index, name in enumerate(SIGNALS):
             if name in energy.bounds:
                 game.bounds[index][:] = energy.bounds[name]
@@ -292,9 +290,10 @@ class _Call:
         problems = self.controls.shape[0] * self.controls.shape[1]
 
         def part(bounds: tuple[int, int]) -> None:
-            address = library.epo_solve(self.doubles, self.game, self.arguments, *bounds)
-            if address:
-                self.tapes.append(_Tape(self.doubles, address))
+            tape = _Address()
+            _check(library.epo_solve(self.doubles, self.game, self.arguments, *bounds, tape))
+            if tape.value:
+                self.tapes.append(_Tape(tape.value))
 
         _in_parallel(part, _parts(problems, library.epo_lanes()))
 
@@ -318,7 +317,7 @@ class _Call:
             gradients.goals = goals.data_ptr()
 
         def part(tape: _Tape) -> None:
-            library.epo_differentiate(self.doubles, tape.address, self.game, self.arguments, gradients)
+            _check(library.epo_differentiate(tape.address, self.game, self.arguments, gradients))
 
         _in_parallel(part, self.tapes)
         return [*own.unbind(0), *([pair] if pair is not None else []), *([goals] if goals is not None else [])]
@@ -337,7 +336,7 @@ class _Unrolled(torch.autograd.Function):
         call.run()
         ctx.call = call
         # The kernel holds addresses: saving the tensors makes sure that nobody changes them in between.
-        ctx.save_for_backward(*inputs)
+        ctx.save_for_backward(*inputs, *call.kept)
         ctx.set_materialize_grads(False)
         iterates = [iterate.clone() for iterate in call.iterates] if call.keep_iterates else []
         # An output that the node holds would be a cycle: its memory would wait for the garbage collector.
@@ -376,14 +375,29 @@ def _parts(problems: int, lanes: int) -> list[tuple[int, int]]:
     return list(pairwise(edges))
 
 
+def _check(outcome: int) -> None:
+    if outcome:
+        raise MemoryError("there is not enough memory for the compiled layer: solve fewer scenes or modes at a time")
+
+
 @functools.cache
-def _threads(count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count, thread_name_prefix="epo")
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="epo")
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads do not survive a fork, but their pool would, and wait for them for ever.
+    os.register_at_fork(after_in_child=_threads.cache_clear)
 
 
 def _in_parallel(body: Callable[[Any], None], parts: Sequence[Any]) -> None:
     # The library lets go of Python's lock while it works.
-    if len(parts) == 1:
+    rest: list[Future[None]] = []
+    try:
+        rest.extend(_threads().submit(body, part) for part in parts[1:])
         body(parts[0])
-    else:
-        list(_threads(len(parts)).map(body, parts))
+    finally:
+        # Whatever happens here, the others write to memory that this call holds: it must not return before they do.
+        wait(rest)
+    for future in rest:
+        future.result()

@@ -88,8 +88,8 @@ class LevenbergMarquardt:
             raise ConfigError(f"solver.truncated_steps must be 1 or more, not {self.truncated_steps}")
         if not 0 < self.step_size <= 1:
             raise ConfigError(f"solver.step_size must be in (0, 1], not {self.step_size}")
-        if not self.damping >= 0:
-            raise ConfigError(f"solver.damping must be 0 or more, not {self.damping}")
+        if not 0 <= self.damping < float("inf"):
+            raise ConfigError(f"solver.damping must be 0 or more, and finite, not {self.damping}")
         for name, choices in _CHOICES.items():
             chosen = getattr(self, name)
             if chosen not in choices:
@@ -108,6 +108,12 @@ class LevenbergMarquardt:
         """
         start = parameters.initial_controls
         energy.validate(scene, parameters, start)
+        if start.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"initial_controls are of type {start.dtype}; the layer takes float32 and float64")
+        if scene.history.dtype != start.dtype:
+            scene = scene.to(start.dtype)
+        if start.numel() == 0:
+            return _nothing(start)
         damping = start.new_full(start.shape[:2], self.damping)
         if self.differentiation == "unrolled":
             return self._run(energy, scene, parameters, self.steps, damping)[0]
@@ -145,7 +151,7 @@ class LevenbergMarquardt:
             damping = torch.where(
                 better, (damping / 10.0).clamp_min(_LEAST_DAMPING), (damping * 10.0).clamp_max(_MOST_DAMPING)
             )
-            solution = _chosen(better, trial, solution)
+            solution = _chosen(better, trial, solution, self.keep_iterates)
         return solution if self.keep_iterates else dataclasses.replace(solution, iterates=None), damping
 
 
@@ -163,7 +169,14 @@ def _backend(name: str, energy: Energy, scene: Scene, parameters: GameParameters
     return structured.solve
 
 
-def _chosen(better: Tensor, trial: Solution, before: Solution) -> Solution:
+def _nothing(controls: Tensor) -> Solution:
+    """The solution of no game at all: no scene, no mode or no agent."""
+    none = controls.new_zeros(controls.shape[:2])
+    states = controls.new_zeros(*controls.shape[:-1], 4)
+    return Solution(controls, states, none, none, none, none.long(), None)
+
+
+def _chosen(better: Tensor, trial: Solution, before: Solution, keep_iterates: bool) -> Solution:
     """The trial where it is better, and what was before elsewhere."""
     keep = better[..., None, None, None]
     controls = torch.where(keep, trial.controls, before.controls)
@@ -177,5 +190,5 @@ def _chosen(better: Tensor, trial: Solution, before: Solution) -> Solution:
         gradient_norm=torch.where(better, trial.gradient_norm, before.gradient_norm),
         # A step without a factor is one more that is rejected; a sample whose energy is no number has no steps at all.
         status=torch.where(before.energy.isfinite(), before.status.maximum(accepted), Status.STOPPED),
-        iterates=(*before.iterates, controls),
+        iterates=(*before.iterates, controls) if keep_iterates else before.iterates,
     )

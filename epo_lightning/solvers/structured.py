@@ -68,7 +68,7 @@ def solve(
     split = controls.device.type == "cpu" if split is None else split
     game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(), split)
     tensors = game.tensors(parameters)
-    status = torch.full(controls.shape[:2], Status.SOLVED, device=controls.device)
+    status = torch.where(game.known, Status.SOLVED, Status.STOPPED)
     iterates = [controls]
     initial_energy = None
     for _ in range(steps):
@@ -105,12 +105,9 @@ class Game:
     split: bool
 
     @cached_property
-    def complete(self) -> Bool[Tensor, "B M"]:
-        """Whose pair weights are finite: of pairs that never touch, nothing else would tell."""
-        complete = torch.ones_like(self.parameters.initial_controls[:, :, 0, 0, 0], dtype=torch.bool)
-        for name in self.energy.pair:
-            complete &= self.energy.pair_weight(self.scene, self.parameters, name).isfinite().all(-1)
-        return complete
+    def known(self) -> Bool[Tensor, "B M"]:
+        """See :meth:`~epo_lightning.game.energy.Energy.known`."""
+        return self.energy.known(self.scene, self.parameters)
 
     def tensors(self, parameters: GameParameters) -> list[Tensor]:
         """The tensors of a game that an iterate is differentiated by."""
@@ -217,35 +214,21 @@ class Factors:
 
     Attributes:
         model: whose matrices these are.
-        damping: lambda of every sample.
         groups: the agents that were factorised together.
         factors: of each group.
         status: a :class:`Status` per sample.
     """
 
     model: Model
-    damping: Float[Tensor, " S"]
     groups: list[Group]
     factors: list[blocks.Factors]
     status: Int[Tensor, " S"]
 
     def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
-        """(J^T J + lambda I)^-1 times a covector of the controls.
-
-        In single precision what is left is solved for once more: in nodes a matrix is worse conditioned than in controls.
-        Where the damping was raised there is nothing to correct: that solution is one of another problem.
-        """
-        solution = self._solve(right)
-        if right.dtype == torch.float64:
-            return solution
-        left = right - self.model.times(solution, self.damping)
-        refined = solution + self._solve(left)
-        return torch.where((self.status == Status.SOLVED)[:, None, None, None], refined, solution)
-
-    def _solve(self, right: Tensor) -> Tensor:
-        right = self.model.to_nodes(right)
-        parts = [f.solve(_gather(group, right)) for f, group in zip(self.factors, self.groups, strict=True)]
-        return self.model.to_controls(_scatter(self.groups, parts, self.model.u))
+        """(J^T J + lambda I)^-1 times a covector of the controls."""
+        exact = self.model.to_nodes(right.to(torch.float64))
+        parts = [f.solve(_gather(group, exact)) for f, group in zip(self.factors, self.groups, strict=True)]
+        return self.model.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
 
 
 def factorise(model: QuadraticModel, damping: Float[Tensor, " S"], split: bool, retry: bool | None = None) -> Factors:
@@ -273,7 +256,7 @@ def factorise(model: QuadraticModel, damping: Float[Tensor, " S"], split: bool, 
             status = outcome
         else:  # of a sample, the worst one of its components
             status = status.scatter_reduce(0, group.agents[:, 0] // model.agents, outcome, "amax")
-    return Factors(model, damping, groups, factors, status)
+    return Factors(model, groups, factors, status)
 
 
 def _retry(
@@ -329,7 +312,7 @@ class _Step(torch.autograd.Function):
         step = factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
         status = factors.status.view(controls.shape[:2])
         moved = controls + game.step_size * step
-        sound = game.complete & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
+        sound = game.known & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
         keep = sound[..., None, None, None]
         status = torch.where(sound, status, Status.STOPPED)
         value = model.value.view(controls.shape[:2])

@@ -296,7 +296,7 @@ def test_the_potential_is_each_agents_own_cost_up_to_what_the_agent_cannot_chang
         ({"own": [], "pair": []}, "at least one feature"),
         ({"own": ["velb"]}, "needs energy.bounds.vel"),
         ({"own": ["vel"], "bounds": {"velocity": (0.0, 1.0)}}, "unknown signal energy.bounds.velocity"),
-        ({"own": ["acc"], "pair_stride": 0}, "energy.pair_stride must be 1 or more"),
+        ({"own": ["acc"], "pair_stride": 0}, "energy.pair_stride must be a whole number"),
         ({"own": ["velb"], "bounds": {"vel": (1.0, 0.0)}}, r"must be \[lowest, highest\]"),
     ],
 )

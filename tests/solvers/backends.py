@@ -187,7 +187,9 @@ class BackendSuite:
             assert torch.equal(weight.grad[:, :, :3], leaves.own_weights[name].grad)
             assert (weight.grad[:, :, 3:] == 0).all()
 
-    @pytest.mark.parametrize("kind", ["history", "weight", "pair weight", "goal", "controls", "overflow"])
+    @pytest.mark.parametrize(
+        "kind", ["history", "weight", "pair weight", "goal", "controls", "overflow", "size", "a point of a line"]
+    )
     def test_a_poisoned_sample_stops_and_leaves_the_others_bit_identical(self, kind):
         scene, damping = random_scene(4, 2, history=2, size=3.0), 10.0
         parameters = random_game(scene)
@@ -198,6 +200,14 @@ class BackendSuite:
             history = scene.history.clone()
             history[1] = torch.nan
             scene = dataclasses.replace(scene, history=history)
+        elif kind == "size":
+            size = scene.size.clone()
+            size[1, 0, 0] = torch.nan
+            scene = dataclasses.replace(scene, size=size)
+        elif kind == "a point of a line":
+            references = scene.references.clone()
+            references[1, :, :, 3, 1] = torch.inf
+            scene = dataclasses.replace(scene, references=references)
         elif kind == "goal":
             poisoned.goals[1, :, 0] = torch.inf
         elif kind == "controls":
@@ -272,6 +282,33 @@ class BackendSuite:
         assert len(still.iterates) == 1
         still.controls.sum().backward()
         assert (leaves.initial_controls.grad == 1).all()
+
+    def test_no_steps_do_not_hide_what_is_no_number(self):
+        scene = random_scene(2, 2, history=2, size=0.01)
+        parameters = random_game(scene)
+        parameters.pair_weights["proximity"][1] = torch.nan
+        solution = self.damped(Energy(ALL, bounds=BOUNDS), scene, parameters, steps=0)
+        assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2]
+
+    def test_stiff_rates_leave_single_precision_enough_digits(self):
+        scene, own = random_scene(8, 2, history=2, size=1.0), ("goal", "acc", "turnr", "jerk")
+        parameters = random_game(scene, 1, 40, own=own, spread=0.2)
+        parameters.own_weights["jerk"].fill_(30.0)
+        single = self.damped(Energy(own), scene, parameters, steps=1)
+        exact = self.damped(Energy(own), scene.to(torch.float64), parameters.to(torch.float64), steps=1)
+        torch.testing.assert_close(single.controls.double(), exact.controls, rtol=0, atol=5e-5)
+        assert (single.status == Status.SOLVED).all()
+
+    def test_small_steps_do_not_drown_far_from_the_origin(self):
+        scene, own = random_scene(4, 2, history=2, size=0.01), ("acc", "turnr")
+        scene.history[..., :2] = 1e4
+        scene.history[..., 3] = 0.3
+        parameters = random_game(scene, horizon=40, own=own, spread=0.01)
+        energy = Energy(own)
+        single = self.damped(energy, scene, parameters, steps=0)
+        exact = self.damped(energy, scene.to(torch.float64), parameters.to(torch.float64), steps=0)
+        # A unit in the last place of the coordinates themselves is 1 mm there.
+        assert (single.states.double() - exact.states)[..., :2].abs().max() < 1.1e-3
 
     def test_nothing_it_was_given_is_changed(self):
         scene, energy = random_scene(3, 3, history=2, size=2.0), Energy(ALL, bounds=BOUNDS)

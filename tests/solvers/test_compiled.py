@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 import subprocess
 import sys
+import time
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
@@ -172,3 +175,62 @@ def test_a_machine_without_a_compiler_is_told_so(tmp_path):
     assert "the compiled layer was not built" in found.stderr
     assert "no-such-compiler" in found.stderr
     assert not list(tmp_path.glob("epo_kernel*"))
+
+
+def test_a_scene_that_changed_before_the_backward_pass_is_noticed():
+    for name in ("history", "size", "references", "reference_speed", "agent_mask"):
+        scene, energy = random_scene(3, 2, history=2, size=2.0), Energy(ALL, bounds=BOUNDS)
+        solution = compiled.solve(energy, scene, leaves_of(random_game(scene)), 2, 0.3, torch.full((3, 2), 10.0))
+        getattr(scene, name)[0] = getattr(scene, name)[1].clone()
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            solution.controls.sum().backward()
+
+
+_FORK = """
+import os, sys, torch
+sys.path[:0] = {path!r}
+from games import random_game, random_scene
+from epo_lightning import Energy, LevenbergMarquardt
+torch.set_num_threads(2)
+scene = random_scene(64, 2, history=2)
+solve, energy = LevenbergMarquardt(backend="compiled"), Energy(["acc", "turnr"])
+parameters = random_game(scene, own=("acc", "turnr"))
+expected = solve(energy, scene, parameters).controls
+child = os.fork()
+if child == 0:
+    os._exit(0 if torch.equal(solve(energy, scene, parameters).controls, expected) else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_has_threads_of_its_own():
+    path = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
+    subprocess.run([sys.executable, "-c", _FORK.format(path=path)], check=True, timeout=120)
+
+
+def test_an_interrupted_call_waits_for_its_threads():
+    """They write to memory that the call holds."""
+    done = []
+
+    def body(part):
+        if part == 0:
+            raise KeyboardInterrupt
+        time.sleep(0.2)
+        done.append(part)
+
+    with pytest.raises(KeyboardInterrupt):
+        compiled._in_parallel(body, [0, 1, 2])
+    assert sorted(done) == [1, 2]
+
+
+def test_too_little_memory_is_an_exception():
+    with pytest.raises(MemoryError, match="fewer scenes or modes"):
+        compiled._check(1)
+
+
+def test_headings_beyond_reduction_stop_a_sample():
+    scene, energy = random_scene(3, 2, history=2), Energy(["acc", "turnr", "goal"])
+    scene.history[1, 0, -1, 2] = 3e9
+    solution = compiled.solve(energy, scene, random_game(scene), 2, 0.3, torch.full((3, 2), 10.0))
+    assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2, [0, 0]]

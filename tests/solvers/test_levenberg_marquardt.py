@@ -107,6 +107,7 @@ def test_many_steps_reach_an_equilibrium():
         ({"step_size": 1.5}, "solver.step_size"),
         ({"damping": -1.0}, "solver.damping"),
         ({"damping": float("nan")}, "solver.damping"),
+        ({"damping": float("inf")}, "solver.damping"),
         ({"test_steps": -1}, "solver.test_steps"),
         ({"truncated_steps": 0}, "solver.truncated_steps"),
         ({"differentiation": "implict"}, "did you mean 'implicit'"),
@@ -299,3 +300,26 @@ def test_another_number_of_steps_outside_training():
     solve = LevenbergMarquardt(2, test_steps=7)
     assert solve.for_test().steps == 7
     assert LevenbergMarquardt(2).for_test().steps == 2
+
+
+@pytest.mark.parametrize("backend", ["compiled", "pytorch"])
+@pytest.mark.parametrize("differentiation", ["unrolled", "truncated", "implicit", "detached"])
+@pytest.mark.parametrize(("scenes", "modes", "agents"), [(0, 2, 2), (2, 0, 2), (2, 2, 0)])
+def test_no_game_at_all_has_an_empty_solution(backend, differentiation, scenes, modes, agents):
+    scene = random_scene(scenes, agents, history=2)
+    solution = LevenbergMarquardt(backend=backend, differentiation=differentiation)(
+        Energy(ALL, bounds=BOUNDS), scene, random_game(scene, modes)
+    )
+    assert solution.states.shape == (scenes, modes, agents, 7, 4)
+    assert solution.status.shape == (scenes, modes)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "pytorch"])
+def test_scenes_follow_the_precision_of_their_game(backend):
+    scene = random_scene(2, 2, history=2, dtype=torch.float64)
+    parameters = random_game(scene).to(torch.float32)
+    solve, energy = LevenbergMarquardt(backend=backend), Energy(ALL, bounds=BOUNDS)
+    mixed = solve(energy, scene, parameters)
+    assert torch.equal(mixed.controls, solve(energy, scene.to(torch.float32), parameters).controls)
+    with pytest.raises(ValueError, match=r"torch\.float16; the layer takes float32 and float64"):
+        solve(energy, scene, parameters.to(torch.float16))

@@ -11,6 +11,7 @@ import ctypes
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -50,8 +51,9 @@ def load(path: Path = LIBRARY) -> ctypes.CDLL:
 
 
 def _compiler() -> list[str]:
-    if os.environ.get("CXX"):
-        return os.environ["CXX"].split()
+    chosen = shlex.split(os.environ.get("CXX", ""))
+    if chosen:
+        return chosen
     found = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
     if found is None:
         raise OSError("no C++ compiler: neither $CXX nor c++, g++ or clang++ was found")
@@ -64,7 +66,7 @@ def _run(commands: list[list[str]]) -> None:
     said = [process.communicate()[0] for process in running]
     for process, command, words in zip(running, commands, said, strict=True):
         if process.returncode != 0:
-            raise OSError(f"{' '.join(command)}\n{words[-2000:]}")
+            raise OSError(f"{shlex.join(command)} ended with {process.returncode}\n{words[-2000:]}")
 
 
 def build() -> None:
@@ -75,10 +77,9 @@ def build() -> None:
     """
     try:
         load()
-    except OSError:
-        LIBRARY.unlink(missing_ok=True)
-    else:
         return
+    except OSError:
+        pass  # none, or a stale one, which is replaced when there is a better one
     compiler = _compiler()
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     levels = _LEVELS if x86 else {"epo_plain": []}

@@ -1,5 +1,6 @@
 // The functions that Python calls, in the best version that this processor can run.
 
+#include <new>
 #include <vector>
 
 #include "game.hpp"
@@ -33,6 +34,13 @@ std::vector<const EpoLevel*> runnable() {
 const std::vector<const EpoLevel*> levels = runnable();
 const EpoLevel* chosen = levels.back();
 
+/// A tape, and who knows how to read it.
+struct Handle {
+    const EpoLevel* level;
+    bool doubles;
+    void* tape;
+};
+
 }  // namespace
 
 extern "C" {
@@ -47,14 +55,32 @@ void epo_choose(int64_t level) { chosen = levels[level]; }
 
 int64_t epo_lanes() { return chosen->lanes; }
 
-/// Solve problems [first, last); the tape that comes back, if any, is for `epo_differentiate` and must be released.
-void* epo_solve(int64_t doubles, const EpoGame* game, const EpoRun* run, int64_t first, int64_t last) {
-    return (doubles ? chosen->solve_double : chosen->solve_float)(game, run, first, last);
+/// Solve problems [first, last). `tape` becomes what `epo_differentiate` needs, or null; it must be released.
+/// Returns 0, or 1 where there was not enough memory.
+int64_t epo_solve(int64_t doubles, const EpoGame* game, const EpoRun* run, int64_t first, int64_t last, void** tape) {
+    *tape = nullptr;
+    try {
+        void* made = (doubles ? chosen->solve_double : chosen->solve_float)(game, run, first, last);
+        if (made) *tape = new Handle{chosen, doubles != 0, made};
+        return 0;
+    } catch (const std::bad_alloc&) {
+        return 1;
+    }
 }
 
-void epo_differentiate(int64_t doubles, const void* tape, const EpoGame* game, const EpoRun* run, const EpoGradients* gradients) {
-    (doubles ? chosen->differentiate_double : chosen->differentiate_float)(tape, game, run, gradients);
+int64_t epo_differentiate(const void* tape, const EpoGame* game, const EpoRun* run, const EpoGradients* gradients) {
+    const Handle& handle = *static_cast<const Handle*>(tape);
+    try {
+        (handle.doubles ? handle.level->differentiate_double : handle.level->differentiate_float)(handle.tape, game, run, gradients);
+        return 0;
+    } catch (const std::bad_alloc&) {
+        return 1;
+    }
 }
 
-void epo_release(int64_t doubles, void* tape) { (doubles ? chosen->release_double : chosen->release_float)(tape); }
+void epo_release(void* tape) {
+    Handle* handle = static_cast<Handle*>(tape);
+    (handle->doubles ? handle->level->release_double : handle->level->release_float)(handle->tape);
+    delete handle;
+}
 }

@@ -202,12 +202,18 @@ struct Group {
                 p.heading[0][lane] = start[2];
                 p.speed[0][lane] = start[3];
             }
+            // Changes are summed up by themselves: far from the origin, small steps would drown in large coordinates.
+            Vec<T> x{}, y{}, turned{}, faster{};
             for (int k = 0; k < K; ++k) {
                 sincos<T>(p.heading[k], p.sine[k], p.cosine[k]);
-                p.x[k + 1] = p.x[k] + dt * p.speed[k] * p.cosine[k];
-                p.y[k + 1] = p.y[k] + dt * p.speed[k] * p.sine[k];
-                p.heading[k + 1] = p.heading[k] + dt * turn[i * K + k];
-                p.speed[k + 1] = p.speed[k] + dt * thrust[i * K + k];
+                x += dt * p.speed[k] * p.cosine[k];
+                y += dt * p.speed[k] * p.sine[k];
+                turned += dt * turn[i * K + k];
+                faster += dt * thrust[i * K + k];
+                p.x[k + 1] = p.x[0] + x;
+                p.y[k + 1] = p.y[0] + y;
+                p.heading[k + 1] = p.heading[0] + turned;
+                p.speed[k + 1] = p.speed[0] + faster;
             }
         }
     }

@@ -32,6 +32,7 @@ struct Lanes<float> {
     typedef int32_t Mask __attribute__((vector_size(kRegister)));
     // Splits of pi/2 whose products with small integers are exact, and minimax polynomials (Cephes).
     static constexpr float kMagic = 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer
+    static constexpr float kFarthest = 1e5f;
     static constexpr float kPart[3] = {1.5703125f, 4.837512969970703125e-4f, 7.54978995489188216e-8f};
     static INLINE V sine(V x, V z) {
         return ((-1.9515295891e-4f * z + 8.3321608736e-3f) * z - 1.6666654611e-1f) * z * x + x;
@@ -51,6 +52,7 @@ struct Lanes<double> {
     typedef double V __attribute__((vector_size(kRegister)));
     typedef int64_t Mask __attribute__((vector_size(kRegister)));
     static constexpr double kMagic = 6755399441055744.0;  // 1.5 * 2^52
+    static constexpr double kFarthest = 1e9;
     static constexpr double kPart[3] = {1.57079632673412561417e+00, 6.07710050630396597660e-11, 2.02226624879595063154e-21};
     static INLINE V sine(V x, V z) {
         V p = 1.58969099521155010221e-10 * z - 2.50507602534068634195e-08;
@@ -180,7 +182,8 @@ INLINE Vec<T> root(Vec<T> x) {
     return result;
 }
 
-/// Sine and cosine, to about one unit in the last place for angles of up to some thousand radians.
+/// Sine and cosine, to about one unit in the last place for angles of up to some thousand radians; beyond what reduction can
+/// do, not a number rather than a wrong one.
 template <class T>
 INLINE void sincos(Vec<T> angle, Vec<T>& sine, Vec<T>& cosine) {
     using L = Lanes<T>;
@@ -191,8 +194,9 @@ INLINE void sincos(Vec<T> angle, Vec<T>& sine, Vec<T>& cosine) {
     const Vec<T> s = L::sine(rest, square), c = L::cosine(square);
     const Mask<T> swapped = (quadrant & 1) != 0;
     const Vec<T> a = swapped ? c : s, b = swapped ? s : c;
-    sine = (quadrant & 2) != 0 ? -a : a;
-    cosine = ((quadrant + 1) & 2) != 0 ? -b : b;
+    const Vec<T> doubt = angle < L::kFarthest && angle > -L::kFarthest ? Vec<T>{} : splat<T>(T(NAN));
+    sine = ((quadrant & 2) != 0 ? -a : a) + doubt;
+    cosine = (((quadrant + 1) & 2) != 0 ? -b : b) + doubt;
 }
 
 template <class T>

@@ -30,15 +30,15 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
     const T dt = T(game.dt);
     Mask<T>* present = reinterpret_cast<Mask<T>*>(arena.take(N));
     for (int i = 0; i < N; ++i) {
-        Vec<T> px, py, heading, speed;
+        Vec<T> start_x, start_y, start_heading, start_speed, moved_x{}, moved_y{}, turned{}, faster{};
         const T* rows[W];
         for (int lane = 0; lane < W; ++lane) {
             const int64_t b = problems[lane] / game.M;
             const T* start = static_cast<const T*>(game.initial) + b * game.initial_b + i * game.initial_n;
-            px[lane] = start[0];
-            py[lane] = start[1];
-            heading[lane] = start[2];
-            speed[lane] = start[3];
+            start_x[lane] = start[0];
+            start_y[lane] = start[1];
+            start_heading[lane] = start[2];
+            start_speed[lane] = start[3];
             radius[i][lane] = T(0.5) * static_cast<const T*>(game.size)[2 * (b * N + i)];
             present[i][lane] = game.present[b * N + i] ? -1 : 0;
             rows[lane] = controls + (int64_t(problems[lane]) * N + i) * K * 2;
@@ -49,11 +49,13 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
         *high_x = *high_y = splat<T>(-T(INFINITY));
         for (int k = 0; k < K; ++k) {
             Vec<T> sine, cosine;
-            sincos<T>(heading, sine, cosine);
-            px += dt * speed * cosine;
-            py += dt * speed * sine;
-            heading += dt * given[2 * k + 1];
-            speed += dt * given[2 * k];
+            const Vec<T> speed = start_speed + faster;
+            sincos<T>(start_heading + turned, sine, cosine);
+            moved_x += dt * speed * cosine;
+            moved_y += dt * speed * sine;
+            turned += dt * given[2 * k + 1];
+            faster += dt * given[2 * k];
+            const Vec<T> px = start_x + moved_x, py = start_y + moved_y;
             if ((k + 1) % stride) continue;
             const int at = i * kept + (k + 1) / stride - 1;
             x[at] = px;
@@ -172,16 +174,28 @@ INLINE bool finite(T value) {
     return value - value == 0;
 }
 
-/// Whether a problem's pair weights are finite and its reference lines exist: what may otherwise go unnoticed.
+/// Whether a problem is all finite numbers, and its lines exist, where nothing computed from it would tell otherwise: a pair
+/// that never touches hides its weight, and a line all its points but the nearest.
 template <class T>
-bool complete(const EpoGame& game, int64_t problem) {
+bool known(const EpoGame& game, int64_t problem) {
     const int64_t b = problem / game.M, m = problem % game.M;
     const uint8_t* present = game.present + b * game.N;
     int64_t pair = 0;
     for (int64_t i = 0; i < game.N; ++i) {
-        if (game.reference && present[i]) {
-            const int64_t line = game.reference[problem * game.N + i];
-            if (line < 0 || line >= game.lines) return false;
+        const int64_t row = b * game.N + i;
+        if (present[i]) {
+            const T* start = static_cast<const T*>(game.initial) + b * game.initial_b + i * game.initial_n;
+            for (int e = 0; e < 4; ++e)
+                if (!finite(start[e])) return false;
+            if ((game.pair || game.own[STEER]) && !finite(static_cast<const T*>(game.size)[2 * row])) return false;
+            if (game.reference) {
+                const int64_t line = game.reference[problem * game.N + i];
+                if (line < 0 || line >= game.lines) return false;
+                const T* point = static_cast<const T*>(game.references) + (row * game.lines + line) * game.points * 2;
+                bool all = true;
+                for (int64_t e = 0; e < 2 * game.points; ++e) all &= finite(point[e]);
+                if (!all) return false;
+            }
         }
         for (int64_t j = i + 1; game.pair && j < game.N; ++j, ++pair)
             if (present[i] && present[j] &&
@@ -206,7 +220,7 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
     std::vector<Buffer<T>> reused(game.N + 1);
     std::vector<char> whole(last - first);
     for (int64_t problem = first; problem < last; ++problem) {
-        whole[problem - first] = complete<T>(game, problem);
+        whole[problem - first] = known<T>(game, problem);
         run.status[problem] = whole[problem - first] ? 0 : 2;
     }
     for (int64_t problem = first; problem < last; ++problem)
