@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -56,7 +57,7 @@ class Implementation:
         self._wait()
         return controls.detach(), *gradients
 
-    @property
+    @cached_property
     def cotangent(self) -> Tensor:
         """What gradients are contracted with."""
         like = self.game.parameters.initial_controls
