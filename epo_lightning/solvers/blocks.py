@@ -102,9 +102,7 @@ def _times(matrix: Float[Tensor, "C a b"], vector: Float[Tensor, "C b 1"]) -> Fl
     return (matrix * vector.mT).sum(-1, keepdim=True)
 
 
-def factorise(
-    model: QuadraticModel, damping: Float[Tensor, " S"], group: Group
-) -> tuple[BlockFactors, Bool[Tensor, " C"]]:
+def factorise(model: QuadraticModel, damping: Float[Tensor, " S"], group: Group) -> tuple[Factors, Bool[Tensor, " C"]]:
     """Factors of a group's matrices, and which of them have none.
 
     Args:
