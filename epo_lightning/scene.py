@@ -212,7 +212,8 @@ class Status(IntEnum):
     DAMPED = 1
     """A factorisation failed at first and succeeded with more damping."""
     STOPPED = 2
-    """A step could not be taken; the last good iterate was kept."""
+    """A step could not be taken and the last good iterate was kept; or an implicit gradient was asked for where the Hessian
+    is not positive definite."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from epo_lightning.forecasters.scene_consistent import joint_losses
 from epo_lightning.game.energy import Energy
 from epo_lightning.losses import Relaxation
 from epo_lightning.optimizers import Adam
-from epo_lightning.registry import register
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, JointForecast, Scene
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
@@ -52,6 +52,12 @@ class EPO(Forecaster):
         relaxation: float = 0.0,
         relaxation_steps: int = 1000,
     ) -> None:
+        lacking = energy.needs - {"goals", "size"}
+        if lacking:
+            raise ConfigError(
+                f"features of energy.own need {', '.join(sorted(lacking))}, which neither the data nor this forecaster "
+                "provide: leave them out, or give them to the layer yourself (docs/solver.md)"
+            )
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver, modes
         self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))

@@ -231,6 +231,8 @@ class Energy:
                 takes = {"parameters.goals": [batch, modes, agents, 2], "parameters.reference": [batch, modes, agents]}
                 if list(value.shape) != takes.get(what, list(value.shape)):
                     raise ValueError(f"{what} has shape {list(value.shape)}; these controls take {takes[what]}")
+        if "reference" in self.needs and parameters.reference.is_floating_point():  # type: ignore[union-attr]
+            raise ValueError("parameters.reference holds indices of lines: it takes whole numbers, not floats")
         if "reference" in self.needs and controls.device.type == "cpu":  # elsewhere, looking would make the host wait
             assert scene.references is not None
             assert parameters.reference is not None

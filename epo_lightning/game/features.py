@@ -139,6 +139,10 @@ _BUILT_IN = {*OWN_FEATURES, *PAIR_FEATURES}
 def _refuse(name: str, source: Source, sources: tuple[Source, ...]) -> None:
     if name in _BUILT_IN:
         raise ConfigError(f"{name!r} is a built-in feature; choose another name")
+    if not isinstance(source, Source):
+        raise ConfigError(
+            f"feature {name!r} is declared by a Source, such as Source.{sources[0].name}, not by {source!r}"
+        )
     if source not in sources:
         raise ConfigError(
             f"feature {name!r} can be declared as one of {[s.name for s in sources]}, not as {source.name}"

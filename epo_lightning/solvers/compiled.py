@@ -102,7 +102,7 @@ def _find() -> ctypes.CDLL | str:
     try:
         library = load()
     except OSError as error:
-        return f"{error}; with a C++ compiler on the path, installing epo_lightning again builds it"
+        return f"{error}; with a C++ compiler on the path, `python -m epo_lightning.solvers.kernel.build` builds it"
     run = (ctypes.POINTER(_Game), ctypes.POINTER(_Run))
     library.epo_solve.argtypes = (_Integer, *run, _Integer, _Integer, ctypes.POINTER(_Address))
     library.epo_differentiate.argtypes = (_Address, *run, ctypes.POINTER(_Gradients))

@@ -18,29 +18,34 @@ PAGE = Path(__file__).parents[2] / "docs" / "extend.md"
 
 
 @pytest.fixture
-def documented(monkeypatch):
+def documented():
     """Runs the page's blocks on features, and forgets their features afterwards."""
-    monkeypatch.setattr(features, "OWN_FEATURES", features.OWN_FEATURES)
-    before = dict(features.OWN_FEATURES)
+    before, pairs = dict(features.OWN_FEATURES), dict(features.PAIR_FEATURES)
     section = PAGE.read_text().split("## An energy feature")[1].split("\n## ")[0]
     blocks = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     for block in blocks:
         exec(block, {})
     yield set(features.OWN_FEATURES) - set(before)
     for name in set(features.OWN_FEATURES) - set(before):
         del features.OWN_FEATURES[name]
+    for name in set(features.PAIR_FEATURES) - set(pairs):
+        del features.PAIR_FEATURES[name]
 
 
 def test_documented_features_work_in_the_layer(documented):
     assert documented == {"lateral", "hurry"}
     scene = random_scene(3, 2, history=2, dtype=torch.float64)
     scene.history[..., 3] += 29.5
+    scene.history[..., 2] = 0.0  # side by side
     own = ("goal", "acc", "turnr", "lateral", "hurry")
-    leaves = leaves_of(random_game(scene, own=own))
-    solution = LevenbergMarquardt()(Energy(own), scene, leaves)
+    parameters = random_game(scene, own=own)
+    parameters.pair_weights["comfort"] = parameters.pair_weights["proximity"]
+    leaves = leaves_of(parameters)
+    solution = LevenbergMarquardt()(Energy(own, ["proximity", "comfort"]), scene, leaves)
     assert (solution.status == Status.SOLVED).all()
     assert (solution.energy < solution.initial_energy).all()
     solution.states.sum().backward()
     for name in documented:
         assert leaves.own_weights[name].grad.abs().max() > 0, name
+    assert leaves.pair_weights["comfort"].grad.abs().max() > 0

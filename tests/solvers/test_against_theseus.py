@@ -1,4 +1,4 @@
-"""Our steps against Theseus' own Levenberg-Marquardt on the same residuals; needs `pip install '.[peer]'`."""
+"""Our steps against Theseus' own Levenberg-Marquardt on the same residuals; docs/benchmarks.md says how to install it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from games import ALL, BOUNDS, random_game, random_scene
 from epo_lightning.game.energy import Energy
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
-theseus = pytest.importorskip("theseus", reason="the peer is not installed: see docs/solver.md on how to install it")
+theseus = pytest.importorskip(
+    "theseus", reason="the peer is not installed: see docs/benchmarks.md on how to install it"
+)
 
 
 def test_steps_equal_theseus():

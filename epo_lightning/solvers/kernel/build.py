@@ -99,7 +99,9 @@ def build() -> None:
 
 
 if __name__ == "__main__":
+    print("building the compiled layer takes a minute or two ...")
     try:
         build()
+        print(f"{LIBRARY} is up to date")
     except OSError as error:
         sys.exit(f"the compiled layer was not built: {error}")
