@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton steps in PyTorch, on any device: one structured assembly and one batched factorisation per step.
+"""Damped Gauss-Newton steps in PyTorch, on any device: the quadratic model of all samples, factorised in blocks.
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Two things happen around it.
 

@@ -9,6 +9,7 @@ import pytest
 from experiment import tiny
 from experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
 
+from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.compose import compose, hydra, jobs, options_of, tree
 from epo_lightning.experiment.settings import Settings, read
@@ -66,7 +67,8 @@ def test_budgets_and_debugging_compose(budget: str, debug: list[str]) -> None:
 
 @pytest.mark.parametrize("data", names(CONF / "data"))
 def test_data_sets_can_be_described(data: str) -> None:
-    assembly.build_data(compose("generate", [f"data={data}"])["data"])
+    built = assembly.build_data(compose("generate", [f"data={data}"])["data"])
+    assert isinstance(built, SceneDataModule)
 
 
 @pytest.mark.parametrize("sweep", names(tree() / "sweeps"))

@@ -62,7 +62,7 @@ INLINE void factorise(Count<N> count, Vec<T>* H, Mask<T>& sound) {
     }
 }
 
-/// X [m, columns] <- L^-1 X, two columns blocks at a time; rows in pairs, m is even.
+/// X [m, S] <- L^-1 X, two rows at a time; m is even.
 template <class T, int N, int S>
 INLINE void eliminate(Count<N> count, const Vec<T>* L, Vec<T>* X, int ldx) {
     const int m = count.controls();
