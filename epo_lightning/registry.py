@@ -54,6 +54,7 @@ _HOMES = {
     "data": "data",
     "dynamics": "game",
     "energy": "game",
+    "format": "data",
     "forecaster": "forecasters",
     "optimizer": "optimizers",
     "solver": "solvers",

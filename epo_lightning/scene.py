@@ -9,6 +9,7 @@ N     agents                     X = 4   state: x, y [m], heading [rad], speed [
 H     history steps              U = 2   control: acceleration [m/s^2], turn rate [rad/s]
 K     future steps               S       optimisation steps
 R     reference lines, residuals Q       points of a reference line
+L     lane polylines             V       vectors of a lane polyline
 ====  =========================  ======  ================================================================
 """
 
@@ -25,6 +26,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 X, Y, HEADING, SPEED = range(4)
+KINDS = ("car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "other")
+"""What agents can be; ``Scene.kind`` is an index into this."""
 ACCELERATION, TURN_RATE = range(2)
 
 
@@ -78,11 +81,17 @@ class Scene(_Batch):
         future_mask: which future steps were observed.
         goal_candidates: positions [m] that an agent may be heading for; G = 1 where the goal is given (RPI).
         goal_mask: which candidates exist.
+        goal_reference: index of the reference line on which each candidate lies.
         size: length and width [m].
+        kind: what an agent is, an index into :data:`KINDS`.
+        lanes: the map, as polylines of vectors from one point of a lane to the next: x, y of both [m].
+        lane_mask: which of these vectors exist.
         references: lines that an agent may follow, as points [m] (lane centres); a line with fewer points repeats its
             last one.
         reference_mask: which of these lines exist.
         reference_speed: the speed at which an agent would like to travel [m/s].
+        frame: origin x, y [m] and rotation [rad] that lead back to the recording's coordinates:
+            world = R(rotation) position + origin.
         subset: index of the named subset of the data that the future belongs to (RPI: executed 0, alternative 1).
         id: which record of its data set a scene is.
 
@@ -98,10 +107,15 @@ class Scene(_Batch):
     future_mask: Bool[Tensor, "B N K"] | None = None
     goal_candidates: Float[Tensor, "B N G 2"] | None = None
     goal_mask: Bool[Tensor, "B N G"] | None = None
+    goal_reference: Int[Tensor, "B N G"] | None = None
     size: Float[Tensor, "B N 2"] | None = None
+    kind: Int[Tensor, "B N"] | None = None
+    lanes: Float[Tensor, "B L V 4"] | None = None
+    lane_mask: Bool[Tensor, "B L V"] | None = None
     references: Float[Tensor, "B N R Q 2"] | None = None
     reference_mask: Bool[Tensor, "B N R"] | None = None
     reference_speed: Float[Tensor, "B N"] | None = None
+    frame: Float[Tensor, "B 3"] | None = None
     subset: Int[Tensor, " B"] | None = None
     id: Int[Tensor, " B"] | None = None
 
@@ -112,7 +126,7 @@ class Scene(_Batch):
             )
         if self.history.shape[2] == 0:
             raise ValueError("scene.history has no step; the last one is the current state, t0")
-        for name in ("history_mask", "agent_mask", "future_mask", "goal_mask", "reference_mask"):
+        for name in ("history_mask", "agent_mask", "future_mask", "goal_mask", "lane_mask", "reference_mask"):
             mask = getattr(self, name)
             if mask is not None and mask.dtype != torch.bool:
                 raise ValueError(
@@ -125,11 +139,22 @@ class Scene(_Batch):
             ("history_mask", (batch, agents, steps)),
             ("agent_mask", (batch, agents)),
             ("size", (batch, agents, 2)),
+            ("kind", (batch, agents)),
             ("reference_speed", (batch, agents)),
+            ("frame", (batch, 3)),
         ):
             given = getattr(self, name)
             if given is not None and given.shape != shape:
                 raise ValueError(f"scene.{name} has shape {list(given.shape)}; this history takes {list(shape)}")
+        if self.lanes is not None and (
+            self.lanes.dim() != 4 or len(self.lanes) != batch or self.lanes.shape[-1] != 4
+        ):
+            raise ValueError(f"scene.lanes has shape {list(self.lanes.shape)}; this history takes [{batch}, L, V, 4]")
+        for name, of in (("goal_mask", "goal_candidates"), ("goal_reference", "goal_candidates"), ("lane_mask", "lanes")):
+            given, owner = getattr(self, name), getattr(self, of)
+            if given is not None and (owner is None or given.shape != owner.shape[:-1]):
+                takes = "None" if owner is None else f"of shape {list(owner.shape)}"
+                raise ValueError(f"scene.{name} has shape {list(given.shape)}, but scene.{of} is {takes}")
         lines = self.references
         if lines is not None and (
             lines.dim() != 5 or lines.shape[:2] != (batch, agents) or lines.shape[3] < 2 or lines.shape[4] != 2
@@ -155,6 +180,8 @@ class Scene(_Batch):
             default("future_mask", self.future.shape[:-1])
         if self.goal_candidates is not None:
             default("goal_mask", self.goal_candidates.shape[:-1])
+        if self.lanes is not None:
+            default("lane_mask", self.lanes.shape[:-1])
         if lines is not None:
             default("reference_mask", lines.shape[:-2])
 
@@ -181,7 +208,14 @@ class Scene(_Batch):
             & sound(self.size, None)
             & sound(None if self.references is None else self.references.flatten(3), self.reference_mask)
             & sound(None if self.reference_speed is None else self.reference_speed[..., None], None)
+            & self._finite_lanes
         )
+
+    @property
+    def _finite_lanes(self) -> Bool[Tensor, " B"]:
+        if self.lanes is None:
+            return torch.ones(len(self.history), dtype=torch.bool, device=self.history.device)
+        return (self.lanes.isfinite().all(-1) | ~self.lane_mask).flatten(1).all(1)  # type: ignore[operator]
 
 
 @dataclass(frozen=True)

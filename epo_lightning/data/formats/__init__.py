@@ -1,0 +1,1 @@
+"""Recording formats, one file each: a function from a folder to the recordings in it."""
