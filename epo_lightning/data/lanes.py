@@ -1,18 +1,92 @@
-"""Lanes: their geometry, and which of them lead into or lie beside which."""
+"""Lanes: their geometry, which of them lead into or lie beside which, and where on them an agent is."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+import shapely
+from jaxtyping import Bool, Float, Int
+
+from epo_lightning.data.errors import RecordingError
 
 Polyline = Float[np.ndarray, "n 2"]
 
 LANE, SHOULDER = range(2)
 """What a lane is for: driving, or standing in an emergency."""
+FARTHEST = 1e7
+"""Coordinates [m] beyond this are no positions on this planet's road maps."""
+BESIDE = 1.0
+"""How far beside all lanes [m] a position may be and still belong to the nearest one: maps have seams."""
+ALONG = np.pi / 2
+"""An agent that heads across a lane by more than this [rad] is not driving on it."""
+
+
+class Polylines:
+    """Many polylines, asked together: where along one of them a position is, and which point is how far along.
+
+    Args:
+        lines: each of at least two different points; consecutive equal points are passed over.
+    """
+
+    def __init__(self, lines: Sequence[Polyline]) -> None:
+        kept = [line[np.append(True, (np.diff(line, axis=0) != 0).any(1))] for line in lines]
+        count = np.array([len(line) for line in kept], dtype=int)
+        self.first = np.concatenate([[0], count.cumsum()])
+        self.points = np.concatenate([np.empty((0, 2)), *kept])
+        owner = np.repeat(np.arange(len(kept)), count)
+        step = np.linalg.norm(np.diff(self.points, axis=0, prepend=self.points[:1]), axis=1)
+        step[self.first[:-1]] = 0.0
+        total = step.cumsum()
+        self._along = total - total[self.first[:-1]][owner]
+        self.length = self._along[self.first[1:] - 1]
+        # Numbers that grow through all polylines, so that one search finds the segment of any of them.
+        self._base = np.concatenate([[0.0], (self.length + 1.0).cumsum()[:-1]])[: len(kept)]
+        self._key = self._along + self._base[owner]
+        self.geometry = shapely.linestrings(self.points, indices=owner) if len(kept) else np.empty(0, dtype=object)
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    def at(
+        self, line: Int[np.ndarray, " n"], along: Float[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+        """The point so many metres along a line, and the unit tangent there; straight on beyond either end."""
+        inside = np.clip(along, 0.0, self.length[line])
+        segment = np.searchsorted(self._key, self._base[line] + inside, side="right") - 1
+        segment = np.clip(segment, self.first[line], self.first[line + 1] - 2)
+        start = self.points[segment]
+        way = self.points[segment + 1] - start
+        tangent = way / np.linalg.norm(way, axis=-1, keepdims=True)
+        return start + (along - self._along[segment])[..., None] * tangent, tangent
+
+    def project(
+        self, line: Int[np.ndarray, " n"], position: Float[np.ndarray, "n 2"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """How far along a line the point nearest to a position is, and how far the position is to the left of it [m]."""
+        along = shapely.line_locate_point(self.geometry[line], shapely.points(position))
+        foot, tangent = self.at(line, along)
+        way = position - foot
+        side = np.where(tangent[:, 0] * way[:, 1] - tangent[:, 1] * way[:, 0] < 0, -1.0, 1.0)
+        return along, side * np.linalg.norm(way, axis=1)
+
+
+@dataclass(frozen=True)
+class Located:
+    """Where positions are on a map.
+
+    Attributes:
+        lane: on which lane, -1 on none.
+        along: how far along its centreline [m].
+        offset: how far to the left of it [m].
+    """
+
+    lane: Int[np.ndarray, " T"]
+    along: Float[np.ndarray, " T"]
+    offset: Float[np.ndarray, " T"]
 
 
 @dataclass(frozen=True)
@@ -45,6 +119,35 @@ class LaneGraph:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def check(self, path: Path | str) -> LaneGraph:
+        """This graph, if it can be a map.
+
+        Args:
+            path: of the file, for error messages.
+
+        Raises:
+            RecordingError: no lanes, a line without length or with coordinates that cannot be right, or a reference to
+                a lane that does not exist.
+        """
+        if not len(self):
+            raise RecordingError(path, "there is no lane in it: is it a map of a road?")
+        for name in ("left", "right", "centre"):
+            for lane, line in zip(self.ids, getattr(self, name), strict=True):
+                if not (np.abs(line) <= FARTHEST).all():
+                    raise RecordingError(
+                        path, f"the {name} line of lane {lane} has coordinates that are no metres on a map"
+                    )
+                if len(line) < 2 or not np.ptp(line, axis=0).any():
+                    raise RecordingError(
+                        path, f"the {name} line of lane {lane} has no length: give it two points or more"
+                    )
+        named = [*map(list, self.successors), self.left_of, self.right_of, self.adjacent_left, self.adjacent_right]
+        lowest = [0] * len(self) + [-1] * 4
+        for references, least in zip(named, lowest, strict=True):
+            if any(not least <= lane < len(self) for lane in references):
+                raise RecordingError(path, "a lane refers to one that does not exist")
+        return self
+
     @cached_property
     def predecessors(self) -> tuple[tuple[int, ...], ...]:
         """Lanes that end where a lane begins."""
@@ -53,3 +156,83 @@ class LaneGraph:
             for successor in following:
                 found[successor].append(lane)
         return tuple(tuple(lanes) for lanes in found)
+
+    @cached_property
+    def centrelines(self) -> Polylines:
+        """All centrelines, to be asked together."""
+        return Polylines(self.centre)
+
+    @cached_property
+    def areas(self) -> np.ndarray:
+        """The ground between the boundaries of each lane, as shapely geometries."""
+        rings = [np.concatenate([left, right[::-1]]) for left, right in zip(self.left, self.right, strict=True)]
+        return np.array([shapely.make_valid(shapely.Polygon(ring)) for ring in rings], dtype=object)
+
+    @cached_property
+    def _tree(self) -> shapely.STRtree:
+        return shapely.STRtree(self.areas)
+
+    def locate(self, position: Float[np.ndarray, "T 2"], heading: Float[np.ndarray, " T"]) -> Located:
+        """On which lanes agents are: of the lanes around a position, the one whose direction an agent shares and whose
+        centreline is nearest."""
+        found = Located(np.full(len(position), -1), np.zeros(len(position)), np.full(len(position), np.inf))
+        points = shapely.points(position)
+        row, lane = self._tree.query(points, predicate="intersects")
+        self._nearer(found, position, heading, row, lane)
+        (beside,) = np.nonzero(found.lane < 0)
+        if len(beside):
+            row, lane = self._tree.query(points[beside], predicate="dwithin", distance=BESIDE)
+            self._nearer(found, position, heading, beside[row], lane)
+        found.offset[found.lane < 0] = 0.0
+        return found
+
+    def _nearer(
+        self,
+        found: Located,
+        position: np.ndarray,
+        heading: np.ndarray,
+        row: Int[np.ndarray, " n"],
+        lane: Int[np.ndarray, " n"],
+    ) -> None:
+        """Write into ``found`` the best of the lanes that are proposed for some rows."""
+        along, offset = self.centrelines.project(lane, position[row])
+        _, tangent = self.centrelines.at(lane, along)
+        turned = np.cos(heading[row]) * tangent[:, 0] + np.sin(heading[row]) * tangent[:, 1]
+        (fits,) = np.nonzero(turned > np.cos(ALONG))
+        # The last one written wins: the nearest centreline, then the first lane.
+        order = fits[np.lexsort((-lane[fits], -np.abs(offset[fits])))]
+        found.lane[row[order]] = lane[order]
+        found.along[row[order]] = along[order]
+        found.offset[row[order]] = offset[order]
+
+    def leads_to(self, lane: int, other: int, hops: int = 3) -> bool:
+        """Whether driving straight on leads from a lane to another."""
+        reached = {lane}
+        for _ in range(hops + 1):
+            if other in reached:
+                return True
+            reached = {successor for each in reached for successor in self.successors[each]}
+        return False
+
+    def beside(self, lane: int, other: int) -> bool:
+        """Whether a lane lies beside another, or beside what leads to it or comes after it."""
+        near = {lane, *self.successors[lane], *self.predecessors[lane]}
+        return any(other in (self.adjacent_left[each], self.adjacent_right[each]) for each in near) or any(
+            lane in (self.adjacent_left[each], self.adjacent_right[each])
+            for each in (other, *self.successors[other], *self.predecessors[other])
+        )
+
+
+def lane_changes(agent: Int[np.ndarray, " T"], located: Located, lanes: LaneGraph) -> Bool[np.ndarray, " T"]:
+    """Rows in which an agent is on the lane beside that of its row before, for the first time (exiD: ``laneChange``).
+
+    Rows on no lane are passed over.
+    """
+    changed = np.zeros(len(agent), dtype=bool)
+    (on,) = np.nonzero(located.lane >= 0)
+    before, after = located.lane[on[:-1]], located.lane[on[1:]]
+    (moved,) = np.nonzero((before != after) & (agent[on[:-1]] == agent[on[1:]]))
+    pairs, which = np.unique(np.stack([before[moved], after[moved]], 1), axis=0, return_inverse=True)
+    aside = np.array([not lanes.leads_to(a, b) and lanes.beside(a, b) for a, b in pairs.tolist()], dtype=bool)
+    changed[on[1:][moved]] = aside[which.ravel()] if len(pairs) else False
+    return changed

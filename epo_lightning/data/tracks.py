@@ -17,22 +17,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from epo_lightning.data.lanes import LaneGraph
-from epo_lightning.registry import ConfigError
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.lanes import FARTHEST, LaneGraph
 
-FARTHEST = 1e7
-"""Coordinates [m] beyond this are no positions on this planet's road maps."""
+__all__ = ["Recording", "RecordingError", "Source", "TrackTable"]
+
 FASTEST = 120.0
 """Speeds [m/s] beyond this are a mistake of units."""
 LONGEST = 40.0
 """Vehicles [m] longer than this are a mistake of units."""
-
-
-class RecordingError(ConfigError):
-    """A recording that cannot be read: the message names the file, the row or element, what was expected and what to do."""
-
-    def __init__(self, path: Path | str, problem: str, row: int | None = None) -> None:
-        super().__init__(f"{path}{'' if row is None else f', row {row}'}: {problem}")
 
 
 @dataclass(frozen=True)
