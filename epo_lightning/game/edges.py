@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from epo_lightning.game.energy import Energy, pairs
-from epo_lightning.game.features import overlap
 from epo_lightning.scene import GameParameters, Scene
 
 
@@ -54,11 +53,12 @@ class Edges:
         weights = torch.stack([energy.pair_weight(scene, parameters, name) for name in energy.pair])
         matters = (weights != 0).any(0)
         first, second = pairs(agents, states.device)
-        if all(feature.function is overlap for feature in energy.pair_features.values()):
+        extent = energy.extent(scene)
+        if extent is not None:
             position = energy.at_pair_steps(states[..., :2])
             if position.shape[3]:
-                radius = energy.radius(scene)[:, None, :, None]
-                low, high = position.amin(3) - radius, position.amax(3) + radius
+                extent = extent[:, None, :, None]
+                low, high = position.amin(3) - extent, position.amax(3) + extent
                 matters &= ((low[:, :, first] < high[:, :, second]) & (low[:, :, second] < high[:, :, first])).all(-1)
         if matters.all():
             return cls.all(batch * modes, agents, states.device)

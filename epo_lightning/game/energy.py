@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from epo_lightning.game.circles import disc, overlap, separation
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.features import (
     OWN_FEATURES,
@@ -19,8 +20,6 @@ from epo_lightning.game.features import (
     PairFeature,
     Source,
     Surroundings,
-    overlap,
-    separation,
     signal,
     signal_change,
     slope,
@@ -57,7 +56,8 @@ class Energy:
     Attributes:
         own: names out of :data:`~epo_lightning.game.features.OWN_FEATURES`, where one's own are found too
             (:func:`~epo_lightning.game.features.own_feature`).
-        pair: names out of :data:`~epo_lightning.game.features.PAIR_FEATURES`. Discs have half an agent's length as radius.
+        pair: names out of :data:`~epo_lightning.game.features.PAIR_FEATURES`. Discs have half an agent's length as radius;
+            for the rows of circles see :mod:`~epo_lightning.game.circles`.
         bounds: lowest and highest value of a signal, for features whose name ends in ``b``: ``{"vel": (-0.05, 2.0)}``.
         dynamics: what turns controls into states.
         pair_stride: pairs are looked at in every step (1), every second step (2), ...: k = stride, 2 stride, ...
@@ -117,6 +117,11 @@ class Energy:
         """Whether a pair feature asks for the agents' radii."""
         return any(feature.source is Source.DISTANCE for feature in self.pair_features.values())
 
+    @cached_property
+    def needs_shape(self) -> bool:
+        """Whether a pair feature asks for the agents' lengths and widths."""
+        return any(feature.needs == "size" for feature in self.pair_features.values())
+
     def residuals(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> dict[str, Float[Tensor, "B M _ _"]]:
@@ -174,7 +179,8 @@ class Energy:
         closing = (normal * (apart[0] - apart[1])[..., :2]).sum(-1)
         for name, pair in self.pair_features.items():
             if pair.source is Source.TRAJECTORY:
-                value, change = along(pair.function, both, apart)
+                sizes = [self.size(scene)[:, None, agents, None] for agents in (first, second) if pair.needs]
+                value, change = along(pair.function, both, apart, *sizes)
             else:
                 value, steepness = self.pair_shape(pair, distance, self.reach(scene)[:, None, :, None])
                 change = steepness * closing
@@ -242,8 +248,9 @@ class Energy:
                 raise ValueError(
                     f"parameters.reference chooses among the R = {lines} lines of scene.references by 0 .. R-1"
                 )
-        if self.needs_reach and scene.size is None:
-            raise ValueError("pair features take the agents' radii from scene.size [B, N, 2], which is None")
+        if (self.needs_reach or self.needs_shape) and scene.size is None:
+            what = "sizes" if self.needs_shape else "radii"
+            raise ValueError(f"pair features take the agents' {what} from scene.size [B, N, 2], which is None")
 
     def known(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
         """Whose game is all finite numbers where nothing computed from it would tell otherwise.
@@ -253,9 +260,10 @@ class Energy:
         """
         present = scene.agent_mask
         known = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)
-        if self.needs_reach or "size" in self.needs:
-            assert scene.size is not None
-            known = known & torch.where(present, scene.size[..., 0], 0.0).isfinite().all(1)
+        if self.needs_shape:
+            known = known & self.size(scene).isfinite().flatten(1).all(1)
+        elif self.needs_reach or "size" in self.needs:
+            known = known & self.size(scene)[..., 0].isfinite().all(1)
         of_modes = known[:, None].expand(-1, parameters.initial_controls.shape[1])
         for name in self.pair:
             of_modes = of_modes & self.pair_weight(scene, parameters, name).isfinite().all(-1)
@@ -282,8 +290,7 @@ class Energy:
             assert scene.reference_speed is not None
             reference_speed = torch.where(present, scene.reference_speed, 0.0)[:, None]
         if "size" in needs:
-            assert scene.size is not None
-            wheelbase = WHEELBASE * torch.where(present, scene.size[..., 0], 0.0)[:, None]
+            wheelbase = WHEELBASE * self.size(scene)[:, None, :, 0]
         return Surroundings(self.initial(scene), scene.dt, goals, line, reference_speed, wheelbase)
 
     def _followed(self, scene: Scene, parameters: GameParameters) -> tuple[tuple[Tensor, ...], Bool[Tensor, "B M N"]]:
@@ -316,14 +323,20 @@ class Energy:
         """Weights of a pair feature, zero for pairs with an absent agent."""
         return torch.where(self.pair_mask(scene)[:, None], parameters.pair_weights[name], 0.0)
 
-    def radius(self, scene: Scene) -> Float[Tensor, "B N"]:
-        """Radii of the agents' discs, zero for absent agents."""
+    def size(self, scene: Scene) -> Float[Tensor, "B N 2"]:
+        """The agents' lengths and widths, zero for absent agents."""
         assert scene.size is not None
-        return torch.where(scene.agent_mask, scene.size[..., 0] / 2, 0.0)
+        return torch.where(scene.agent_mask[..., None], scene.size, 0.0)
+
+    def extent(self, scene: Scene) -> Float[Tensor, "B N"] | None:
+        """How far from their positions agents can be felt by others; None where a pair feature knows no limit."""
+        extents = [feature.extent for feature in self.pair_features.values()]
+        known = [extent(self.size(scene)) for extent in extents if extent is not None]
+        return torch.stack(known).amax(0) if len(known) == len(extents) else None
 
     def reach(self, scene: Scene) -> Float[Tensor, "B P"]:
         """The distance at which the discs of two agents touch."""
-        radius = self.radius(scene)
+        radius = disc(self.size(scene))
         first, second = pairs(scene.agent_mask.shape[1], radius.device)
         return radius[:, first] + radius[:, second]
 
@@ -348,10 +361,15 @@ class Energy:
 
 
 def along(
-    function: Callable[..., Tensor], at: tuple[Tensor, Tensor], directions: tuple[Tensor, Tensor]
+    function: Callable[..., Tensor], at: tuple[Tensor, Tensor], directions: tuple[Tensor, Tensor], *others: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Value of an undeclared feature, and its change along every one of D directions (their first dimension)."""
-    value = function(*at)
+    """Value of an undeclared feature, and its change along every one of D directions (their first dimension).
+
+    What else the function takes stays as it is.
+    """
+    value = function(*at, *others)
     if len(directions[0]) == 0:
         return value, value.new_zeros(0, *value.shape)
-    return value, torch.func.vmap(lambda *moved: torch.func.jvp(function, at, moved)[1])(*directions)
+    return value, torch.func.vmap(
+        lambda *moved: torch.func.jvp(lambda *states: function(*states, *others), at, moved)[1]
+    )(*directions)

@@ -3,7 +3,8 @@
 An own feature is a *signal* of the trajectory (a control, its rate of change, the speed, the steering angle, the way to a
 line or a goal), taken as it is, or as the amount by which it leaves its bounds (names that end in ``b``: the paper's soft
 constraints max(0, g(z))), or through an elementwise function of one's own. A pair feature is such a function of the
-distance between two agents. Where a signal comes from is *declared*, and is all that a solver has to know of its Jacobian.
+distance between two agents, or any function of their states and sizes. Where a signal comes from is *declared*, and is all
+that a solver has to know of its Jacobian.
 
 A feature of one's own needs no declaration: any differentiable function of the trajectory will do, at lower speed::
 
@@ -31,6 +32,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from epo_lightning.game.circles import disc, overlap, row_extent, row_overlap
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import ACCELERATION, SPEED, TURN_RATE
 
@@ -90,11 +92,16 @@ class PairFeature:
 
     Attributes:
         source: DISTANCE or TRAJECTORY.
-        function: of distance and reach, elementwise; of the states of both agents where the source is TRAJECTORY.
+        function: of distance and reach, elementwise; of the states of both agents where the source is TRAJECTORY, and of
+            their sizes where it needs them.
+        needs: ``size`` for a function of states that takes the agents' sizes too.
+        extent: how far from its position an agent of some size can be felt [m]; None for a function that knows no limit.
     """
 
     source: Source
     function: Callable[..., Tensor]
+    needs: str | None = None
+    extent: Callable[[Tensor], Tensor] | None = None
 
 
 def _with_bounds(features: Mapping[str, OwnFeature]) -> dict[str, OwnFeature]:
@@ -125,13 +132,12 @@ the reference speed by [m/s]; acc [m/s^2]; turnr [rad/s]; jerk [m/s^3]; turnacc 
 vehicle that turns like this [rad]; ``...b`` for what bounds are exceeded by."""
 
 
-def overlap(distance: Float[Tensor, "*shape"], reach: Float[Tensor, "*#shape"]) -> Float[Tensor, "*shape"]:
-    """How deep two discs overlap; touching is not overlapping."""
-    return torch.relu(reach - distance)
-
-
-PAIR_FEATURES: dict[str, PairFeature] = {"proximity": PairFeature(Source.DISTANCE, overlap)}
-"""``proximity``: max(0, r_i + r_j - |p_i - p_j|) [m], how deep two discs overlap."""
+PAIR_FEATURES: dict[str, PairFeature] = {
+    "proximity": PairFeature(Source.DISTANCE, overlap, extent=disc),
+    "circles": PairFeature(Source.TRAJECTORY, row_overlap, needs="size", extent=row_extent),
+}
+"""``proximity``: max(0, r_i + r_j - |p_i - p_j|) [m], how deep two discs overlap; ``circles``: how deep two rows of circles
+do [m] (:mod:`~epo_lightning.game.circles`)."""
 
 _BUILT_IN = {*OWN_FEATURES, *PAIR_FEATURES}
 
@@ -173,7 +179,9 @@ def own_feature(
     return add
 
 
-def pair_feature(name: str, source: Source = Source.TRAJECTORY) -> Callable[[Function], Function]:
+def pair_feature(
+    name: str, source: Source = Source.TRAJECTORY, needs: str | None = None
+) -> Callable[[Function], Function]:
     """Make a function a pair feature that energies can name.
 
     Args:
@@ -182,14 +190,21 @@ def pair_feature(name: str, source: Source = Source.TRAJECTORY) -> Callable[[Fun
             TRAJECTORY for any differentiable function of the states [.., K, 4] of the first and of the second agent,
             elementwise over all leading dimensions, that returns residuals [.., R]. Either sees only the steps at which
             the energy evaluates pairs.
+        needs: ``size`` for a function of states that takes the length and width [.., 1, 2] of the first and of the second
+            agent too; those of absent agents are zero.
 
     Raises:
-        ConfigError: the name of a built-in feature, or a source that functions cannot be declared with.
+        ConfigError: the name of a built-in feature, a source that functions cannot be declared with, or another need.
     """
     _refuse(name, source, (Source.DISTANCE, Source.TRAJECTORY))
+    if needs is not None and (needs != "size" or source is not Source.TRAJECTORY):
+        raise ConfigError(
+            f"pair feature {name!r} can need 'size' if it is a function of states (Source.TRAJECTORY), "
+            f"not {needs!r} as {source.name}"
+        )
 
     def add(function: Function) -> Function:
-        PAIR_FEATURES[name] = PairFeature(source, function)
+        PAIR_FEATURES[name] = PairFeature(source, function, needs)
         return function
 
     return add
@@ -357,18 +372,3 @@ def violation(
     excess = (value - upper).clamp_min(0.0) + (lower - value).clamp_min(0.0)
     slope = (value > upper).to(value.dtype) - (value < lower).to(value.dtype)
     return excess, slope
-
-
-def separation(
-    first: Float[Tensor, "*batch K 2"], second: Float[Tensor, "*batch K 2"]
-) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 2"]]:
-    """How far two agents are apart, and the unit vector from the second to the first.
-
-    Agents at one and the same point have no direction between them: the vector is then zero, and so is every gradient,
-    instead of undefined.
-    """
-    offset = first - second
-    squared = offset.square().sum(-1)
-    apart = squared > 0
-    root = torch.where(apart, squared, 1.0).sqrt()
-    return torch.where(apart, root, 0.0), torch.where(apart[..., None], offset / root[..., None], 0.0)

@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from epo_lightning.game.circles import overlap
 from epo_lightning.game.edges import Edges
 from epo_lightning.game.energy import Energy, along
 from epo_lightning.game.features import (
@@ -31,7 +32,6 @@ from epo_lightning.game.features import (
     PairFeature,
     Source,
     foot,
-    overlap,
     slope,
     steering,
     steering_curvatures,
@@ -415,10 +415,14 @@ class QuadraticModel:
         moved = self.of.at_pair_steps(moved).permute(1, 2, 0, 3, 4)  # [S, N, 2 K, L, 4]
         first, second = (side.transpose(0, 1) for side in edges.ends(moved))
         still = torch.zeros_like(first)
+        sizes: tuple[Tensor, ...] = ()
+        if feature.needs:
+            modes = self.samples // len(self.scene.agent_mask)
+            sizes = edges.ends(self.of.size(self.scene).repeat_interleave(modes, 0)[:, :, None])
         exists = self.of.pair_mask(self.scene)[:, None].expand(-1, self.samples // len(self.scene.agent_mask), -1)
         exists = exists.flatten().index_select(0, edges.pair)[:, None]
-        value, by_first = along(feature.function, both, (first, still))
-        _, by_second = along(feature.function, both, (still, second))
+        value, by_first = along(feature.function, both, (first, still), *sizes)
+        _, by_second = along(feature.function, both, (still, second), *sizes)
         value, by_first, by_second = (weight * torch.where(exists, part, 0.0) for part in (value, by_first, by_second))
         jacobians = by_first.permute(1, 0, 2), by_second.permute(1, 0, 2)  # [E, 2 K, R]
         self.linked |= ((by_first != 0).any(-1).any(0)) & exists[:, 0]

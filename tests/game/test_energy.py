@@ -13,6 +13,7 @@ from games import ALL, BOUNDS, feet_held, leaves_of, normal_equations, pad, rand
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from epo_lightning.game.circles import overlap, separation
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.features import (
@@ -20,10 +21,8 @@ from epo_lightning.game.features import (
     PAIR_FEATURES,
     Source,
     foot,
-    overlap,
     own_feature,
     pair_feature,
-    separation,
 )
 from epo_lightning.registry import ConfigError
 
