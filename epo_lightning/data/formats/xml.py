@@ -10,7 +10,7 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import DefusedXMLParser
 from defusedxml.ElementTree import parse as defused_parse
 
-from epo_lightning.data.tracks import RecordingError
+from epo_lightning.data.errors import RecordingError
 
 _LARGEST = 2**63
 

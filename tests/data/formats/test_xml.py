@@ -6,8 +6,8 @@ import time
 
 import pytest
 
+from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.formats import xml
-from epo_lightning.data.tracks import RecordingError
 
 BOMB = (
     '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY e0 "ha">'
