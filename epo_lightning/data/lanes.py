@@ -66,8 +66,16 @@ class Polylines:
     def project(
         self, line: Int[np.ndarray, " n"], position: Float[np.ndarray, "n 2"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """How far along a line the point nearest to a position is, and how far the position is to the left of it [m]."""
+        """How far along a line the point nearest to a position is, and how far the position is to the left of it [m].
+
+        Lines go straight on beyond their ends: there, the first number is negative or more than the line's length.
+        """
         along = shapely.line_locate_point(self.geometry[line], shapely.points(position))
+        foot, tangent = self.at(line, along)
+        way = position - foot
+        beyond = (tangent * way).sum(1)
+        along = np.where(along <= 0, along + np.minimum(beyond, 0.0), along)
+        along = np.where(along >= self.length[line], along + np.maximum(beyond, 0.0), along)
         foot, tangent = self.at(line, along)
         way = position - foot
         side = np.where(tangent[:, 0] * way[:, 1] - tangent[:, 1] * way[:, 0] < 0, -1.0, 1.0)
@@ -141,11 +149,11 @@ class LaneGraph:
                     raise RecordingError(
                         path, f"the {name} line of lane {lane} has no length: give it two points or more"
                     )
-        named = [*map(list, self.successors), self.left_of, self.right_of, self.adjacent_left, self.adjacent_right]
-        lowest = [0] * len(self) + [-1] * 4
-        for references, least in zip(named, lowest, strict=True):
-            if any(not least <= lane < len(self) for lane in references):
-                raise RecordingError(path, "a lane refers to one that does not exist")
+        for neighbours in (self.left_of, self.right_of, self.adjacent_left, self.adjacent_right):
+            if not ((neighbours >= -1) & (neighbours < len(self))).all():
+                raise RecordingError(path, "a lane lies beside one that does not exist")
+        if not all(0 <= lane < len(self) for following in self.successors for lane in following):
+            raise RecordingError(path, "a lane leads into one that does not exist")
         return self
 
     @cached_property

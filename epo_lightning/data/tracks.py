@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -73,7 +74,7 @@ class TrackTable:
                 backwards or who is in two places in one frame.
         """
 
-        def first(bad: np.ndarray) -> int:
+        def first(bad: Any) -> int:
             return int(np.flatnonzero(bad)[0])
 
         if not len(self.agent):
@@ -94,7 +95,7 @@ class TrackTable:
             ("heading", self.heading[:, None], 1e4, "rad"),
             ("velocity", self.velocity, FASTEST, "m/s"),
         ):
-            bad = ~(np.abs(values) <= limit).all(1)
+            bad = ~np.all(np.abs(values) <= limit, axis=1)
             if bad.any():
                 row = first(bad)
                 raise RecordingError(
@@ -102,7 +103,7 @@ class TrackTable:
                     f"{name} {values[row].tolist()} of track {self.ids[self.agent[row]]} in frame {self.frame[row]} was "
                     f"expected to be finite and at most {limit:g} {unit}: is it in another unit?",
                 )
-        bad = ~((self.size > 0) & (self.size <= LONGEST)).all(1)
+        bad = ~np.all((self.size > 0) & (self.size <= LONGEST), axis=1)
         if bad.any():
             agent = first(bad)
             raise RecordingError(

@@ -13,7 +13,6 @@ import json
 import math
 import multiprocessing
 import os
-import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -32,6 +31,7 @@ from epo_lightning.data.rpi.game import GameConstants, main_game
 from epo_lightning.data.rpi.solve import FeedbackSettings, PotentialSettings
 from epo_lightning.data.rpi.splits import assign
 from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, MAIN_STARTS, RANDOM_STARTS, Records, play
+from epo_lightning.data.workers import default_workers, watch_parent
 
 RECIPE = 1
 """Version of the numerical recipe: raised whenever the same configuration would give other records."""
@@ -65,18 +65,6 @@ def set_config(pool: Mapping[str, Any], split: str, sizes: Sequence[int] | None)
 def set_folder(root: Path, config: Mapping[str, Any]) -> Path:
     """Where the set of a configuration is kept."""
     return root / f"rpi-{cache.digest(config)[:12]}"
-
-
-def _watch_parent() -> None:
-    """Let a worker end with the process that started it, also when that was killed."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-
-        def wait() -> None:
-            parent.join()
-            os._exit(1)
-
-        threading.Thread(target=wait, daemon=True).start()
 
 
 def _play(task: tuple[int, int, int, int, str]) -> tuple[Records, dict[str, int]]:
@@ -126,11 +114,6 @@ def _read_part(path: Path, pool: str) -> tuple[Records, dict[str, int]] | None:
     return records, about["counts"]
 
 
-def default_workers() -> int:
-    """One worker per core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def make_pool(
     root: Path, config: Mapping[str, Any], workers: int | None, progress: bool
 ) -> tuple[Records, dict[str, int]]:
@@ -176,7 +159,7 @@ def make_pool(
             # The first placement is solved here: it compiles the kernels, which the workers then find on disk.
             finish(tasks[0][1], tasks[0][2], _play(tasks[0]))
             context = multiprocessing.get_context("spawn")
-            with ProcessPoolExecutor(workers, mp_context=context, initializer=_watch_parent) as pool:
+            with ProcessPoolExecutor(workers, mp_context=context, initializer=watch_parent) as pool:
                 running = {pool.submit(_play, task): task for task in tasks[1:]}
                 try:
                     for future in as_completed(running):

@@ -1,0 +1,470 @@
+"""Recordings as data for training: scenes extracted once, kept in the cache, read by whole batches."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import zlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+from torch import Tensor
+
+from epo_lightning.data import cache
+from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
+from epo_lightning.data.routes import LINES, PER_LINE
+from epo_lightning.data.tracks import Source
+from epo_lightning.data.windows import Extract, Recipe, extract, joined
+from epo_lightning.data.workers import default_workers, watch_parent
+from epo_lightning.registry import ConfigError, lookup, nearest, register
+from epo_lightning.scene import Scene
+
+VERSION = 1
+"""Of the extraction: raised whenever the same recordings would give other scenes."""
+PARTS = ("train", "val", "test")
+FRAMES = ("fixed", "aligned")
+UNITS = ("recording", "group")
+
+
+class RecordedScenes:
+    """Scenes of one split, put together batch by batch.
+
+    Args:
+        tables: the columns of an :class:`~epo_lightning.data.windows.Extract`.
+        dt: time step [s].
+        frame: ``fixed`` (axes of the recording, origin amid the agents) or ``aligned`` (x where they head on average).
+        names: of the recordings.
+    """
+
+    def __init__(self, tables: Mapping[str, Tensor], dt: float, frame: str, names: Sequence[str]) -> None:
+        self.tables, self.dt, self.frame, self.names = tables, dt, frame, tuple(names)
+
+    def __len__(self) -> int:
+        return len(self.tables["agents"])
+
+    def set_epoch(self, epoch: int) -> None:
+        """Every epoch has the same scenes."""
+
+    def __getitem__(self, indices: Tensor) -> Scene:
+        of = {name: self.tables[name][indices] for name in ("agents", "lanes", "centre", "direction", "recording")}
+        present = of["agents"] >= 0
+        rows = of["agents"].clamp_min(0).long()
+        angle = of["direction"] if self.frame == "aligned" else torch.zeros_like(of["direction"])
+        cosine, sine = angle.cos(), angle.sin()
+
+        def move(points: Tensor) -> Tensor:
+            """Positions [B, .., 2] in the scenes' own frames."""
+            shape = (len(indices), *[1] * (points.dim() - 2))
+            x, y = (points[..., axis] - of["centre"][:, axis].to(points.dtype).view(shape) for axis in range(2))
+            if self.frame == "fixed":
+                return torch.stack((x, y), -1).float()
+            c, s = (value.to(points.dtype).view(shape) for value in (cosine, sine))
+            return torch.stack((c * x + s * y, c * y - s * x), -1).float()
+
+        def states(name: str) -> tuple[Tensor, Tensor]:
+            values, mask = self.tables[name][rows], self.tables[f"{name}_mask"][rows] & present[..., None]
+            heading = values[..., 2:3]
+            if self.frame == "aligned":
+                # The branch of the current heading decides for the whole scene.
+                now = self.tables["history"][rows, -1, 2].double() - angle[:, None]
+                turns = torch.round(now / (2 * torch.pi)) * 2 * torch.pi
+                heading = (heading.double() - (angle[:, None] + turns)[..., None, None]).float()
+            moved = torch.cat((move(values[..., :2]), heading, values[..., 3:]), -1)
+            return moved.where(mask[..., None], 0.0), mask
+
+        def known(values: Tensor) -> Tensor:
+            return values.where(present.view(*present.shape, *[1] * (values.dim() - 2)), 0)
+
+        history, history_mask = states("history")
+        future, future_mask = states("future")
+        origin = self.tables["origin"][of["recording"].long()] + of["centre"]
+        on_map: dict[str, Tensor] = {}
+        if len(self.tables["polylines"]):
+            points = move(self.tables["polylines"][of["lanes"].clamp_min(0).long()])
+            there = (of["lanes"] >= 0)[..., None].expand(*points.shape[:2], points.shape[2] - 1)
+            line = torch.arange(LINES).repeat_interleave(PER_LINE).expand(*present.shape, -1)
+            on_map = {
+                "lanes": torch.cat((points[:, :, :-1], points[:, :, 1:]), -1).where(there[..., None], 0.0),
+                "lane_mask": there,
+                "goal_candidates": known(move(self.tables["candidates"][rows])),
+                "goal_mask": present[..., None].expand(*present.shape, line.shape[-1]),
+                "goal_reference": line,
+                "references": known(move(self.tables["references"][rows])),
+                "reference_mask": present[..., None].expand(*present.shape, LINES),
+                "reference_speed": known(self.tables["reference_speed"][rows]),
+            }
+        return Scene(
+            history=history,
+            dt=self.dt,
+            history_mask=history_mask,
+            agent_mask=present,
+            future=future,
+            future_mask=future_mask,
+            size=known(self.tables["size"][rows]),
+            kind=known(self.tables["kind"][rows]),
+            frame=torch.cat((origin, angle[:, None]), -1),
+            id=indices,
+            **on_map,
+        )
+
+    def provenance(self, indices: Tensor) -> list[dict[str, Any]]:
+        """Which recording, frame and tracks each of some scenes was extracted from."""
+        found = []
+        for index in indices.tolist():
+            agents = self.tables["agents"][index]
+            found.append(
+                {
+                    "recording": self.names[int(self.tables["recording"][index])],
+                    "frame": int(self.tables["frame"][index]),
+                    "tracks": self.tables["track"][agents[agents >= 0].long()].tolist(),
+                }
+            )
+        return found
+
+
+def _recipe(windows: Mapping[str, Any]) -> Recipe:
+    """The recipe that a configuration spells out."""
+    known = {field.name: getattr(Recipe, field.name) for field in dataclasses.fields(Recipe)}
+    optional = {"radius": float, "smoothing": float}
+    for key, value in windows.items():
+        if key not in known:
+            raise ConfigError(f"unknown key data.windows.{key}: {nearest(str(key), known)}")
+        kind = optional.get(key, type(known[key]))
+        if value is None and key in optional:
+            continue
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number if kind is float else type(value) is kind):
+            expected = {float: "a number", int: "a whole number", bool: "true or false"}[kind]
+            raise ConfigError(f"data.windows.{key} must be {expected}, not {value!r}")
+    return Recipe(**windows)
+
+
+@register("data", "recordings")
+class RecordedData(SceneDataModule):
+    """Scenes extracted from a folder of recordings in any registered format.
+
+    Args:
+        dataset: how tables and the cache call the data.
+        format: name of a registered recording format.
+        folder: where the recordings are.
+        windows: what becomes a scene: fields of :class:`~epo_lightning.data.windows.Recipe`.
+        map: whether there are lanes, and thus goal candidates.
+        test: groups (maps, scenes, layouts) that are the test split; null to draw ``test_share`` of them.
+        test_share: of the groups.
+        val_share: of what remains, drawn by ``val_by``.
+        val_by: ``recording`` or ``group``. Windows of one recording are never in two splits.
+        frame: ``fixed`` (axes of the recording) or ``aligned`` (x where the agents head on average).
+        shape: agents' outline in the overlap rates, ``box`` or ``disc``.
+        root: folder of the cache; None for $EPO_CACHE or ``cache``.
+        seed: of the draws, and of the batches' order where a run sets no other.
+        batch_size: scenes per batch.
+    """
+
+    def __init__(
+        self,
+        dataset: str,
+        format: str,
+        folder: str,
+        windows: Mapping[str, Any],
+        map: bool = True,
+        test: Sequence[str] | None = None,
+        test_share: float = 0.12,
+        val_share: float = 0.18,
+        val_by: str = "recording",
+        frame: str = "fixed",
+        shape: str = "box",
+        root: str | None = None,
+        seed: int = 0,
+        batch_size: int = 32,
+    ) -> None:
+        super().__init__(batch_size, seed)
+        self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
+        self.list_sources = lookup("format", format)
+        self.recipe = _recipe(windows)
+        self.has_map, self.candidates = map, LINES * PER_LINE if map else 0
+        self.dt, self.horizon, self.num_agents = self.recipe.dt, self.recipe.horizon, self.recipe.agents
+        if self.recipe.lane_change and not map:
+            raise ConfigError("data.windows.lane_change asks for lanes, but data.map is false: set it to false as well")
+        self.test = None if test is None else [str(group) for group in test]
+        for name, share in (("test_share", test_share), ("val_share", val_share)):
+            if not 0 < share < 1:
+                raise ConfigError(f"data.{name} must be a share between 0 and 1, not {share}")
+        for name, value, known in (
+            ("frame", frame, FRAMES),
+            ("val_by", val_by, UNITS),
+            ("shape", shape, ("box", "disc")),
+        ):
+            if value not in known:
+                raise ConfigError(f"unknown data.{name} {value!r}: {nearest(str(value), known)}")
+        self.test_share, self.val_share, self.val_by = test_share, val_share, val_by
+        self.frame, self.shape = frame, shape
+        self.root = Path(root).expanduser() if root else cache.default_root()
+
+    def sources(self) -> list[Source]:
+        """The recordings, in the order of their names.
+
+        Raises:
+            ConfigError: no folder, or nothing in it.
+        """
+        folder = self.folder_of_recordings
+        if not folder.is_dir():
+            raise ConfigError(
+                f"no folder {folder} with {self.dataset_name} recordings: point data.folder at it, "
+                "or unpack the recordings there"
+            )
+        found = sorted(self.list_sources(folder), key=lambda source: source.name)
+        if not found:
+            raise ConfigError(f"{folder} holds no recording in the format {self.format!r}: is it the right folder?")
+        return found
+
+    def splits(self, sources: Sequence[Source]) -> dict[str, list[Source]]:
+        """Which recordings belong to which split.
+
+        Raises:
+            ConfigError: a group that does not exist, or too few recordings for three splits.
+        """
+        draw = np.random.default_rng([self.seed, 4])
+        groups = sorted({source.group for source in sources})
+        if self.test is None:
+            chosen = set(draw.permutation(groups)[: max(1, round(self.test_share * len(groups)))].tolist())
+        else:
+            chosen = set(self.test)
+            for group in sorted(chosen - set(groups)):
+                raise ConfigError(
+                    f"data.test names the group {group!r}, which no recording has: {nearest(group, groups)}"
+                )
+        rest = [source for source in sources if source.group not in chosen]
+        units = sorted({getattr(source, "name" if self.val_by == "recording" else "group") for source in rest})
+        held = set(draw.permutation(units)[: max(1, round(self.val_share * len(units)))].tolist())
+        unit = "name" if self.val_by == "recording" else "group"
+        found = {
+            "train": [source for source in rest if getattr(source, unit) not in held],
+            "val": [source for source in rest if getattr(source, unit) in held],
+            "test": [source for source in sources if source.group in chosen],
+        }
+        empty = [part for part in PARTS if not found[part]]
+        if empty:
+            raise ConfigError(
+                f"{len(sources)} recording(s) in {len(groups)} group(s) leave none for {', '.join(empty)}: "
+                "three splits need recordings of their own"
+            )
+        return found
+
+    def identity(self, sources: Sequence[Source]) -> Any:
+        """What tells these recordings from others: names, sizes and the ends of all files."""
+        return [[source.name, source.group, [_fingerprint(file) for file in source.files]] for source in sources]
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Everything that the set on disk depends on."""
+        sources = self.sources()
+        return {
+            "version": VERSION,
+            "dataset": self.dataset_name,
+            "format": self.format,
+            "recordings": self.identity(sources),
+            "windows": dataclasses.asdict(self.recipe),
+            "map": self.has_map,
+            "splits": {part: [source.name for source in held] for part, held in self.splits(sources).items()},
+        }
+
+    @property
+    def folder(self) -> Path:
+        """Where the set lies, or will lie."""
+        return self.root / f"{self.dataset_name}-{cache.digest(self.config)[:12]}"
+
+    @property
+    def digest(self) -> str:
+        """Hash of everything that a run's data depends on."""
+        return cache.digest({"set": self.config, "frame": self.frame})[:16]
+
+    @property
+    def command(self) -> str:
+        """The command that makes this set, for error messages."""
+        return f"epo generate data={self.dataset_name}"
+
+    def generate(self, workers: int | None = None, progress: bool = True) -> Path:
+        """Extract the scenes unless they are there already, and return the set's folder.
+
+        Args:
+            workers: processes; None for one per core. The bytes do not depend on it.
+            progress: whether to show a progress bar.
+
+        Raises:
+            ConfigError: a recording that cannot be read, a split without scenes, or a killed worker.
+        """
+        config = self.config
+        name = cache.digest(config)
+        folder = self.root / f"{self.dataset_name}-{name[:12]}"
+        if folder.exists():
+            cache.verify(folder, self.command)
+            return folder
+        parts = self.root / f"{self.dataset_name}-parts-{name[:12]}"
+        parts.mkdir(parents=True, exist_ok=True)
+        splits = self.splits(self.sources())
+        everything = [source.name for part in PARTS for source in splits[part]]
+        files = {each: parts / f"{number:04d}.safetensors" for number, each in enumerate(everything)}
+        self._extract(files, workers, progress)
+        tensors, report = {}, {}
+        for part in PARTS:
+            tensors[part], report[part] = self._gather(part, [files[source.name] for source in splits[part]])
+        names = {part: [source.name for source in splits[part]] for part in PARTS}
+        made = cache.write(folder, tensors, config, {**report, "recordings": names})
+        shutil.rmtree(parts)
+        return made
+
+    def _extract(self, files: Mapping[str, Path], workers: int | None, progress: bool) -> None:
+        """Make the files that are missing."""
+        tasks = [
+            (self.format, self.folder_of_recordings, name, self.recipe, self.has_map, file)
+            for name, file in files.items()
+            if not _complete(file)
+        ]
+        bar = Progress(
+            TextColumn("extracting scenes"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("recordings"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            refresh_per_second=1,
+            disable=not progress,
+        )
+        workers = min(workers or default_workers(), max(1, len(tasks)))
+        with bar:
+            row = bar.add_task("", total=len(files), completed=len(files) - len(tasks))
+            if workers == 1:
+                for task in tasks:
+                    _extract_to_file(*task)
+                    bar.advance(row)
+                return
+            with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=watch_parent) as pool:
+                running = [pool.submit(_extract_to_file, *task) for task in tasks]
+                try:
+                    for future in as_completed(running):
+                        future.result()
+                        bar.advance(row)
+                except BrokenProcessPool as error:
+                    raise cache.CacheError(
+                        "a worker process was killed while extracting scenes; finished recordings are kept: run the same "
+                        "command again, with fewer workers if memory is short"
+                    ) from error
+                except BaseException:
+                    pool.shutdown(cancel_futures=True)
+                    raise
+
+    def _gather(self, part: str, files: Sequence[Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """The scenes of a split, and what there is to say about them."""
+        counts: Counter[str] = Counter()
+        extracts = []
+        for file in files:
+            columns, counted = _read(file)
+            counts.update(counted)
+            # A recording without scenes still has its place in the order of recordings.
+            extracts.append(Extract(**columns) if columns else None)
+        full = [found for found in extracts if found is not None]
+        if not full:
+            gone = ", ".join(f"{reason}: {count}" for reason, count in counts.items() if count)
+            raise ConfigError(
+                f"the split {part!r} of {self.dataset_name} has not a single scene ({gone}): relax data.windows, or give it "
+                "more recordings"
+            )
+        whole = joined(full)
+        index = np.array([number for number, found in enumerate(extracts) if found is not None])
+        columns = {field.name: getattr(whole, field.name) for field in dataclasses.fields(Extract)}
+        origin = np.zeros((len(files), 2))
+        origin[index] = whole.origin
+        columns["recording"], columns["origin"] = index[whole.recording].astype(np.int32), origin
+        tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in columns.items()}
+        return tensors, {**dict(counts), **_describe(whole, self.dt)}
+
+    def report(self) -> dict[str, Any]:
+        """The report that the set was made with.
+
+        Raises:
+            cache.CacheError: the set is missing or broken.
+        """
+        return cache.manifest(self.folder, self.command)["report"]
+
+    def open(self, split: str) -> SceneDataset:
+        """The scenes of a split.
+
+        Raises:
+            cache.CacheError: the set is missing, broken, of another format, or holds numbers that are not finite.
+        """
+        folder = self.folder
+        tables = cache.load(folder, split, command=self.command)
+        names = cache.manifest(folder, self.command)["report"]["recordings"][split]
+        return RecordedScenes(tables, self.dt, self.frame, names)
+
+
+def _fingerprint(file: Path) -> list[Any]:
+    """Name, size and a checksum of both ends of a file: cheap where recordings have gigabytes."""
+    size = file.stat().st_size
+    with file.open("rb") as content:
+        ends = content.read(1 << 16)
+        content.seek(max(0, size - (1 << 16)))
+        ends += content.read()
+    return [file.name, size, zlib.crc32(ends)]
+
+
+def _extract_to_file(format: str, folder: Path, name: str, recipe: Recipe, has_map: bool, file: Path) -> None:
+    """Extract the scenes of one recording into a file, atomically."""
+    (source,) = (source for source in lookup("format", format)(folder) if source.name == name)
+    recording = source.read()
+    if has_map and recording.lanes is None:
+        raise ConfigError(f"the recording {name} has no map: set data.map=false, or give it one")
+    if not has_map:
+        recording = dataclasses.replace(recording, lanes=None)
+    found, counts = extract(recording, recipe)
+    columns = {} if found is None else {field.name: getattr(found, field.name) for field in dataclasses.fields(Extract)}
+    # safetensors writes memory as it lies, so it must lie in the order of its indices.
+    ordered = {name: np.ascontiguousarray(values) for name, values in columns.items()}
+    temporary = file.with_suffix(".tmp")
+    temporary.write_bytes(save(ordered, {"counts": json.dumps(counts)}))
+    temporary.replace(file)
+
+
+def _read(file: Path) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    with safe_open(file, framework="np") as content:
+        counts = json.loads(content.metadata()["counts"])
+        return {name: content.get_tensor(name) for name in content.keys()}, counts  # noqa: SIM118 - not a mapping
+
+
+def _complete(file: Path) -> bool:
+    """Whether a part was written whole: it was renamed into place, so it is, unless somebody damaged it."""
+    try:
+        return file.is_file() and bool(_read(file)[1])
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _describe(scenes: Extract, dt: float) -> dict[str, Any]:
+    """Numbers for people who want to know what they train on."""
+    speed = scenes.history[:, -1, 3]
+    found: dict[str, Any] = {
+        "agents per scene": float((scenes.agents >= 0).sum(1).mean()),
+        "speed [m/s], 5th and 95th percentile": [float(value) for value in np.percentile(speed, [5, 95])],
+    }
+    ends = scenes.future_mask[:, -1]
+    if scenes.candidates.shape[1] and ends.any():
+        way = scenes.candidates[ends] - scenes.future[ends, -1, None, :2]
+        nearest_goal = np.linalg.norm(way, axis=-1).min(1)
+        found["distance of the nearest goal candidate [m], mean and 95th percentile"] = [
+            float(nearest_goal.mean()),
+            float(np.percentile(nearest_goal, 95)),
+        ]
+    return found
