@@ -10,8 +10,10 @@ l and width w,
 
 all of radius w / sqrt(2): each is drawn around a square of side w, and reaches 0.21 w beyond its sides. Together they cover
 the vehicle's box, corners and all, as long as these squares leave no gap: up to l = 2 w, 3 w and 5 w with two, three and
-five circles, which every usual car is. Longer vehicles have notches in their flanks: up to 0.72 m deep in a truck of 16 m x
-2.5 m; and there is nothing between the two circles of a bicycle of 1.8 m x 0.6 m.
+five circles. Longer vehicles have notches in their flanks: 0.37 m deep in a car of 3.9 m x 1.7 m, 0.72 m in a truck of 16 m
+x 2.5 m; and a bicycle of 1.8 m x 0.6 m has nothing between its two circles.
+
+Where other circles become the deepest in each other, the depth is continuous and has a kink.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def sizes(draw):
     size=sizes(),
     absent=st.integers(0, 2),
     own=st.sets(st.sampled_from(ALL), min_size=1),
-    pair=st.booleans(),
+    pair=st.sampled_from([(), ("proximity",), ("proximity",), ("circles",)]),
     length=st.sampled_from([0.3, 2.0]),
     integrator=st.sampled_from(["euler", "euler", "heun", "semi_implicit"]),
     stride=st.sampled_from([1, 1, 3]),
@@ -83,9 +83,12 @@ def test_steps_and_gradients_equal_a_dense_reference(size, absent, own, pair, le
     torch.manual_seed(seed)
     agents, horizon = size
     scene = random_scene(2, agents, history=2, size=length, dtype=torch.float64)
+    scene.size[..., 1] *= 0.4
     parameters = random_game(scene, 2, horizon)
-    bounds, dynamics = BOUNDS, Unicycle(integrator)
-    energy = Energy(sorted(own), ["proximity"] if pair else [], bounds, dynamics, stride)
+    if pair:
+        weights = dict.fromkeys(pair, parameters.pair_weights["proximity"])
+        parameters = dataclasses.replace(parameters, pair_weights=weights)
+    energy = Energy(sorted(own), pair, BOUNDS, Unicycle(integrator), stride)
     expected = with_gradients(lambda leaves: dense(energy, scene, leaves), parameters)
     if absent == 0:
         assert_same(
@@ -174,11 +177,13 @@ class HostMustNotWait(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("integrator", ["euler", "heun"])
-def test_the_unsplit_path_never_asks_the_device_for_a_number(integrator):
+@pytest.mark.parametrize(("integrator", "pair"), [("euler", "proximity"), ("heun", "proximity"), ("euler", "circles")])
+def test_the_unsplit_path_never_asks_the_device_for_a_number(integrator, pair):
     scene = random_scene(3, 3, history=2, size=2.0)
-    parameters = leaves_of(random_game(scene))
-    energy = Energy(ALL, bounds=BOUNDS, dynamics=Unicycle(integrator))
+    parameters = random_game(scene)
+    weights = {pair: parameters.pair_weights["proximity"]}
+    parameters = leaves_of(dataclasses.replace(parameters, pair_weights=weights))
+    energy = Energy(ALL, [pair], BOUNDS, Unicycle(integrator))
     with HostMustNotWait():
         solve(energy, scene, parameters, split=False).states.sum().backward()
     assert parameters.initial_controls.grad.isfinite().all()
