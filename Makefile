@@ -46,7 +46,7 @@ data: $(STAMP)
 rows: $(ROWS:%=row-%)
 
 $(ROWS:%=row-%): row-%:
-	@$(EPO) train experiment=rpi/$* budget=reduced runs=$(RUNS) existing=continue callbacks.progress=lines
+	@$(EPO) train experiment=rpi/$* data=rpi_reduced budget=reduced runs=$(RUNS) existing=continue callbacks.progress=lines
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
