@@ -238,7 +238,7 @@ def _record(settings: Settings, data: Any, overrides: Sequence[str]) -> dict[str
         "goal": settings.goal,
         "seed": settings.seed,
         "budget": settings.budget.name,
-        "data": settings.data["name"],
+        "data": settings.data.get("dataset", settings.data["name"]),
         "data_digest": data.digest,
         "command": " ".join(["epo", "train", *overrides]),
         "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),

@@ -48,7 +48,9 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     folder = data.generate(workers=settings.workers, progress=settings.progress)
     print(f"\ndata in {folder}, digest {data.digest}")
     _print_report(data.report())
-    print("\nnext: epo train experiment=rpi/v_lstm_epo" + "".join(f" {o}" for o in overrides if o.startswith("data")))
+    row = f"{settings.data.get('dataset', 'rpi')}/v_lstm_epo"
+    words = " ".join(["epo train", f"experiment={row}", *(o for o in overrides if o.startswith("data"))])
+    print(f"\nnext: {words}")
 
 
 def train(config: dict[str, Any], overrides: Sequence[str]) -> float | None:
@@ -112,6 +114,9 @@ def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
             _print_report(value, indent + "  ")
         elif isinstance(value, float):
             print(f"{indent}{key:<34} {value:.4g}")
+        elif isinstance(value, list):
+            shown = ", ".join(f"{entry:.4g}" if isinstance(entry, float) else str(entry) for entry in value)
+            print(f"{indent}{key:<34} {shown}")
         else:
             print(f"{indent}{key:<34} {value}")
 

@@ -19,7 +19,9 @@ class EvaluatedRun:
         path: the run folder.
         name: how its row is called in tables.
         seed: of the run.
-        data, backbone, forecaster: names of its parts.
+        data: what its data set is called.
+        backbone, forecaster: names of its parts.
+        experiment: the configuration file it was made from, empty for none.
         goal: who knows a given goal, ``energy`` or ``all``.
         budget: name of its budget.
         split: which part of the data it was evaluated on.
@@ -36,6 +38,7 @@ class EvaluatedRun:
     data: str
     backbone: str
     forecaster: str
+    experiment: str
     goal: str
     budget: str
     split: str
@@ -99,9 +102,10 @@ def read_run(run: RunFolder) -> EvaluatedRun:
         path=run.path,
         name=str(entry(config, run.config_file, "title")),
         seed=int(entry(config, run.config_file, "seed")),
-        data=str(entry(config, run.config_file, "data", "name")),
+        data=str(entry(config, run.config_file, "data", "dataset" if "dataset" in config.get("data", {}) else "name")),
         backbone=str(entry(config, run.config_file, "backbone", "name")),
         forecaster=str(entry(config, run.config_file, "forecaster", "name")),
+        experiment=str(config.get("experiment") or ""),
         goal=str(config.get("goal", "energy")),
         budget=str(entry(config, run.config_file, "budget", "name")),
         split=str(result.get("split", "test")),

@@ -177,7 +177,7 @@ def _row(group: tuple[str, str], runs: tuple[EvaluatedRun, ...]) -> Row:
                 f"row {run.name!r} has seed {run.seed} twice, {twin.path} and {run.path}: move one of them away, "
                 "or give it a title of its own"
             )
-    paper = paper_values(first.data, first.backbone, first.forecaster, first.goal)
+    paper = paper_values(first.data, first.backbone, first.forecaster, first.goal, first.experiment)
     cells = {}
     for metric in first.metrics:
         values = [run.metrics[metric] for run in runs if metric in run.metrics]
