@@ -1,0 +1,5 @@
+"""Simulated motorway traffic as recordings in exiD's format: see ``docs/highway_sim.md``."""
+
+from epo_lightning.data.simulate.generate import config, make_recordings
+
+__all__ = ["config", "make_recordings"]

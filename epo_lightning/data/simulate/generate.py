@@ -1,0 +1,251 @@
+"""Making a folder of simulated recordings: one process per recording, finished ones are kept, the folder appears when whole.
+
+Every recording draws from its own random numbers, so the bytes do not depend on the number of workers. Work goes on in a
+hidden folder beside the final one; a run that was killed continues there with the recordings that are not finished.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from epo_lightning.data import cache
+from epo_lightning.data.simulate import recording
+from epo_lightning.data.simulate.lanelets import write_map
+from epo_lightning.data.simulate.layout import LAYOUTS, Layout
+from epo_lightning.data.simulate.motion import move
+from epo_lightning.data.simulate.traffic import RATE, WARM_UP, simulate, simulator
+from epo_lightning.data.workers import default_workers, watch_parent
+from epo_lightning.registry import ConfigError
+
+RECIPE = 1
+"""Version of the recipe: raised whenever the same configuration would give other recordings."""
+MOST_DROPPED = 0.05
+"""A simulation in which more than this share of vehicles collide or jump is refused."""
+
+
+def config(
+    seed: int = 0, recordings: int = 2, minutes: float = 8.0, layouts: Sequence[int] | None = None
+) -> dict[str, Any]:
+    """Everything that simulated recordings depend on, as plain values.
+
+    Args:
+        recordings: per layout.
+        minutes: that each of them lasts.
+        layouts: their ids; all when not given.
+
+    Raises:
+        ConfigError: a value that cannot be.
+    """
+    known = [layout.id for layout in LAYOUTS]
+    chosen = known if layouts is None else sorted(set(layouts))
+    for layout in chosen:
+        if layout not in known:
+            raise ConfigError(f"unknown layout {layout!r}: known are {', '.join(map(str, known))}")
+    if not chosen:
+        raise ConfigError(f"layouts is empty: choose from {', '.join(map(str, known))}")
+    if not 1 <= recordings * len(chosen) <= 1000:
+        raise ConfigError(
+            f"recordings is {recordings} for each of {len(chosen)} layouts: 1 to 1000 in all are possible"
+        )
+    if not 0.1 <= minutes <= 60.0:
+        raise ConfigError(f"minutes is {minutes}: expected 0.1 to 60 minutes per recording")
+    return {
+        "recipe": RECIPE,
+        "seed": seed,
+        "recordings": recordings,
+        "minutes": float(minutes),
+        "layouts": chosen,
+        "rate": RATE,
+        "warm_up": WARM_UP,
+    }
+
+
+def map_path(layout: Layout) -> str:
+    """Where exiD v2.1 keeps a location's Lanelet2 map."""
+    return f"maps/lanelet2/{layout.id}_{layout.name}/location{layout.id}.osm"
+
+
+def _record(work: Path, name: str, number: int, layout: int, seed: int, seconds: float) -> int:
+    """Simulate and write one recording; its ``.done`` file comes last."""
+    place = LAYOUTS[layout]
+    with tempfile.TemporaryDirectory() as folder:
+        traffic = simulate(place, [seed, number], seconds, Path(folder))
+    dropped = sum(traffic.dropped.values())
+    if dropped > MOST_DROPPED * len(traffic.size):
+        raise ConfigError(
+            f"recording {number} on layout {place.name}: {dropped} of {len(traffic.size)} vehicles collide or jump "
+            f"({traffic.dropped}): use another seed"
+        )
+    motion = move(traffic, place, seconds)
+    changes = int(recording.lane_changes(motion).sum())
+    if not changes:
+        raise ConfigError(
+            f"recording {number} on layout {place.name}: nobody changes lane in {seconds:g} s: use more minutes"
+        )
+    paths = recording.write(motion, place, number, work / "data")
+    done = {
+        "config": name,
+        "layout": place.name,
+        "vehicles": len(motion.size),
+        "lane_changes": changes,
+        "frames": len(motion.frame),
+        "dropped": motion.dropped,
+        "files": {
+            f"data/{path.name}": {"bytes": path.stat().st_size, "sha256": cache.file_digest(path)} for path in paths
+        },
+    }
+    _write_json(_done_path(work, number), done)
+    return number
+
+
+def _done_path(work: Path, number: int) -> Path:
+    return work / f".{number:02d}.done"
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n")
+    temporary.replace(path)
+
+
+def _finished(work: Path, number: int, name: str) -> dict[str, Any] | None:
+    """What a finished recording says about itself, or None where it is not finished, damaged or of another configuration."""
+    try:
+        done = json.loads(_done_path(work, number).read_text())
+        if done["config"] != name:
+            return None
+        for file, expected in done["files"].items():
+            if cache.file_digest(work / file) != expected["sha256"]:
+                return None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return dict(done)
+
+
+def verify(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    """The manifest of a folder of simulated recordings, after a look at its configuration and the sizes of its files.
+
+    Raises:
+        cache.CacheError: another configuration, no manifest, a file that is missing or truncated.
+    """
+    remedy = f"delete the folder {folder} and make it again"
+    try:
+        manifest = json.loads((folder / cache.MANIFEST).read_text())
+        found, files = manifest["hash"], manifest["files"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise cache.CacheError(
+            f"{folder / cache.MANIFEST} is not a readable manifest ({type(error).__name__}: {error}); {remedy}"
+        ) from None
+    if found != cache.digest(config):
+        raise cache.CacheError(f"{folder} holds recordings of another configuration; {remedy}, or use another folder")
+    for file, expected in files.items():
+        path = folder / file
+        if not path.is_file() or path.stat().st_size != expected["bytes"]:
+            raise cache.CacheError(f"{path} is missing or truncated; {remedy}")
+    return dict(manifest)
+
+
+def make_recordings(folder: Path, config: Mapping[str, Any], workers: int | None = None, progress: bool = True) -> Path:
+    """The folder of simulated recordings of a configuration, made now unless it is there already.
+
+    It has exiD's layout, ``data/XX_*.csv`` and ``maps/lanelet2/``, and a ``manifest.json`` with the configuration, every
+    file's size and SHA-256, and what each recording holds.
+
+    Args:
+        folder: where it shall be.
+        config: of :func:`config`.
+        workers: processes; one per core when not given.
+        progress: whether to show a bar on standard error.
+
+    Raises:
+        ConfigError: SUMO is missing or fails, a recording without lane changes or with too many accidents.
+        cache.CacheError: the folder is there but something else or broken, or a worker was killed.
+    """
+    if folder.exists():
+        verify(folder, config)
+        return folder
+    simulator()
+    name = cache.digest(config)
+    work = folder.with_name(f".{folder.name}-{name[:12]}")
+    (work / "data").mkdir(parents=True, exist_ok=True)
+    numbers = dict(enumerate(layout for layout in config["layouts"] for _ in range(config["recordings"])))
+    missing = [number for number in numbers if _finished(work, number, name) is None]
+    bar = Progress(
+        TextColumn("simulating"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("recordings"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        refresh_per_second=1,
+        disable=not progress,
+    )
+    # A process per recording: SUMO keeps its state in global variables.
+    context = multiprocessing.get_context("spawn")
+    with bar:
+        row = bar.add_task("", total=len(numbers), completed=len(numbers) - len(missing))
+        with ProcessPoolExecutor(
+            min(workers or default_workers(), max(1, len(missing))),
+            mp_context=context,
+            initializer=watch_parent,
+            max_tasks_per_child=1,
+        ) as pool:
+            running = [
+                pool.submit(_record, work, name, number, numbers[number], config["seed"], config["minutes"] * 60.0)
+                for number in missing
+            ]
+            try:
+                for future in as_completed(running):
+                    future.result()
+                    bar.advance(row)
+            except BrokenProcessPool as error:
+                raise cache.CacheError(
+                    f"a worker process was killed while simulating; finished recordings are kept in {work}: run the "
+                    "same command again, with fewer workers if memory is short"
+                ) from error
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    return _finish(folder, work, config, numbers)
+
+
+def _finish(folder: Path, work: Path, config: Mapping[str, Any], numbers: Mapping[int, int]) -> Path:
+    """Add maps and manifest, and give the folder its name."""
+    name = cache.digest(config)
+    files: dict[str, Any] = {}
+    report: dict[str, Any] = {}
+    for layout in sorted(set(numbers.values())):
+        path = work / map_path(LAYOUTS[layout])
+        write_map(LAYOUTS[layout], path)
+        files[map_path(LAYOUTS[layout])] = {"bytes": path.stat().st_size, "sha256": cache.file_digest(path)}
+    for number in numbers:
+        done = _finished(work, number, name)
+        if done is None:
+            raise cache.CacheError(f"recording {number} in {work} cannot be read back: is the disk full?")
+        files.update(done.pop("files"))
+        report[f"{number:02d}"] = done
+    for number in numbers:
+        _done_path(work, number).unlink()
+    _write_json(
+        work / cache.MANIFEST,
+        {"hash": name, "config": dict(config), "files": files, "recordings": report},
+    )
+    try:
+        work.replace(folder)
+    except OSError:
+        if not folder.exists():
+            raise
+        verify(folder, config)  # somebody else finished the same recordings first
+    return folder

@@ -1,0 +1,257 @@
+"""A recording in exiD's files: tracks with all derived columns of v2.1, what each track is, and the recording itself.
+
+Derived columns come from the simulation, not from the map: which lane holds the centre, how far it is from the middle of
+that lane, who drives ahead. ``leadDHW`` is the free distance along the lane from front to rear bumper, ``leadTHW`` that
+distance by the own speed, ``leadDV`` the own speed minus the leader's, ``leadTTC`` the distance by ``leadDV`` where it is
+positive. A vehicle beside is ahead, behind or alongside as its length is wholly ahead, wholly behind or neither. The three
+columns of OpenDRIVE ids that some copies of exiD have are absent, as there is no such map.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from jaxtyping import Float, Int
+from pyproj import Transformer
+
+from epo_lightning.data.simulate.lanelets import lanelets
+from epo_lightning.data.simulate.layout import Layout
+from epo_lightning.data.simulate.motion import Motion
+
+NONE = -1
+FAR = 1e5
+"""More [m] than any position along a road."""
+MOST_ALONGSIDE = 4
+
+
+def lane_changes(motion: Motion) -> Int[np.ndarray, " T"]:
+    """1 in the first frame in which a vehicle's centre is in another lane than before."""
+    changed = np.diff(motion.strip, prepend=motion.strip[:1]) != 0
+    return (changed & (np.diff(motion.vehicle, prepend=-1) == 0)).astype(np.int64)
+
+
+def _piecewise(strip: Int[np.ndarray, " T"], values: list[Float[np.ndarray, " T"]]) -> Float[np.ndarray, " T"]:
+    return np.select([strip == index for index in range(len(values))], values)
+
+
+def tracks(motion: Motion, layout: Layout, number: int) -> pl.DataFrame:
+    """The table of tracks of recording ``number``."""
+    lanes = layout.lanes
+    count = np.bincount(motion.vehicle)
+    starts = np.repeat(np.cumsum(count) - count, count)
+    length, width = motion.size[motion.vehicle].T
+    cosine, sine = np.cos(motion.heading), np.sin(motion.heading)
+
+    def ahead_and_aside(vector: Float[np.ndarray, "T 2"]) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, " T"]]:
+        return vector[:, 0] * cosine + vector[:, 1] * sine, vector[:, 1] * cosine - vector[:, 0] * sine
+
+    speed, slip = ahead_and_aside(motion.velocity)
+    pull, push = ahead_and_aside(motion.acceleration)
+    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(motion.position, axis=0).T))])
+
+    # Offsets are measured across the lane, not across the reference curve.
+    direction = _piecewise(motion.strip, [layout.direction(lane, motion.s) for lane in lanes])
+    normal = np.interp(motion.s, *layout.course)
+    across = np.cos(direction - normal)
+    offset = (motion.d - _piecewise(motion.strip, [layout.offset(lane, motion.s) for lane in lanes])) * across
+    lanelet, position, extent = _lanelets(motion, layout)
+    around = _neighbours(motion, layout)
+
+    lead = around.pop("leadId")
+    has = lead != NONE
+    leader = np.where(has, lead, 0)
+    stretch = 1.0 - layout.curvature_at(motion.s) * motion.d
+    headway = np.where(has, (motion.s[leader] - motion.s - (length + length[leader]) / 2) * stretch, NONE)
+    closing = np.where(has, speed - speed[leader], -1000.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        time_headway = np.where(has & (speed > 0.1), headway / speed, NONE)
+        collision = np.where(has & (closing > 0.01), headway / closing, NONE)
+
+    def ids(rows: Int[np.ndarray, " T"]) -> Int[np.ndarray, " T"]:
+        return np.where(rows == NONE, NONE, motion.vehicle[rows])
+
+    columns: dict[str, np.ndarray | pl.Series] = {
+        "recordingId": np.full(len(motion.frame), number),
+        "trackId": motion.vehicle,
+        "frame": motion.frame,
+        "trackLifetime": np.arange(len(motion.frame)) - starts,
+        "xCenter": motion.position[:, 0],
+        "yCenter": motion.position[:, 1],
+        "heading": np.degrees(motion.heading) % 360.0,
+        "width": width,
+        "length": length,
+        "xVelocity": motion.velocity[:, 0],
+        "yVelocity": motion.velocity[:, 1],
+        "xAcceleration": motion.acceleration[:, 0],
+        "yAcceleration": motion.acceleration[:, 1],
+        "lonVelocity": speed,
+        "latVelocity": slip,
+        "lonAcceleration": pull,
+        "latAcceleration": push,
+        "traveledDistance": travelled - travelled[starts],
+        "latLaneCenterOffset": offset,
+        "laneWidth": layout.width * across,
+        "laneletId": lanelet,
+        "laneChange": lane_changes(motion),
+        "lonLaneletPos": position,
+        "laneletLength": extent,
+        "leadDHW": headway,
+        "leadDV": closing,
+        "leadTHW": time_headway,
+        "leadTTC": collision,
+        "leadId": ids(lead),
+        "rearId": ids(around["rearId"]),
+        "leftLeadId": ids(around["leftLeadId"]),
+        "leftRearId": ids(around["leftRearId"]),
+        "leftAlongsideId": _listed(around["leftAlongsideId"], motion),
+        "rightLeadId": ids(around["rightLeadId"]),
+        "rightRearId": ids(around["rightRearId"]),
+        "rightAlongsideId": _listed(around["rightAlongsideId"], motion),
+    }
+    return pl.DataFrame(
+        {
+            name: np.round(values, 4) + 0.0 if isinstance(values, np.ndarray) and values.dtype.kind == "f" else values
+            for name, values in columns.items()
+        }
+    )
+
+
+def _lanelets(
+    motion: Motion, layout: Layout
+) -> tuple[Int[np.ndarray, " T"], Float[np.ndarray, " T"], Float[np.ndarray, " T"]]:
+    """Id of the lanelet that holds each row, the position along its centreline and its length [m]."""
+    ident = np.full(len(motion.s), NONE)
+    position, extent = np.zeros(len(motion.s)), np.zeros(len(motion.s))
+    driven = [index for index, strip in enumerate(layout.strips) if not strip.shoulder]
+    for piece in lanelets(layout):
+        if piece.strip not in driven:
+            continue
+        rows = (motion.strip == driven.index(piece.strip)) & (motion.s >= piece.begin) & (motion.s < piece.end)
+        s = np.linspace(piece.begin, piece.end, max(2, round(piece.end - piece.begin) + 1))
+        points = layout.locate(s, layout.offset(layout.strips[piece.strip], s))
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        ident[rows] = piece.id
+        position[rows] = np.interp(motion.s[rows], s, along)
+        extent[rows] = along[-1]
+    return ident, position, extent
+
+
+def _neighbours(motion: Motion, layout: Layout) -> dict[str, Int[np.ndarray, " ..."]]:
+    """Rows of the vehicles around each row's vehicle, -1 for nobody; alongside, up to MOST_ALONGSIDE of them."""
+    lanes = layout.lanes
+    half = motion.size[motion.vehicle, 0] / 2
+    rear, front = motion.s - half, motion.s + half
+    group = motion.frame * len(lanes) + motion.strip
+    by_rear, by_front = (np.argsort(group * FAR + values, kind="stable") for values in (rear, front))
+    rears, fronts = (group * FAR + rear)[by_rear], (group * FAR + front)[by_front]
+    rows = np.arange(len(group))
+
+    def ahead(target: np.ndarray, point: np.ndarray) -> Int[np.ndarray, " T"]:
+        """Place in the order of rear bumpers of the first one that is not behind a point of a lane."""
+        return np.searchsorted(rears, target * FAR + point)
+
+    def lead_and_rear(target: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        first = ahead(target, front)
+        found = by_rear[np.minimum(first, len(rows) - 1)]
+        lead = np.where(valid & (first < len(rows)) & (group[found] == target), found, NONE)
+        last = np.searchsorted(fronts, target * FAR + rear, side="right") - 1
+        found = by_front[np.maximum(last, 0)]
+        return lead, np.where(valid & (last >= 0) & (group[found] == target), found, NONE)
+
+    around: dict[str, np.ndarray] = {}
+    around["leadId"], around["rearId"] = lead_and_rear(group, np.ones(len(rows), dtype=bool))
+    for side, step in (("left", 1), ("right", -1)):
+        beside = np.full(len(rows), NONE)
+        for index, lane in enumerate(lanes):
+            for other, neighbour in enumerate(lanes):
+                if neighbour.place == lane.place + step:
+                    there = (motion.s >= neighbour.begin) & (motion.s <= neighbour.end)
+                    together = (motion.s >= max(lane.join, neighbour.join)) & (
+                        motion.s <= min(lane.leave, neighbour.leave)
+                    )
+                    if (lane.join, lane.leave) == (neighbour.join, neighbour.leave):
+                        together = np.ones(len(rows), dtype=bool)
+                    beside[(motion.strip == index) & there & together] = other
+        valid = beside != NONE
+        target = motion.frame * len(lanes) + beside
+        around[f"{side}LeadId"], around[f"{side}RearId"] = lead_and_rear(target, valid)
+        first = ahead(target, front)
+        alongside = np.full((len(rows), MOST_ALONGSIDE), NONE)
+        for count in range(MOST_ALONGSIDE):
+            found = by_rear[np.maximum(first - 1 - count, 0)]
+            touching = valid & (first - 1 - count >= 0) & (group[found] == target) & (front[found] > rear)
+            alongside[touching, count] = found[touching]
+        around[f"{side}AlongsideId"] = alongside
+    return around
+
+
+def _listed(rows: Int[np.ndarray, "T m"], motion: Motion) -> pl.Series:
+    """Ids of several vehicles in one text, separated by semicolons; empty for nobody."""
+    text = np.where(rows[:, 0] == NONE, "", motion.vehicle[rows[:, 0]].astype(str)).astype(object)
+    for row in np.flatnonzero(rows[:, 1] != NONE):
+        text[row] = ";".join(str(motion.vehicle[other]) for other in rows[row] if other != NONE)
+    return pl.Series(text, dtype=pl.String)
+
+
+def tracks_meta(motion: Motion, number: int) -> pl.DataFrame:
+    """What each track is and when it is there."""
+    count = np.bincount(motion.vehicle)
+    first = motion.frame[np.cumsum(count) - count]
+    return pl.DataFrame(
+        {
+            "recordingId": np.full(len(count), number),
+            "trackId": np.arange(len(count)),
+            "initialFrame": first,
+            "finalFrame": first + count - 1,
+            "numFrames": count,
+            "width": np.round(motion.size[:, 1], 4),
+            "length": np.round(motion.size[:, 0], 4),
+            "class": list(motion.kind),
+        }
+    )
+
+
+def recording_meta(motion: Motion, layout: Layout, number: int) -> pl.DataFrame:
+    """Where, when and how the recording was made. Simulated days are Wednesdays."""
+    longitude, latitude = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True).transform(*layout.origin)
+    vehicles = len(motion.size)
+    return pl.DataFrame(
+        {
+            "recordingId": [number],
+            "locationId": [layout.id],
+            "frameRate": [round(motion.rate)],
+            "speedLimit": [NONE if layout.limit is None else round(layout.limit, 2)],
+            "weekday": ["wednesday"],
+            "startTime": ["12:00"],
+            "duration": [round(float(motion.frame.max() + 1) / motion.rate, 2)],
+            "numTracks": [vehicles],
+            "numVehicles": [vehicles],
+            "numVrus": [0],
+            "latLocation": [round(latitude, 7)],
+            "lonLocation": [round(longitude, 7)],
+            "xUtmOrigin": [layout.origin[0]],
+            "yUtmOrigin": [layout.origin[1]],
+            "orthoPxToMeter": [0.1],
+            "exportVersion": ["2.1"],
+        }
+    )
+
+
+def write(motion: Motion, layout: Layout, number: int, folder: Path) -> list[Path]:
+    """Write the three files of recording ``number``, each of them whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tables = {
+        "tracks": tracks(motion, layout, number),
+        "tracksMeta": tracks_meta(motion, number),
+        "recordingMeta": recording_meta(motion, layout, number),
+    }
+    paths = []
+    for name, table in tables.items():
+        path = folder / f"{number:02d}_{name}.csv"
+        temporary = path.with_name(f".{path.name}.{os.getpid()}")
+        table.write_csv(temporary, null_value="", quote_style="never")
+        paths.append(temporary.replace(path))
+    return paths

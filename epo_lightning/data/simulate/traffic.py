@@ -1,0 +1,373 @@
+"""Traffic: SUMO drives vehicles through a layout's lanes and tells, 25 times a second, where each of them is in its lane.
+
+SUMO sees a straight abstract network: one edge per carriageway and section, whose lanes are the layout's strips. Its
+sublane model (SL2015) moves vehicles sideways smoothly; its EIDM drivers follow. Drivers differ from vehicle type to
+vehicle type, and the mixture from recording to recording.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from epo_lightning.data.simulate.layout import Layout
+from epo_lightning.registry import ConfigError
+
+RATE = 25
+"""Steps per second [Hz], which is exiD's frame rate."""
+WARM_UP = 90.0
+"""Time [s] in which the road fills; nothing of it is recorded."""
+UNLIMITED = 130 / 3.6
+"""Speed [m/s] that drivers' desires refer to where there is no limit."""
+RAMP_SPEED = 90 / 3.6
+"""Speed limit on ramps [m/s]."""
+FASTEST = 60.0
+"""Nobody drives this fast [m/s]: who does was moved, not driven."""
+CLASSES = ("car", "van", "truck", "motorcycle")
+"""exiD's names of what vehicles are."""
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """What SUMO did. Rows are sorted by vehicle, and by step within a vehicle.
+
+    Attributes:
+        vehicle: index of each row's vehicle.
+        step: of the simulation, at RATE.
+        strip: index into ``layout.lanes`` of the lane whose middle is nearest.
+        front: s of the front bumper [m].
+        aside: offset from the middle of the strip, positive to the left [m].
+        size: length and width of each vehicle [m].
+        kind: of each vehicle, an index into CLASSES.
+        dropped: vehicles that were left out, by reason.
+    """
+
+    vehicle: Int[np.ndarray, " T"]
+    step: Int[np.ndarray, " T"]
+    strip: Int[np.ndarray, " T"]
+    front: Float[np.ndarray, " T"]
+    aside: Float[np.ndarray, " T"]
+    size: Float[np.ndarray, "A 2"]
+    kind: Int[np.ndarray, " A"]
+    dropped: dict[str, int]
+
+
+def simulator() -> tuple[ModuleType, Path]:
+    """SUMO as a library, and the folder of its programs.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        import libsumo
+        import sumo
+    except ImportError as error:
+        raise ConfigError(
+            f"simulated recordings need the traffic simulator SUMO ({error}): install it with "
+            "`pip install 'epo_lightning[sim]'`"
+        ) from None
+    return libsumo, Path(sumo.SUMO_HOME) / "bin"
+
+
+@dataclass(frozen=True)
+class _Edge:
+    name: str
+    road: str
+    begin: float
+    end: float
+    strips: tuple[int, ...]
+    """Indices into ``layout.lanes``, from right to left."""
+
+
+def _edges(layout: Layout) -> list[_Edge]:
+    """One edge per section and carriageway, downstream."""
+    lanes = layout.lanes
+    cuts = [s for strip in lanes for s in (*strip.driven, strip.join, strip.leave)]
+    edges = []
+    for number, (begin, end) in enumerate(layout.sections(cuts)):
+        middle = (begin + end) / 2
+        roads: dict[str, list[int]] = {}
+        for index, strip in sorted(enumerate(lanes), key=lambda item: item[1].place):
+            if strip.driven[0] < middle < strip.driven[1]:
+                roads.setdefault(strip.road(middle), []).append(index)
+        edges += [_Edge(f"{road}_{number}", road, begin, end, tuple(strips)) for road, strips in roads.items()]
+    return edges
+
+
+def _xml(path: Path, tag: str, children: Iterable[tuple[str, dict[str, Any]]]) -> Path:
+    root = ElementTree.Element(tag)
+    for name, attributes in children:
+        ElementTree.SubElement(root, name, {key: str(value) for key, value in attributes.items()})
+    ElementTree.ElementTree(root).write(path)
+    return path
+
+
+def _network(layout: Layout, edges: list[_Edge], programs: Path, folder: Path) -> Path:
+    """The layout as SUMO sees it: every edge straight, vehicles hop from its end to the beginning of the next."""
+    height = {road: -50.0 * row for row, road in enumerate(dict.fromkeys(edge.road for edge in edges))}
+    height["main"] = 0.0
+
+    # Ramp and road meet in a node of the road; elsewhere the two lie apart.
+    def node(edge: _Edge, s: float) -> tuple[str, float]:
+        meeting = [other for other in edges if s in (other.begin, other.end) and set(other.strips) & set(edge.strips)]
+        road = "main" if any(other.road == "main" for other in meeting) else edge.road
+        return f"{road}@{s:g}", height[road]
+
+    nodes: dict[str, dict[str, Any]] = {}
+    rows, links = [], []
+    speed = layout.limit or UNLIMITED
+    for edge in edges:
+        ends = []
+        for s in (edge.begin, edge.end):
+            name, y = node(edge, s)
+            nodes[name] = {"id": name, "x": s, "y": y}
+            ends.append(name)
+        rows.append(
+            (
+                "edge",
+                {
+                    "id": edge.name,
+                    "from": ends[0],
+                    "to": ends[1],
+                    "numLanes": len(edge.strips),
+                    "speed": speed if edge.road == "main" else min(speed, RAMP_SPEED),
+                    "length": edge.end - edge.begin,
+                    "width": layout.width,
+                },
+            )
+        )
+        for after in edges:
+            if after.begin == edge.end:
+                links += [
+                    (
+                        "connection",
+                        {
+                            "from": edge.name,
+                            "to": after.name,
+                            "fromLane": edge.strips.index(strip),
+                            "toLane": after.strips.index(strip),
+                        },
+                    )
+                    for strip in edge.strips
+                    if strip in after.strips
+                ]
+    net = folder / "net.xml"
+    command = [
+        str(programs / "netconvert"),
+        f"--node-files={_xml(folder / 'nodes.xml', 'nodes', (('node', row) for row in nodes.values()))}",
+        f"--edge-files={_xml(folder / 'edges.xml', 'edges', rows)}",
+        f"--connection-files={_xml(folder / 'connections.xml', 'connections', links)}",
+        f"--output-file={net}",
+        "--no-internal-links=true",
+        "--no-turnarounds=true",
+        "--junctions.limit-turn-speed=-1",
+        "--offset.disable-normalization=true",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode or not net.is_file():
+        raise ConfigError(f"SUMO's netconvert refuses the network of layout {layout.name}: {done.stderr.strip()}")
+    return net
+
+
+def _drivers(random: np.random.Generator, layout: Layout) -> list[dict[str, Any]]:
+    """Vehicle types of one recording: as many kinds of drivers as there are rows, each with its share of the traffic."""
+    speed = layout.limit or UNLIMITED
+    heavy = random.uniform(0.08, 0.18)
+    hurry, haste = random.uniform(0.97, 1.06), random.uniform(0.85, 1.15)
+    cars, vans, trucks = 20, 4, 8
+    rows = []
+    for number in range(cars + vans + trucks + 1):
+        kind = 0 if number < cars else 1 if number < cars + vans else 2 if number < cars + vans + trucks else 3
+        common = {
+            "id": f"{CLASSES[kind]}{number}",
+            "carFollowModel": "EIDM",
+            "laneChangeModel": "SL2015",
+            "latAlignment": "center",
+            "lcSublane": 1,
+            "lcSigma": 0.1,
+            "lcMaxSpeedLatStanding": 0,
+            "lcCooperative": round(random.uniform(0.7, 1.0), 2),
+            "lcAssertive": round(random.uniform(1.0, 1.5), 2),
+            "minGapLat": 0.6,
+            "sigma": 0.3,
+            "emergencyDecel": 8.0,
+        }
+        if kind == 2:
+            own = {
+                "vClass": "truck",
+                "length": random.uniform(8.0, 18.5),
+                "width": 2.5,
+                "maxSpeed": 25.0,
+                "speedFactor": f"normc({24.0 / speed:.3f},{0.6 / speed:.3f},{22.0 / speed:.3f},{25.0 / speed:.3f})",
+                "accel": random.uniform(0.7, 1.1),
+                "decel": 4.0,
+                "tau": random.uniform(1.2, 1.9) * haste,
+                "minGap": 3.0,
+                "lcStrategic": 1.5,
+                "lcSpeedGain": 0.5,
+                "lcKeepRight": 1.5,
+                "maxSpeedLat": random.uniform(0.8, 1.0),
+                "lcAccelLat": 0.5,
+                "probability": heavy / trucks,
+            }
+        else:
+            spread = 0.08 if layout.limit else 0.13
+            share = {0: (0.93 - heavy) / cars, 1: 0.06 / vans, 3: 0.01}[kind]
+            length, width = {0: ((3.7, 5.1), (1.7, 2.0)), 1: ((5.2, 7.2), (2.0, 2.2)), 3: ((2.1, 2.3), (0.8, 0.9))}[
+                kind
+            ]
+            mean = hurry * (0.92 if kind == 1 else 1.0)
+            own = {
+                "vClass": "motorcycle" if kind == 3 else "passenger",
+                "length": random.uniform(*length),
+                "width": random.uniform(*width),
+                "maxSpeed": 55.0,
+                "speedFactor": f"normc({mean:.3f},{spread},{mean - 2 * spread:.3f},{mean + 2.5 * spread:.3f})",
+                "accel": random.uniform(1.4, 2.4),
+                "decel": 4.5,
+                "tau": random.uniform(0.7, 1.5) * haste,
+                "minGap": 2.0,
+                "lcStrategic": round(random.uniform(1.0, 2.0), 2),
+                "lcSpeedGain": round(random.uniform(0.8, 2.0), 2),
+                "lcKeepRight": round(random.uniform(0.3, 1.2), 2),
+                "maxSpeedLat": random.uniform(0.9, 1.3),
+                "lcAccelLat": random.uniform(0.6, 0.9),
+                "probability": share,
+            }
+        rows.append({key: round(v, 3) if isinstance(v, float) else v for key, v in {**common, **own}.items()})
+    return rows
+
+
+def _demand(
+    layout: Layout, edges: list[_Edge], random: np.random.Generator, until: float, path: Path
+) -> list[dict[str, Any]]:
+    """Write who drives from where to where, and return the vehicle types."""
+    drivers = _drivers(random, layout)
+    busy = random.uniform(0.85, 1.1)
+    roads = {road: [edge for edge in edges if edge.road == road] for road in dict.fromkeys(edge.road for edge in edges)}
+    flows: list[tuple[str, str, float]] = []
+    on = next((road for road in roads if road.startswith("on")), None)
+    off = next((road for road in roads if road.startswith("off")), None)
+    leaving = layout.off / (layout.main + layout.on)
+    for source, rate in (("main", layout.main), (on, layout.on)):
+        # Who comes up the ramp leaves again on a weaving lane only, and there less often than others.
+        weave = source == "main" or any(np.isfinite((strip.join, strip.leave)).all() for strip in layout.lanes)
+        away = leaving * (1.0 if source == "main" else 0.4) if off and weave else 0.0
+        if source:
+            flows += [(source, "main", rate * (1 - away))] + ([(source, str(off), rate * away)] if away else [])
+    root = ElementTree.Element("routes")
+    mixture = ElementTree.SubElement(root, "vTypeDistribution", {"id": "mixture"})
+    for row in drivers:
+        ElementTree.SubElement(mixture, "vType", {key: str(value) for key, value in row.items()})
+    for source, target, rate in flows:
+        ElementTree.SubElement(
+            root,
+            "flow",
+            {
+                "id": f"{source}-{target}",
+                "type": "mixture",
+                "from": roads[source][0].name,
+                "to": roads[target][-1].name,
+                "begin": "0",
+                "end": f"{until}",
+                "period": f"exp({rate * busy / 3600:.6f})",
+                "departLane": "best",
+                "departPos": "base",
+                "departSpeed": "desired" if source == "main" else f"{RAMP_SPEED * 0.8:.2f}",
+            },
+        )
+    ElementTree.ElementTree(root).write(path)
+    return drivers
+
+
+def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path) -> Traffic:
+    """Drive for ``seconds`` after the road has filled.
+
+    Args:
+        seed: of the drivers and of everything that SUMO draws.
+        folder: for SUMO's input files.
+
+    Raises:
+        ConfigError: SUMO is not installed, or fails.
+    """
+    libsumo, programs = simulator()
+    random = np.random.default_rng(seed)
+    edges = _edges(layout)
+    net = _network(layout, edges, programs, folder)
+    steps = round((WARM_UP + seconds + 2.0) * RATE)
+    drivers = _demand(layout, edges, random, steps / RATE, folder / "routes.xml")
+    where = {f"{edge.name}_{lane}": (strip, edge.begin) for edge in edges for lane, strip in enumerate(edge.strips)}
+    constants = libsumo.constants
+    variables = (constants.VAR_LANE_ID, constants.VAR_LANEPOSITION, constants.VAR_LANEPOSITION_LAT)
+    command = [
+        "sumo",
+        f"--net-file={net}",
+        f"--route-files={folder / 'routes.xml'}",
+        f"--step-length={1 / RATE}",
+        "--lateral-resolution=0.3",
+        "--time-to-teleport=-1",
+        "--collision.action=warn",
+        "--collision.mingap-factor=0",
+        "--no-warnings=true",
+        "--no-step-log=true",
+        "--xml-validation=never",
+        f"--seed={random.integers(2**31)}",
+    ]
+    rows: list[tuple[int, int, int, float, float, float]] = []
+    numbers: dict[str, int] = {}
+    types: list[str] = []
+    crashed: set[str] = set()
+    first = round((WARM_UP - 1.0) * RATE)
+    try:
+        libsumo.start(command)
+        for step in range(steps):
+            libsumo.simulationStep()
+            for name in libsumo.simulation.getDepartedIDList():
+                libsumo.vehicle.subscribe(name, variables)
+                numbers[name] = len(numbers)
+                types.append(libsumo.vehicle.getTypeID(name))
+            for hit in libsumo.simulation.getCollisions():
+                crashed |= {hit.collider, hit.victim}
+            if step >= first:
+                for name, values in libsumo.vehicle.getAllSubscriptionResults().items():
+                    lane, position, aside = (values[variable] for variable in variables)
+                    strip, begin = where[lane]
+                    rows.append((numbers[name], step, strip, begin, position, aside))
+    except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+        raise ConfigError(f"SUMO fails on layout {layout.name} with seed {list(seed)}: {error}") from None
+    finally:
+        libsumo.close()
+    return _sorted(np.array(rows), drivers, types, {numbers[name] for name in crashed})
+
+
+def _sorted(
+    rows: Float[np.ndarray, "T 6"], drivers: list[dict[str, Any]], types: list[str], crashed: set[int]
+) -> Traffic:
+    """Rows by vehicle instead of by step, without vehicles that do what vehicles cannot do."""
+    rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+    vehicle, step, strip = rows[:, :3].astype(np.int64).T
+    front, aside = rows[:, 3] + rows[:, 4], rows[:, 5]
+    same = np.diff(vehicle) == 0
+    forward = np.diff(front)
+    jumps = same & ((np.diff(step) != 1) | (forward < -0.01) | (forward > FASTEST / RATE))
+    jumped = set(vehicle[1:][jumps].tolist())
+    kept = ~np.isin(vehicle, list(crashed | jumped))
+    described = {row["id"]: row for row in drivers}
+    return Traffic(
+        vehicle=vehicle[kept],
+        step=step[kept],
+        strip=strip[kept],
+        front=front[kept],
+        aside=aside[kept],
+        size=np.array([[described[name]["length"], described[name]["width"]] for name in types]),
+        kind=np.array([CLASSES.index(name.rstrip("0123456789")) for name in types]),
+        dropped={"collision": len(crashed), "jump": len(jumped - crashed)},
+    )
