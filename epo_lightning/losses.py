@@ -63,6 +63,24 @@ def scene_probability(probabilities: Float[Tensor, "B M"], mode: Int[Tensor, " B
     return -_log(probabilities).gather(1, mode[:, None]).mean()
 
 
+def goal(
+    probabilities: Float[Tensor, "B N G"],
+    candidates: Float[Tensor, "B N G 2"],
+    exists: Bool[Tensor, "B N G"],
+    final: Float[Tensor, "B N 2"],
+    observed: Bool[Tensor, " B N"],
+) -> Float[Tensor, ""]:
+    """L_goal: cross entropy between each agent's goal probabilities and the candidate closest to where it ended up.
+
+    Averaged over the agents that have a candidate and whose last step was ``observed``.
+    """
+    counts = observed & exists.any(-1)
+    way = torch.where((exists & counts[..., None])[..., None], candidates - final[:, :, None], torch.inf)
+    closest = way.square().sum(-1).argmin(-1)
+    cost = -_log(probabilities).gather(-1, closest[..., None])
+    return _mean_over_agents(cost[..., 0], counts[..., None]).mean()
+
+
 def marginal_imitation(
     distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0
 ) -> tuple[Float[Tensor, ""], Int[Tensor, "B N"]]:

@@ -285,6 +285,7 @@ class JointForecast(_Batch):
         initial_states: the futures of the strategies from which the solver started.
         parameters: the inferred game.
         solution: how the game was solved.
+        goal_probabilities: of each agent's goal candidates, for forecasters that choose among them.
         own_energy: energy by feature and agent at the solution.
         pair_energy: energy by feature and pair at the solution.
     """
@@ -296,5 +297,6 @@ class JointForecast(_Batch):
     initial_states: Float[Tensor, "B M N K 4"] | None = None
     parameters: GameParameters | None = None
     solution: Solution | None = None
+    goal_probabilities: Float[Tensor, "B N G"] | None = None
     own_energy: Mapping[str, Float[Tensor, "B M N"]] | None = None
     pair_energy: Mapping[str, Float[Tensor, "B M P"]] | None = None

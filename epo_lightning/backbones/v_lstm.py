@@ -2,41 +2,51 @@
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from epo_lightning.backbones.base import Backbone
-from epo_lightning.decoders.goals import given_goals
+from epo_lightning.backbones.base import PolylineBackbone
 from epo_lightning.encoders.history import LSTMHistory
 from epo_lightning.encoders.interaction import Attention
+from epo_lightning.encoders.polyline import LanePolylines
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 
 
 @register("backbone", "v_lstm")
-class VLSTM(Backbone):
+class VLSTM(PolylineBackbone):
     """Vector-LSTM: each history through an LSTM, then one layer of attention (Appendix C.1, "Global Interaction").
 
     Args:
         history_width: size of the LSTM's hidden state.
         history_depth: number of stacked LSTM layers.
         width: size of the features z that leave the global interaction graph.
+        lane_width, lane_depth: size and number of the lane encoder's layers.
+        scale: metres that an input of one stands for.
         goal_input: whether a given goal is also an input of the network (``goal=all``), not of the energy alone.
+        map_input: whether the data has a map.
     """
 
     def __init__(
-        self, history_width: int = 64, history_depth: int = 3, width: int = 128, goal_input: bool = False
+        self,
+        history_width: int = 64,
+        history_depth: int = 3,
+        width: int = 128,
+        lane_width: int = 64,
+        lane_depth: int = 3,
+        scale: float = 1.0,
+        goal_input: bool = False,
+        map_input: bool = False,
     ) -> None:
-        super().__init__()
-        self.width = width
-        self.history = LSTMHistory(history_width, history_depth)
-        self.to_graph = nn.Linear(history_width, width)
-        self.goal_to_graph = nn.Linear(2, width) if goal_input else None
+        history = LSTMHistory(history_width, history_depth, scale)
+        lanes = LanePolylines(lane_width, lane_depth, scale) if map_input else None
+        super().__init__(history, lanes, width, goal_input)
         self.interaction = Attention(width)
 
     def forward(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
         """Features z_i of all agents."""
-        features = self.to_graph(self.history(scene))
-        if self.goal_to_graph is not None:
-            features = features + self.goal_to_graph(given_goals(scene))
-        return self.interaction(features, scene.agent_mask)
+        agents = self.agent_features(scene)
+        lanes, drawn = self.lane_features(scene)
+        everything, exists = torch.cat((agents, lanes), 1), torch.cat((scene.agent_mask, drawn), 1)
+        return self.interaction(agents, everything, exists)

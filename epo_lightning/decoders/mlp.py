@@ -44,8 +44,13 @@ class MLP(nn.Module):
         self, features: Float[Tensor, "*batch inputs"], mask: Bool[Tensor, "*batch"] | None = None
     ) -> Float[Tensor, "*batch outputs"]:
         """Apply the layers to every row; ``mask`` tells which rows count for batch normalisation."""
-        for linear, norm in zip(self.hidden, self.norms, strict=True):
-            features = linear(features)
+        return self.after_first(self.hidden[0](features), mask)
+
+    def after_first(
+        self, features: Float[Tensor, "*batch width"], mask: Bool[Tensor, "*batch"] | None = None
+    ) -> Float[Tensor, "*batch outputs"]:
+        """What follows the first linear layer, for those who have a cheaper way to compute that one."""
+        for norm, linear in zip(self.norms, [*self.hidden[1:], self.output], strict=True):
             features = norm(features, mask) if isinstance(norm, _MaskedBatchNorm) else norm(features)
-            features = features.relu()
-        return self.output(features)
+            features = linear(features.relu())
+        return features

@@ -20,10 +20,14 @@ class SceneProbabilities(nn.Module):
         width: size of the agent features.
         modes: number M of joint modes.
         horizon: number K of future steps.
+        scale: metres that an input of one stands for.
     """
 
-    def __init__(self, width: int, modes: int, horizon: int) -> None:
+    def __init__(self, width: int, modes: int, horizon: int, scale: float = 1.0) -> None:
         super().__init__()
+        if modes < 1:
+            raise ValueError(f"modes must be 1 or more, not {modes}")
+        self.scale = scale
         self.agent = nn.Linear(width + modes * horizon * 2, 16 * modes)
         self.scene = MLP(16 * modes, 16 * modes, modes, layers=2, norm="batch")
 
@@ -36,5 +40,5 @@ class SceneProbabilities(nn.Module):
     ) -> Float[Tensor, "B M"]:
         """Probabilities, which sum to one over the modes."""
         travelled = (positions.detach() - current[:, None, :, None]).transpose(1, 2).flatten(2)
-        agents = self.agent(torch.cat((z, travelled), -1))
+        agents = self.agent(torch.cat((z, travelled / self.scale), -1))
         return self.scene(torch.where(mask[..., None], agents, 0.0).sum(1)).softmax(-1)

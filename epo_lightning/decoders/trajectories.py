@@ -15,13 +15,14 @@ class Trajectories(nn.Module):
         width: size of the agent features.
         modes: number M of modes of each agent.
         horizon: number K of future steps.
+        scale: metres that a network output of one stands for.
     """
 
-    def __init__(self, width: int, modes: int, horizon: int) -> None:
+    def __init__(self, width: int, modes: int, horizon: int, scale: float = 1.0) -> None:
         super().__init__()
         if modes < 1:
             raise ValueError(f"modes must be 1 or more, not {modes}")
-        self.modes, self.horizon = modes, horizon
+        self.modes, self.horizon, self.scale = modes, horizon, scale
         self.positions = MLP(width, 64, modes * horizon * 2, norm="layer")
         self.logits = MLP(width, 64, modes, norm="layer")
 
@@ -29,5 +30,5 @@ class Trajectories(nn.Module):
         self, z: Float[Tensor, "B N D"], current: Float[Tensor, "B N 2"]
     ) -> tuple[Float[Tensor, "B M N K 2"], Float[Tensor, "B M N"]]:
         """Positions [m] and each agent's probabilities, which sum to one over the modes."""
-        travelled = self.positions(z).unflatten(-1, (self.modes, self.horizon, 2)).transpose(1, 2)
+        travelled = (self.scale * self.positions(z)).unflatten(-1, (self.modes, self.horizon, 2)).transpose(1, 2)
         return current[:, None, :, None] + travelled, self.logits(z).softmax(-1).transpose(1, 2)

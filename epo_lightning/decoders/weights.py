@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,17 +24,24 @@ class OwnWeights(nn.Module):
         width: size of the agent features.
         modes: number M of joint modes.
         features: names of the own features.
-        start: weight that a network output of zero stands for.
+        start: weight that a network output of zero stands for, one for all features or by name (others: 1). An output of
+            one doubles it: signals are metres here and hundredths of a radian there, and so are their weights.
     """
 
-    def __init__(self, width: int, modes: int, features: Sequence[str], start: float = 1.0) -> None:
+    start: Tensor
+
+    def __init__(
+        self, width: int, modes: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0
+    ) -> None:
         super().__init__()
-        self.modes, self.features, self.start = modes, tuple(features), start
+        self.modes, self.features = modes, tuple(features)
+        starts = [start.get(name, 1.0) if isinstance(start, Mapping) else start for name in self.features]
+        self.register_buffer("start", torch.tensor(starts * modes), persistent=False)
         self.mlp = MLP(width, 64, modes * len(self.features), norm="batch")
 
     def forward(self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> dict[str, Float[Tensor, "B M N"]]:
         """Weights by feature name."""
-        return _by_name(self.start + self.mlp(z, mask), self.features, self.modes)
+        return _by_name(self.start * (1.0 + self.mlp(z, mask)), self.features, self.modes)
 
 
 class PairWeights(nn.Module):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from epo_lightning.scene import Scene
@@ -12,39 +14,128 @@ VECTOR = 5
 """Features of a history vector: where it starts, where it ends (x, y each) and when it ends."""
 
 
+def history_vectors(scene: Scene, scale: float = 1.0) -> tuple[Float[Tensor, "B N V 5"], Bool[Tensor, "B N V"]]:
+    """Every agent's history as V = H - 1 vectors, oldest first, and which of them were observed at both ends.
+
+    A vector holds the 2-D positions in which a step starts and ends, in units of ``scale`` metres, and the time [s] at which
+    it ends, as in VectorNet. An agent that was seen at t0 alone has one vector, which starts where it ends.
+
+    Raises:
+        ValueError: a history of a single state, which shows no motion.
+    """
+    if scene.history.shape[2] < 2:
+        raise ValueError("scene.history holds H = 1 state per agent; reading a motion takes at least 2")
+    seen = scene.history_mask & scene.agent_mask[..., None]
+    position = torch.where(seen[..., None], scene.history[..., :2], 0.0) / scale
+    batch, agents, steps = seen.shape
+    start, end = position[..., :-1, :], position[..., 1:, :]
+    observed = seen[..., :-1] & seen[..., 1:]
+    alone = ~observed.any(-1, keepdim=True) & (torch.arange(2 - steps, 1, device=seen.device) == 0)
+    time = scene.dt * torch.arange(2 - steps, 1, dtype=position.dtype, device=position.device)
+    time = time[:, None].expand(batch, agents, steps - 1, 1)
+    return torch.cat((torch.where(alone[..., None], end, start), end, time), -1), observed | alone
+
+
 class LSTMHistory(nn.Module):
     """Reads an agent's history as a polyline of vectors, oldest first (Appendix C.1, "Agent History Encoder").
 
-    A vector holds the 2-D positions in which a step starts and ends and the time at which it ends, as in VectorNet.
     Vectors of unobserved steps are left out: the others close ranks, so that any padding gives the same feature.
 
     Args:
         width: size of the hidden state.
         depth: number of stacked LSTM layers.
+        scale: metres that an input of one stands for.
     """
 
-    def __init__(self, width: int = 64, depth: int = 3) -> None:
+    def __init__(self, width: int = 64, depth: int = 3, scale: float = 1.0) -> None:
         super().__init__()
-        self.width = width
+        self.width, self.scale = width, scale
         self.lstm = nn.LSTM(VECTOR, width, num_layers=depth, batch_first=True)
 
     def forward(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
         """The feature of every agent; what it holds for absent agents is of no meaning.
 
         Raises:
-            ValueError: a history of a single state, which shows no motion.
+            ValueError: a history of a single state.
         """
-        if scene.history.shape[2] < 2:
-            raise ValueError("scene.history holds H = 1 state per agent; reading a motion takes at least 2")
-        observed = scene.history_mask & scene.agent_mask[..., None]
-        position = torch.where(observed[..., None], scene.history[..., :2], 0.0)
-        batch, agents, steps = observed.shape
-        time = scene.dt * torch.arange(2 - steps, 1, dtype=position.dtype, device=position.device)
-        time = time[:, None].expand(batch, agents, steps - 1, 1)
-        vectors = torch.cat((position[..., :-1, :], position[..., 1:, :], time), -1).flatten(0, 1)
-        valid = (observed[..., :-1] & observed[..., 1:]).flatten(0, 1)
+        vectors, observed = (part.flatten(0, 1) for part in history_vectors(scene, self.scale))
         # A stable sort moves the observed vectors to the front. The LSTM is causal: what stands behind them cannot matter.
-        order = (~valid).to(torch.uint8).argsort(dim=1, stable=True)
+        order = (~observed).to(torch.uint8).argsort(dim=1, stable=True)
         states, _ = self.lstm(vectors.gather(1, order[..., None].expand_as(vectors)))
-        last = (valid.sum(1) - 1).clamp_min(0)
-        return states[torch.arange(len(last), device=last.device), last].view(batch, agents, self.width)
+        last = observed.sum(1) - 1
+        return states[torch.arange(len(last), device=last.device), last].view(*scene.agent_mask.shape, self.width)
+
+
+class TransformerHistory(nn.Module):
+    """Reads an agent's history by self-attention among its vectors (Appendix C.1, after HiVT's temporal encoder).
+
+    Vectors are told apart by a sinusoidal encoding of their own age, and only observed ones are attended to, so that any
+    padding gives the same feature: that of the newest observed vector.
+
+    Args:
+        width: size of the tokens and of the feature.
+        depth: number of layers.
+        heads: of the attention; a divisor of ``width``.
+        scale: metres that an input of one stands for.
+
+    Raises:
+        ValueError: a width that the heads cannot share, or no layer.
+    """
+
+    def __init__(self, width: int = 64, depth: int = 3, heads: int = 4, scale: float = 1.0) -> None:
+        super().__init__()
+        if heads < 1 or width % (2 * heads):
+            raise ValueError(f"a width of {width} is not a multiple of twice the {heads} heads that share it")
+        if depth < 1:
+            raise ValueError(f"a transformer takes one layer or more, not {depth}")
+        self.width, self.scale = width, scale
+        self.embed = nn.Linear(VECTOR, width)
+        self.layers = nn.ModuleList(_TransformerLayer(width, heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
+        """The feature of every agent; what it holds for absent agents is of no meaning.
+
+        Raises:
+            ValueError: a history of a single state.
+        """
+        vectors, observed = (part.flatten(0, 1) for part in history_vectors(scene, self.scale))
+        age = torch.arange(vectors.shape[1] - 1, -1, -1, device=vectors.device)
+        tokens = self.embed(vectors) + _sinusoids(age, self.width).to(vectors)
+        newest = torch.where(observed, age, len(age)).argmin(1)
+        for layer in self.layers[:-1]:
+            tokens = layer(tokens, tokens, observed)
+        # Of the last layer's tokens only the newest is read.
+        reader = tokens[torch.arange(len(newest), device=newest.device), newest][:, None]
+        return self.norm(self.layers[-1](reader, tokens, observed)).view(*scene.agent_mask.shape, self.width)
+
+
+class _TransformerLayer(nn.Module):
+    """Multi-head attention and a perceptron, each after a layer normalisation and around a residual connection."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.read_norm, self.think_norm = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.query = nn.Linear(width, width, bias=False)
+        self.key_value = nn.Linear(width, 2 * width, bias=False)
+        self.mix = nn.Linear(width, width)
+        self.think = nn.Sequential(nn.Linear(width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width))
+
+    def forward(
+        self, readers: Float[Tensor, "A R D"], tokens: Float[Tensor, "A V D"], observed: Bool[Tensor, "A V"]
+    ) -> Float[Tensor, "A R D"]:
+        """What the readers, which are some of the tokens, become after reading the observed tokens."""
+        query = self.query(self.read_norm(readers)).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        key, value = self.key_value(self.read_norm(tokens)).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        scores = query @ key.mT / math.sqrt(query.shape[-1])
+        read = scores.masked_fill(~observed[:, None, None], -1e9).softmax(-1) @ value
+        readers = readers + self.mix(read.transpose(1, 2).flatten(2))
+        return readers + self.think(self.think_norm(readers))
+
+
+def _sinusoids(age: Tensor, width: int) -> Float[Tensor, "V {width}"]:
+    """Sines and cosines of an age in steps, of wavelengths from 2 pi to 20000 pi (Vaswani et al. 2017, Section 3.5)."""
+    rate = torch.exp(-math.log(1e4) * torch.arange(0, width, 2, device=age.device) / width)
+    angle = age[:, None] * rate
+    return torch.cat((angle.sin(), angle.cos()), -1)

@@ -1,9 +1,10 @@
-"""Global interaction: every agent looks at every other one."""
+"""Global interaction: every agent looks at every other one, and at the lanes."""
 
 from __future__ import annotations
 
 import math
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
@@ -22,9 +23,37 @@ class Attention(nn.Module):
         self.value = nn.Linear(width, width)
         self.scale = 1.0 / math.sqrt(width)
 
-    def forward(self, features: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B N D"]:
-        """Features after each has gathered from those that ``mask`` says exist."""
-        scores = self.query(features) @ self.key(features).mT * self.scale
-        # A large negative number instead of -inf keeps a scene without any agent finite.
-        scores = scores.masked_fill(~mask[:, None, :], -1e9)
-        return features + scores.softmax(-1) @ self.value(features)
+    def forward(
+        self, features: Float[Tensor, "B N D"], sources: Float[Tensor, "B S D"], mask: Bool[Tensor, "B S"]
+    ) -> Float[Tensor, "B N D"]:
+        """Features after each has gathered from the sources that ``mask`` says exist; unchanged where none does."""
+        scores = self.query(features) @ self.key(sources).mT * self.scale
+        # A large negative number instead of -inf keeps a scene without any source finite.
+        gathered = scores.masked_fill(~mask[:, None, :], -1e9).softmax(-1) @ self.value(sources)
+        return features + torch.where(mask.any(-1)[:, None, None], gathered, 0.0)
+
+
+class TwoStageAttention(nn.Module):
+    """Agents look at the lanes first and then, knowing them, at each other (Appendix C.1, "Global Interaction").
+
+    Args:
+        width: size of the features, in and out.
+        map_input: whether there are lanes to look at; without them the second stage is all there is.
+    """
+
+    def __init__(self, width: int = 128, map_input: bool = True) -> None:
+        super().__init__()
+        self.to_lanes = Attention(width) if map_input else None
+        self.to_agents = Attention(width)
+
+    def forward(
+        self,
+        agents: Float[Tensor, "B N D"],
+        present: Bool[Tensor, "B N"],
+        lanes: Float[Tensor, "B L D"],
+        drawn: Bool[Tensor, "B L"],
+    ) -> Float[Tensor, "B N D"]:
+        """Features of agents after both stages; ``present`` and ``drawn`` say which agents and lanes exist."""
+        if self.to_lanes is not None:
+            agents = self.to_lanes(agents, lanes, drawn)
+        return self.to_agents(agents, agents, present)

@@ -38,6 +38,8 @@ def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
         "dt": float(data.dt),
         "subsets": list(data.subsets),
         "shape": getattr(data, "shape", "disc"),
+        "candidates": int(getattr(data, "candidates", 1)),
+        "map": bool(getattr(data, "has_map", False)),
     }
 
 

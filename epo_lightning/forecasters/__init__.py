@@ -17,7 +17,7 @@ __all__ = ["Forecaster", "Task", "build_forecaster", "check_model", "load"]
 
 _PARTS = ("backbone", "dynamics", "energy", "solver")
 _SECTIONS = ("forecaster", "optimizer", *_PARTS)
-_TASK = ("horizon", "dt", "subsets", "shape")
+_TASK = ("horizon", "dt", "subsets", "shape", "candidates", "map")
 GOALS = ("energy", "all")
 """Who is told a given goal: the energy alone (the paper), or the network of every learned forecaster as well."""
 
@@ -36,10 +36,15 @@ def check_model(model: Mapping[str, Any]) -> None:
             raise ConfigError(f"the model's configuration lacks the section {section!r}")
     if model["goal"] not in GOALS:
         raise ConfigError(f"unknown goal {model['goal']!r}: {nearest(str(model['goal']), GOALS)}")
+    if model["goal"] == "all" and model.get("candidates", 1) > 1:
+        raise ConfigError(
+            f"goal is 'all', but this data gives no goal that the network could be told, only {model['candidates']} "
+            "candidates for each agent: use goal=energy, with which the forecaster chooses among them"
+        )
     check("optimizer", model["optimizer"])
     check("forecaster", model["forecaster"], supplied=("task", "optimizer", *_PARTS))
     for kind in _PARTS:
-        check(kind, model[kind], supplied=("goal_input", "dynamics"))
+        check(kind, model[kind], supplied=("goal_input", "map_input", "dynamics"))
 
 
 def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
@@ -48,7 +53,7 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
     Args:
         model: the sections ``forecaster``, ``backbone``, ``dynamics``, ``energy``, ``solver`` and ``optimizer``, each with
             the ``name`` of a part and its arguments; ``goal`` (``energy`` or ``all``); and the task: ``horizon``, ``dt``,
-            ``subsets`` and ``shape``.
+            ``subsets``, ``shape``, ``candidates`` and ``map``.
 
     Raises:
         ConfigError: as :func:`check_model`, or a value that a part refuses.
@@ -65,8 +70,18 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
     if "solver" in wanted:
         parts["solver"] = build("solver", model["solver"])
     if "backbone" in wanted:
-        parts["backbone"] = build("backbone", model["backbone"], goal_input=model["goal"] == "all")
-    task = Task(model["horizon"], model["dt"], tuple(model.get("subsets", ())), model.get("shape", "disc"))
+        inputs = {"goal_input": model["goal"] == "all"}
+        if "map_input" in inspect.signature(lookup("backbone", model["backbone"]["name"])).parameters:
+            inputs["map_input"] = model.get("map", False)
+        parts["backbone"] = build("backbone", model["backbone"], **inputs)
+    task = Task(
+        model["horizon"],
+        model["dt"],
+        tuple(model.get("subsets", ())),
+        model.get("shape", "disc"),
+        model.get("candidates", 1),
+        model.get("map", False),
+    )
     optimizer = build("optimizer", model["optimizer"])
     forecaster: Forecaster = build("forecaster", model["forecaster"], task=task, optimizer=optimizer, **parts)
     forecaster.configuration = dict(model)

@@ -26,12 +26,17 @@ class Task:
         dt: length of a time step [s].
         subsets: names of the subsets of the data that metrics are also reported for.
         shape: agents' outline in the overlap rates, ``disc`` or ``box``.
+        candidates: number G of goal candidates per agent. One is a given goal; where there are more, scenes also bring
+            reference lines, the line of each candidate, and reference speeds.
+        map: whether scenes bring lanes.
     """
 
     horizon: int
     dt: float
     subsets: tuple[str, ...] = ()
     shape: str = "disc"
+    candidates: int = 1
+    map: bool = False
 
 
 class Forecaster(LightningModule):
@@ -140,13 +145,13 @@ def observed_future(scene: Scene) -> tuple[Tensor, Bool[Tensor, "B N K"]]:
     return scene.future, scene.future_mask & scene.agent_mask[..., None]
 
 
-def weights_of(weights: Mapping[str, float], names: tuple[str, ...]) -> dict[str, float]:
-    """The loss weights lambda, all of them and no others.
+def weights_of(weights: Mapping[str, float], names: tuple[str, ...], idle: tuple[str, ...] = ()) -> dict[str, float]:
+    """The loss weights lambda, all of them and no others but those of ``idle`` terms.
 
     Raises:
         ValueError: a missing or an unknown name.
     """
-    if set(weights) != set(names):
+    if set(weights) - set(idle) != set(names):
         raise ValueError(f"loss_weights must name {list(names)}, not {sorted(weights)}")
     return dict(weights)
 

@@ -45,7 +45,7 @@ def test_the_papers_settings() -> None:
         "step_size": 0.3,
         "damping": 10.0,
     }
-    assert config["forecaster"]["loss_weights"] == {"imitation": 1.0, "probability": 0.1}
+    assert config["forecaster"]["loss_weights"] == {"imitation": 1.0, "goal": 0.1, "probability": 0.1}
     assert config["forecaster"]["modes"] == 2
     assert config["goal"] == "energy"
 
