@@ -87,21 +87,27 @@ def _table(path: Path) -> Float[np.ndarray, "T 8"]:
         raise RecordingError(path, f"the file is no text ({error.reason}): fetch it again") from error
     if not text.strip():
         raise RecordingError(path, f"the file is empty; rows of {', '.join(COLUMNS)} were expected")
-    try:
-        table = np.loadtxt(text.split("\n"), ndmin=2, comments=None)
-    except ValueError as error:
-        raise RecordingError(path, f"{error}; rows of the numbers {', '.join(COLUMNS)} were expected") from error
-    if table.shape[1] != len(COLUMNS):
-        raise RecordingError(path, f"there are {table.shape[1]} columns; {', '.join(COLUMNS)} were expected")
+    rows = [(row, line.split()) for row, line in enumerate(text.split("\n"), 1) if line.strip()]
+    for row, cells in rows:
+        if len(cells) != len(COLUMNS):
+            raise RecordingError(path, f"there are {len(cells)} columns; {', '.join(COLUMNS)} were expected", row)
+    table = np.array([[_number(cell) for cell in cells] for _, cells in rows])
     bad = ~np.isfinite(table)
     bad[:, :2] |= (np.abs(table[:, :2]) > LARGEST) | (table[:, :2] != np.rint(table[:, :2]))
     if bad.any():
-        row, column = np.argwhere(bad)[0]
-        expected = "whole" if column < 2 else "finite"
-        raise RecordingError(
-            path, f"{COLUMNS[column]} is {table[row, column]}; a {expected} number was expected", row + 1
-        )
+        at, column = np.argwhere(bad)[0]
+        row, cells = rows[at]
+        expected = f"whole number up to {LARGEST:g}" if column < 2 else "finite number"
+        raise RecordingError(path, f"{COLUMNS[column]} is {cells[column][:40]!r}; a {expected} was expected", row)
     return table
+
+
+def _number(cell: str) -> float:
+    """What is no number is NaN; Python would also take 1_000 for one."""
+    try:
+        return np.nan if "_" in cell else float(cell)
+    except ValueError:
+        return np.nan
 
 
 def _heading(agent: Int[np.ndarray, " T"], velocity: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, " T"]:
