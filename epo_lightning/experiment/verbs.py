@@ -49,7 +49,7 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     print(f"\ndata in {folder}, digest {data.digest}")
     _print_report(data.report())
     row = f"{settings.data.get('dataset', 'rpi')}/v_lstm_epo"
-    words = " ".join(["epo train", f"experiment={row}", *(o for o in overrides if o.startswith("data"))])
+    words = " ".join(["epo train", f"experiment={row}", *(o for o in overrides if o.startswith("data."))])
     print(f"\nnext: {words}")
 
 

@@ -1,0 +1,82 @@
+"""Simulated recordings as data: simulated once, then extracted like any others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from epo_lightning.data import cache, simulate
+from epo_lightning.data.recordings import RecordedData
+from epo_lightning.data.tracks import Recording, Source
+from epo_lightning.registry import lookup, register
+
+
+@register("data", "highway_sim")
+class SimulatedHighway(RecordedData):
+    """Scenes from traffic that is simulated on motorway ramps, by way of recordings in exiD's format.
+
+    Args:
+        recordings: per layout.
+        minutes: that each of them lasts.
+        layouts: their ids; null for all.
+        dataset, windows, test, val_share, val_by, frame, root, batch_size: as of
+            :class:`~epo_lightning.data.recordings.RecordedData`.
+        seed: of the traffic and of the splits, and of the batches' order where a run sets no other.
+    """
+
+    def __init__(
+        self,
+        windows: Mapping[str, Any],
+        recordings: int = 2,
+        minutes: float = 8.0,
+        layouts: Sequence[int] | None = None,
+        dataset: str = "highway_sim",
+        test: Sequence[str] | None = ("0",),
+        val_share: float = 0.18,
+        val_by: str = "recording",
+        frame: str = "fixed",
+        root: str | None = None,
+        seed: int = 0,
+        batch_size: int = 32,
+    ) -> None:
+        self.simulation = simulate.config(seed, recordings, minutes, layouts)
+        home = Path(root).expanduser() if root else cache.default_root()
+        super().__init__(
+            dataset=dataset,
+            format="exid",
+            folder=str(home / f"{dataset}-recordings-{cache.digest(self.simulation)[:12]}"),
+            windows=windows,
+            test=test,
+            val_share=val_share,
+            val_by=val_by,
+            frame=frame,
+            root=root,
+            seed=seed,
+            batch_size=batch_size,
+        )
+
+    def sources(self) -> list[Source]:
+        """The recordings that the simulation makes, whether or not they are there already."""
+        layouts = [str(layout) for layout in self.simulation["layouts"] for _ in range(self.simulation["recordings"])]
+        names = [f"{number:02d}" for number in range(len(layouts))]
+        return [
+            Source(name, layout, (), partial(self._read, name)) for name, layout in zip(names, layouts, strict=True)
+        ]
+
+    def _read(self, name: str) -> Recording:
+        (source,) = (
+            source for source in lookup("format", self.format)(self.folder_of_recordings) if source.name == name
+        )
+        return source.read()
+
+    def identity(self, sources: Sequence[Source]) -> Any:
+        """The simulation: the same configuration makes the same recordings."""
+        return self.simulation
+
+    def generate(self, workers: int | None = None, progress: bool = True) -> Path:
+        """Simulate, then extract the scenes, each unless it is there already."""
+        if not self.folder.exists():
+            simulate.make_recordings(self.folder_of_recordings, self.simulation, workers, progress)
+        return super().generate(workers, progress)
