@@ -296,4 +296,4 @@ LAYOUTS = (
         off=0,
     ),
 )
-"""Seven layouts, as exiD has seven locations: ramps alone and in either order, weaving, a lane that ends, one that is added."""
+"""Seven layouts, as exiD has seven locations: ramps alone and in either order, weaving, a lane that ends or is added."""

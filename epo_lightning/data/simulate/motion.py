@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from epo_lightning.data.simulate.layout import Layout
-from epo_lightning.data.simulate.traffic import CLASSES, RATE, WARM_UP, Traffic
+from epo_lightning.data.simulate.traffic import CLASSES, Traffic
 
-WINDOW = 25
-"""Frames [1 s] of the Savitzky-Golay filter, and the degree of its polynomials."""
+WINDOW = 1.0
+"""Length [s] of the Savitzky-Golay filter, and the degree of its polynomials."""
 DEGREE = 3
 SLOWEST = 2.0
 """Below this speed [m/s] a vehicle's sideways speed says little about where it points."""
@@ -34,7 +34,7 @@ class Motion:
         dropped: vehicles that were left out, by reason.
     """
 
-    rate: float
+    rate: int
     vehicle: Int[np.ndarray, " T"]
     frame: Int[np.ndarray, " T"]
     s: Float[np.ndarray, " T"]
@@ -48,15 +48,8 @@ class Motion:
     kind: tuple[str, ...]
     dropped: dict[str, int]
 
-    def select(self, rows: Bool[np.ndarray, " T"], every: int = 1) -> Motion:
-        """Some rows, at a lower frame rate, with vehicles and frames counted anew.
-
-        Args:
-            rows: which to keep; no vehicle may lose rows in the midst of its track.
-            every: keep every so many frames.
-        """
-        start = self.frame[rows].min()
-        rows = rows & ((self.frame - start) % every == 0)
+    def select(self, rows: Bool[np.ndarray, " T"]) -> Motion:
+        """Some rows, with vehicles and frames counted anew; no vehicle may lose rows in the midst of its track."""
         # Vehicles are numbered by their first appearance.
         present, begins = np.unique(self.vehicle[rows], return_index=True)
         present = present[np.argsort(self.frame[rows][begins], kind="stable")]
@@ -65,9 +58,9 @@ class Motion:
         chosen = np.flatnonzero(rows)
         chosen = chosen[np.argsort(number[self.vehicle[chosen]], kind="stable")]
         return Motion(
-            rate=self.rate / every,
+            rate=self.rate,
             vehicle=number[self.vehicle[chosen]],
-            frame=(self.frame[chosen] - start) // every,
+            frame=self.frame[chosen] - self.frame[chosen].min(),
             s=self.s[chosen],
             d=self.d[chosen],
             position=self.position[chosen],
@@ -82,10 +75,9 @@ class Motion:
 
 
 def savitzky_golay(
-    values: Float[np.ndarray, "T c"], dt: float, window: int = WINDOW, degree: int = DEGREE
+    values: Float[np.ndarray, "T c"], dt: float, half: int, degree: int = DEGREE
 ) -> tuple[Float[np.ndarray, "t c"], Float[np.ndarray, "t c"], Float[np.ndarray, "t c"]]:
-    """Value, first and second derivative of the polynomials fitted around each row but the outermost ``window // 2``."""
-    half = window // 2
+    """Value, first and second derivative of the polynomials fitted to ``half`` rows before and behind each row."""
     powers = (np.arange(-half, half + 1) * dt)[:, None] ** np.arange(degree + 1)
     fit = np.linalg.pinv(powers)
     middle = values.mean(0)  # large coordinates would cost digits
@@ -114,22 +106,22 @@ def move(traffic: Traffic, layout: Layout, seconds: float) -> Motion:
         [traffic.strip == index for index in range(len(lanes))], [layout.offset(lane, s) for lane in lanes]
     )
     d = middle + traffic.aside
+    half = round(WINDOW * traffic.rate / 2 - 0.5)
     raw = np.column_stack([s, d, layout.locate(s, d)])
-    value, rate, second = savitzky_golay(raw, 1 / RATE)
-    half = WINDOW // 2
+    value, rate, second = savitzky_golay(raw, 1 / traffic.rate, half)
     inside = slice(half, len(raw) - half)
     # A window that reaches into another vehicle's rows says nothing.
     own = traffic.vehicle[: -2 * half] == traffic.vehicle[2 * half :]
-    frame = traffic.step[inside] - round(WARM_UP * RATE)
+    frame = traffic.step[inside]
     s, d = value[:, 0], value[:, 1]
-    kept = own & (frame >= 0) & (frame < round(seconds * RATE)) & (s >= layout.area[0]) & (s <= layout.area[1])
+    kept = own & (frame >= 0) & (frame < round(seconds * traffic.rate)) & (s >= layout.area[0]) & (s <= layout.area[1])
     s, d, velocity = s[kept], d[kept], rate[kept, 2:]
     strip = strip_at(layout, s, d)
     along = np.select([strip == index for index in range(len(lanes))], [layout.direction(lane, s) for lane in lanes])
     ahead = velocity[:, 0] * np.cos(along) + velocity[:, 1] * np.sin(along)
     sideways = velocity[:, 1] * np.cos(along) - velocity[:, 0] * np.sin(along)
     motion = Motion(
-        rate=RATE,
+        rate=traffic.rate,
         vehicle=traffic.vehicle[inside][kept],
         frame=frame[kept],
         s=s,

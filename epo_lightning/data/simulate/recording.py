@@ -222,7 +222,7 @@ def recording_meta(motion: Motion, layout: Layout, number: int) -> pl.DataFrame:
         {
             "recordingId": [number],
             "locationId": [layout.id],
-            "frameRate": [round(motion.rate)],
+            "frameRate": [motion.rate],
             "speedLimit": [NONE if layout.limit is None else round(layout.limit, 2)],
             "weekday": ["wednesday"],
             "startTime": ["12:00"],

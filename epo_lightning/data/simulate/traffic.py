@@ -1,4 +1,4 @@
-"""Traffic: SUMO drives vehicles through a layout's lanes and tells, 25 times a second, where each of them is in its lane.
+"""Traffic: SUMO drives vehicles through a layout's lanes and tells, step by step, where each of them is in its lane.
 
 SUMO sees a straight abstract network: one edge per carriageway and section, whose lanes are the layout's strips. Its
 sublane model (SL2015) moves vehicles sideways smoothly; its EIDM drivers follow. Drivers differ from vehicle type to
@@ -22,9 +22,11 @@ from epo_lightning.data.simulate.layout import Layout
 from epo_lightning.registry import ConfigError
 
 RATE = 25
-"""Steps per second [Hz], which is exiD's frame rate."""
+"""exiD's frame rate [Hz]."""
 WARM_UP = 90.0
 """Time [s] in which the road fills; nothing of it is recorded."""
+MARGIN = 1.0
+"""Time [s] before and behind the recorded time that the smoothing looks into."""
 UNLIMITED = 130 / 3.6
 """Speed [m/s] that drivers' desires refer to where there is no limit."""
 RAMP_SPEED = 90 / 3.6
@@ -40,8 +42,9 @@ class Traffic:
     """What SUMO did. Rows are sorted by vehicle, and by step within a vehicle.
 
     Attributes:
+        rate: steps per second [Hz].
         vehicle: index of each row's vehicle.
-        step: of the simulation, at RATE.
+        step: of the simulation, from the end of the warm-up.
         strip: index into ``layout.lanes`` of the lane whose middle is nearest.
         front: s of the front bumper [m].
         aside: offset from the middle of the strip, positive to the left [m].
@@ -50,6 +53,7 @@ class Traffic:
         dropped: vehicles that were left out, by reason.
     """
 
+    rate: int
     vehicle: Int[np.ndarray, " T"]
     step: Int[np.ndarray, " T"]
     strip: Int[np.ndarray, " T"]
@@ -288,12 +292,13 @@ def _demand(
     return drivers
 
 
-def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path) -> Traffic:
+def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path, rate: int = RATE) -> Traffic:
     """Drive for ``seconds`` after the road has filled.
 
     Args:
         seed: of the drivers and of everything that SUMO draws.
         folder: for SUMO's input files.
+        rate: steps per second [Hz].
 
     Raises:
         ConfigError: SUMO is not installed, or fails.
@@ -302,8 +307,9 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path) 
     random = np.random.default_rng(seed)
     edges = _edges(layout)
     net = _network(layout, edges, programs, folder)
-    steps = round((WARM_UP + seconds + 2.0) * RATE)
-    drivers = _demand(layout, edges, random, steps / RATE, folder / "routes.xml")
+    warm_up = round(WARM_UP * rate)
+    steps = warm_up + round((seconds + MARGIN) * rate)
+    drivers = _demand(layout, edges, random, steps / rate, folder / "routes.xml")
     where = {f"{edge.name}_{lane}": (strip, edge.begin) for edge in edges for lane, strip in enumerate(edge.strips)}
     constants = libsumo.constants
     variables = (constants.VAR_LANE_ID, constants.VAR_LANEPOSITION, constants.VAR_LANEPOSITION_LAT)
@@ -311,7 +317,7 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path) 
         "sumo",
         f"--net-file={net}",
         f"--route-files={folder / 'routes.xml'}",
-        f"--step-length={1 / RATE}",
+        f"--step-length={1 / rate}",
         "--lateral-resolution=0.3",
         "--time-to-teleport=-1",
         "--collision.action=warn",
@@ -325,7 +331,7 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path) 
     numbers: dict[str, int] = {}
     types: list[str] = []
     crashed: set[str] = set()
-    first = round((WARM_UP - 1.0) * RATE)
+    first = warm_up - round(MARGIN * rate)
     try:
         libsumo.start(command)
         for step in range(steps):
@@ -340,16 +346,16 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path) 
                 for name, values in libsumo.vehicle.getAllSubscriptionResults().items():
                     lane, position, aside = (values[variable] for variable in variables)
                     strip, begin = where[lane]
-                    rows.append((numbers[name], step, strip, begin, position, aside))
+                    rows.append((numbers[name], step - warm_up, strip, begin, position, aside))
     except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
         raise ConfigError(f"SUMO fails on layout {layout.name} with seed {list(seed)}: {error}") from None
     finally:
         libsumo.close()
-    return _sorted(np.array(rows), drivers, types, {numbers[name] for name in crashed})
+    return _sorted(np.array(rows), rate, drivers, types, {numbers[name] for name in crashed})
 
 
 def _sorted(
-    rows: Float[np.ndarray, "T 6"], drivers: list[dict[str, Any]], types: list[str], crashed: set[int]
+    rows: Float[np.ndarray, "T 6"], rate: int, drivers: list[dict[str, Any]], types: list[str], crashed: set[int]
 ) -> Traffic:
     """Rows by vehicle instead of by step, without vehicles that do what vehicles cannot do."""
     rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
@@ -357,11 +363,12 @@ def _sorted(
     front, aside = rows[:, 3] + rows[:, 4], rows[:, 5]
     same = np.diff(vehicle) == 0
     forward = np.diff(front)
-    jumps = same & ((np.diff(step) != 1) | (forward < -0.01) | (forward > FASTEST / RATE))
+    jumps = same & ((np.diff(step) != 1) | (forward < -0.01) | (forward > FASTEST / rate))
     jumped = set(vehicle[1:][jumps].tolist())
     kept = ~np.isin(vehicle, list(crashed | jumped))
     described = {row["id"]: row for row in drivers}
     return Traffic(
+        rate=rate,
         vehicle=vehicle[kept],
         step=step[kept],
         strip=strip[kept],
