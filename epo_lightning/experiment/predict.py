@@ -10,22 +10,39 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.evaluate import open_checkpoint, open_data, split_of
 from epo_lightning.experiment.settings import PredictSettings, Settings, read
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import HEADING, KINDS, JointForecast, Scene, X, Y
 
 MEANING = {
     "states": "[B, M, N, K, 4] x, y [m], heading [rad], speed [m/s] of every joint mode",
     "probabilities": "[B, M] of the joint modes",
     "agent_probabilities": "[B, M, N] of each agent's own modes",
+    "goal_probabilities": "[B, N, G] of each agent's goal candidates",
     "controls": "[B, M, N, K, 2] acceleration [m/s^2], turn rate [rad/s]",
     "initial_states": "[B, M, N, K, 4] where the solver started",
     "goals": "[B, M, N, 2] goals of the inferred game [m]",
-    "history": "[B, N, H, 4] what was observed",
+    "reference": "[B, M, N] index of the line in references that an agent follows",
+    "history": "[B, N, H, 4] what was observed: x, y [m], heading [rad], speed [m/s]",
+    "history_mask": "[B, N, H] which of its steps were observed",
+    "agent_mask": "[B, N] which agents exist",
     "future": "[B, N, K, 4] what happened",
+    "future_mask": "[B, N, K] which of its steps were observed",
+    "goal_candidates": "[B, N, G, 2] where an agent may be heading for [m]",
+    "goal_mask": "[B, N, G] which candidates exist",
+    "goal_reference": "[B, N, G] index of the line in references on which a candidate lies",
+    "size": "[B, N, 2] length and width [m]",
+    "kind": "[B, N] index into kinds",
+    "lanes": "[B, L, V, 4] vectors along the lanes: x, y of both ends [m]",
+    "lane_mask": "[B, L, V] which of these vectors exist",
+    "references": "[B, N, R, Q, 2] lines that an agent may follow [m]",
+    "reference_mask": "[B, N, R] which of these lines exist",
+    "reference_speed": "[B, N] the speed at which an agent would like to travel [m/s]",
+    "frame": "[B, 3] origin x, y [m] and rotation [rad]: in the recording a position is R(rotation) position + origin",
     "id": "[B] record of the data set",
     "subset": "[B] index into subsets",
 }
@@ -50,34 +67,102 @@ def predict(settings: PredictSettings) -> list[Path]:
         raise ConfigError(f"{out} holds forecasts already: nothing is overwritten; choose another out=<folder>")
     of_run = read(Settings, run.config())
     forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
-    scenes = spread(gather(split_of(open_data(run, of_run), settings.split)), settings.scenes)
+    scenes, origins = choose(open_data(run, of_run), settings.split, settings.scenes)
     forecast = forecast_of(forecaster, scenes)
     tensors = dict(_tensors(scenes, forecast))
     out.mkdir(parents=True, exist_ok=True)
     temporary = tensors_file.with_suffix(".tmp")
     save_file(tensors, temporary)
     temporary.replace(tensors_file)
-    written = [tensors_file, index_file]
-    if settings.figures and scenes.future is not None:
+    pictures = draw(settings, of_run.title, forecaster, scenes, forecast)
+    index = {
+        "run": str(run.path),
+        "title": of_run.title,
+        "split": settings.split,
+        "data_digest": run.record.get("data_digest"),
+        "dt": scenes.dt,
+        "scenes": len(scenes.history),
+        "subsets": list(forecaster.configuration["subsets"]),
+        "tensors": {name: MEANING.get(name, name.replace("/", " of ")) for name in sorted(tensors)},
+        "pictures": [{"file": str(file.relative_to(out)), "rows": rows} for file, rows in pictures],
+    }
+    if scenes.kind is not None:
+        index["kinds"] = list(KINDS)
+    if origins is not None:
+        index["provenance"] = origins
+    write_json(index_file, index)
+    return [tensors_file, index_file, *(file for file, _ in pictures)]
+
+
+def choose(data: Any, split: str, count: int | None) -> tuple[Scene, list[dict[str, Any]] | None]:
+    """``count`` scenes at even distances, and which piece of which recording each one is, where the data set knows."""
+    loader = split_of(data, split)
+    if not isinstance(data, SceneDataModule):
+        return spread(gather(loader), count), None
+    dataset = data.dataset(split)
+    scenes = dataset[even(len(dataset), count)]
+    provenance = getattr(dataset, "provenance", None)
+    return scenes, provenance(scenes.id.tolist()) if provenance and scenes.id is not None else None
+
+
+def draw(
+    settings: PredictSettings, title: str, forecaster: Any, scenes: Scene, forecast: JointForecast
+) -> list[tuple[Path, list[int]]]:
+    """Pictures and animations below ``out``, each with the rows of the scenes that it shows.
+
+    Vehicles, and agents that are said to be something, are drawn one scene at a time; where all are equal discs (RPI), a
+    few scenes share a picture.
+    """
+    folder = Path(settings.out).expanduser() / "figures"
+    ids = list(range(len(scenes.history))) if scenes.id is None else scenes.id.tolist()
+    if len(set(ids)) < len(ids):  # a record with two futures, say
+        ids = list(range(len(ids)))
+    drawn: list[tuple[Path, list[int]]] = []
+    if settings.figures and is_traffic(scenes, forecaster.configuration.get("shape", "disc")):
+        from epo_lightning.report.scenes import highway_scene
+
+        for row in eventful(scenes, settings.figures):
+            path, name = folder / f"scene_{ids[row]}.png", f"{title}, scene {ids[row]}"
+            drawn.append((highway_scene(scenes[row], forecast[row], path, name), [row]))
+    elif settings.figures and scenes.future is not None:
         from epo_lightning.report.figures import joint_predictions
 
-        shown, other = examples(scenes, settings.figures)
-        drawn = {of_run.title: forecast_of(forecaster, shown)}
-        written.append(joint_predictions(shown, drawn, out / "figures" / "joint_predictions.png", other))
-    write_json(
-        index_file,
-        {
-            "run": str(run.path),
-            "title": of_run.title,
-            "split": settings.split,
-            "data_digest": run.record.get("data_digest"),
-            "dt": scenes.dt,
-            "scenes": len(scenes.history),
-            "subsets": list(forecaster.configuration["subsets"]),
-            "tensors": {name: MEANING.get(name, name.replace("/", " of ")) for name in sorted(tensors)},
-        },
-    )
-    return written
+        rows, others = pairs(scenes, settings.figures)
+        other = None if others is None else scenes.future[others]
+        forecasts = {title: forecast_of(forecaster, scenes[rows])}
+        path = joint_predictions(scenes[rows], forecasts, folder / "joint_predictions.png", other)
+        drawn.append((path, rows.tolist()))
+    if settings.animate:
+        from epo_lightning.report.scenes import animate
+
+        for row in eventful(scenes, settings.animate):
+            path, name = folder / f"scene_{ids[row]}.gif", f"{title}, scene {ids[row]}"
+            drawn.append((animate(scenes[row], forecast[row], path, name), [row]))
+    return drawn
+
+
+def is_traffic(scenes: Scene, shape: str) -> bool:
+    """Whether scenes have lanes, boxes, or agents of which something is known."""
+    return scenes.lanes is not None or scenes.kind is not None or shape == "box"
+
+
+def eventful(scenes: Scene, count: int) -> list[int]:
+    """Rows of ``count`` scenes spread over all, of their neighbours those in which agents' sideways motions differ most.
+
+    Differ, because in a bend everyone moves sideways, but few at a time change lane.
+    """
+    steps, mask = scenes.history, scenes.history_mask
+    if scenes.future is not None:
+        assert scenes.future_mask is not None
+        steps, mask = scenes.future, scenes.future_mask
+    heading, moved = scenes.current[..., None, HEADING], steps[..., :2] - scenes.current[..., None, :2]
+    sideways = moved[..., Y] * heading.cos() - moved[..., X] * heading.sin()
+    known = scenes.agent_mask[..., None] & mask & sideways.isfinite()
+    infinity = torch.full_like(sideways, torch.inf)
+    spans = torch.where(known, sideways, -infinity).amax(1) - torch.where(known, sideways, infinity).amin(1)
+    spans = spans.amax(1)
+    parts = torch.arange(len(spans), device=spans.device).tensor_split(min(count, len(spans)))
+    return [int(part[spans[part].argmax()]) for part in parts]
 
 
 def gather(loader: Iterable[Scene]) -> Scene:
@@ -93,18 +178,23 @@ def gather(loader: Iterable[Scene]) -> Scene:
     return Scene(**{entry.name: join(entry.name) for entry in dataclasses.fields(Scene)})
 
 
+def even(total: int, count: int | None) -> Tensor:
+    """Indices of ``count`` of ``total`` at even distances; all where there are fewer."""
+    if count is None or count >= total:
+        return torch.arange(total)
+    return torch.linspace(0, total - 1, count).round().long()
+
+
 def spread(scenes: Scene, count: int | None) -> Scene:
     """``count`` scenes at even distances; all where there are fewer."""
+    return scenes[even(len(scenes.history), count)]
+
+
+def pairs(scenes: Scene, count: int) -> tuple[Tensor, Tensor | None]:
+    """Rows of scenes worth drawing, those with two known futures first, and the rows of the other futures."""
     total = len(scenes.history)
-    if count is None or count >= total:
-        return scenes
-    return scenes[torch.linspace(0, total - 1, count).round().long()]
-
-
-def examples(scenes: Scene, count: int) -> tuple[Scene, Tensor | None]:
-    """Scenes worth drawing: those with two known futures first. The second one is returned beside them."""
-    if scenes.id is None or scenes.subset is None or scenes.future is None:
-        return spread(scenes, count), None
+    if scenes.id is None or scenes.subset is None:
+        return even(total, count), None
     first: dict[int, int] = {}
     both: list[tuple[int, int]] = []
     for index, (record, subset) in enumerate(zip(scenes.id.tolist(), scenes.subset.tolist(), strict=True)):
@@ -113,10 +203,18 @@ def examples(scenes: Scene, count: int) -> tuple[Scene, Tensor | None]:
             both.append((one, other))
         first.setdefault(record, index)
     if not both:
-        return spread(scenes, count), None
+        return even(total, count), None
     chosen = [both[int(i)] for i in torch.linspace(0, len(both) - 1, min(count, len(both))).round()]
     ones, others = (torch.tensor(indices) for indices in zip(*chosen, strict=True))
-    return scenes[ones], scenes.future[others]
+    return ones, others
+
+
+def examples(scenes: Scene, count: int) -> tuple[Scene, Tensor | None]:
+    """The scenes of :func:`pairs`, and the other future of each."""
+    if scenes.future is None:
+        return spread(scenes, count), None
+    rows, others = pairs(scenes, count)
+    return scenes[rows], None if others is None else scenes.future[others]
 
 
 def forecast_of(forecaster: Any, scenes: Scene, batch_size: int = 256) -> JointForecast:
@@ -141,15 +239,13 @@ def _join(parts: list[Any]) -> Any:
 
 
 def _tensors(scenes: Scene, forecast: JointForecast) -> Iterable[tuple[str, Tensor]]:
-    for name in ("states", "probabilities", "agent_probabilities", "controls", "initial_states"):
-        if (value := getattr(forecast, name)) is not None:
-            yield name, value.contiguous()
-    if forecast.parameters is not None:
-        if forecast.parameters.goals is not None:
-            yield "goals", forecast.parameters.goals.contiguous()
+    """Everything in :data:`MEANING` that is there, and the weights of the inferred game by name."""
+    game = forecast.parameters
+    for name in MEANING:
+        for owner in (forecast, game, scenes):
+            if (value := getattr(owner, name, None)) is not None:
+                yield name, value.contiguous()
+    if game is not None:
         for kind in ("own_weights", "pair_weights"):
-            for name, value in getattr(forecast.parameters, kind).items():
+            for name, value in getattr(game, kind).items():
                 yield f"{kind}/{name}", value.contiguous()
-    for name in ("history", "future", "id", "subset"):
-        if (value := getattr(scenes, name)) is not None:
-            yield name, value.contiguous()

@@ -170,12 +170,14 @@ class PredictSettings:
     checkpoint: str = "best"
     scenes: int | None = 64
     figures: int = 4
+    animate: int = 0
 
     def __post_init__(self) -> None:
         if self.scenes is not None and self.scenes < 1:
             raise ConfigError(f"scenes must be 1 or more, or null for all, not {self.scenes}")
-        if self.figures < 0:
-            raise ConfigError(f"figures must be 0 or more, not {self.figures}")
+        for name in ("figures", "animate"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)

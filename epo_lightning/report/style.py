@@ -17,6 +17,10 @@ MODES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Okabe and Ito's colours; the first two modes are red and blue as in the paper."""
 AGENT_COLORS = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Agents, where colours do not stand for modes."""
+VEHICLES = (*MODES, "#6A3D9A", "#8C510A")
+"""Agents of a traffic scene, where there are more than a few."""
+ROAD, LANE = "#ECECEC", "#CFCFCF"
+"""Lanes, and the line in the middle of each."""
 HISTORY, TRUTH, OTHER = "#8A8A8A", "#111111", "#8A8A8A"
 AGENTS = ("robot", "pedestrian")
 """What the agents of the RPI environment are called."""
@@ -52,16 +56,29 @@ def style() -> Iterator[None]:
 
 def save(figure: Figure, path: str | Path) -> Path:
     """Write a PNG as a whole; the same picture gives the same bytes."""
+    FigureCanvasAgg(figure)  # no display, and no figure that pyplot remembers
+    with whole(path, ".png") as temporary:
+        figure.savefig(temporary, dpi=DPI, bbox_inches="tight", pad_inches=0.08, metadata={"Software": None})
+    return Path(path)
+
+
+@contextmanager
+def whole(path: str | Path, suffix: str) -> Iterator[Path]:
+    """A file beside ``path`` to write to, which becomes ``path`` when all went well and vanishes when not.
+
+    Args:
+        path: of the picture; its folder is made.
+        suffix: says which format the file is of.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    FigureCanvasAgg(figure)  # no display, and no figure that pyplot remembers
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-", suffix=".png")
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-", suffix=suffix)
     os.close(descriptor)
+    temporary = Path(name)
     try:
-        figure.savefig(temporary, dpi=DPI, bbox_inches="tight", pad_inches=0.08, metadata={"Software": None})
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
+        yield temporary
+        temporary.chmod(0o644)
+        temporary.replace(path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
-    return path
