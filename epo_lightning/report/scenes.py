@@ -1,4 +1,4 @@
-"""Traffic scenes: joint forecasts on their lanes, as in the paper's Figs. 6, 10 and 11, as pictures and short animations.
+"""Traffic scenes: joint forecasts on their lanes, as in the paper's Figs. 4, 10 and 11, as pictures and short animations.
 
 A picture is turned so that the road runs to the right, and everything in it is drawn to scale: both axes are in metres, and
 agents have their size.
@@ -40,6 +40,8 @@ MOST_NAMED = len(VEHICLES)
 """Agents that the legend names at most: beyond, colours repeat."""
 LANE_WIDTH = 3.1
 """Of the band that stands for a lane [m]: a little less than lanes have, so that lanes side by side stay apart."""
+CAR = (4.5, 1.8)
+"""Length and width of an agent of unknown size [m]."""
 WIDTH, LEFT, TITLE, AXIS, ROW = 8.6, 0.5, 0.27, 0.42, 0.2
 """Of a picture, of the margin left of a panel, above and below it, and of a line of the legend [inch]."""
 FRAME, HOLD = 0.1, 1.2
@@ -74,7 +76,7 @@ def highway_scene(scene: Scene, forecast: JointForecast, path: str | Path, title
 
 
 def highway_comparison(scene: Scene, forecasts: Mapping[str, JointForecast], path: str | Path, title: str = "") -> Path:
-    """The most likely joint mode of several forecasters on one scene, one panel each (Fig. 6).
+    """The most likely joint mode of several forecasters on one scene, one panel each (Fig. 4).
 
     Args:
         scene, path, title: as for :func:`highway_scene`.
@@ -408,9 +410,9 @@ def _fading(
 
 
 def _agent(axes: Axes, ground: _Ground, i: int, state: Float[np.ndarray, " 4"], **look: Any) -> list[Artist]:
-    """An agent to scale: a disc, or a box; a full one has a triangle that points to the front."""
+    """An agent to scale: a disc, or a box; a full one has a triangle that points to the front. A car where no size is known."""
     x, y, heading, _ = state
-    length, width = (4.5, 1.8) if ground.size is None else ground.size[i]
+    length, width = CAR if ground.size is None else ground.size[i]
     if ground.disc[i]:
         ring = np.linspace(0, 2 * np.pi, 25)[:-1]
         return [
