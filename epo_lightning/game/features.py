@@ -95,12 +95,14 @@ class PairFeature:
         function: of distance and reach, elementwise; of the states of both agents where the source is TRAJECTORY, and of
             their sizes where it needs them.
         needs: ``size`` for a function of states that takes the agents' sizes too.
+        stepwise: whether a function of states has one residual for every step, which reads the states at that step alone.
         extent: how far from its position an agent of some size can be felt [m]; None for a function that knows no limit.
     """
 
     source: Source
     function: Callable[..., Tensor]
     needs: str | None = None
+    stepwise: bool = False
     extent: Callable[[Tensor], Tensor] | None = None
 
 
@@ -134,7 +136,7 @@ vehicle that turns like this [rad]; ``...b`` for what bounds are exceeded by."""
 
 PAIR_FEATURES: dict[str, PairFeature] = {
     "proximity": PairFeature(Source.DISTANCE, overlap, extent=disc),
-    "circles": PairFeature(Source.TRAJECTORY, row_overlap, needs="size", extent=row_extent),
+    "circles": PairFeature(Source.TRAJECTORY, row_overlap, needs="size", stepwise=True, extent=row_extent),
 }
 """``proximity``: max(0, r_i + r_j - |p_i - p_j|) [m], how deep two discs overlap; ``circles``: how deep two rows of circles
 do [m] (:mod:`~epo_lightning.game.circles`)."""

@@ -414,15 +414,24 @@ class QuadraticModel:
         moved = self.of.dynamics.tangent(self.states, self._node_directions(), self.dt).flatten(1, 2)
         moved = self.of.at_pair_steps(moved).permute(1, 2, 0, 3, 4)  # [S, N, 2 K, L, 4]
         first, second = (side.transpose(0, 1) for side in edges.ends(moved))
-        still = torch.zeros_like(first)
         sizes: tuple[Tensor, ...] = ()
         if feature.needs:
             modes = self.samples // len(self.scene.agent_mask)
             sizes = edges.ends(self.of.size(self.scene).repeat_interleave(modes, 0)[:, :, None])
         exists = self.of.pair_mask(self.scene)[:, None].expand(-1, self.samples // len(self.scene.agent_mask), -1)
         exists = exists.flatten().index_select(0, edges.pair)[:, None]
-        value, by_first = along(feature.function, both, (first, still), *sizes)
-        _, by_second = along(feature.function, both, (still, second), *sizes)
+        if feature.stepwise:  # eight slopes per step, in the states of both, instead of 4 K through the function
+            unit = torch.eye(8, dtype=states.dtype, device=states.device)
+            unit = unit[:, None, None].expand(-1, *both[0].shape[:2], -1)
+            value, slopes = along(feature.function, both, (unit[..., :4], unit[..., 4:]), *sizes)
+            by_first, by_second = (
+                (slope.movedim(0, -1) * side).sum(-1)
+                for slope, side in zip(slopes.split(4), (first, second), strict=True)
+            )
+        else:
+            still = torch.zeros_like(first)
+            value, by_first = along(feature.function, both, (first, still), *sizes)
+            _, by_second = along(feature.function, both, (still, second), *sizes)
         value, by_first, by_second = (weight * torch.where(exists, part, 0.0) for part in (value, by_first, by_second))
         jacobians = by_first.permute(1, 0, 2), by_second.permute(1, 0, 2)  # [E, 2 K, R]
         self.linked |= ((by_first != 0).any(-1).any(0)) & exists[:, 0]
