@@ -410,7 +410,7 @@ def _fading(
 
 
 def _agent(axes: Axes, ground: _Ground, i: int, state: Float[np.ndarray, " 4"], **look: Any) -> list[Artist]:
-    """An agent to scale: a disc, or a box; a full one has a triangle that points to the front. A car where no size is known."""
+    """An agent to scale: a disc, or a box (a car's where no size is known); a full one has a triangle that points ahead."""
     x, y, heading, _ = state
     length, width = CAR if ground.size is None else ground.size[i]
     if ground.disc[i]:
