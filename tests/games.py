@@ -29,13 +29,18 @@ def random_scene(
     horizon: int = 40,
     size: float = 0.5,
     references: bool = True,
+    lanes: int = 0,
     dtype: torch.dtype = torch.float32,
 ) -> Scene:
-    """Agents within a few metres of each other, moving, each with two wiggly lines to follow."""
+    """Agents within a few metres of each other, moving, each with two wiggly lines to follow; lanes of one to four vectors."""
     state = torch.randn(scenes, agents, history, 4, dtype=dtype)
     state[..., 3].abs_()
     way = torch.linspace(-4.0, 4.0, 6, dtype=dtype)
     lines = torch.stack((way.expand(scenes, agents, 2, 6), torch.randn(scenes, agents, 2, 6, dtype=dtype)), -1)
+    drawn: dict[str, torch.Tensor] = {}
+    if lanes:
+        drawn["lanes"] = torch.randn(scenes, lanes, 4, 4, dtype=dtype)
+        drawn["lane_mask"] = torch.arange(4) <= torch.randint(4, (scenes, lanes, 1))
     return Scene(
         history=state,
         dt=0.1,
@@ -46,7 +51,64 @@ def random_scene(
         reference_speed=2.0 * torch.rand(scenes, agents, dtype=dtype) if references else None,
         subset=torch.arange(scenes) % 2,
         id=torch.arange(scenes),
+        **drawn,
     )
+
+
+def highway_scene(scenes: int = 3, agents: int = 4, *, candidates: int = 6, horizon: int = 8) -> Scene:
+    """Vehicles on three lanes of a motorway, up to 60 m apart, who keep or change their lane.
+
+    Of every scene, one lane has no vector and one agent no last future step; agents have between one and all candidates.
+    """
+    steps, reference_lines, lanes, vectors = 10, 3, 5, 4
+    speed = 20.0 + 10.0 * torch.rand(scenes, agents)
+    lane = torch.randint(reference_lines, (scenes, agents))
+    start = torch.stack((60.0 * torch.rand(scenes, agents) - 30.0, 3.5 * lane), -1)
+    time = 0.2 * torch.arange(1 - steps, horizon + 1)
+    drift = torch.randn(scenes, agents, 1) * time.clamp_min(0.0)
+    position = torch.stack((start[..., :1] + speed[..., None] * time, start[..., 1:] + drift), -1)
+    motion = torch.stack((torch.zeros_like(drift), speed[..., None].expand_as(drift)), -1)
+    states = torch.cat((position, motion), -1)
+    future_mask = torch.ones(scenes, agents, horizon, dtype=torch.bool)
+    future_mask[torch.arange(scenes), torch.randint(agents, (scenes,)), -1:] = False
+    history_mask = torch.arange(steps) >= torch.randint(steps - 1, (scenes, agents, 1))
+
+    middles = 3.5 * torch.arange(reference_lines)[:, None]
+    along = torch.linspace(-60.0, 120.0, 12)
+    line = torch.stack((along.expand(reference_lines, 12), middles.expand(reference_lines, 12)), -1)
+    on = torch.randint(reference_lines, (scenes, agents, candidates))
+    ahead = speed[..., None] * (1.0 + torch.rand(scenes, agents, candidates))
+    points = torch.stack((torch.linspace(-100.0, 150.0, vectors + 1).repeat(lanes, 1), 0.01 * torch.randn(lanes, vectors + 1)), -1)
+    points[..., 1] += 3.5 * torch.arange(lanes)[:, None]
+    points = points + torch.randn(scenes, 1, 1, 2)
+    lane_mask = torch.ones(scenes, lanes, vectors, dtype=torch.bool)
+    lane_mask[:, 1, 2:] = lane_mask[:, 3] = False
+    return Scene(
+        history=states[:, :, :steps].contiguous(),
+        dt=0.2,
+        history_mask=history_mask,
+        future=states[:, :, steps:].contiguous(),
+        future_mask=future_mask,
+        goal_candidates=torch.stack((start[..., :1] + ahead, 3.5 * on), -1),
+        goal_mask=torch.arange(candidates) <= torch.randint(candidates, (scenes, agents, 1)),
+        goal_reference=on,
+        size=torch.tensor([4.5, 1.9]).repeat(scenes, agents, 1),
+        kind=torch.zeros(scenes, agents, dtype=torch.long),
+        lanes=torch.cat((points[..., :-1, :], points[..., 1:, :]), -1),
+        lane_mask=lane_mask,
+        references=line.repeat(scenes, agents, 1, 1, 1),
+        reference_speed=speed + torch.randn(scenes, agents),
+        frame=torch.zeros(scenes, 3),
+        id=torch.arange(scenes),
+    )
+
+
+def reordered(scene: Scene, order: list[int]) -> Scene:
+    """The same scene with its agents in another order."""
+    whose = ("history", "history_mask", "agent_mask", "future", "future_mask", "goal_candidates", "goal_mask")
+    whose += ("goal_reference", "size", "kind", "references", "reference_mask", "reference_speed")
+    fields = dict(vars(scene))
+    return Scene(**{**fields, **{name: fields[name][:, order] for name in whose if fields[name] is not None}})
 
 
 def random_game(
@@ -96,8 +158,18 @@ def widen(parameters: GameParameters, agents: int = 2, filling: float = float("n
     )
 
 
-def pad(scene: Scene, agents: int = 2, steps: int = 0, filling: float = float("nan")) -> Scene:
-    """The same scene with absent agents appended and unobserved steps put before its history, all holding ``filling``."""
+def pad(
+    scene: Scene,
+    agents: int = 2,
+    steps: int = 0,
+    filling: float = float("nan"),
+    *,
+    lanes: int = 0,
+    vectors: int = 0,
+    candidates: int = 0,
+) -> Scene:
+    """The same scene with absent agents, lanes, vectors of lanes and goal candidates appended and unobserved steps put before
+    its history, all holding ``filling``."""
 
     def grow(tensor: torch.Tensor | None, dim: int, count: int, value: float | bool, before: bool = False):
         if tensor is None or count == 0:
@@ -109,6 +181,8 @@ def pad(scene: Scene, agents: int = 2, steps: int = 0, filling: float = float("n
 
     history = grow(grow(scene.history, 1, agents, filling), 2, steps, filling, before=True)
     history_mask = grow(grow(scene.history_mask, 1, agents, False), 2, steps, False, before=True)
+    drawn = scene.lane_mask
+    behind = None if scene.lanes is None else torch.where(drawn[..., None], scene.lanes, filling)
     return Scene(
         history=history,
         dt=scene.dt,
@@ -116,9 +190,14 @@ def pad(scene: Scene, agents: int = 2, steps: int = 0, filling: float = float("n
         agent_mask=grow(scene.agent_mask, 1, agents, False),
         future=grow(scene.future, 1, agents, filling),
         future_mask=grow(scene.future_mask, 1, agents, False),
-        goal_candidates=grow(scene.goal_candidates, 1, agents, filling),
-        goal_mask=grow(scene.goal_mask, 1, agents, False),
+        goal_candidates=grow(grow(scene.goal_candidates, 1, agents, filling), 2, candidates, filling),
+        goal_mask=grow(grow(scene.goal_mask, 1, agents, False), 2, candidates, False),
+        goal_reference=grow(grow(scene.goal_reference, 1, agents, -99), 2, candidates, -99),
         size=grow(scene.size, 1, agents, filling),
+        kind=grow(scene.kind, 1, agents, -99),
+        lanes=grow(grow(behind, 1, lanes, filling), 2, vectors, filling),
+        lane_mask=grow(grow(drawn, 1, lanes, False), 2, vectors, False),
+        frame=scene.frame,
         references=grow(scene.references, 1, agents, filling),
         reference_mask=grow(scene.reference_mask, 1, agents, True),
         reference_speed=grow(scene.reference_speed, 1, agents, filling),

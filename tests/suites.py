@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any, ClassVar
 
 import lightning
 import pytest
 import torch
-from games import pad, random_scene
+from games import EXID, highway_scene, pad, random_scene, reordered
 
 import epo_lightning
 from epo_lightning.forecasters import build_forecaster
-from epo_lightning.registry import build
+from epo_lightning.registry import build, lookup
 from epo_lightning.scene import Scene
 
 OWN = ["goal", "vel", "acc", "turnr", "jerk", "turnacc", "velb", "accb", "turnrb", "jerkb", "turnaccb"]
@@ -42,66 +43,146 @@ def model(forecaster: dict[str, Any], **changes: Any) -> dict[str, Any]:
     }
 
 
+def highway_model(forecaster: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """A complete configuration of a model for highway scenes."""
+    return model(
+        forecaster,
+        **{
+            "backbone": {"name": "v_lstm", "scale": 50.0},
+            "energy": {"name": "features", "own": list(EXID), "pair": ["proximity"]},
+            "horizon": 8,
+            "dt": 0.2,
+            "subsets": [],
+            "shape": "box",
+            "candidates": 6,
+            "map": True,
+            **changes,
+        },
+    )
+
+
 class BackboneSuite:
-    """A backbone gives every agent a feature, which depends on its scene alone."""
+    """A backbone gives every agent a feature, which depends on its scene alone, whether or not it reads a map."""
 
     config: ClassVar[dict[str, Any]]
 
-    def backbone(self) -> torch.nn.Module:
+    @pytest.fixture(params=[False, True], ids=["no map", "map"])
+    def backbone(self, request: pytest.FixtureRequest) -> torch.nn.Module:
         torch.manual_seed(1)
-        return build("backbone", self.config).eval()
+        if not request.param:
+            return build("backbone", self.config).eval()
+        if "map_input" not in inspect.signature(lookup("backbone", self.config["name"])).parameters:
+            pytest.skip("this backbone reads no map")
+        return build("backbone", self.config, map_input=True).eval()
 
-    def test_shape_and_gradient_flow(self):
-        backbone = self.backbone()
-        z = backbone(random_scene(3, 4))
+    def test_shape_and_gradient_flow(self, backbone):
+        z = backbone(random_scene(3, 4, lanes=5))
         assert z.shape == (3, 4, backbone.width)
         z.square().sum().backward()
         assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in backbone.parameters())
 
-    def test_every_agent_sees_every_other_one(self):
-        backbone, scene = self.backbone(), random_scene(1, 3)
+    def test_every_agent_sees_every_other_one(self, backbone):
+        scene = random_scene(1, 3, lanes=5)
         before = backbone(scene)
         scene.history[0, 2] += 1.0
-        assert (backbone(scene)[0, 0] - before[0, 0]).abs().max() > 1e-6
+        assert (backbone(scene) - before)[0].abs().amax(1).gt(1e-6).all()
+
+    @pytest.mark.parametrize("lane", range(3))
+    def test_every_agent_sees_every_lane_and_nothing_else_of_the_map(self, backbone, lane):
+        scene = random_scene(1, 3, lanes=3)
+        scene.lane_mask[0, :, 1:3] = torch.tensor([True, False])
+        before = backbone(scene)
+        scene.lanes[0, lane, 2] = torch.nan
+        assert torch.equal(backbone(scene), before)
+        scene.lanes[0, lane, 1] += 1.0
+        read = backbone.lanes is not None
+        assert (backbone(scene) - before)[0].abs().amax(1).gt(1e-6).all() == read
 
     @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
-    def test_padding_independence(self, filling):
-        backbone, scene = self.backbone(), random_scene(3, 2)
-        padded = backbone(pad(scene, agents=3, steps=4, filling=filling))
+    def test_padding_independence(self, backbone, filling):
+        scene = random_scene(3, 2, lanes=5)
+        padded = backbone(pad(scene, agents=3, steps=4, filling=filling, lanes=2, vectors=3))
         torch.testing.assert_close(padded[:, :2], backbone(scene), rtol=0, atol=1e-5)
 
-    def test_batch_independence(self):
-        backbone, scene = self.backbone(), random_scene(4, 2)
+    def test_padding_leaves_gradients_as_they_are(self, backbone):
+        scene = random_scene(3, 2, lanes=5)
+        gradients = []
+        for given in (scene, pad(scene, agents=3, steps=4, lanes=2, vectors=3)):
+            backbone.zero_grad()
+            backbone(given)[:, :2].square().sum().backward()
+            gradients.append([p.grad.clone() for p in backbone.parameters()])
+        torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-4, atol=1e-4)
+
+    def test_batch_independence(self, backbone):
+        scene = random_scene(4, 2, lanes=5)
         together = backbone(scene)
         for index in range(4):
             torch.testing.assert_close(backbone(scene[index])[0], together[index], rtol=0, atol=1e-5)
 
+    def test_a_scene_without_any_lane(self, backbone):
+        scene = random_scene(3, 2, lanes=5)
+        scene.lane_mask[1] = False
+        scene.lanes[1] = torch.nan
+        z = backbone(scene)
+        z.square().sum().backward()
+        assert z.isfinite().all()
+        assert all(p.grad.isfinite().all() for p in backbone.parameters())
+        torch.testing.assert_close(z[1], backbone(scene[1])[0], rtol=0, atol=1e-5)
+
+    def test_the_order_of_agents_lanes_and_vectors(self, backbone):
+        scene = random_scene(3, 4, lanes=5)
+        z = backbone(scene)
+        torch.testing.assert_close(backbone(reordered(scene, [2, 0, 3, 1])), z[:, [2, 0, 3, 1]], rtol=0, atol=1e-5)
+        lanes, vectors = torch.randperm(5), torch.randperm(4)
+        shuffled = {name: getattr(scene, name)[:, lanes][:, :, vectors] for name in ("lanes", "lane_mask")}
+        torch.testing.assert_close(backbone(Scene(**{**vars(scene), **shuffled})), z, rtol=0, atol=1e-5)
+
 
 class ForecasterSuite:
-    """A forecaster keeps its samples apart, learns, is deterministic and survives being saved."""
+    """A forecaster keeps its samples apart, learns, is deterministic and survives being saved.
+
+    Attributes:
+        config: the forecaster's own section.
+        modes: how many joint modes it forecasts.
+        goals: who may be told the goal of its scenes.
+        tolerance: relative and absolute, of positions that two ways of computing should agree on.
+    """
 
     config: ClassVar[dict[str, Any]]
     modes: ClassVar[int] = 2
+    goals: ClassVar[tuple[str, ...]] = ("energy", "all")
+    tolerance: ClassVar[dict[str, float]] = {"rtol": 0.0, "atol": 1e-5}
+
+    def model(self, **changes: Any) -> dict[str, Any]:
+        return model(self.config, **changes)
+
+    def scene(self, scenes: int, **details: Any) -> Scene:
+        return random_scene(scenes, 2, **details)
 
     def forecaster(self, **changes: Any) -> epo_lightning.forecasters.Forecaster:
         torch.manual_seed(1)
-        forecaster = build_forecaster(model(self.config, **changes))
+        forecaster = build_forecaster(self.model(**changes))
         # Statistics of batch normalisation that have seen something.
         forecaster.train()
         with torch.no_grad():
-            forecaster(random_scene(16, 2))
+            forecaster(self.scene(16))
         return forecaster.eval()
 
+    def assert_same(self, one: torch.Tensor, other: torch.Tensor) -> None:
+        """Headings of agents that stand still are of no meaning: positions are compared."""
+        torch.testing.assert_close(one[..., :2], other[..., :2], **self.tolerance)
+
     def test_shapes_and_probabilities(self):
-        forecast = self.forecaster().predict(random_scene(3, 2))
-        assert forecast.states.shape == (3, self.modes, 2, 40, 4)
+        forecaster, scene = self.forecaster(), self.scene(3)
+        forecast = forecaster.predict(scene)
+        assert forecast.states.shape == (3, self.modes, scene.history.shape[1], forecaster.task.horizon, 4)
         assert forecast.states.isfinite().all()
         torch.testing.assert_close(forecast.probabilities.sum(1), torch.ones(3))
         assert (forecast.probabilities >= 0).all()
 
     def test_gradients_reach_every_parameter(self):
         forecaster = self.forecaster().train()
-        scene = random_scene(16, 2, size=2.0)
+        scene = self.crowded()
         terms = forecaster.losses(scene, forecaster(scene))
         sum(weight * value for weight, value in terms.values()).backward() if self.trained(forecaster) else None
         for name, parameter in forecaster.named_parameters():
@@ -109,13 +190,20 @@ class ForecasterSuite:
             assert parameter.grad.isfinite().all(), name
             assert parameter.grad.abs().sum() > 0, name
 
+    def crowded(self) -> Scene:
+        """Scenes in which agents come so close that they have to mind each other."""
+        return self.scene(16, size=2.0)
+
+    def lesson(self) -> Scene:
+        """Scenes whose futures can be learned."""
+        truth = self.forecaster().predict(self.scene(8)).states[:, 0]
+        return Scene(**{**vars(self.scene(8)), "future": truth})
+
     def test_learning_fits_a_batch(self):
         forecaster = self.forecaster().train()
         if not self.trained(forecaster):
             pytest.skip("nothing to train")
-        scene = random_scene(8, 2)
-        truth = self.forecaster().predict(random_scene(8, 2)).states[:, 0]
-        scene = Scene(**{**vars(scene), "future": truth})
+        scene = self.lesson()
         optimizer = torch.optim.Adam(forecaster.parameters(), 3e-3)
         history = []
         for _ in range(30):
@@ -126,37 +214,40 @@ class ForecasterSuite:
             history.append(loss.item())
         assert history[-1] < 0.8 * history[0]
 
-    @pytest.mark.parametrize("goal", ["energy", "all"])
-    def test_batch_independence(self, goal):
-        forecaster, scene = self.forecaster(goal=goal), random_scene(5, 2)
-        together = forecaster.predict(scene)
-        for index in range(5):
-            alone = forecaster.predict(scene[index])
-            # Headings of agents that stand still are of no meaning: positions are compared.
-            torch.testing.assert_close(alone.states[0, ..., :2], together.states[index, ..., :2], rtol=0, atol=1e-5)
-            torch.testing.assert_close(alone.probabilities[0], together.probabilities[index], rtol=0, atol=1e-5)
+    def test_batch_independence(self):
+        for goal in self.goals:
+            forecaster, scene = self.forecaster(goal=goal), self.scene(5)
+            together = forecaster.predict(scene)
+            for index in range(5):
+                alone = forecaster.predict(scene[index])
+                self.assert_same(alone.states[0], together.states[index])
+                torch.testing.assert_close(alone.probabilities[0], together.probabilities[index], rtol=0, atol=1e-5)
 
     @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
-    @pytest.mark.parametrize("goal", ["energy", "all"])
-    def test_padding_independence(self, filling, goal):
-        forecaster, scene = self.forecaster(goal=goal), random_scene(3, 2)
-        alone = forecaster.predict(scene)
-        padded = forecaster.predict(pad(scene, agents=2, steps=3, filling=filling))
-        torch.testing.assert_close(padded.states[:, :, :2, :, :2], alone.states[..., :2], rtol=0, atol=1e-5)
-        torch.testing.assert_close(padded.probabilities, alone.probabilities, rtol=0, atol=1e-5)
+    def test_padding_independence(self, filling):
+        for goal in self.goals:
+            forecaster, scene = self.forecaster(goal=goal), self.scene(3)
+            alone = forecaster.predict(scene)
+            padded = forecaster.predict(self.padded(scene, steps=3, filling=filling))
+            self.assert_same(padded.states[:, :, : scene.history.shape[1]], alone.states)
+            torch.testing.assert_close(padded.probabilities, alone.probabilities, rtol=0, atol=1e-5)
+
+    def padded(self, scene: Scene, **details: Any) -> Scene:
+        return pad(scene, agents=2, **details)
 
     def test_padding_does_not_change_training(self):
-        forecaster, scene = self.forecaster().train(), random_scene(6, 2)
+        forecaster, scene = self.forecaster().train(), self.scene(6)
         alone = forecaster.losses(scene, forecaster(scene))
-        padded = pad(scene, agents=2)
+        padded = self.padded(scene)
         for name, (_, value) in forecaster.losses(padded, forecaster(padded)).items():
-            torch.testing.assert_close(value, alone[name][1], rtol=0, atol=1e-5)
+            torch.testing.assert_close(value, alone[name][1], rtol=1e-5, atol=1e-5)
 
     def test_a_poisoned_scene_leaves_the_others_bit_identical(self):
-        forecaster, scene = self.forecaster(), random_scene(4, 2)
+        forecaster, scene = self.forecaster(), self.scene(4)
         sound = forecaster.predict(scene)
         history = scene.history.clone()
-        history[1, 0, 5] = torch.nan
+        history[1, 0, -2] = torch.nan
+        scene.history_mask[1, 0, -2] = True
         with pytest.warns(UserWarning, match=r"scene\(s\) \[1\]"):
             poisoned = forecaster.predict(Scene(**{**vars(scene), "history": history}))
         others = [0, 2, 3]
@@ -165,7 +256,7 @@ class ForecasterSuite:
         assert poisoned.states[1].isnan().all()
 
     def test_save_and_load(self, tmp_path):
-        forecaster, scene = self.forecaster(), random_scene(3, 2)
+        forecaster, scene = self.forecaster(), self.scene(3)
         trainer = lightning.Trainer(logger=False, enable_checkpointing=False, accelerator="cpu")
         trainer.strategy.connect(forecaster)
         trainer.save_checkpoint(tmp_path / "model.ckpt")
@@ -174,14 +265,48 @@ class ForecasterSuite:
         assert torch.equal(loaded.predict(scene).states, forecaster.predict(scene).states)
 
     def test_determinism(self):
-        scene = random_scene(3, 2)
+        scene = self.scene(3)
         assert torch.equal(self.forecaster().predict(scene).states, self.forecaster().predict(scene).states)
 
     def test_another_time_step_is_refused(self):
-        scene = Scene(**{**vars(random_scene(1, 2)), "dt": 0.2})
-        with pytest.raises(ValueError, match=r"dt = 0\.2 s"):
+        scene = Scene(**{**vars(self.scene(1)), "dt": 0.05})
+        with pytest.raises(ValueError, match=r"dt = 0\.05 s"):
             self.forecaster().predict(scene)
 
     @staticmethod
     def trained(forecaster) -> bool:
         return any(parameter.requires_grad for parameter in forecaster.parameters())
+
+
+class HighwaySuite(ForecasterSuite):
+    """The same on highway scenes, with every backbone; and the order of agents is of no consequence."""
+
+    modes = 3
+    goals = ("energy",)
+    tolerance: ClassVar[dict[str, float]] = {"rtol": 1e-5, "atol": 2e-4}
+
+    @pytest.fixture(autouse=True, params=["v_lstm", "vibes", "hivt_m"])
+    def name(self, request: pytest.FixtureRequest) -> None:
+        self.backbone = request.param
+
+    def model(self, **changes: Any) -> dict[str, Any]:
+        return highway_model(self.config, **{"backbone": {"name": self.backbone, "scale": 50.0}, **changes})
+
+    def scene(self, scenes: int) -> Scene:
+        return highway_scene(scenes)
+
+    def crowded(self) -> Scene:
+        scene = self.scene(16)
+        return Scene(**{**vars(scene), "size": 20.0 * scene.size})
+
+    def lesson(self) -> Scene:
+        return self.scene(8)
+
+    def padded(self, scene: Scene, **details: Any) -> Scene:
+        return pad(scene, agents=2, **details, lanes=2, vectors=3, candidates=4)
+
+    def test_the_order_of_agents(self):
+        forecaster, scene, order = self.forecaster(), self.scene(3), [2, 0, 3, 1]
+        forecast, other = forecaster.predict(scene), forecaster.predict(reordered(scene, order))
+        self.assert_same(other.states, forecast.states[:, :, order])
+        torch.testing.assert_close(other.probabilities, forecast.probabilities, rtol=0, atol=1e-5)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from epo_lightning import losses
 
@@ -52,3 +56,44 @@ def test_probabilities_are_scored_at_the_closest_mode():
     assert value.item() == pytest.approx((0.2877 + 0.6931) / 2, abs=1e-4)
     certain = torch.tensor([[1.0, 0.0]], requires_grad=True)
     assert losses.scene_probability(certain, torch.tensor([1])).isfinite()
+
+
+@settings(deadline=None)
+@given(
+    st.lists(
+        st.lists(
+            st.tuples(
+                st.booleans(),  # whether the last step was observed
+                st.tuples(st.integers(-9, 9), st.integers(-9, 9)),
+                st.lists(st.tuples(st.booleans(), st.integers(-9, 9), st.integers(-9, 9)), min_size=3, max_size=3),
+            ),
+            min_size=2,
+            max_size=2,
+        ),
+        min_size=1,
+        max_size=3,
+    )
+)
+def test_goals_are_scored_at_the_candidate_closest_to_the_last_position(scenes):
+    batch = len(scenes)
+    candidates, exists = torch.full((batch, 2, 3, 2), torch.nan), torch.zeros(batch, 2, 3, dtype=torch.bool)
+    final, observed = torch.full((batch, 2, 2), torch.nan), torch.zeros(batch, 2, dtype=torch.bool)
+    probabilities = torch.rand(batch, 2, 3).softmax(-1).requires_grad_()
+    of_scenes = []
+    for b, agents in enumerate(scenes):
+        costs = []
+        for i, (seen, end, offered) in enumerate(agents):
+            way = {}
+            for g, (real, x, y) in enumerate(offered):
+                if real:
+                    candidates[b, i, g], exists[b, i, g] = torch.tensor([x, y]), True
+                    way[g] = (x - end[0]) ** 2 + (y - end[1]) ** 2
+            if seen:
+                final[b, i], observed[b, i] = torch.tensor(end), True
+            if seen and way:
+                costs.append(-math.log(probabilities[b, i, min(way, key=way.get)].item()))
+        of_scenes.append(sum(costs) / len(costs) if costs else 0.0)
+    loss = losses.goal(probabilities, candidates, exists, final, observed)
+    assert loss.item() == pytest.approx(sum(of_scenes) / batch, abs=1e-5)
+    loss.backward()
+    assert probabilities.grad.isfinite().all()

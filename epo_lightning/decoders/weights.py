@@ -48,22 +48,28 @@ class PairWeights(nn.Module):
     """phi_pair: interaction weights of a pair from the features of both agents, shared by all pairs.
 
     For two agents this is the paper's decoder on the concatenation of all agent features. For more agents the paper
-    concatenates all N of them, which ties a model to one N; a decoder per pair does not.
+    concatenates all N of them, which ties a model to one N; a decoder per pair does not. Which agent of a pair comes first
+    may mean something (RPI: the robot); where it does not, ``symmetric`` weights are the mean over both orders.
 
     Args:
         width: size of the agent features.
         modes: number M of joint modes.
         features: names of the pair features.
         start: weight that a network output of zero stands for.
+        symmetric: whether the order of agents is of no consequence.
     """
 
-    def __init__(self, width: int, modes: int, features: Sequence[str], start: float = 3.0) -> None:
+    def __init__(
+        self, width: int, modes: int, features: Sequence[str], start: float = 3.0, symmetric: bool = False
+    ) -> None:
         super().__init__()
-        self.modes, self.features, self.start = modes, tuple(features), start
+        self.modes, self.features, self.start, self.symmetric = modes, tuple(features), start, symmetric
         self.mlp = MLP(2 * width, 64, modes * len(self.features), norm="layer")
 
     def forward(self, z: Float[Tensor, "B N D"]) -> dict[str, Float[Tensor, "B M P"]]:
         """Weights by feature name."""
         first, second = pairs(z.shape[1], z.device)
-        both = torch.cat((z[:, first], z[:, second]), -1)
-        return _by_name(self.start + self.mlp(both), self.features, self.modes)
+        weights = self.mlp(torch.cat((z[:, first], z[:, second]), -1))
+        if self.symmetric:
+            weights = 0.5 * (weights + self.mlp(torch.cat((z[:, second], z[:, first]), -1)))
+        return _by_name(self.start + weights, self.features, self.modes)

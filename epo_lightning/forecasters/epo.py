@@ -41,6 +41,8 @@ class EPO(Forecaster):
         own_start: own weights that a network output of zero stands for, which scale it as well: one number, or some by the
             feature's name while the others are 1. ``vel`` pulls speeds towards zero and has to start small on highways.
         pair_start: pair weight that a network output of zero stands for.
+        symmetric_pairs: whether pair weights ignore which agent comes first, so that forecasts do not depend on the order of
+            agents.
         initial: ``decoded`` or ``zero``.
         control_scale: initial control that a network output of one stands for.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
@@ -57,6 +59,7 @@ class EPO(Forecaster):
         loss_weights: Mapping[str, float],
         own_start: float | Mapping[str, float] = 1.0,
         pair_start: float = 3.0,
+        symmetric_pairs: bool = False,
         initial: str = "decoded",
         control_scale: float = 0.3,
         relaxation: float = 0.0,
@@ -80,7 +83,7 @@ class EPO(Forecaster):
             self.loss_weights = weights_of(loss_weights, ("imitation", "probability"), idle=("goal",))
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.own_weights = OwnWeights(width, modes, energy.own, _checked(own_start, energy.own))
-        self.pair_weights = PairWeights(width, modes, energy.pair, pair_start)
+        self.pair_weights = PairWeights(width, modes, energy.pair, pair_start, symmetric_pairs)
         decodes_strategies = initial == "decoded"
         self.strategies = InitialStrategies(width, modes, task.horizon, control_scale) if decodes_strategies else None
         self.probabilities = SceneProbabilities(width, modes, task.horizon, scale)

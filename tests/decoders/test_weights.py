@@ -1,0 +1,39 @@
+"""Where weights start, and whether the order of a pair counts."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from epo_lightning.decoders.trajectories import Trajectories
+from epo_lightning.decoders.weights import OwnWeights, PairWeights
+
+
+def test_own_weights_start_where_they_are_told_to_by_name():
+    decoder = OwnWeights(8, 3, ["goal", "vel"], {"vel": 0.05}).eval()
+    z, everyone = torch.randn(2, 4, 8), torch.ones(2, 4, dtype=torch.bool)
+    plain = OwnWeights(8, 3, ["goal", "vel"]).eval()
+    plain.load_state_dict(decoder.state_dict())
+    weights, others = decoder(z, everyone), plain(z, everyone)
+    assert torch.equal(weights["goal"], others["goal"])
+    torch.testing.assert_close(weights["vel"], 0.05 * others["vel"])
+    torch.nn.init.zeros_(decoder.mlp.output.weight)
+    torch.nn.init.zeros_(decoder.mlp.output.bias)
+    weights = decoder(z, everyone)
+    assert (weights["goal"] == 1.0).all()
+    assert (weights["vel"] == torch.tensor(0.05)).all()
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_symmetric_pair_weights_ignore_the_order_of_agents(symmetric):
+    decoder, z = PairWeights(8, 2, ["proximity"], symmetric=symmetric), torch.randn(3, 2, 8)
+    weights, swapped = decoder(z)["proximity"], decoder(z.flip(1))["proximity"]
+    assert torch.allclose(weights, swapped, atol=1e-6) == symmetric
+
+
+def test_trajectories_in_larger_units():
+    z, current = torch.randn(2, 3, 8), torch.zeros(2, 3, 2)
+    metres, units = Trajectories(8, 2, 5), Trajectories(8, 2, 5, scale=50.0)
+    units.load_state_dict(metres.state_dict())
+    torch.testing.assert_close(units(z, current)[0], 50.0 * metres(z, current)[0])
+    assert torch.equal(units(z, current)[1], metres(z, current)[1])
