@@ -26,6 +26,8 @@ from epo_lightning.data.lanes import FARTHEST, LANE, SHOULDER, LaneGraph, Polyli
 EMERGENCY_LANE = "emergency_lane"
 FOR_VEHICLES = frozenset({"", "road", "highway", "play_street", "bus_lane", "exit", EMERGENCY_LANE})
 """Subtypes of lanelets on which vehicles drive, if only in an emergency."""
+WIDEST = 9.0
+"""A node farther than this from the meridian of its UTM zone [deg] does not belong to a map in that zone."""
 TO_LEFT, TO_RIGHT = 1, 2
 CROSSABLE = {"dashed": TO_LEFT | TO_RIGHT, "dashed_solid": TO_RIGHT, "solid_dashed": TO_LEFT}
 """In which direction a painted line may be crossed, by its subtype, which names its two lines from left to right."""
@@ -173,6 +175,8 @@ def _positions(
     zone = int((longitude + 180) // 6) % 60 + 1 if zone is None else zone
     east, north = _projection(zone, bool(latitude >= 0)).transform(*degrees.T)
     positions = np.stack((east, north), 1) - np.asarray(origin)
+    meridian = 6 * zone - 183
+    outside |= np.abs((degrees[:, 1] - meridian + 180) % 360 - 180) > WIDEST
     outside |= ~(np.abs(positions) <= FARTHEST).all(1)
     if outside.any():
         bad = int(np.flatnonzero(outside)[0])
@@ -333,18 +337,25 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 @njit(cache=True)
+def _clear(
+    last: np.ndarray, middle: np.ndarray, near: np.ndarray, far: np.ndarray, foot: np.ndarray, line: np.ndarray
+) -> bool:
+    """Whether a boundary is crossed neither on the way from ``last`` to ``middle`` nor, but at its foot, by the rung."""
+    for k in range(len(line) - 1):
+        a, b = line[k], line[k + 1]
+        if not _same(a, last) and _meet(last, middle, a, b):
+            return False
+        if not _same(a, foot) and not _same(b, foot) and _meet(near, far, a, b):
+            return False
+    return True
+
+
+@njit(cache=True)
 def _connects(last: np.ndarray, near: np.ndarray, far: np.ndarray, near_line: np.ndarray, far_line: np.ndarray) -> bool:
     """Whether a rung from ``near`` on one boundary to ``far`` on the other one crosses neither of them elsewhere, nor does
     the centreline on its way from its ``last`` point to the middle of the rung."""
     middle = 0.5 * (near + far)
-    for line, foot in ((near_line, near), (far_line, far)):
-        for k in range(len(line) - 1):
-            a, b = line[k], line[k + 1]
-            if not _same(a, last) and _meet(last, middle, a, b):
-                return False
-            if not _same(a, foot) and not _same(b, foot) and _meet(near, far, a, b):
-                return False
-    return True
+    return _clear(last, middle, near, far, near, near_line) and _clear(last, middle, near, far, far, far_line)
 
 
 @njit(cache=True)
@@ -353,17 +364,22 @@ def _next_rung(
 ) -> tuple[int, float]:
     """The nearest point after number ``far`` of one boundary that a rung can connect to point ``near`` of the other one,
     and the length of that rung; -1 where there is none. ``gates`` are entry and exit, each with the lanelet to its right."""
-    rest = far_line[far + 1 :] - near_line[near]
-    lengths = np.sqrt(rest[:, 0] ** 2 + rest[:, 1] ** 2)
-    for k in np.argsort(lengths, kind="mergesort"):
-        candidate = far_line[far + 1 + k]
-        middle = 0.5 * (near_line[near] + candidate)
+    lengths = np.empty(len(far_line))
+    lengths[: far + 1] = np.inf
+    for k in range(far + 1, len(far_line)):
+        lengths[k] = np.hypot(far_line[k, 0] - near_line[near, 0], far_line[k, 1] - near_line[near, 1])
+    for _ in range(far + 1, len(far_line)):
+        k = int(lengths.argmin())
+        middle = 0.5 * (near_line[near] + far_line[k])
         leaves = False
-        for gate in gates:
-            if _side(gate[0], gate[1], middle) > 0 and _meet(last, middle, gate[0], gate[1]):
+        for gate in range(2):
+            if _side(gates[gate, 0], gates[gate, 1], middle) > 0 and _meet(
+                last, middle, gates[gate, 0], gates[gate, 1]
+            ):
                 leaves = True
-        if not leaves and _connects(last, near_line[near], candidate, near_line, far_line):
-            return far + 1 + k, lengths[k]
+        if not leaves and _connects(last, near_line[near], far_line[k], near_line, far_line):
+            return k, lengths[k]
+        lengths[k] = np.inf
     return -1, np.inf
 
 
