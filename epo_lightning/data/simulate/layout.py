@@ -126,10 +126,6 @@ class Layout:
         """Values of s and the heading of the reference curve there, for interpolation."""
         return self._curve[0], self._curve[2]
 
-    def curvature_at(self, s: Values) -> Values:
-        """Curvature of the reference curve [1/m]."""
-        return np.interp(s, *self._curve[:2])
-
     def edges(self, strip: Strip, s: Values) -> tuple[Values, Values]:
         """Offsets of a strip's left and right boundary [m]."""
         left = (strip.place + 0.5) * self.width - self._swing(strip.join - s) - self._swing(s - strip.leave)
@@ -145,6 +141,13 @@ class Layout:
         slope = self._steepness(strip.join - s) - self._steepness(s - strip.leave)
         stretch = 1.0 - np.interp(s, grid, curvature) * self.offset(strip, s)
         return np.interp(s, grid, heading) + np.arctan2(slope, stretch)
+
+    def along(self, strip: Strip, s: Values) -> Values:
+        """Distance along a strip's centreline from its beginning [m]."""
+        grid = self._curve[0]
+        points = self.locate(grid, self.offset(strip, grid))
+        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        return np.interp(s, grid, arc) - np.interp(strip.begin, grid, arc)
 
     def _swing(self, beyond: Values) -> Values:
         """How far a ramp is away from its place on the road, so far beyond the point where it touches the road [m]."""
@@ -216,9 +219,9 @@ LAYOUTS = (
         slope=0.06,
         strips=(*_main(2, 1500), Strip(-1, 820, 1470, leave=1120), *_shoulders((0, 820), (1300, 1500))),
         area=(450, 1330),
-        main=2900,
+        main=3400,
         on=0,
-        off=1000,
+        off=1200,
     ),
     Layout(
         id=3,
@@ -249,11 +252,11 @@ LAYOUTS = (
         width=3.5,
         limit=120 / 3.6,
         slope=0.07,
-        strips=(*_main(2, 1550), Strip(-1, 400, 1350, join=640, leave=1080), *_shoulders((0, 480), (1250, 1550))),
-        area=(500, 1280),
-        main=2500,
-        on=800,
-        off=800,
+        strips=(*_main(2, 1550), Strip(-1, 400, 1350, join=640, leave=1080), *_shoulders((0, 460), (1270, 1550))),
+        area=(460, 1380),
+        main=2900,
+        on=900,
+        off=900,
     ),
     Layout(
         id=5,
@@ -271,8 +274,8 @@ LAYOUTS = (
             *_shoulders((0, 460), (860, 1500)),
         ),
         area=(480, 1380),
-        main=2700,
-        on=600,
+        main=3000,
+        on=700,
         off=0,
     ),
     Layout(
@@ -291,8 +294,8 @@ LAYOUTS = (
             *_shoulders((0, 440)),
         ),
         area=(500, 1350),
-        main=2400,
-        on=1500,
+        main=3200,
+        on=1800,
         off=0,
     ),
 )

@@ -57,14 +57,14 @@ def tracks(motion: Motion, layout: Layout, number: int) -> pl.DataFrame:
     normal = np.interp(motion.s, *layout.course)
     across = np.cos(direction - normal)
     offset = (motion.d - _piecewise(motion.strip, [layout.offset(lane, motion.s) for lane in lanes])) * across
-    lanelet, position, extent = _lanelets(motion, layout)
+    lanelet, before, extent = _lanelets(motion, layout)
     around = _neighbours(motion, layout)
 
     lead = around.pop("leadId")
     has = lead != NONE
     leader = np.where(has, lead, 0)
-    stretch = 1.0 - layout.curvature_at(motion.s) * motion.d
-    headway = np.where(has, (motion.s[leader] - motion.s - (length + length[leader]) / 2) * stretch, NONE)
+    along = _piecewise(motion.strip, [layout.along(lane, motion.s) for lane in lanes])
+    headway = np.where(has, along[leader] - along - (length + length[leader]) / 2, NONE)
     closing = np.where(has, speed - speed[leader], -1000.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         time_headway = np.where(has & (speed > 0.1), headway / speed, NONE)
@@ -96,7 +96,7 @@ def tracks(motion: Motion, layout: Layout, number: int) -> pl.DataFrame:
         "laneWidth": layout.width * across,
         "laneletId": lanelet,
         "laneChange": lane_changes(motion),
-        "lonLaneletPos": position,
+        "lonLaneletPos": along - before,
         "laneletLength": extent,
         "leadDHW": headway,
         "leadDV": closing,
@@ -122,21 +122,16 @@ def tracks(motion: Motion, layout: Layout, number: int) -> pl.DataFrame:
 def _lanelets(
     motion: Motion, layout: Layout
 ) -> tuple[Int[np.ndarray, " T"], Float[np.ndarray, " T"], Float[np.ndarray, " T"]]:
-    """Id of the lanelet that holds each row, the position along its centreline and its length [m]."""
+    """Id of the lanelet that holds each row, how far along its strip it begins and how long it is [m]."""
     ident = np.full(len(motion.s), NONE)
-    position, extent = np.zeros(len(motion.s)), np.zeros(len(motion.s))
-    driven = [index for index, strip in enumerate(layout.strips) if not strip.shoulder]
+    before, extent = np.zeros(len(motion.s)), np.zeros(len(motion.s))
     for piece in lanelets(layout):
-        if piece.strip not in driven:
-            continue
-        rows = (motion.strip == driven.index(piece.strip)) & (motion.s >= piece.begin) & (motion.s < piece.end)
-        s = np.linspace(piece.begin, piece.end, max(2, round(piece.end - piece.begin) + 1))
-        points = layout.locate(s, layout.offset(layout.strips[piece.strip], s))
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        ident[rows] = piece.id
-        position[rows] = np.interp(motion.s[rows], s, along)
-        extent[rows] = along[-1]
-    return ident, position, extent
+        strip = layout.strips[piece.strip]
+        if not strip.shoulder:
+            here = (motion.strip == layout.lanes.index(strip)) & (motion.s >= piece.begin) & (motion.s < piece.end)
+            begin, end = layout.along(strip, np.array([piece.begin, piece.end]))
+            ident[here], before[here], extent[here] = piece.id, begin, end - begin
+    return ident, before, extent
 
 
 def _neighbours(motion: Motion, layout: Layout) -> dict[str, Int[np.ndarray, " ..."]]:
