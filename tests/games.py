@@ -32,7 +32,7 @@ def random_scene(
     lanes: int = 0,
     dtype: torch.dtype = torch.float32,
 ) -> Scene:
-    """Agents within a few metres of each other, moving, each with two wiggly lines to follow; lanes of one to four vectors."""
+    """Agents within a few metres of each other, moving, each with two wiggly lines to follow, among lanes anywhere."""
     state = torch.randn(scenes, agents, history, 4, dtype=dtype)
     state[..., 3].abs_()
     way = torch.linspace(-4.0, 4.0, 6, dtype=dtype)
@@ -78,8 +78,8 @@ def highway_scene(scenes: int = 3, agents: int = 4, *, candidates: int = 6, hori
     line = torch.stack((along.expand(reference_lines, 12), middles.expand(reference_lines, 12)), -1)
     on = torch.randint(reference_lines, (scenes, agents, candidates))
     ahead = speed[..., None] * (1.0 + torch.rand(scenes, agents, candidates))
-    points = torch.stack((torch.linspace(-100.0, 150.0, vectors + 1).repeat(lanes, 1), 0.01 * torch.randn(lanes, vectors + 1)), -1)
-    points[..., 1] += 3.5 * torch.arange(lanes)[:, None]
+    across = 3.5 * torch.arange(lanes)[:, None] + 0.01 * torch.randn(lanes, vectors + 1)
+    points = torch.stack((torch.linspace(-100.0, 150.0, vectors + 1).expand_as(across), across), -1)
     points = points + torch.randn(scenes, 1, 1, 2)
     lane_mask = torch.ones(scenes, lanes, vectors, dtype=torch.bool)
     lane_mask[:, 1, 2:] = lane_mask[:, 3] = False
@@ -168,8 +168,8 @@ def pad(
     vectors: int = 0,
     candidates: int = 0,
 ) -> Scene:
-    """The same scene with absent agents, lanes, vectors of lanes and goal candidates appended and unobserved steps put before
-    its history, all holding ``filling``."""
+    """The same scene with absent agents, lanes, vectors and goal candidates appended and unobserved steps put before its
+    history, all of which hold ``filling``."""
 
     def grow(tensor: torch.Tensor | None, dim: int, count: int, value: float | bool, before: bool = False):
         if tensor is None or count == 0:

@@ -43,7 +43,7 @@ class GoalDecoder(nn.Module):
     def __init__(self, width: int, scale: float = 1.0) -> None:
         super().__init__()
         self.width, self.scale = width, scale
-        self.mlp = MLP(width + 2, 64, 1, norm="batch")
+        self.mlp = MLP(width + 2, 64, 1, norm="batch", bias=False)
 
     def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B N G"]:
         """Logits of the candidates, ``NO_CANDIDATE`` where there is none.

@@ -30,15 +30,18 @@ class MLP(nn.Module):
         width: size of the hidden features.
         layers: number of linear layers.
         norm: ``batch`` or ``layer`` normalisation of hidden features.
+        bias: whether the output has one; a softmax over rows takes no notice of it.
     """
 
-    def __init__(self, inputs: int, width: int, outputs: int, layers: int = 3, norm: str = "layer") -> None:
+    def __init__(
+        self, inputs: int, width: int, outputs: int, layers: int = 3, norm: str = "layer", bias: bool = True
+    ) -> None:
         super().__init__()
         sizes = [inputs, *[width] * (layers - 1)]
         normalisation = {"batch": _MaskedBatchNorm, "layer": nn.LayerNorm}[norm]
         self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
         self.norms = nn.ModuleList(normalisation(size) for size in sizes[1:])
-        self.output = nn.Linear(sizes[-1], outputs)
+        self.output = nn.Linear(sizes[-1], outputs, bias=bias)
 
     def forward(
         self, features: Float[Tensor, "*batch inputs"], mask: Bool[Tensor, "*batch"] | None = None

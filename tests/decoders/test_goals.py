@@ -98,5 +98,5 @@ def test_goals_and_their_lines_are_those_of_the_chosen_candidates():
 def test_a_scene_without_candidates_is_refused():
     scene = highway_scene(2, 3)
     bare = Scene(scene.history, scene.dt)
-    with pytest.raises(ValueError, match="goal_candidates .* is None"):
+    with pytest.raises(ValueError, match=r"goal_candidates .* is None"):
         GoalDecoder(8)(torch.randn(2, 3, 8), bare)

@@ -91,7 +91,10 @@ EPO = TestEPO.config
         ({"backbone": {"name": "v_lstm", "widht": 3}}, "did you mean 'width'"),
         ({"backbone": {}}, r"backbone\.name is missing"),
         ({"energy": {"name": "features", "own": ["gaol"]}}, "did you mean 'goal'"),
-        ({"energy": {"name": "features", "own": ["lane", "velref"]}}, "need reference, reference_speed, which neither"),
+        (
+            {"energy": {"name": "features", "own": ["lane", "velref"]}},
+            "need reference, reference_speed, which come with",
+        ),
         ({"energy": {"name": "features"}}, r"missing key energy\.own"),
         ({"solver": {"name": "levenberg_marquardt", "stepsize": 1}}, "did you mean 'step_size'"),
         ({"optimizer": {"name": "adam", "lr": -1.0}}, "optimizer.lr must be positive"),
