@@ -119,10 +119,10 @@ class RecordedScenes:
             **on_map,
         )
 
-    def provenance(self, indices: Tensor) -> list[dict[str, Any]]:
+    def provenance(self, indices: Sequence[int]) -> list[dict[str, Any]]:
         """Which recording, frame and tracks each of some scenes was extracted from."""
         found = []
-        for index in indices.tolist():
+        for index in indices:
             agents = self.tables["agents"][index]
             found.append(
                 {

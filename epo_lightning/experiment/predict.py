@@ -209,14 +209,6 @@ def pairs(scenes: Scene, count: int) -> tuple[Tensor, Tensor | None]:
     return ones, others
 
 
-def examples(scenes: Scene, count: int) -> tuple[Scene, Tensor | None]:
-    """The scenes of :func:`pairs`, and the other future of each."""
-    if scenes.future is None:
-        return spread(scenes, count), None
-    rows, others = pairs(scenes, count)
-    return scenes[rows], None if others is None else scenes.future[others]
-
-
 def forecast_of(forecaster: Any, scenes: Scene, batch_size: int = 256) -> JointForecast:
     """The forecasts of many scenes, batch by batch."""
     parts = [forecaster.predict(scenes[slice(i, i + batch_size)]) for i in range(0, len(scenes.history), batch_size)]

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.evaluate import open_checkpoint, open_data, split_of
-from epo_lightning.experiment.predict import examples, forecast_of, gather, spread
+from epo_lightning.experiment.evaluate import open_checkpoint, open_data
+from epo_lightning.experiment.predict import choose, eventful, forecast_of, is_traffic, pairs, spread
 from epo_lightning.experiment.settings import ReportSettings, Settings, read
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import build_tables, collect, write_report
@@ -52,6 +52,7 @@ def draw(runs: list[RunFolder], folder: Path) -> list[Path]:
     Every row is drawn by its first run; rows that were trained on other data than the first row are left out.
     """
     from epo_lightning.report.figures import joint_predictions
+    from epo_lightning.report.scenes import highway_comparison
     from epo_lightning.report.weights import learned_weights
 
     rows: dict[str, RunFolder] = {}
@@ -64,15 +65,24 @@ def draw(runs: list[RunFolder], folder: Path) -> list[Path]:
     of_rows = {title: read(Settings, run.config()) for title, run in rows.items()}
     try:
         first = next(iter(rows))
-        scenes = gather(split_of(open_data(rows[first], of_rows[first]), "test"))
         forecasters = {title: open_checkpoint(of_rows[title], run.checkpoint()) for title, run in rows.items()}
+        data, shape = open_data(rows[first], of_rows[first]), forecasters[first].configuration.get("shape", "disc")
+        # Records with two futures are found among all scenes only.
+        scenes, _ = choose(data, "test", None if data.subsets else GAMES)
     except ConfigError as error:
         print(f"no figures: {error}")
         return []
-    shown, other = examples(scenes, SCENES)
-    forecasts = {title: forecast_of(forecaster, shown) for title, forecaster in forecasters.items()}
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = [joint_predictions(shown, forecasts, folder / "joint_predictions.png", other)]
+    drawn: list[Path] = []
+    if is_traffic(scenes, shape):
+        for number, row in enumerate(eventful(scenes, SCENES), 1):
+            forecasts = {title: forecast_of(forecaster, scenes[row]) for title, forecaster in forecasters.items()}
+            drawn.append(highway_comparison(scenes[row], forecasts, folder / f"scene_{number}.png"))
+    else:
+        shown, others = pairs(scenes, SCENES)
+        other = None if others is None or scenes.future is None else scenes.future[others]
+        forecasts = {title: forecast_of(forecaster, scenes[shown]) for title, forecaster in forecasters.items()}
+        drawn.append(joint_predictions(scenes[shown], forecasts, folder / "joint_predictions.png", other))
     many = spread(scenes, GAMES)
     games = {title: forecast_of(forecasters[title], many) for title, f in forecasts.items() if f.parameters is not None}
     if games:

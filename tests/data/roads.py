@@ -1,4 +1,4 @@
-"""Roads and traffic that tests can reason about: parallel lanes, straight or on an arc; vehicles that keep or change lane."""
+"""Roads and traffic to reason about: parallel lanes, straight or on an arc; vehicles that keep or change lane."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def test_windows_are_those_that_a_loop_finds(seed, recipe):
         assert not expected
         return
     data = RecordedScenes(tables(scenes), recipe.dt, "fixed", [of.name])
-    known = data.provenance(torch.arange(len(data)))
+    known = data.provenance(range(len(data)))
     assert {(entry["frame"], frozenset(entry["tracks"])) for entry in known} == expected
     dropped = sum(
         counts[reason]
@@ -112,7 +112,7 @@ def test_a_scene_holds_what_the_recording_says():
     of = recording(curve(700.0, 0.4, (4000.0, -900.0)))
     scene, data = scenes_of(of)
     tracks = of.tracks
-    for index, entry in enumerate(data.provenance(torch.arange(len(data)))):
+    for index, entry in enumerate(data.provenance(range(len(data)))):
         for i, track in enumerate(entry["tracks"]):
             rows = np.flatnonzero(tracks.ids[tracks.agent] == track)
             origin = scene.frame[index, :2].numpy()
@@ -180,7 +180,7 @@ def test_neighbours_may_be_observed_in_part():
     seen = part.agent_mask.all(1)
     assert seen.any()
     for index in seen.nonzero().flatten().tolist():
-        entry = data.provenance(torch.tensor([index]))[0]
+        entry = data.provenance([index])[0]
         steps = part.history_mask[index, entry["tracks"].index(3)].sum()
         assert int(steps) == min(10, (entry["frame"] - 125) // 5 + 1)
     assert (part.history[~part.history_mask] == 0).all()
@@ -206,7 +206,7 @@ def test_joined_scenes_are_the_same_scenes():
     for field in dataclasses.fields(ours):
         if isinstance(getattr(ours, field.name), torch.Tensor) and field.name != "id":
             assert torch.equal(getattr(ours, field.name), getattr(theirs, field.name)), field.name
-    assert both.provenance(torch.tensor([len(first)]))[0]["recording"] == "1.0"
+    assert both.provenance([len(first)])[0]["recording"] == "1.0"
 
 
 @pytest.mark.parametrize(
