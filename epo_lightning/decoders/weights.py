@@ -35,7 +35,7 @@ class OwnWeights(nn.Module):
     ) -> None:
         super().__init__()
         self.modes, self.features = modes, tuple(features)
-        starts = [start.get(name, 1.0) if isinstance(start, Mapping) else start for name in self.features]
+        starts = [float(start.get(name, 1.0) if isinstance(start, Mapping) else start) for name in self.features]
         self.register_buffer("start", torch.tensor(starts * modes), persistent=False)
         self.mlp = MLP(width, 64, modes * len(self.features), norm="batch")
 

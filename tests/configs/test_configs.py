@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from experiment import tiny
@@ -13,6 +14,7 @@ from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.compose import compose, hydra, jobs, options_of, tree
 from epo_lightning.experiment.settings import Settings, read
+from epo_lightning.forecasters import build_forecaster
 
 CONF = tree() / "conf"
 
@@ -69,6 +71,19 @@ def test_budgets_and_debugging_compose(budget: str, debug: list[str]) -> None:
 def test_data_sets_can_be_described(data: str) -> None:
     built = assembly.build_data(compose("generate", [f"data={data}"])["data"])
     assert isinstance(built, SceneDataModule)
+
+
+@pytest.mark.parametrize("backbone", names(CONF / "backbone"))
+@pytest.mark.parametrize("forecaster", names(CONF / "forecaster"))
+def test_backbones_and_forecasters_can_be_built_for_highways(backbone: str, forecaster: str) -> None:
+    words = ["experiment=rpi/v_lstm", "energy=exid", f"backbone={backbone}", f"forecaster={forecaster}"]
+    settings = read(Settings, compose("train", words))
+    data = SimpleNamespace(horizon=20, dt=0.2, subsets=(), shape="box", candidates=60, has_map=True)
+    built = build_forecaster(assembly.describe_model(settings, data))
+    assert (built.task.candidates, built.task.map) == (60, True)
+    learned = [name for name, _ in built.named_parameters()]
+    assert any(name.startswith("backbone.lanes") for name in learned) == (forecaster != "constant_velocity")
+    assert any(name.startswith("goals") for name in learned) == forecaster.startswith("epo")
 
 
 @pytest.mark.parametrize("sweep", names(tree() / "sweeps"))
