@@ -76,9 +76,12 @@ def map_path(layout: Layout) -> str:
     return f"maps/lanelet2/{layout.id}_{layout.name}/location{layout.id}.osm"
 
 
-def _record(work: Path, name: str, number: int, layout: int, seed: int, seconds: float) -> int:
-    """Simulate and write one recording; its ``.done`` file comes last."""
-    place = LAYOUTS[layout]
+def record(work: Path, name: str, number: int, place: Layout, seed: int, seconds: float) -> int:
+    """Simulate and write recording ``number`` of the configuration called ``name``; its ``.done`` file comes last.
+
+    Raises:
+        ConfigError: SUMO is missing or fails, too many vehicles have accidents, or nobody changes lane.
+    """
     with tempfile.TemporaryDirectory() as folder:
         traffic = simulate(place, [seed, number], seconds, Path(folder))
     dropped = sum(traffic.dropped.values())
@@ -203,7 +206,9 @@ def make_recordings(folder: Path, config: Mapping[str, Any], workers: int | None
             max_tasks_per_child=1,
         ) as pool:
             running = [
-                pool.submit(_record, work, name, number, numbers[number], config["seed"], config["minutes"] * 60.0)
+                pool.submit(
+                    record, work, name, number, LAYOUTS[numbers[number]], config["seed"], config["minutes"] * 60.0
+                )
                 for number in missing
             ]
             try:
@@ -235,6 +240,7 @@ def _finish(folder: Path, work: Path, config: Mapping[str, Any], numbers: Mappin
         if done is None:
             raise cache.CacheError(f"recording {number} in {work} cannot be read back: is the disk full?")
         files.update(done.pop("files"))
+        del done["config"]
         report[f"{number:02d}"] = done
     for number in numbers:
         _done_path(work, number).unlink()

@@ -1,0 +1,158 @@
+"""Folders of simulated recordings: complete or not there, the same for any number of workers, continued after a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from epo_lightning.data import cache
+from epo_lightning.data.simulate import config, generate, make_recordings
+from epo_lightning.data.simulate.layout import LAYOUTS
+from epo_lightning.registry import ConfigError, lookup
+
+SMALL = config(seed=3, recordings=2, minutes=0.25, layouts=[2])
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_a_configuration_is_plain_and_names_everything_that_matters():
+    base = config()
+    assert json.loads(json.dumps(base)) == base
+    assert base["layouts"] == [layout.id for layout in LAYOUTS]
+    others = [config(seed=1), config(recordings=1), config(minutes=1.0), config(layouts=[0])]
+    assert len({cache.digest(each) for each in (base, *others)}) == 5
+    assert config(layouts=[3, 1, 1]) == config(layouts=[1, 3])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"layouts": [0, 99]}, "unknown layout 99: known are 0, 1"),
+        ({"layouts": []}, "layouts is empty"),
+        ({"recordings": 0}, "recordings is 0"),
+        ({"minutes": 0.01}, "minutes is 0.01"),
+        ({"minutes": float("nan")}, "minutes is nan"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(wrong: dict[str, Any], message: str):
+    with pytest.raises(ConfigError, match=message):
+        config(**wrong)
+
+
+def finished(folder: Path, of: dict[str, Any]) -> Path:
+    """A folder like a finished one, with one file."""
+    (folder / "data").mkdir(parents=True)
+    file = folder / "data" / "00_tracks.csv"
+    file.write_text("trackId\n")
+    files = {"data/00_tracks.csv": {"bytes": file.stat().st_size, "sha256": cache.file_digest(file)}}
+    (folder / cache.MANIFEST).write_text(json.dumps({"hash": cache.digest(of), "config": of, "files": files}))
+    return folder
+
+
+def test_a_folder_that_is_there_is_not_made_again(tmp_path: Path):
+    folder = finished(tmp_path / "there", SMALL)
+    before = contents(folder)
+    assert make_recordings(folder, SMALL) == folder
+    assert contents(folder) == before
+
+
+def test_a_folder_that_is_something_else_is_left_alone(tmp_path: Path):
+    folder = finished(tmp_path / "there", SMALL)
+    with pytest.raises(cache.CacheError, match="another configuration"):
+        make_recordings(folder, config(seed=4))
+    (folder / "data" / "00_tracks.csv").write_text("")
+    with pytest.raises(cache.CacheError, match=r"00_tracks\.csv is missing or truncated; delete the folder"):
+        make_recordings(folder, SMALL)
+    (folder / cache.MANIFEST).write_text("{")
+    with pytest.raises(cache.CacheError, match="not a readable manifest"):
+        make_recordings(folder, SMALL)
+
+
+def test_too_many_accidents_are_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    monkeypatch.setattr(generate, "MOST_DROPPED", -1.0)
+    with pytest.raises(ConfigError, match=r"recording 0 on layout diverge: 0 of \d+ vehicles collide or jump"):
+        generate.record(tmp_path, "", 0, LAYOUTS[2], 3, 2.0)
+
+
+def test_traffic_in_which_nobody_changes_lane_is_no_recording(tmp_path: Path):
+    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    with pytest.raises(ConfigError, match=r"nobody changes lane in 0\.04 s: use more minutes"):
+        generate.record(tmp_path, "", 0, LAYOUTS[2], 3, 0.04)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    return make_recordings(tmp_path_factory.mktemp("two") / "set", SMALL, workers=2, progress=False)
+
+
+@pytest.mark.slow
+def test_a_set_is_whole(made: Path):
+    manifest = generate.verify(made, SMALL)
+    files = contents(made)
+    assert set(manifest["files"]) == set(files) - {cache.MANIFEST}
+    assert [path for path in made.iterdir() if path.name.startswith(".")] == []
+    assert [path for path in made.parent.iterdir() if path != made] == []
+    assert all(row["lane_changes"] > 0 for row in manifest["recordings"].values())
+    assert files["data/00_tracks.csv"] != files["data/01_tracks.csv"]
+    read = [source.read() for source in lookup("format", "exid")(made)]
+    assert [recording.group for recording in read] == ["2", "2"]
+    for name, recording in zip(("00", "01"), read, strict=True):
+        assert len(recording.tracks.ids) == manifest["recordings"][name]["vehicles"]
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(made: Path, tmp_path: Path):
+    """One worker, killed after the first recording: the second run keeps it, and equals the run of two workers."""
+    folder = tmp_path / "set"
+    program = (
+        "from pathlib import Path\n"
+        "from epo_lightning.data.simulate import make_recordings\n"
+        "if __name__ == '__main__':\n"
+        f"    make_recordings(Path({str(folder)!r}), {SMALL!r}, workers=1, progress=False)\n"
+    )
+    (tmp_path / "run.py").write_text(program)
+    process = subprocess.Popen([sys.executable, str(tmp_path / "run.py")], cwd=Path.cwd())
+    work = tmp_path / f".set-{cache.digest(SMALL)[:12]}"
+    deadline = time.monotonic() + 120
+    while not (work / ".00.done").exists():
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not folder.exists()
+    first = work / "data" / "00_tracks.csv"
+    written = first.stat().st_mtime_ns
+    assert make_recordings(folder, SMALL, workers=1, progress=False) == folder
+    assert (folder / "data" / "00_tracks.csv").stat().st_mtime_ns == written
+    assert contents(folder) == contents(made)
+
+
+@pytest.mark.slow
+def test_a_damaged_recording_is_made_again(made: Path, tmp_path: Path):
+    work = tmp_path / f".set-{cache.digest(SMALL)[:12]}"
+    (work / "data").mkdir(parents=True)
+    manifest = generate.verify(made, SMALL)
+    for number in ("00", "01"):
+        files = {name: entry for name, entry in manifest["files"].items() if name.startswith(f"data/{number}")}
+        for name in files:
+            os.link(made / name, work / name)
+        (work / f".{number}.done").write_text(
+            json.dumps({**manifest["recordings"][number], "config": cache.digest(SMALL), "files": files})
+        )
+    (work / "data" / "01_tracks.csv").unlink()
+    (work / "data" / "01_tracks.csv").write_text("cut off")
+    make_recordings(tmp_path / "set", SMALL, workers=1, progress=False)
+    assert contents(tmp_path / "set") == contents(made)
