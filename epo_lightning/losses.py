@@ -68,7 +68,7 @@ def goal(
     candidates: Float[Tensor, "B N G 2"],
     exists: Bool[Tensor, "B N G"],
     final: Float[Tensor, "B N 2"],
-    observed: Bool[Tensor, " B N"],
+    observed: Bool[Tensor, "B N"],
 ) -> Float[Tensor, ""]:
     """L_goal: cross entropy between each agent's goal probabilities and the candidate closest to where it ended up.
 

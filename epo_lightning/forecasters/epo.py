@@ -165,10 +165,10 @@ def _checked(start: float | Mapping[str, float], features: Sequence[str]) -> flo
     Raises:
         ConfigError: the name of a feature that the energy does not have, or a weight that is not positive.
     """
-    named = start if isinstance(start, Mapping) else {"": start}
+    named = start if isinstance(start, Mapping) else dict.fromkeys(features, start)
     for name, value in named.items():
-        if name and name not in features:
+        if name not in features:
             raise ConfigError(f"unknown feature forecaster.own_start.{name}: {nearest(name, features)}")
         if not value > 0:
-            raise ConfigError(f"forecaster.own_start{'.' * bool(name)}{name} must be positive, not {value}")
+            raise ConfigError(f"forecaster.own_start must be positive, but {name} would start at {value}")
     return start

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from games import EXID, highway_scene, pad
-from suites import LOSS_WEIGHTS, HighwaySuite, highway_model
+from suites import LOSS_WEIGHTS, HighwaySuite, highway_model, model
 
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.registry import ConfigError
@@ -126,13 +126,13 @@ def test_an_agent_without_a_future_teaches_nothing():
     for config in (EPO, TestSceneConsistent.config, TestMarginal.config):
         gradients = []
         for filling in (0.0, float("nan")):
-            model, scene = forecaster(config).train(), highway_scene(6)
+            learner = forecaster(config).train()
             torch.manual_seed(2)
             scene = highway_scene(6)
             scene.future_mask[:, 1] = False
             scene.future[~scene.future_mask] = filling
-            sum(weight * value for weight, value in model.losses(scene, model(scene)).values()).backward()
-            gradients.append([p.grad for p in model.parameters()])
+            sum(weight * value for weight, value in learner.losses(scene, learner(scene)).values()).backward()
+            gradients.append([p.grad for p in learner.parameters()])
         torch.testing.assert_close(gradients[0], gradients[1], rtol=0, atol=0)
         assert all(gradient.isfinite().all() for gradient in gradients[1])
 
@@ -144,7 +144,7 @@ def test_an_agent_without_a_future_teaches_nothing():
         ({"candidates": 1}, "need lane|need reference, reference_speed, which come with data that has several"),
         ({"forecaster": {**EPO, "initial": "zeros"}}, "unknown forecaster.initial 'zeros': did you mean 'zero'"),
         ({"forecaster": {**EPO, "own_start": {"val": 1.0}}}, "own_start.val: did you mean 'vel'"),
-        ({"forecaster": {**EPO, "own_start": {"vel": 0.0}}}, "own_start.vel must be positive"),
+        ({"forecaster": {**EPO, "own_start": {"vel": 0.0}}}, "own_start must be positive, but vel would start at 0.0"),
         ({"forecaster": {**EPO, "own_start": -1.0}}, "own_start must be positive"),
         ({"forecaster": {**EPO, "loss_weights": LOSS_WEIGHTS}}, "loss_weights must name"),
     ],
@@ -172,8 +172,6 @@ def test_scenes_that_lack_what_is_needed_are_refused(gone, message):
 
 def test_models_from_before_there_were_maps_still_build():
     """The keys that old checkpoints lack."""
-    from suites import model
-
     old = model({"name": "epo", "modes": 2, "loss_weights": LOSS_WEIGHTS, "own_start": 1.0})
     assert not {"candidates", "map"} & set(old)
     task = build_forecaster(old).task
