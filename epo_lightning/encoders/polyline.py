@@ -43,12 +43,11 @@ class LanePolylines(nn.Module):
         # Absent vectors repeat the first existing one, which no maximum notices.
         first = mask.to(torch.uint8).argmax(-1)[..., None, None].expand(-1, -1, -1, VECTOR)
         vectors = torch.where(mask[..., None], lanes, lanes.gather(2, first))
-        features = self.linears[0](torch.where(exists, vectors, 0.0) / self.scale)
-        features = self.norms[0](features).relu()
+        features = self.norms[0](self.linears[0](torch.where(exists, vectors, 0.0) / self.scale)).relu_()
         for linear, norm in zip(self.linears[1:], self.norms[1:], strict=True):
             assert isinstance(linear, nn.Linear)
             # The linear map of the concatenation, without writing the maximum down once for every vector.
             of_vector, of_polyline = linear.weight.split(self.width, 1)
             of_maximum = F.linear(features.amax(-2), of_polyline, linear.bias)
-            features = norm(F.linear(features, of_vector) + of_maximum[..., None, :]).relu()
+            features = norm(F.linear(features, of_vector).add_(of_maximum[..., None, :])).relu_()
         return features.amax(-2)
