@@ -65,11 +65,12 @@ class EPO(Forecaster):
         relaxation: float = 0.0,
         relaxation_steps: int = 1000,
     ) -> None:
-        lacking = energy.needs - {"goals", "size"}
-        if lacking and task.candidates == 1:
+        known = {"size"} | ({"goals"} if task.candidates else set())
+        lacking = energy.needs - known - ({"reference", "reference_speed"} if task.candidates > 1 else set())
+        if lacking:
             raise ConfigError(
-                f"features of energy.own need {', '.join(sorted(lacking))}, which come with data that has several goal "
-                "candidates: leave them out, or choose data with a map"
+                f"features of energy.own need {', '.join(sorted(lacking))}, which this data does not give: leave them out, "
+                "or choose data with a map"
             )
         if initial not in INITIAL:
             raise ConfigError(f"unknown forecaster.initial {initial!r}: {nearest(str(initial), INITIAL)}")
