@@ -48,7 +48,7 @@ def highway_model(forecaster: dict[str, Any], **changes: Any) -> dict[str, Any]:
     return model(
         forecaster,
         **{
-            "backbone": {"name": "v_lstm", "scale": 50.0},
+            "backbone": {"name": "v_lstm"},
             "energy": {"name": "features", "own": list(EXID), "pair": ["proximity"]},
             "horizon": 8,
             "dt": 0.2,
@@ -56,6 +56,7 @@ def highway_model(forecaster: dict[str, Any], **changes: Any) -> dict[str, Any]:
             "shape": "box",
             "candidates": 6,
             "map": True,
+            "scale": 50.0,
             **changes,
         },
     )
@@ -293,7 +294,7 @@ class HighwaySuite(ForecasterSuite):
         self.backbone = request.param
 
     def model(self, **changes: Any) -> dict[str, Any]:
-        return highway_model(self.config, **{"backbone": {"name": self.backbone, "scale": 50.0}, **changes})
+        return highway_model(self.config, **{"backbone": {"name": self.backbone}, **changes})
 
     def scene(self, scenes: int) -> Scene:
         return highway_scene(scenes)

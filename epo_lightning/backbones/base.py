@@ -15,8 +15,6 @@ class Backbone(nn.Module):
     """Observation encoder phi_glob: ``forward(scene)`` returns features z [B, N, width] of all agents (Section 4.1)."""
 
     width: int
-    scale: float = 1.0
-    """Metres that an input of one stands for, which decoders that read or write positions take over."""
 
 
 class PolylineBackbone(Backbone):
@@ -35,7 +33,7 @@ class PolylineBackbone(Backbone):
         super().__init__()
         if not history.scale > 0:
             raise ValueError(f"scale must be positive, not {history.scale}: the metres that an input of one stands for")
-        self.width, self.scale = width, history.scale
+        self.width = width
         self.history = history
         self.to_graph = nn.Linear(history.width, width)
         self.goal_to_graph = nn.Linear(2, width) if goal_input else None
@@ -46,7 +44,7 @@ class PolylineBackbone(Backbone):
         """What each agent did, and its goal where that is given to the network."""
         features = self.to_graph(self.history(scene))
         if self.goal_to_graph is not None:
-            features = features + self.goal_to_graph(given_goals(scene) / self.scale)
+            features = features + self.goal_to_graph(given_goals(scene) / self.history.scale)
         return features
 
     def lane_features(self, scene: Scene) -> tuple[Float[Tensor, "B L {self.width}"], Bool[Tensor, "B L"]]:

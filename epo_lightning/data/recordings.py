@@ -167,6 +167,7 @@ class RecordedData(SceneDataModule):
         val_by: ``recording`` or ``group``. Windows of one recording are never in two splits.
         frame: ``fixed`` (axes of the recording) or ``aligned`` (x where the agents head on average).
         shape: agents' outline in the overlap rates, ``box`` or ``disc``.
+        scale: metres that an input of one of a network stands for.
         root: folder of the cache; None for $EPO_CACHE or ``cache``.
         seed: of the draws, and of the batches' order where a run sets no other.
         batch_size: scenes per batch.
@@ -185,6 +186,7 @@ class RecordedData(SceneDataModule):
         val_by: str = "recording",
         frame: str = "fixed",
         shape: str = "box",
+        scale: float = 20.0,
         root: str | None = None,
         seed: int = 0,
         batch_size: int = 32,
@@ -209,7 +211,9 @@ class RecordedData(SceneDataModule):
             if value not in known:
                 raise ConfigError(f"unknown data.{name} {value!r}: {nearest(str(value), known)}")
         self.test_share, self.val_share, self.val_by = test_share, val_share, val_by
-        self.frame, self.shape = frame, shape
+        if not 0 < scale < np.inf:
+            raise ConfigError(f"data.scale must be positive, not {scale}: the metres that an input of one stands for")
+        self.frame, self.shape, self.scale = frame, shape, scale
         self.root = Path(root).expanduser() if root else cache.default_root()
 
     def sources(self) -> list[Source]:

@@ -40,6 +40,7 @@ def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
         "shape": getattr(data, "shape", "disc"),
         "candidates": int(getattr(data, "candidates", 1)),
         "map": bool(getattr(data, "has_map", False)),
+        "scale": float(getattr(data, "scale", 1.0)),
     }
 
 

@@ -17,7 +17,7 @@ __all__ = ["Forecaster", "Task", "build_forecaster", "check_model", "load"]
 
 _PARTS = ("backbone", "dynamics", "energy", "solver")
 _SECTIONS = ("forecaster", "optimizer", *_PARTS)
-_TASK = ("horizon", "dt", "subsets", "shape", "candidates", "map")
+_TASK = ("horizon", "dt", "subsets", "shape", "candidates", "map", "scale")
 GOALS = ("energy", "all")
 """Who is told a given goal: the energy alone (the paper), or the network of every learned forecaster as well."""
 
@@ -44,7 +44,7 @@ def check_model(model: Mapping[str, Any]) -> None:
     check("optimizer", model["optimizer"])
     check("forecaster", model["forecaster"], supplied=("task", "optimizer", *_PARTS))
     for kind in _PARTS:
-        check(kind, model[kind], supplied=("goal_input", "map_input", "dynamics"))
+        check(kind, model[kind], supplied=("goal_input", "map_input", "scale", "dynamics"))
 
 
 def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
@@ -53,7 +53,7 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
     Args:
         model: the sections ``forecaster``, ``backbone``, ``dynamics``, ``energy``, ``solver`` and ``optimizer``, each with
             the ``name`` of a part and its arguments; ``goal`` (``energy`` or ``all``); and the task: ``horizon``, ``dt``,
-            ``subsets``, ``shape``, ``candidates`` and ``map``.
+            ``subsets``, ``shape``, ``candidates``, ``map`` and ``scale``.
 
     Raises:
         ConfigError: as :func:`check_model`, or a value that a part refuses.
@@ -71,8 +71,9 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
         parts["solver"] = build("solver", model["solver"])
     if "backbone" in wanted:
         inputs = {"goal_input": model["goal"] == "all"}
-        if "map_input" in inspect.signature(lookup("backbone", model["backbone"]["name"])).parameters:
-            inputs["map_input"] = model.get("map", False)
+        told = {"map_input": model.get("map", False), "scale": model.get("scale", 1.0)}
+        asked = inspect.signature(lookup("backbone", model["backbone"]["name"])).parameters
+        inputs |= {name: value for name, value in told.items() if name in asked}
         parts["backbone"] = build("backbone", model["backbone"], **inputs)
     task = Task(
         model["horizon"],
@@ -81,6 +82,7 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
         model.get("shape", "disc"),
         model.get("candidates", 1),
         model.get("map", False),
+        model.get("scale", 1.0),
     )
     optimizer = build("optimizer", model["optimizer"])
     forecaster: Forecaster = build("forecaster", model["forecaster"], task=task, optimizer=optimizer, **parts)

@@ -29,6 +29,7 @@ class Task:
         candidates: number G of goal candidates per agent. One is a given goal; where there are more, scenes also bring
             reference lines, the line of each candidate, and reference speeds.
         map: whether scenes bring lanes.
+        scale: metres that an input or output of one stands for.
     """
 
     horizon: int
@@ -37,6 +38,7 @@ class Task:
     shape: str = "disc"
     candidates: int = 1
     map: bool = False
+    scale: float = 1.0
 
 
 class Forecaster(LightningModule):

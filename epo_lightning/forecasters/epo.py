@@ -76,7 +76,7 @@ class EPO(Forecaster):
             raise ConfigError(f"unknown forecaster.initial {initial!r}: {nearest(str(initial), INITIAL)}")
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver, modes
-        width, scale = backbone.width, backbone.scale
+        width, scale = backbone.width, task.scale
         decodes_goals = task.candidates > 1 and bool(energy.needs & {"goals", "reference"})
         if decodes_goals:
             self.loss_weights = weights_of(loss_weights, ("imitation", "goal", "probability"))

@@ -44,7 +44,7 @@ class Marginal(Forecaster):
         self.backbone = backbone
         self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
-        self.decoder = Trajectories(backbone.width, modes, task.horizon, backbone.scale)
+        self.decoder = Trajectories(backbone.width, modes, task.horizon, task.scale)
 
     def forward(self, scene: Scene) -> JointForecast:
         current = scene.current.where(scene.agent_mask[..., None], 0.0)

@@ -48,7 +48,7 @@ class SceneConsistent(Forecaster):
         self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
-        self.probabilities = SceneProbabilities(backbone.width, modes, task.horizon, backbone.scale)
+        self.probabilities = SceneProbabilities(backbone.width, modes, task.horizon, task.scale)
 
     def forward(self, scene: Scene) -> JointForecast:
         z = self.backbone(scene)

@@ -93,7 +93,7 @@ EPO = TestEPO.config
         ({"energy": {"name": "features", "own": ["gaol"]}}, "did you mean 'goal'"),
         (
             {"energy": {"name": "features", "own": ["lane", "velref"]}},
-            "need reference, reference_speed, which come with",
+            "need reference, reference_speed, which this data does not give",
         ),
         ({"energy": {"name": "features"}}, r"missing key energy\.own"),
         ({"solver": {"name": "levenberg_marquardt", "stepsize": 1}}, "did you mean 'step_size'"),

@@ -95,7 +95,7 @@ def test_without_a_decoder_of_strategies_solutions_start_at_zero():
 @pytest.mark.parametrize("backbone", ["v_lstm", "vibes", "hivt_m"])
 def test_without_a_goal_in_the_energy_no_goal_is_decoded(backbone):
     """The ablation "no goal"."""
-    epo = forecaster(energy=WITHOUT_GOAL, backbone={"name": backbone, "scale": 50.0}).train()
+    epo = forecaster(energy=WITHOUT_GOAL, backbone={"name": backbone}).train()
     scene = highway_scene(16)
     scene = Scene(**{**vars(scene), "size": 20.0 * scene.size})
     forecast = epo(scene)

@@ -21,7 +21,7 @@ class SimulatedHighway(RecordedData):
         recordings: per layout.
         minutes: that each of them lasts.
         layouts: their ids; null for all.
-        dataset, windows, test, val_share, val_by, frame, root, batch_size: as of
+        dataset, windows, test, val_share, val_by, frame, scale, root, batch_size: as of
             :class:`~epo_lightning.data.recordings.RecordedData`.
         seed: of the traffic and of the splits, and of the batches' order where a run sets no other.
     """
@@ -37,6 +37,7 @@ class SimulatedHighway(RecordedData):
         val_share: float = 0.18,
         val_by: str = "recording",
         frame: str = "fixed",
+        scale: float = 20.0,
         root: str | None = None,
         seed: int = 0,
         batch_size: int = 32,
@@ -52,6 +53,7 @@ class SimulatedHighway(RecordedData):
             val_share=val_share,
             val_by=val_by,
             frame=frame,
+            scale=scale,
             root=root,
             seed=seed,
             batch_size=batch_size,
