@@ -35,7 +35,7 @@ MOST_DROPPED = 0.05
 
 
 def config(
-    seed: int = 0, recordings: int = 2, minutes: float = 8.0, layouts: Sequence[int] | None = None
+    seed: int = 0, recordings: int = 3, minutes: float = 9.0, layouts: Sequence[int] | None = None
 ) -> dict[str, Any]:
     """Everything that simulated recordings depend on, as plain values.
 
