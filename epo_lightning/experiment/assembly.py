@@ -127,7 +127,8 @@ def build_trainer(
             precision=settings.precision,  # type: ignore[arg-type]
             max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,
             max_steps=settings.max_steps,
-            check_val_every_n_epoch=settings.validate_every,
+            check_val_every_n_epoch=settings.validate_every if settings.validate_steps is None else None,
+            val_check_interval=settings.validate_steps,
             limit_train_batches=settings.limit_train_batches,
             limit_val_batches=settings.limit_val_batches,
             log_every_n_steps=settings.log_every,

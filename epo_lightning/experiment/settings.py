@@ -29,6 +29,7 @@ class TrainerSettings:
     precision: str = "32-true"
     threads: int = 1
     validate_every: int = 1
+    validate_steps: int | None = None
     limit_train_batches: int | float = 1.0
     limit_val_batches: int | float = 1.0
     log_every: int = 50
@@ -40,6 +41,8 @@ class TrainerSettings:
         for name in ("threads", "devices", "validate_every", "log_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"trainer.{name} must be 1 or more, not {getattr(self, name)}")
+        if self.validate_steps is not None and self.validate_steps < 1:
+            raise ConfigError(f"trainer.validate_steps must be 1 or more, or null, not {self.validate_steps}")
         for name in ("limit_train_batches", "limit_val_batches"):
             value = getattr(self, name)
             if value <= 0 or (isinstance(value, float) and value > 1):

@@ -29,8 +29,8 @@ class SimulatedHighway(RecordedData):
     def __init__(
         self,
         windows: Mapping[str, Any],
-        recordings: int = 2,
-        minutes: float = 8.0,
+        recordings: int = 3,
+        minutes: float = 9.0,
         layouts: Sequence[int] | None = None,
         dataset: str = "highway_sim",
         test: Sequence[str] | None = ("0",),
