@@ -1,0 +1,65 @@
+"""The recording format of docs/extend.md, run as it stands there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+
+from epo_lightning import registry
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recordings import RecordedData
+from epo_lightning.experiment.compose import tree
+
+PAGE = Path(__file__).parents[2] / "docs" / "extend.md"
+
+
+@pytest.fixture
+def settings(tmp_path: Path):
+    """The page's format, registered, and its YAML over those that it builds on."""
+    section = PAGE.read_text().split("## A recording format")[1].split("\n## ")[0]
+    (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    (text,) = re.findall(r"```yaml\n(.*?)```", section, re.DOTALL)
+    exec(code, {})
+    merged: dict = {}
+    for part in (*((tree() / "conf" / "data" / f"{name}.yaml").read_text() for name in ("exid", "ucy")), text):
+        entries = yaml.safe_load(part)
+        entries.pop("defaults", None)
+        windows = {**merged.get("windows", {}), **entries.get("windows", {})}
+        merged = {**merged, **entries, "windows": windows}
+    merged.pop("name")
+    yield {**merged, "folder": str(tmp_path), "root": str(tmp_path / "cache")}
+    del registry._PARTS["format"]["plain_csv"]
+
+
+def walkers(seed: int) -> pl.DataFrame:
+    """Four pedestrians side by side for eight seconds."""
+    random = np.random.default_rng(seed)
+    frame, agent = np.tile(np.arange(80), 4), np.repeat(np.arange(4), 80)
+    speed = random.uniform(1.0, 1.4, 4)[agent]
+    zeros = np.zeros(320)
+    columns = {"id": 7 + agent, "frame": frame, "x": speed * frame / 10, "y": 1.0 * agent, "heading": zeros}
+    return pl.DataFrame({**columns, "vx": speed, "vy": zeros, "length": zeros + 0.5, "width": zeros + 0.5})
+
+
+def test_the_documented_format_becomes_scenes(settings, tmp_path):
+    for seed in range(3):
+        walkers(seed).sample(fraction=1.0, shuffle=True, seed=seed).write_csv(tmp_path / f"{seed}.csv")
+    data = RecordedData(**settings)
+    data.generate(workers=1, progress=False)
+    data.setup("fit")
+    scene = next(iter(data.train_dataloader()))
+    assert scene.history.shape == (min(32, len(scene.history)), 4, 10, 4)
+    assert scene.agent_mask.all()
+    assert scene.lanes is None
+
+
+def test_the_documented_format_refuses_what_cannot_be(settings, tmp_path):
+    for seed in range(3):
+        walkers(seed).with_columns(vx=pl.col("vx") * 1000).write_csv(tmp_path / f"{seed}.csv")
+    with pytest.raises(RecordingError, match=r"\.csv: velocity .* of track 7 .* is it in another unit"):
+        RecordedData(**settings).generate(workers=1, progress=False)
