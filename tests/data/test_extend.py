@@ -52,7 +52,7 @@ def test_the_documented_format_becomes_scenes(settings, tmp_path):
     data = RecordedData(**settings)
     data.generate(workers=1, progress=False)
     data.setup("fit")
-    scene = next(iter(data.train_dataloader()))
+    scene = next(iter(data.val_dataloader()))
     assert scene.history.shape == (min(32, len(scene.history)), 4, 10, 4)
     assert scene.agent_mask.all()
     assert scene.lanes is None
