@@ -8,16 +8,11 @@ import shutil
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
@@ -27,7 +22,7 @@ from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
 from epo_lightning.data.routes import LINES, PER_LINE
 from epo_lightning.data.tracks import Source
 from epo_lightning.data.windows import Extract, Recipe, extract, joined
-from epo_lightning.data.workers import default_workers, watch_parent
+from epo_lightning.data.workers import finished
 from epo_lightning.registry import ConfigError, lookup, nearest, register
 from epo_lightning.scene import Scene
 
@@ -336,39 +331,9 @@ class RecordedData(SceneDataModule):
             for name, file in files.items()
             if not _complete(file)
         ]
-        bar = Progress(
-            TextColumn("extracting scenes"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("recordings"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-            refresh_per_second=1,
-            disable=not progress,
-        )
-        workers = min(workers or default_workers(), max(1, len(tasks)))
-        with bar:
-            row = bar.add_task("", total=len(files), completed=len(files) - len(tasks))
-            if workers == 1:
-                for task in tasks:
-                    _extract_to_file(*task)
-                    bar.advance(row)
-                return
-            with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=watch_parent) as pool:
-                running = [pool.submit(_extract_to_file, *task) for task in tasks]
-                try:
-                    for future in as_completed(running):
-                        future.result()
-                        bar.advance(row)
-                except BrokenProcessPool as error:
-                    raise cache.CacheError(
-                        "a worker process was killed while extracting scenes; finished recordings are kept: run the same "
-                        "command again, with fewer workers if memory is short"
-                    ) from error
-                except BaseException:
-                    pool.shutdown(cancel_futures=True)
-                    raise
+        done, kept = len(files) - len(tasks), "finished recordings are kept"
+        for _ in finished(_extract_to_file, tasks, workers, progress, "extracting scenes", "recordings", done, kept):
+            pass
 
     def _gather(self, part: str, files: Sequence[Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The scenes of a split, and what there is to say about them."""

@@ -15,13 +15,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from epo_lightning.data.clock import Stretches, stretches
-from epo_lightning.data.lanes import LaneGraph, Located, lane_changes
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.lanes import Located, lane_changes
 from epo_lightning.data.routes import Routes, pieces
 from epo_lightning.data.tracks import Recording
 from epo_lightning.registry import ConfigError
 
 VECTORS, SPACING = 10, 6.0
 """Vectors V of a lane polyline and their greatest length [m]."""
+MOST_BESIDE = 0.5
+"""Share of positions on no lane beyond which a map does not belong to its tracks."""
 CHUNK = 4_000_000
 """Distances between agents that are held at a time."""
 
@@ -161,7 +164,7 @@ def extract(recording: Recording, recipe: Recipe) -> tuple[Extract | None, dict[
     shortest = recipe.history + recipe.horizon if recipe.complete else 2
     clock, left_out = stretches(recording.tracks, recipe.dt, recipe.smoothing, shortest)
     counts.update(left_out)
-    located, changes = _on_lanes(clock, recording.lanes)
+    located, changes = _on_lanes(clock, recording)
     moments, members = _choose(clock, changes, recipe, counts)
     if recording.lanes is not None:
         on = _current(located.lane, clock, moments, members)
@@ -174,13 +177,24 @@ def extract(recording: Recording, recipe: Recipe) -> tuple[Extract | None, dict[
     return _assemble(recording, recipe, clock, located, moments, members), dict(counts)
 
 
-def _on_lanes(clock: Stretches, lanes: LaneGraph | None) -> tuple[Located, Int[np.ndarray, " Z"]]:
-    """Where every state is, and how many lane changes the rows have seen until then."""
+def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.ndarray, " Z"]]:
+    """Where every state is, and how many lane changes the rows have seen until then.
+
+    Raises:
+        RecordingError: a map that does not fit the tracks.
+    """
     rows = len(clock.state)
-    if lanes is None:
+    if recording.lanes is None:
         return Located(np.full(rows, -1), np.zeros(rows), np.zeros(rows)), np.zeros(rows, dtype=int)
-    located = lanes.locate(clock.state[:, :2], clock.state[:, 2])
-    return located, lane_changes(clock.owner, located, lanes).cumsum()
+    located = recording.lanes.locate(clock.state[:, :2], clock.state[:, 2])
+    beside = float((located.lane < 0).mean()) if rows else 0.0
+    if beside > MOST_BESIDE:
+        raise RecordingError(
+            recording.name,
+            f"{beside:.0%} of all positions lie on no lane of its map: is it the map of another place, or in other "
+            "coordinates? Give it the right one, or set data.map=false",
+        )
+    return located, lane_changes(clock.owner, located, recording.lanes).cumsum()
 
 
 def _current(values: np.ndarray, clock: Stretches, moments: np.ndarray, members: np.ndarray) -> np.ndarray:

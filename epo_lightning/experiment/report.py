@@ -40,9 +40,8 @@ def preface(runs: Iterable[RunFolder]) -> str:
         return ""
     return (
         f"**Budget: {', '.join(budgets)}.** These runs saw less data or fewer steps than the paper's, so the numbers show "
-        "that everything works, not which row is best, and do not reproduce the table. The paper's settings:\n\n"
-        "```\nepo generate\nepo train -m sweeps=rpi_main\nepo evaluate runs=runs\nepo report runs=runs out=report\n```\n\n"
-        "With `budget=long` after the sweep it takes about an hour per run."
+        "that everything works, not which row is best, and do not reproduce the table. The paper's settings are those of "
+        "`epo train` without `budget=`."
     )
 
 

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.lanes import lane_changes
 from epo_lightning.data.recordings import RecordedScenes
 from epo_lightning.data.windows import Extract, Recipe, extract, joined
@@ -193,6 +194,12 @@ def test_a_vehicle_on_no_lane_is_counted_and_left_out():
     assert counts["an agent on no lane"] > 0
     _, fewer = extract(of, Recipe(agents=5, least_agents=5))
     assert fewer["scenes"] == 0
+
+
+def test_a_map_of_another_place_is_refused():
+    of = recording()
+    with pytest.raises(RecordingError, match="road: 100% of all positions lie on no lane"):
+        extract(dataclasses.replace(of, lanes=recording(curve(None, 0.0, (0.0, 500.0))).lanes), Recipe())
 
 
 def test_joined_scenes_are_the_same_scenes():

@@ -11,18 +11,13 @@ import dataclasses
 import hashlib
 import json
 import math
-import multiprocessing
 import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
@@ -31,7 +26,7 @@ from epo_lightning.data.rpi.game import GameConstants, main_game
 from epo_lightning.data.rpi.solve import FeedbackSettings, PotentialSettings
 from epo_lightning.data.rpi.splits import assign
 from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, MAIN_STARTS, RANDOM_STARTS, Records, play
-from epo_lightning.data.workers import default_workers, watch_parent
+from epo_lightning.data.workers import finished
 
 RECIPE = 1
 """Version of the numerical recipe: raised whenever the same configuration would give other records."""
@@ -67,9 +62,8 @@ def set_folder(root: Path, config: Mapping[str, Any]) -> Path:
     return root / f"rpi-{cache.digest(config)[:12]}"
 
 
-def _play(task: tuple[int, int, int, int, str]) -> tuple[Records, dict[str, int]]:
+def _play(seed: int, game: int, placement: int, placements: int, solver: str) -> tuple[Records, dict[str, int]]:
     """Solve one placement of one main game."""
-    seed, game, placement, placements, solver = task
     constants = GameConstants()
     records, counts = play(seed, main_game(seed, game, placement, placements, constants), constants, solver)
     return {name: values.astype(_dtype(name)) for name, values in records.items()}, counts
@@ -129,50 +123,23 @@ def make_pool(
     paths = [folder / f"game-{game:04d}.safetensors" for game in range(games)]
     missing = [game for game in range(games) if _read_part(paths[game], name) is None]
     done: dict[int, dict[int, tuple[Records, dict[str, int]]]] = {game: {} for game in missing}
-    bar = Progress(
-        TextColumn("solving games"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("placements"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        refresh_per_second=1,
-        disable=not progress,
-    )
 
-    def finish(game: int, placement: int, result: tuple[Records, dict[str, int]]) -> None:
+    def finish(task: tuple[Any, ...], result: tuple[Records, dict[str, int]]) -> None:
+        _, game, placement, _, _ = task
         done[game][placement] = result
-        bar.advance(row)
         if len(done[game]) == placements:
             _write_part(paths[game], name, [done[game][p] for p in range(placements)])
             del done[game]
 
     tasks = [(config["seed"], game, p, placements, config["solver"]) for game in missing for p in range(placements)]
-    workers = min(workers or default_workers(), max(1, len(tasks)))
-    with bar:
-        row = bar.add_task("", total=games * placements, completed=games * placements - len(tasks))
-        if workers == 1:
-            for task in tasks:
-                finish(task[1], task[2], _play(task))
-        else:
-            # The first placement is solved here: it compiles the kernels, which the workers then find on disk.
-            finish(tasks[0][1], tasks[0][2], _play(tasks[0]))
-            context = multiprocessing.get_context("spawn")
-            with ProcessPoolExecutor(workers, mp_context=context, initializer=watch_parent) as pool:
-                running = {pool.submit(_play, task): task for task in tasks[1:]}
-                try:
-                    for future in as_completed(running):
-                        task = running.pop(future)
-                        finish(task[1], task[2], future.result())
-                except BrokenProcessPool as error:
-                    raise cache.CacheError(
-                        f"a worker process was killed while solving games; finished main games are kept in {folder}: "
-                        "run the same command again, with fewer workers if memory is short"
-                    ) from error
-                except BaseException:
-                    pool.shutdown(cancel_futures=True)
-                    raise
+    before, kept = games * placements - len(tasks), f"finished main games are kept in {folder}"
+    if tasks:
+        # The first placement is solved here: it compiles the kernels, which the workers then find on disk.
+        finish(tasks[0], _play(*tasks[0]))
+    for task, result in finished(
+        _play, tasks[1:], workers, progress, "solving games", "placements", before + bool(tasks), kept
+    ):
+        finish(task, result)
     parts = [_read_part(path, name) for path in paths]
     broken = [path for path, part in zip(paths, parts, strict=True) if part is None]
     if broken:
