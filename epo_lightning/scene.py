@@ -146,11 +146,13 @@ class Scene(_Batch):
             given = getattr(self, name)
             if given is not None and given.shape != shape:
                 raise ValueError(f"scene.{name} has shape {list(given.shape)}; this history takes {list(shape)}")
-        if self.lanes is not None and (
-            self.lanes.dim() != 4 or len(self.lanes) != batch or self.lanes.shape[-1] != 4
-        ):
+        if self.lanes is not None and (self.lanes.dim() != 4 or len(self.lanes) != batch or self.lanes.shape[-1] != 4):
             raise ValueError(f"scene.lanes has shape {list(self.lanes.shape)}; this history takes [{batch}, L, V, 4]")
-        for name, of in (("goal_mask", "goal_candidates"), ("goal_reference", "goal_candidates"), ("lane_mask", "lanes")):
+        for name, of in (
+            ("goal_mask", "goal_candidates"),
+            ("goal_reference", "goal_candidates"),
+            ("lane_mask", "lanes"),
+        ):
             given, owner = getattr(self, name), getattr(self, of)
             if given is not None and (owner is None or given.shape != owner.shape[:-1]):
                 takes = "None" if owner is None else f"of shape {list(owner.shape)}"

@@ -80,6 +80,7 @@ def write(
         for split, tensors in splits.items():
             path = temporary / f"{split}.safetensors"
             save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
+            path.chmod(0o644)
             files[path.name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
         manifest = {
             "format": FORMAT,

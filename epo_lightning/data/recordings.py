@@ -8,6 +8,7 @@ import shutil
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -265,7 +266,7 @@ class RecordedData(SceneDataModule):
         """What tells these recordings from others: names, sizes and the ends of all files."""
         return [[source.name, source.group, [_fingerprint(file) for file in source.files]] for source in sources]
 
-    @property
+    @cached_property
     def config(self) -> dict[str, Any]:
         """Everything that the set on disk depends on."""
         sources = self.sources()
@@ -304,13 +305,11 @@ class RecordedData(SceneDataModule):
         Raises:
             ConfigError: a recording that cannot be read, a split without scenes, or a killed worker.
         """
-        config = self.config
-        name = cache.digest(config)
-        folder = self.root / f"{self.dataset_name}-{name[:12]}"
+        folder = self.folder
         if folder.exists():
             cache.verify(folder, self.command)
             return folder
-        parts = self.root / f"{self.dataset_name}-parts-{name[:12]}"
+        parts = folder.with_name(f".{folder.name}-parts")
         parts.mkdir(parents=True, exist_ok=True)
         splits = self.splits(self.sources())
         everything = [source.name for part in PARTS for source in splits[part]]
@@ -320,7 +319,7 @@ class RecordedData(SceneDataModule):
         for part in PARTS:
             tensors[part], report[part] = self._gather(part, [files[source.name] for source in splits[part]])
         names = {part: [source.name for source in splits[part]] for part in PARTS}
-        made = cache.write(folder, tensors, config, {**report, "recordings": names})
+        made = cache.write(folder, tensors, self.config, {**report, "recordings": names})
         shutil.rmtree(parts)
         return made
 

@@ -60,7 +60,7 @@ def test_generate_once_then_train_from_the_cache(folder):
     written = made.stat().st_mtime_ns
     assert module.generate(workers=1, progress=False) == made
     assert made.stat().st_mtime_ns == written
-    assert not list(made.parent.glob("*parts*"))
+    assert not list(made.parent.glob(".*parts*"))
     module.setup("fit")
     batch = next(iter(module.train_dataloader()))
     assert batch.history.shape == (8, 4, 10, 4)
