@@ -196,6 +196,31 @@ def test_a_vehicle_on_no_lane_is_counted_and_left_out():
     assert fewer["scenes"] == 0
 
 
+@given(st.integers(0, 10_000))
+@settings(max_examples=10, deadline=None)
+def test_what_a_network_sees_does_not_know_the_future(seed):
+    recipe = Recipe(radius=None, lane_change=False)
+    of, frame = recording(vehicles=crowd(seed, 6)), 100
+    random = np.random.default_rng(seed)
+    later = of.tracks.frame > frame
+    position = of.tracks.position + np.where(later, random.normal(size=len(later)), 0.0)[:, None]
+    heading = of.tracks.heading + np.where(later, 0.3, 0.0)
+    velocity = of.tracks.velocity * np.where(later, 1.2, 1.0)[:, None]
+    other = dataclasses.replace(
+        of, tracks=dataclasses.replace(of.tracks, position=position, heading=heading, velocity=velocity)
+    )
+    now, then = scenes_of(of, recipe), scenes_of(other, recipe)
+    at = [
+        [i for i, entry in enumerate(data.provenance(range(len(data)))) if entry["frame"] == frame]
+        for _, data in (now, then)
+    ]
+    assert at[0]
+    here, there = now[0][at[0]], then[0][at[1]]
+    for name in ("history", "goal_candidates", "references", "reference_speed", "lanes", "frame", "size"):
+        assert torch.equal(getattr(here, name), getattr(there, name)), name
+    assert not torch.equal(here.future, there.future)
+
+
 def test_a_map_of_another_place_is_refused():
     of = recording()
     with pytest.raises(RecordingError, match="road: 100% of all positions lie on no lane"):
