@@ -31,7 +31,7 @@ from epo_lightning.registry import ConfigError
 RECIPE = 1
 """Version of the recipe: raised whenever the same configuration would give other recordings."""
 MOST_DROPPED = 0.05
-"""A simulation in which more than this share of vehicles collide or jump is refused."""
+"""A simulation in which more than this share of vehicles move as none can is refused."""
 
 
 def config(
@@ -84,13 +84,13 @@ def record(work: Path, name: str, number: int, place: Layout, seed: int, seconds
     """
     with tempfile.TemporaryDirectory() as folder:
         traffic = simulate(place, [seed, number], seconds, Path(folder))
-    dropped = sum(traffic.dropped.values())
+    motion = move(traffic, place, seconds)
+    dropped = sum(motion.dropped.values())
     if dropped > MOST_DROPPED * len(traffic.size):
         raise ConfigError(
-            f"recording {number} on layout {place.name}: {dropped} of {len(traffic.size)} vehicles collide or jump "
-            f"({traffic.dropped}): use another seed"
+            f"recording {number} on layout {place.name}: {dropped} of {len(traffic.size)} vehicles move as none can "
+            f"({motion.dropped}): use another seed"
         )
-    motion = move(traffic, place, seconds)
     changes = int(recording.lane_changes(motion).sum())
     if not changes:
         raise ConfigError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,6 +13,8 @@ from epo_lightning.data.simulate.traffic import CLASSES, Traffic
 WINDOW = 1.0
 """Length [s] of the Savitzky-Golay filter, and the degree of its polynomials."""
 DEGREE = 3
+HARDEST = 9.0
+"""No vehicle accelerates, brakes or swerves harder than this [m/s^2]: who does is left out."""
 SLOWEST = 2.0
 """Below this speed [m/s] a vehicle's sideways speed says little about where it points."""
 
@@ -135,4 +137,6 @@ def move(traffic: Traffic, layout: Layout, seconds: float) -> Motion:
         kind=tuple(CLASSES[kind] for kind in traffic.kind),
         dropped=traffic.dropped,
     )
-    return motion.select(np.ones(len(s), dtype=bool))
+    hard = np.unique(motion.vehicle[np.linalg.norm(motion.acceleration, axis=1) > HARDEST])
+    selected = motion.select(~np.isin(motion.vehicle, hard))
+    return replace(selected, dropped={**traffic.dropped, "acceleration": len(hard)})

@@ -17,7 +17,7 @@ from epo_lightning.data.simulate.generate import map_path
 from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS
 from epo_lightning.data.simulate.motion import Motion, move, savitzky_golay
-from epo_lightning.data.simulate.traffic import RATE, simulate, simulator
+from epo_lightning.data.simulate.traffic import RATE, Traffic, simulate, simulator
 from epo_lightning.data.tracks import Recording
 from epo_lightning.data.traffic import FURTHEST_LEADER, leaders
 from epo_lightning.registry import ConfigError, lookup
@@ -63,7 +63,7 @@ def test_the_road_is_busy_from_the_first_frame(motion: Motion):
     assert set(np.unique(motion.frame)) == set(range(round(SECONDS * RATE)))
     assert np.bincount(motion.frame).min() >= 5
     assert recording.lane_changes(motion).sum() >= 5
-    assert motion.dropped == {"collision": 0, "jump": 0}
+    assert motion.dropped == {"collision": 0, "jump": 0, "acceleration": 0}
 
 
 def test_speeds_and_accelerations_are_those_of_vehicles(motion: Motion):
@@ -198,6 +198,22 @@ def test_the_same_seed_gives_the_same_bytes(folder: Path, tmp_path: Path):
     recording.write(run(tmp_path), LAYOUT, 4, tmp_path / "again")
     for path in sorted((folder / "data").iterdir()):
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_vehicles_that_swerve_as_none_can_are_left_out():
+    """A vehicle that is moved 1.5 m sideways from one step to the next, in otherwise steady traffic."""
+    step = np.tile(np.arange(-25, 250), 2)
+    aside = np.where((step > 100) & (np.arange(550) >= 275), 1.5, 0.0)
+    size, kind = np.array([[4.0, 1.8], [4.0, 1.8]]), np.zeros(2, dtype=int)
+    front = np.concatenate([600 + np.arange(275.0), 500 + np.arange(275.0)])
+    traffic = Traffic(
+        RATE, np.repeat([0, 1], 275), step, np.zeros(550, dtype=int), front, aside, size, kind, {"jump": 1}
+    )
+    left = move(traffic, LAYOUT, 8.0)
+    assert left.dropped == {"jump": 1, "acceleration": 1}
+    assert len(left.size) == 1
+    assert left.s[0] == pytest.approx(600 + 25 - 2)
+    assert np.linalg.norm(left.velocity, axis=1) == pytest.approx(25.0, rel=0.01)
 
 
 def test_the_filter_keeps_cubics_and_their_derivatives():
