@@ -131,6 +131,8 @@ def _run(words: Sequence[str]) -> None:
 
 def _help(arguments: Arguments) -> None:
     """The verb's own configuration file is its help: every line of it is commented."""
+    from textwrap import fill
+
     from epo_lightning.experiment.compose import hydra, options_of, tree
 
     print(f"epo {arguments.verb} [-m] [key=value ...]: {VERBS[arguments.verb]}\n")
@@ -144,10 +146,14 @@ def _help(arguments: Arguments) -> None:
     for line in (tree() / "conf" / f"{arguments.verb}.yaml").read_text(encoding="utf-8").splitlines():
         if not line.startswith(hidden):
             print(f"  {line}")
+    if arguments.verb == "generate":
+        with hydra(arguments.extra) as instance:
+            print(f"  data=         {' | '.join(sorted(options_of(instance, 'data')))}")
     if arguments.verb == "train":
         with hydra(arguments.extra) as instance:
-            for group in ("experiment", "budget", "data", "backbone", "forecaster", "logger", "debug", "sweeps"):
-                print(f"  {group + '=':<14}{' | '.join(sorted(options_of(instance, group)))}")
+            for group in ("experiment", "budget", "task", "data", "backbone", "forecaster", "logger", "debug", "sweeps"):
+                words = " | ".join(sorted(options_of(instance, group)))
+                print(fill(words, 120, initial_indent=f"  {group + '=':<14}", subsequent_indent=" " * 16))
 
 
 def _config(arguments: Arguments) -> None:
