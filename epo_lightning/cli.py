@@ -151,7 +151,17 @@ def _help(arguments: Arguments) -> None:
             print(f"  data=         {' | '.join(sorted(options_of(instance, 'data')))}")
     if arguments.verb == "train":
         with hydra(arguments.extra) as instance:
-            for group in ("experiment", "budget", "task", "data", "backbone", "forecaster", "logger", "debug", "sweeps"):
+            for group in (
+                "experiment",
+                "budget",
+                "task",
+                "data",
+                "backbone",
+                "forecaster",
+                "logger",
+                "debug",
+                "sweeps",
+            ):
                 words = " | ".join(sorted(options_of(instance, group)))
                 print(fill(words, 120, initial_indent=f"  {group + '=':<14}", subsequent_indent=" " * 16))
 

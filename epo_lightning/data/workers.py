@@ -62,7 +62,7 @@ def finished(
         with ProcessPoolExecutor(
             workers,
             mp_context=multiprocessing.get_context("spawn"),
-            initializer=watch_parent,
+            initializer=_watch_parent,
             max_tasks_per_child=1 if fresh else None,
         ) as pool:
             running = {pool.submit(function, *task): task for task in tasks}
@@ -81,7 +81,7 @@ def finished(
                 raise
 
 
-def watch_parent() -> None:
+def _watch_parent() -> None:
     """Let a worker end with the process that started it, also when that was killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:

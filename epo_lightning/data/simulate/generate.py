@@ -7,17 +7,11 @@ hidden folder beside the final one; a run that was killed continues there with t
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from epo_lightning.data import cache
 from epo_lightning.data.simulate import recording
@@ -25,7 +19,7 @@ from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.data.simulate.motion import move
 from epo_lightning.data.simulate.traffic import RATE, WARM_UP, simulate, simulator
-from epo_lightning.data.workers import default_workers, watch_parent
+from epo_lightning.data.workers import finished
 from epo_lightning.registry import ConfigError
 
 RECIPE = 1
@@ -184,45 +178,12 @@ def make_recordings(folder: Path, config: Mapping[str, Any], workers: int | None
     (work / "data").mkdir(parents=True, exist_ok=True)
     numbers = dict(enumerate(layout for layout in config["layouts"] for _ in range(config["recordings"])))
     missing = [number for number in numbers if _finished(work, number, name) is None]
-    bar = Progress(
-        TextColumn("simulating"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("recordings"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        refresh_per_second=1,
-        disable=not progress,
-    )
+    seconds = config["minutes"] * 60.0
+    tasks = [(work, name, number, LAYOUTS[numbers[number]], config["seed"], seconds) for number in missing]
+    before, kept = len(numbers) - len(missing), f"finished recordings are kept in {work}"
     # A process per recording: SUMO keeps its state in global variables.
-    context = multiprocessing.get_context("spawn")
-    with bar:
-        row = bar.add_task("", total=len(numbers), completed=len(numbers) - len(missing))
-        with ProcessPoolExecutor(
-            min(workers or default_workers(), max(1, len(missing))),
-            mp_context=context,
-            initializer=watch_parent,
-            max_tasks_per_child=1,
-        ) as pool:
-            running = [
-                pool.submit(
-                    record, work, name, number, LAYOUTS[numbers[number]], config["seed"], config["minutes"] * 60.0
-                )
-                for number in missing
-            ]
-            try:
-                for future in as_completed(running):
-                    future.result()
-                    bar.advance(row)
-            except BrokenProcessPool as error:
-                raise cache.CacheError(
-                    f"a worker process was killed while simulating; finished recordings are kept in {work}: run the "
-                    "same command again, with fewer workers if memory is short"
-                ) from error
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+    for _ in finished(record, tasks, workers, progress, "simulating", "recordings", before, kept, fresh=True):
+        pass
     return _finish(folder, work, config, numbers)
 
 
