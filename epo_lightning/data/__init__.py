@@ -1,3 +1,1 @@
-"""Where scenes come from. Importing this package registers the data parts."""
-
-from epo_lightning.data.rpi import scenes as _rpi  # noqa: F401
+"""Where scenes come from."""

@@ -11,7 +11,6 @@ import torch
 from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
 
-import epo_lightning.data  # noqa: F401 - registers the data parts
 from epo_lightning.experiment.settings import PARTS, Settings, TrainerSettings, check_part, check_types
 from epo_lightning.forecasters import build_forecaster, check_model
 from epo_lightning.registry import ConfigError, build

@@ -33,8 +33,6 @@ def check(verb: str, config: dict[str, Any]) -> Any:
     """
     settings: Any = read(SCHEMAS[verb], config)
     if isinstance(settings, GenerateSettings):
-        import epo_lightning.data  # noqa: F401 - registers the data parts
-
         check_part("data", settings.data)
     return settings
 
