@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.lanes import lane_changes
-from epo_lightning.data.recordings import RecordedScenes
+from epo_lightning.data.scenes import RecordedScenes
 from epo_lightning.data.windows import Extract, Recipe, extract, joined
 from epo_lightning.registry import ConfigError
 
@@ -217,8 +217,9 @@ def test_what_a_network_sees_does_not_know_the_future(seed):
     assert at[0]
     here, there = now[0][at[0]], then[0][at[1]]
     for name in ("history", "goal_candidates", "references", "reference_speed", "lanes", "frame", "size"):
-        assert torch.equal(getattr(here, name), getattr(there, name)), name
-    assert not torch.equal(here.future, there.future)
+        # A recording's origin is the mean of all its positions, which moves what is rounded.
+        torch.testing.assert_close(getattr(here, name), getattr(there, name), rtol=0, atol=1e-4, msg=name)
+    assert (here.future - there.future).abs().max() > 0.1
 
 
 def test_a_map_of_another_place_is_refused():
