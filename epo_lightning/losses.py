@@ -58,9 +58,12 @@ def scene_imitation(
     return torch.lerp(closest, joint.mean(1), relaxation).mean(), mode
 
 
-def scene_probability(probabilities: Float[Tensor, "B M"], mode: Int[Tensor, " B"]) -> Float[Tensor, ""]:
-    """L_prob: cross entropy between the joint futures' probabilities and the closest one."""
-    return -_log(probabilities).gather(1, mode[:, None]).mean()
+def scene_probability(
+    probabilities: Float[Tensor, "B M"], mode: Int[Tensor, " B"], mask: Bool[Tensor, "B N K"]
+) -> Float[Tensor, ""]:
+    """L_prob: cross entropy between the joint futures' probabilities and the closest one; 0 where nothing was observed."""
+    entropy = -log(probabilities).gather(1, mode[:, None])[:, 0]
+    return torch.where(mask.flatten(1).any(1), entropy, 0.0).mean()
 
 
 def goal(
@@ -77,7 +80,7 @@ def goal(
     counts = observed & exists.any(-1)
     way = torch.where((exists & counts[..., None])[..., None], candidates - final[:, :, None], torch.inf)
     closest = way.square().sum(-1).argmin(-1)
-    cost = -_log(probabilities).gather(-1, closest[..., None])
+    cost = -log(probabilities).gather(-1, closest[..., None])
     return _mean_over_agents(cost[..., 0], counts[..., None]).mean()
 
 
@@ -93,8 +96,9 @@ def marginal_probability(
     probabilities: Float[Tensor, "B M N"], mode: Int[Tensor, "B N"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, ""]:
     """Cross entropy between each agent's probabilities and its own closest future, averaged over agents."""
-    return _mean_over_agents(-_log(probabilities).gather(1, mode[:, None])[:, 0], mask).mean()
+    return _mean_over_agents(-log(probabilities).gather(1, mode[:, None])[:, 0], mask).mean()
 
 
-def _log(probabilities: Tensor) -> Tensor:
+def log(probabilities: Tensor) -> Tensor:
+    """The logarithm, finite also where a probability is too small for its precision."""
     return probabilities.clamp_min(torch.finfo(probabilities.dtype).tiny).log()

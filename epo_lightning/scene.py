@@ -38,11 +38,13 @@ class _Batch:
     """Tensors that share their leading dimension B, moved and indexed together."""
 
     def map(self: Batch, function: Callable[[Tensor], Tensor]) -> Batch:
-        """Apply ``function`` to every tensor, also inside mappings and tuples."""
+        """Apply ``function`` to every tensor, also inside mappings, tuples and batches within this one."""
 
         def visit(value: Any) -> Any:
             if isinstance(value, Tensor):
                 return function(value)
+            if isinstance(value, _Batch):
+                return value.map(function)
             if isinstance(value, Mapping):
                 return {key: visit(entry) for key, entry in value.items()}
             if isinstance(value, tuple):

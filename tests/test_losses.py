@@ -50,12 +50,13 @@ def test_relaxation_adds_the_mean_over_modes_and_fades():
 
 def test_probabilities_are_scored_at_the_closest_mode():
     probabilities = torch.tensor([[0.25, 0.75]])
-    assert losses.scene_probability(probabilities, torch.tensor([1])).item() == pytest.approx(0.2877, abs=1e-4)
+    assert losses.scene_probability(probabilities, torch.tensor([1]), MASK).item() == pytest.approx(0.2877, abs=1e-4)
     agents = torch.tensor([[[0.25, 0.5], [0.75, 0.5]]])
     value = losses.marginal_probability(agents, torch.tensor([[1, 0]]), MASK)
     assert value.item() == pytest.approx((0.2877 + 0.6931) / 2, abs=1e-4)
     certain = torch.tensor([[1.0, 0.0]], requires_grad=True)
-    assert losses.scene_probability(certain, torch.tensor([1])).isfinite()
+    assert losses.scene_probability(certain, torch.tensor([1]), MASK).isfinite()
+    assert losses.scene_probability(probabilities, torch.tensor([1]), ~MASK) == 0, "nothing was observed"
 
 
 @settings(deadline=None)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from games import random_scene
 
-from epo_lightning.scene import Scene
+from epo_lightning.scene import GameParameters, JointForecast, Scene
 
 
 @pytest.fixture(autouse=True)
@@ -70,3 +70,11 @@ def test_masks_are_boolean(name):
 def test_a_history_has_a_current_state():
     with pytest.raises(ValueError, match="has no step"):
         Scene(torch.zeros(1, 2, 0, 4), 0.1)
+
+
+def test_batches_within_a_batch_are_indexed_with_it():
+    goals = torch.arange(3.0).view(3, 1, 1, 1).expand(3, 1, 1, 2)
+    game = GameParameters({"goal": goals[..., 0]}, {}, torch.zeros(3, 1, 1, 2, 2), goals)
+    forecast = JointForecast(torch.zeros(3, 1, 1, 2, 4), torch.ones(3, 1), parameters=game)
+    assert torch.equal(forecast[2].parameters.goals, goals[2:])
+    assert torch.equal(forecast[2].parameters.own_weights["goal"], goals[2:, ..., 0])

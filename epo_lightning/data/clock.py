@@ -22,6 +22,8 @@ class Stretches:
         count: how many steps it lasts.
         start: its first row.
         state: x, y [m], heading [rad], speed [m/s] of every row; headings go on beyond half a turn.
+        ending: where tracks are smoothed, every row's state and those of the steps right before it as they are known at its
+            time: fitted to no later frame. Later smoothing knows better, but a forecaster must not.
     """
 
     dt: float
@@ -30,6 +32,12 @@ class Stretches:
     count: Int[np.ndarray, " C"]
     start: Int[np.ndarray, " C"]
     state: Float[np.ndarray, "Z 4"]
+    ending: Float[np.ndarray, "Z J 4"] | None = None
+
+    @property
+    def now(self) -> Float[np.ndarray, "Z 4"]:
+        """Every row's state as it is known at its time."""
+        return self.state if self.ending is None else self.ending[:, 0]
 
     @property
     def owner(self) -> Int[np.ndarray, " Z"]:
@@ -57,7 +65,7 @@ def stretches(
     """
     if dt * tracks.rate < 1 - 1e-6:
         raise ConfigError(
-            f"data.dt={dt} asks for more than the recording's {tracks.rate:g} frames per second: "
+            f"data.windows.dt={dt} asks for more than the recording's {tracks.rate:g} frames per second: "
             f"use {1 / tracks.rate:g} or more"
         )
     rows = len(tracks)
@@ -79,6 +87,7 @@ def stretches(
     within = length.cumsum() - length
     heading = _unwrap(tracks.heading[kept], within)
     values = np.column_stack([tracks.position[kept], heading, tracks.velocity[kept]])
+    raw = values
     if window:
         values = _smooth(values, within, length, window, tracks.rate)
 
@@ -90,9 +99,16 @@ def stretches(
     row = np.repeat(within, count) + lower
     after = np.minimum(row + 1, len(values) - 1)
     values = np.where(share < 1e-6, values[row], (1 - share) * values[row] + share * values[after])
-    along = values[:, 3] * np.cos(values[:, 2]) + values[:, 4] * np.sin(values[:, 2])
-    state = np.column_stack([values[:, :3], along])
-    return Stretches(dt, tracks.agent[begin], first, count, start, state), dropped
+    ending = None
+    if window:
+        ending = _ending(raw, row, lower, at - lower, window, tracks.rate, dt)
+    return Stretches(dt, tracks.agent[begin], first, count, start, _states(values), ending), dropped
+
+
+def _states(values: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "*n 4"]:
+    """Positions, headings and velocities as states: the speed is that along the heading."""
+    x, y, heading, right, up = np.moveaxis(values, -1, 0)
+    return np.stack([x, y, heading, right * np.cos(heading) + up * np.sin(heading)], -1)
 
 
 def _unwrap(heading: Float[np.ndarray, " n"], begin: Int[np.ndarray, " C"]) -> Float[np.ndarray, " n"]:
@@ -117,16 +133,7 @@ def _smooth(
     Near the ends of a stretch, the first or last whole window's parabola goes on.
     """
     half = window // 2
-    time = (np.arange(window) - half) / rate
-    fit = np.linalg.pinv(np.vander(time, 3, increasing=True))  # samples -> coefficients
-
-    def evaluate(around: Float[np.ndarray, "*n window 3"], at: Float[np.ndarray, " m"]) -> np.ndarray:
-        """Values and slopes of the windows' parabolas: x, y, heading, and the speeds in x and y."""
-        constant, slope, bend = np.moveaxis(np.einsum("cw,...wv->...cv", fit, around), -2, 0)
-        t = at[:, None]
-        value = constant + slope * t + bend * t**2
-        return np.concatenate([value, (slope + 2 * bend * t)[..., :2]], -1)
-
+    time, fit = _parabolas(window, rate)
     smooth = np.empty_like(values)
     if len(values) >= window:
         middle = np.lib.stride_tricks.sliding_window_view(values[:, :3], window, axis=0)  # [n - window + 1, 3, window]
@@ -135,5 +142,48 @@ def _smooth(
         smooth[half : len(values) - half, 3:] = coefficients[1][:, :2]
     for offset, edge in ((begin, np.arange(half)), (begin + length - window, np.arange(half + 1, window))):
         around = values[offset[:, None] + np.arange(window), :3]  # [C, window, 3]
-        smooth[offset[:, None] + edge] = evaluate(around[:, None], time[edge])
+        smooth[offset[:, None] + edge] = _evaluate(fit, around[:, None], time[edge])
     return smooth
+
+
+def _ending(
+    raw: Float[np.ndarray, "n 5"],
+    row: Int[np.ndarray, " Z"],
+    before: Int[np.ndarray, " Z"],
+    beyond: Float[np.ndarray, " Z"],
+    window: int,
+    rate: float,
+    dt: float,
+) -> Float[np.ndarray, "Z J 4"]:
+    """The states at every step, and at those before it that a centred window would smooth with later frames, by the parabola
+    through the window that ends there; as they were recorded where a stretch is too young for a whole window.
+
+    Args:
+        raw: positions, headings and velocities as recorded.
+        row: of ``raw``, the last one at or before each step.
+        before: how many rows of the stretch lie before that.
+        beyond: how far each step lies after its row [rows].
+    """
+    time, fit = _parabolas(window, rate)
+    steps = int(window // 2 / (dt * rate)) + 1
+    whole = before >= window - 1
+    around = raw[np.maximum(row[:, None] - window + 1 + np.arange(window), 0), :3]
+    at = time[-1] + np.minimum(beyond, 1.0)[:, None] / rate - dt * np.arange(steps)  # [Z, J]
+    fitted = _states(_evaluate(fit, around[:, None], at))
+    earlier = np.maximum(row[:, None] - np.round(np.arange(steps) * dt * rate).astype(int), (row - before)[:, None])
+    return np.where(whole[:, None, None], fitted, _states(raw[earlier]))
+
+
+def _parabolas(window: int, rate: float) -> tuple[Float[np.ndarray, " window"], Float[np.ndarray, "3 window"]]:
+    """The times of a window's frames around its middle [s], and the matrix from samples to a parabola's coefficients."""
+    time = (np.arange(window) - window // 2) / rate
+    return time, np.linalg.pinv(np.vander(time, 3, increasing=True))
+
+
+def _evaluate(
+    fit: Float[np.ndarray, "3 window"], around: Float[np.ndarray, "*n window 3"], at: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 5"]:
+    """Values and slopes of windows' parabolas: x, y, heading, and the speeds in x and y."""
+    constant, slope, bend = np.moveaxis(np.einsum("cw,...wv->...cv", fit, around), -2, 0)
+    t = at[..., None]
+    return np.concatenate([constant + slope * t + bend * t**2, (slope + 2 * bend * t)[..., :2]], -1)

@@ -23,6 +23,10 @@ BESIDE = 1.0
 """How far beside all lanes [m] a position may be and still belong to the nearest one: maps have seams."""
 ALONG = np.pi / 2
 """An agent that heads across a lane by more than this [rad] is not driving on it."""
+ASTRAY = 5.0
+"""Metres beside a centreline that weigh as much as one radian across it, where lanes lie over each other."""
+HOPS = 6
+"""Lanes, one after the other, that an agent may pass within a time step."""
 
 
 class Polylines:
@@ -181,8 +185,8 @@ class LaneGraph:
         return shapely.STRtree(self.areas)
 
     def locate(self, position: Float[np.ndarray, "T 2"], heading: Float[np.ndarray, " T"]) -> Located:
-        """On which lanes agents are: of the lanes around a position, the one whose direction an agent shares and whose
-        centreline is nearest."""
+        """On which lanes agents are: of the lanes around a position, the one whose centreline is near and whose direction an
+        agent shares; a crossing road may be nearer."""
         found = Located(np.full(len(position), -1), np.zeros(len(position)), np.full(len(position), np.inf))
         points = shapely.points(position)
         row, lane = self._tree.query(points, predicate="intersects")
@@ -206,29 +210,31 @@ class LaneGraph:
         along, offset = self.centrelines.project(lane, position[row])
         _, tangent = self.centrelines.at(lane, along)
         turned = np.cos(heading[row]) * tangent[:, 0] + np.sin(heading[row]) * tangent[:, 1]
-        (fits,) = np.nonzero(turned > np.cos(ALONG))
-        # The last one written wins: the nearest centreline, then the first lane.
-        order = fits[np.lexsort((-lane[fits], -np.abs(offset[fits])))]
+        across = np.arccos(np.clip(turned, -1.0, 1.0))
+        (fits,) = np.nonzero(across < ALONG)
+        # The last one written wins: the best fit, then the first lane.
+        order = fits[np.lexsort((-lane[fits], -(np.abs(offset) + ASTRAY * across)[fits]))]
         found.lane[row[order]] = lane[order]
         found.along[row[order]] = along[order]
         found.offset[row[order]] = offset[order]
 
-    def leads_to(self, lane: int, other: int, hops: int = 3) -> bool:
+    def leads_to(self, lane: int, other: int) -> bool:
         """Whether driving straight on leads from a lane to another."""
-        reached = {lane}
-        for _ in range(hops + 1):
-            if other in reached:
-                return True
-            reached = {successor for each in reached for successor in self.successors[each]}
-        return False
+        return other in _reached(lane, self.successors)
 
     def beside(self, lane: int, other: int) -> bool:
         """Whether a lane lies beside another, or beside what leads to it or comes after it."""
-        near = {lane, *self.successors[lane], *self.predecessors[lane]}
-        return any(other in (self.adjacent_left[each], self.adjacent_right[each]) for each in near) or any(
-            lane in (self.adjacent_left[each], self.adjacent_right[each])
-            for each in (other, *self.successors[other], *self.predecessors[other])
-        )
+        around = _reached(lane, self.successors) | _reached(lane, self.predecessors)
+        near = _reached(other, self.successors) | _reached(other, self.predecessors)
+        return any(int(beside[each]) in near for each in around for beside in (self.adjacent_left, self.adjacent_right))
+
+
+def _reached(lane: int, following: Sequence[tuple[int, ...]]) -> set[int]:
+    """A lane and those that are reached from it within a few hops."""
+    reached = {lane}
+    for _ in range(HOPS):
+        reached |= {other for each in reached for other in following[each]}
+    return reached
 
 
 def lane_changes(agent: Int[np.ndarray, " T"], located: Located, lanes: LaneGraph) -> Bool[np.ndarray, " T"]:

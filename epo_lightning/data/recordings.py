@@ -27,7 +27,7 @@ from epo_lightning.data.windows import Extract, Recipe, extract, joined
 from epo_lightning.data.workers import finished
 from epo_lightning.registry import ConfigError, lookup, nearest, register
 
-VERSION = 1
+VERSION = 2
 """Of the extraction: raised whenever the same recordings would give other scenes."""
 PARTS = ("train", "val", "test")
 UNITS = ("recording", "group")

@@ -57,11 +57,17 @@ class Routes:
         for lane in range(len(lanes)):
             before = _follow(lane, back, length, BACKWARDS)[:0:-1]
             chains.append((before, _follow(lane, straight, length, FORWARDS)))
+        sides = (lanes.centre, lanes.left, lanes.right)
         self.lines = Polylines(
+            [np.concatenate([side[lane] for lane in (*before, *after)]) for side in sides for before, after in chains]
+        )
+        # A line may come by twice, on a loop or a ring: agents are looked for on the piece that they are on or beside.
+        self.parts = Polylines([line for side in sides for line in side])
+        self.begin = np.array(
             [
-                np.concatenate([side[lane] for lane in (*before, *after)])
-                for side in (lanes.centre, lanes.left, lanes.right)
-                for before, after in chains
+                _length(np.concatenate([*(side[each] for each in before), side[lane][:1]]))
+                for side in sides
+                for lane, (before, _) in enumerate(chains)
             ]
         )
         self.beside = tuple(
@@ -90,7 +96,8 @@ class Routes:
             chosen.append(np.where(reachable, neighbour[lane], (1 + side) * count + lane))
         left, right = chosen
         lines = np.stack([left, lane, right], 1)  # [n, R]
-        along, _ = self.lines.project(lines.ravel(), np.repeat(position, LINES, axis=0))
+        on_part, _ = self.parts.project(lines.ravel(), np.repeat(position, LINES, axis=0))
+        along = self.begin[lines.ravel()] + on_part
 
         def sample(start: np.ndarray, end: np.ndarray, points: int) -> np.ndarray:
             way = np.linspace(start, end, points, axis=1)  # [n, points]
@@ -118,6 +125,10 @@ def _direction(line: Polyline, at_end: bool) -> Float[np.ndarray, " 2"]:
     points = line[np.append(True, (np.diff(line, axis=0) != 0).any(1))]
     way = points[-1] - points[-2] if at_end else points[1] - points[0]
     return way / np.linalg.norm(way)
+
+
+def _length(line: Polyline) -> float:
+    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
 
 
 def _follow(lane: int, following: np.ndarray, length: np.ndarray, distance: float) -> list[int]:

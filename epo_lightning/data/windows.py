@@ -25,6 +25,10 @@ VECTORS, SPACING = 10, 6.0
 """Vectors V of a lane polyline and their greatest length [m]."""
 MOST_BESIDE = 0.5
 """Share of positions on no lane beyond which a map does not belong to its tracks."""
+AGREE = 0.2
+"""Length of the mean of the agents' directions below which they do not head anywhere together."""
+MOST_AGENTS, LONGEST_SMOOTHING = 32, 10.0
+"""Agents of a scene, and seconds of a smoothing window, that make sense."""
 CHUNK = 4_000_000
 """Distances between agents that are held at a time."""
 
@@ -64,24 +68,31 @@ class Recipe:
     def __post_init__(self) -> None:
         for name, least in (
             ("history", 2),
-            ("horizon", 1),
+            ("horizon", 2),
             ("agents", 1),
             ("least_agents", 1),
             ("every", 1),
             ("lanes", 1),
         ):
             if getattr(self, name) < least:
-                raise ConfigError(f"data.{name} must be {least} or more, not {getattr(self, name)}")
+                raise ConfigError(f"data.windows.{name} must be {least} or more, not {getattr(self, name)}")
         for name in ("dt", "speed_limit"):
             if not 0 < getattr(self, name) < np.inf:
-                raise ConfigError(f"data.{name} must be positive, not {getattr(self, name)}")
+                raise ConfigError(f"data.windows.{name} must be positive, not {getattr(self, name)}")
         for name in ("radius", "smoothing"):
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
-                raise ConfigError(f"data.{name} must be positive, or null for none, not {value}")
+                raise ConfigError(f"data.windows.{name} must be positive, or null for none, not {value}")
+        if self.agents > MOST_AGENTS:
+            raise ConfigError(f"data.windows.agents must be {MOST_AGENTS} or less, not {self.agents}")
+        if self.smoothing is not None and self.smoothing > LONGEST_SMOOTHING:
+            raise ConfigError(
+                f"data.windows.smoothing must be {LONGEST_SMOOTHING:g} s or less, or null for none, not {self.smoothing}"
+            )
         if self.least_agents > self.agents:
             raise ConfigError(
-                f"data.least_agents={self.least_agents} asks for more agents than data.agents={self.agents} lets in"
+                f"data.windows.least_agents={self.least_agents} asks for more agents than data.windows.agents={self.agents} "
+                "lets in"
             )
 
 
@@ -158,7 +169,7 @@ def extract(recording: Recording, recipe: Recipe) -> tuple[Extract | None, dict[
     """
     if recipe.lane_change and recording.lanes is None:
         raise ConfigError(
-            f"{recording.name} has no lanes, so nobody can change lane on them: use data.lane_change=false"
+            f"{recording.name} has no lanes, so nobody can change lane on them: use data.windows.lane_change=false"
         )
     counts: Counter[str] = Counter(recording.dropped)
     shortest = recipe.history + recipe.horizon if recipe.complete else 2
@@ -186,7 +197,7 @@ def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.n
     rows = len(clock.state)
     if recording.lanes is None:
         return Located(np.full(rows, -1), np.zeros(rows), np.zeros(rows)), np.zeros(rows, dtype=int)
-    located = recording.lanes.locate(clock.state[:, :2], clock.state[:, 2])
+    located = recording.lanes.locate(clock.now[:, :2], clock.now[:, 2])
     beside = float((located.lane < 0).mean()) if rows else 0.0
     if beside > MOST_BESIDE:
         raise RecordingError(
@@ -194,7 +205,8 @@ def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.n
             f"{beside:.0%} of all positions lie on no lane of its map: is it the map of another place, or in other "
             "coordinates? Give it the right one, or set data.map=false",
         )
-    return located, lane_changes(clock.owner, located, recording.lanes).cumsum()
+    smooth = located if clock.ending is None else recording.lanes.locate(clock.state[:, :2], clock.state[:, 2])
+    return located, lane_changes(clock.owner, smooth, recording.lanes).cumsum()
 
 
 def _current(values: np.ndarray, clock: Stretches, moments: np.ndarray, members: np.ndarray) -> np.ndarray:
@@ -208,7 +220,7 @@ def _choose(
     """Moments and members (stretches) of all windows that pass, the focal agent first, then by distance."""
     found_moments, found_members = [np.empty(0, dtype=int)], [np.empty((0, recipe.agents), dtype=int)]
     for moment, stretch, focal in _crowds(clock, recipe):
-        position = clock.state[_current(np.arange(len(clock.state)), clock, moment, stretch), :2]
+        position = clock.now[_current(np.arange(len(clock.state)), clock, moment, stretch), :2]
         distance = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
         distance[np.broadcast_to((stretch < 0)[:, None], distance.shape)] = np.inf
         everyone = np.arange(stretch.shape[1])
@@ -280,12 +292,15 @@ def _assemble(
     origin = np.floor(clock.state[:, :2].mean(0))
     owner = clock.owner[used]
     begin, end = clock.start[owner], clock.start[owner] + clock.count[owner] - 1
-    turns = 2 * np.pi * np.round(clock.state[used, 2] / (2 * np.pi))
+    turns = 2 * np.pi * np.round(clock.now[used, 2] / (2 * np.pi))
 
     def states(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         at = used[:, None] + steps
         real = (at >= begin[:, None]) & (at <= end[:, None])
         found = clock.state[np.clip(at, begin[:, None], end[:, None])]
+        if clock.ending is not None and steps[-1] == 0:
+            recent = min(clock.ending.shape[1], len(steps))
+            found[:, len(steps) - recent :] = clock.ending[used, recent - 1 :: -1]
         found[..., :2] -= origin
         found[..., 2] -= turns[:, None]
         return np.where(real[..., None], found, 0.0).astype(np.float32), real
@@ -293,12 +308,15 @@ def _assemble(
     history, history_mask = states(np.arange(1 - recipe.history, 1))
     future, future_mask = states(np.arange(1, recipe.horizon + 1))
     agent = clock.agent[owner]
-    now = clock.state[used]
+    now = clock.now[used]
     at = now[place, :2]
     there = (place >= 0)[..., None]
     centre = (at * there).sum(1) / there.sum(1)
     heading = now[place, 2]
-    direction = np.arctan2(*(((f(heading) * there[..., 0]).sum(1)) for f in (np.sin, np.cos)))
+    ahead = np.stack([(f(heading) * there[..., 0]).sum(1) for f in (np.cos, np.sin)], 1)
+    # Agents that head against each other have no mean: the focal one decides then.
+    scattered = np.linalg.norm(ahead, axis=1) < AGREE * there[..., 0].sum(1)
+    direction = np.where(scattered, heading[:, 0], np.arctan2(ahead[:, 1], ahead[:, 0]))
     candidates, references = np.empty((len(used), 0, 2)), np.empty((len(used), 0, 0, 2))
     speed, polylines = np.empty((len(used), 0)), np.empty((0, VECTORS + 1, 2))
     if recording.lanes is not None:

@@ -50,10 +50,11 @@ class Marginal(Forecaster):
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
         positions, probabilities = self.decoder(self.backbone(scene), current[..., :2])
         states, probabilities = marginal_to_joint(_with_motion(positions, current, scene.dt), probabilities)
-        joint = probabilities.where(scene.agent_mask[:, None], 1.0).prod(-1)
+        # A sum of logarithms: the product over many agents and modes is smaller than any number of this precision.
+        joint = losses.log(probabilities).where(scene.agent_mask[:, None], 0.0).sum(-1).softmax(1)
         return JointForecast(
             states=states,
-            probabilities=joint / joint.sum(1, keepdim=True),
+            probabilities=joint,
             agent_probabilities=probabilities,
         )
 

@@ -72,5 +72,5 @@ def joint_losses(
     future, mask = observed_future(scene)
     distance = losses.distances(forecast.states[..., :2], future, mask)
     imitation, mode = losses.scene_imitation(distance, mask, relaxation)
-    probability = losses.scene_probability(forecast.probabilities, mode)
+    probability = losses.scene_probability(forecast.probabilities, mode, mask)
     return {"imitation": (weights["imitation"], imitation), "probability": (weights["probability"], probability)}

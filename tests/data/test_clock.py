@@ -90,7 +90,7 @@ def test_smoothing_is_the_filter_of_savitzky_and_golay(seed):
 
 
 def test_a_clock_faster_than_the_recording_is_refused():
-    with pytest.raises(ConfigError, match=r"data\.dt=0\.02 .* 25 frames per second: use 0\.04"):
+    with pytest.raises(ConfigError, match=r"data\.windows\.dt=0\.02 .* 25 frames per second: use 0\.04"):
         stretches(traffic(curve(None), FOUR), 0.02, None, 1)
 
 

@@ -168,6 +168,28 @@ def test_moving_the_world_moves_the_frame_and_nothing_else(seed, turn):
         torch.testing.assert_close(getattr(moved, name), getattr(still, name), rtol=0, atol=5e-3)
 
 
+def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
+    of = recording(vehicles=((1, 30.0, 0, 20.0, None), (2, 60.0, 1, 20.0, None)))
+    away = of.tracks.agent == 1
+    tracks = dataclasses.replace(
+        of.tracks,
+        heading=of.tracks.heading + np.where(away, np.pi, 0.0),
+        velocity=of.tracks.velocity * np.where(away, -1.0, 1.0)[:, None],
+    )
+    recipe = Recipe(agents=2, least_agents=2, lane_change=False)
+    for turn in (0.0, 1e-6, 1.0):
+        cosine, sine = np.cos(turn), np.sin(turn)
+        rotation = np.array([[cosine, -sine], [sine, cosine]])
+        turned = dataclasses.replace(
+            tracks,
+            position=tracks.position @ rotation.T,
+            heading=tracks.heading + turn,
+            velocity=tracks.velocity @ rotation.T,
+        )
+        scene, _ = scenes_of(dataclasses.replace(of, tracks=turned, lanes=None), recipe, "aligned")
+        torch.testing.assert_close(scene.current[:, 0, 2], torch.zeros(len(scene.history)), rtol=0, atol=1e-5)
+
+
 def test_neighbours_may_be_observed_in_part():
     of = recording()
     late = of.tracks.frame >= np.where(of.tracks.agent == 1, 125, 0)
@@ -196,10 +218,11 @@ def test_a_vehicle_on_no_lane_is_counted_and_left_out():
     assert fewer["scenes"] == 0
 
 
+@pytest.mark.parametrize("smoothing", [None, 1.0])
 @given(st.integers(0, 10_000))
 @settings(max_examples=10, deadline=None)
-def test_what_a_network_sees_does_not_know_the_future(seed):
-    recipe = Recipe(radius=None, lane_change=False)
+def test_what_a_network_sees_does_not_know_the_future(smoothing, seed):
+    recipe = Recipe(radius=None, lane_change=False, smoothing=smoothing)
     of, frame = recording(vehicles=crowd(seed, 6)), 100
     random = np.random.default_rng(seed)
     later = of.tracks.frame > frame
@@ -245,11 +268,14 @@ def test_joined_scenes_are_the_same_scenes():
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("history", 1, "data.history must be 2 or more"),
-        ("agents", 0, "data.agents must be 1"),
+        ("agents", 33, "agents must be 32 or less"),
+        ("horizon", 1, "horizon must be 2 or more"),
+        ("smoothing", 1e9, "smoothing must be 10 s or less"),
+        ("history", 1, "data.windows.history must be 2 or more"),
+        ("agents", 0, "data.windows.agents must be 1"),
         ("least_agents", 5, "lets in"),
         ("radius", -1.0, "positive, or null"),
-        ("dt", 0.0, "data.dt must be positive"),
+        ("dt", 0.0, "data.windows.dt must be positive"),
     ],
 )
 def test_recipes_that_cannot_work_are_refused(key, value, message):

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -104,7 +105,11 @@ def exid(folder: Path) -> list[Source]:
     roots = [folder / "maps" / "lanelet2", home]
     if folder.name == "data":
         roots.append(folder.parent / "maps" / "lanelet2")
-    return [_source(home, name, roots) for name in sorted(names, key=lambda name: (int(name), name))]
+    ordered = sorted(names, key=lambda name: (int(name), name))
+    for one, other in pairwise(ordered):
+        if int(one) == int(other):
+            raise RecordingError(home, f"{one}_* and {other}_* are the same recording: remove one of them")
+    return [_source(home, name, roots) for name in ordered]
 
 
 class _Files(NamedTuple):

@@ -111,11 +111,9 @@ def _number(cell: str) -> float:
 
 
 def _heading(agent: Int[np.ndarray, " T"], velocity: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, " T"]:
-    """Pedestrians face where they walk; while standing, where they walked last, else where they walk next, else along x."""
+    """Pedestrians face where they walk; while standing, where they walked last; before they have walked, along x."""
     moving = (velocity != 0).any(axis=1)
     rows = np.arange(len(agent))
     before = np.maximum.accumulate(np.where(moving, rows, 0))
-    after = np.minimum.accumulate(np.where(moving, rows, len(rows) - 1)[::-1])[::-1]
-    facing = np.where(moving[before] & (agent[before] == agent), before, after)
-    known = moving[facing] & (agent[facing] == agent)
-    return np.where(known, np.arctan2(velocity[facing, 1], velocity[facing, 0]), 0.0)
+    known = moving[before] & (agent[before] == agent)
+    return np.where(known, np.arctan2(velocity[before, 1], velocity[before, 0]), 0.0)

@@ -22,7 +22,7 @@ from epo_lightning.data.simulate.traffic import RATE, WARM_UP, simulate, simulat
 from epo_lightning.data.workers import finished
 from epo_lightning.registry import ConfigError
 
-RECIPE = 1
+RECIPE = 2
 """Version of the recipe: raised whenever the same configuration would give other recordings."""
 MOST_DROPPED = 0.05
 """A simulation in which more than this share of vehicles move as none can is refused."""
