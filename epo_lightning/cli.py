@@ -102,12 +102,18 @@ def main(words: Sequence[str] | None = None) -> None:
             raise
         print(f"epo: {error}", file=sys.stderr)
         raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        print("epo: interrupted; an unfinished run continues with `epo train resume=<run folder>`", file=sys.stderr)
-        raise SystemExit(130) from None
     except BrokenPipeError:  # `epo config ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
+    except OSError as error:
+        if trace:
+            raise
+        where = f": {error.filename}" if error.filename else ""
+        print(f"epo: {error.strerror or error}{where}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        print("epo: interrupted; an unfinished run continues with `epo train resume=<run folder>`", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def _run(words: Sequence[str]) -> None:

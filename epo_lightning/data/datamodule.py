@@ -108,6 +108,7 @@ class SceneDataModule(LightningDataModule):
     dt: float
     horizon: int
     num_agents: int
+    has_map = False
 
     def __init__(self, batch_size: int, seed: int) -> None:
         super().__init__()

@@ -122,6 +122,8 @@ class RecordedData(SceneDataModule):
             ConfigError: no folder, or nothing in it.
         """
         folder = self.folder_of_recordings
+        if folder.is_file():
+            raise ConfigError(f"{folder} is a file: data.folder takes the folder that it lies in")
         if not folder.is_dir():
             raise ConfigError(
                 f"no folder {folder} with {self.dataset_name} recordings: point data.folder at it, "
@@ -208,16 +210,31 @@ class RecordedData(SceneDataModule):
         Raises:
             ConfigError: a recording that cannot be read, a split without scenes, or a killed worker.
         """
-        folder = self.folder
-        if folder.exists():
-            cache.verify(folder, self.command)
-            return folder
+        with cache.alone(self.folder):
+            if not self.folder.exists():
+                return self._make(self.folder, workers, progress)
+        cache.verify(self.folder, self.command)
+        return self.folder
+
+    def recordings(self) -> list[Source]:
+        """What scenes are extracted from."""
+        return self.sources()
+
+    def _make(self, folder: Path, workers: int | None, progress: bool) -> Path:
         parts = folder.with_name(f".{folder.name}-parts")
         parts.mkdir(parents=True, exist_ok=True)
-        splits = self.splits(self.sources())
-        everything = [source.name for part in PARTS for source in splits[part]]
-        files = {each: parts / f"{number:04d}.safetensors" for number, each in enumerate(everything)}
-        self._extract(files, workers, progress)
+        recordings = {source.name: source for source in self.recordings()}
+        splits = self.splits(list(recordings.values()))
+        files = {name: parts / f"{number:04d}.safetensors" for number, name in enumerate(recordings)}
+        done = [name for name, file in files.items() if _complete(file)]
+        tasks = [
+            (source, self.recipe, self.has_map, files[name]) for name, source in recordings.items() if name not in done
+        ]
+        kept = "finished recordings are kept"
+        for _ in finished(
+            _extract_to_file, tasks, workers, progress, "extracting scenes", "recordings", len(done), kept
+        ):
+            pass
         tensors, report = {}, {}
         for part in PARTS:
             tensors[part], report[part] = self._gather(part, [files[source.name] for source in splits[part]])
@@ -225,17 +242,6 @@ class RecordedData(SceneDataModule):
         made = cache.write(folder, tensors, self.config, {**report, "recordings": names})
         shutil.rmtree(parts)
         return made
-
-    def _extract(self, files: Mapping[str, Path], workers: int | None, progress: bool) -> None:
-        """Make the files that are missing."""
-        tasks = [
-            (self.format, self.folder_of_recordings, name, self.recipe, self.has_map, file)
-            for name, file in files.items()
-            if not _complete(file)
-        ]
-        done, kept = len(files) - len(tasks), "finished recordings are kept"
-        for _ in finished(_extract_to_file, tasks, workers, progress, "extracting scenes", "recordings", done, kept):
-            pass
 
     def _gather(self, part: str, files: Sequence[Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The scenes of a split, and what there is to say about them."""
@@ -248,7 +254,7 @@ class RecordedData(SceneDataModule):
             extracts.append(Extract(**columns) if columns else None)
         full = [found for found in extracts if found is not None]
         if not full:
-            gone = ", ".join(f"{reason}: {count}" for reason, count in counts.items() if count)
+            gone = ", ".join(f"{reason}: {count}" for reason, count in counts.items() if count) or "no window at all"
             raise ConfigError(
                 f"the split {part!r} of {self.dataset_name} has not a single scene ({gone}): relax data.windows, or give it "
                 "more recordings"
@@ -292,12 +298,11 @@ def _fingerprint(file: Path) -> list[Any]:
     return [file.name, size, zlib.crc32(ends)]
 
 
-def _extract_to_file(format: str, folder: Path, name: str, recipe: Recipe, has_map: bool, file: Path) -> None:
+def _extract_to_file(source: Source, recipe: Recipe, has_map: bool, file: Path) -> None:
     """Extract the scenes of one recording into a file, atomically."""
-    (source,) = (source for source in lookup("format", format)(folder) if source.name == name)
     recording = source.read()
     if has_map and recording.lanes is None:
-        raise ConfigError(f"the recording {name} has no map: set data.map=false, or give it one")
+        raise ConfigError(f"the recording {source.name} has no map: set data.map=false, or give it one")
     if not has_map:
         recording = dataclasses.replace(recording, lanes=None)
     found, counts = extract(recording, recipe)
@@ -334,7 +339,7 @@ def _describe(scenes: Extract, dt: float) -> dict[str, Any]:
     if scenes.candidates.shape[1] and ends.any():
         way = scenes.candidates[ends] - scenes.future[ends, -1, None, :2]
         nearest_goal = np.linalg.norm(way, axis=-1).min(1)
-        found["distance of the nearest goal candidate [m], mean and 95th percentile"] = [
+        found["way to the nearest goal candidate [m], mean and 95th percentile"] = [
             float(nearest_goal.mean()),
             float(np.percentile(nearest_goal, 95)),
         ]

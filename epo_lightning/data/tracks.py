@@ -140,7 +140,8 @@ class Source:
     Attributes:
         name, group: as of the :class:`Recording`.
         files: what it is read from; their contents identify a data set.
-        read: reads it. Raises :class:`RecordingError`.
+        read: reads it, in another process maybe, so it is a function of a module or a partial of one. Raises
+            :class:`RecordingError`.
     """
 
     name: str

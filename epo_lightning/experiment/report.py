@@ -52,6 +52,7 @@ def draw(runs: list[RunFolder], folder: Path) -> list[Path]:
     """
     from epo_lightning.report.figures import joint_predictions
     from epo_lightning.report.scenes import highway_comparison
+    from epo_lightning.report.style import AGENTS
     from epo_lightning.report.weights import learned_weights
 
     rows: dict[str, RunFolder] = {}
@@ -85,7 +86,8 @@ def draw(runs: list[RunFolder], folder: Path) -> list[Path]:
     many = spread(scenes, GAMES)
     games = {title: forecast_of(forecasters[title], many) for title, f in forecasts.items() if f.parameters is not None}
     if games:
-        drawn.append(learned_weights(games, folder / "learned_weights.png"))
+        names = () if is_traffic(scenes, shape) else AGENTS
+        drawn.append(learned_weights(games, folder / "learned_weights.png", names))
     return drawn
 
 

@@ -41,14 +41,18 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Make the data set, unless it is there already, and print its report."""
     settings = check("generate", config)
     from epo_lightning.experiment import assembly
+    from epo_lightning.experiment.compose import tree
 
     data = assembly.build_data(settings.data)
     folder = data.generate(workers=settings.workers, progress=settings.progress)
     print(f"\ndata in {folder}, digest {data.digest}")
     _print_report(data.report())
     row = f"{settings.data.get('dataset', 'rpi')}/v_lstm_epo"
-    words = " ".join(["epo train", f"experiment={row}", *(o for o in overrides if o.startswith("data."))])
-    print(f"\nnext: {words}")
+    if (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
+        words = [f"experiment={row}", *(o for o in overrides if o.startswith("data."))]
+    else:
+        words = [f"experiment={'exid' if data.has_map else 'ucy'}/v_lstm_epo", *overrides]
+    print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
 
 
 def train(config: dict[str, Any], overrides: Sequence[str]) -> float | None:
@@ -106,6 +110,10 @@ def report(config: dict[str, Any], overrides: Sequence[str]) -> None:
 
 
 def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
+    splits = [name for name in ("train", "val", "test") if isinstance(report.get(name), dict)]
+    if "recordings" in report and splits:
+        _print_windows(report, splits)
+        return
     for key, value in report.items():
         if isinstance(value, dict):
             print(f"{indent}{key}")
@@ -117,6 +125,27 @@ def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
             print(f"{indent}{key:<34} {shown}")
         else:
             print(f"{indent}{key:<34} {value}")
+
+
+def _print_windows(report: dict[str, Any], splits: list[str]) -> None:
+    """What became of all windows of recorded data, split by split: where they come from, where they went, what is left."""
+    names = {name: None for split in splits for name in report[split]}
+    counts = [name for name in names if isinstance(report[splits[0]].get(name, 0), int)]
+    lost = sorted((name for name in counts if name not in ("windows", "scenes")), key=str)
+    left = [name for name in names if name not in counts]
+    print(f"  {'':<64}" + "".join(f"{split:>18}" for split in splits))
+    print(f"  {'recordings':<64}" + "".join(f"{len(report['recordings'][split]):>18}" for split in splits))
+    for name in ("windows", *lost, "scenes", *left):
+        values = [report[split].get(name, 0) for split in splits]
+        if any(values):
+            shown = ("less: " if name in lost else "") + name
+            print(f"  {shown:<64}" + "".join(f"{_number(value):>18}" for value in values))
+
+
+def _number(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_number, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 RUN: dict[str, Callable[[dict[str, Any], Sequence[str]], Any]] = {

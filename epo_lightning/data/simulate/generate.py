@@ -169,9 +169,14 @@ def make_recordings(folder: Path, config: Mapping[str, Any], workers: int | None
         ConfigError: SUMO is missing or fails, a recording without lane changes or with too many accidents.
         cache.CacheError: the folder is there but something else or broken, or a worker was killed.
     """
-    if folder.exists():
-        verify(folder, config)
-        return folder
+    with cache.alone(folder):
+        if not folder.exists():
+            return _make(folder, config, workers, progress)
+    verify(folder, config)
+    return folder
+
+
+def _make(folder: Path, config: Mapping[str, Any], workers: int | None, progress: bool) -> Path:
     simulator()
     name = cache.digest(config)
     work = folder.with_name(f".{folder.name}-{name[:12]}")
@@ -205,14 +210,11 @@ def _finish(folder: Path, work: Path, config: Mapping[str, Any], numbers: Mappin
         report[f"{number:02d}"] = done
     for number in numbers:
         _done_path(work, number).unlink()
+    for leftover in (work / "data").glob(".*"):  # of a recording that was killed while it was written
+        leftover.unlink()
     _write_json(
         work / cache.MANIFEST,
         {"hash": name, "config": dict(config), "files": files, "recordings": report},
     )
-    try:
-        work.replace(folder)
-    except OSError:
-        if not folder.exists():
-            raise
-        verify(folder, config)  # somebody else finished the same recordings first
+    work.replace(folder)
     return folder
