@@ -157,6 +157,13 @@ def test_missing_data_is_said_before_a_folder_is_made(refused: Callable[..., str
     assert "epo generate" in refused("train", "experiment=rpi/v_lstm", "data.root=nowhere")
 
 
+def test_what_the_disk_refuses_is_one_message(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    (tmp_path / "file").touch()
+    assert epo("generate", "data=rpi_reduced", "data.root=file/cache", "progress=false") == 1
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("epo: Not a directory: file/cache"), message
+
+
 def test_help_and_configurations_are_printed(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
     for words, expected in (
         (["--help"], "epo train"),

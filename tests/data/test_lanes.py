@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.lanes import Polylines, lane_changes
+from epo_lightning.data.lanes import LaneGraph, Polylines, lane_changes
+from epo_lightning.data.routes import Routes
 from epo_lightning.data.traffic import leaders
 
 from .roads import FOUR, WIDTH, curve, road, traffic
@@ -90,6 +91,75 @@ def test_leaders_are_the_nearest_ahead(seed):
         nearest = min(ahead, default=(np.inf, -1))
         expected = nearest if nearest[0] < 250 else (np.inf, -1)
         assert (pytest.approx(distance[row]), leader[row]) == expected
+
+
+def crossing(angle: float):
+    """Two straight lanes that cross at the origin, as under a bridge; the second one turned by ``angle``."""
+    one, other = (road(curve(None, turn, (-100 * np.cos(turn), -100 * np.sin(turn))), 1, 1) for turn in (0.0, angle))
+    both = {n: [*getattr(one, n), *getattr(other, n)] for n in ("left", "right", "centre", "successors")}
+    none = np.full(2, -1)
+    return LaneGraph(
+        ids=np.arange(2),
+        **both,
+        left_of=none,
+        right_of=none,
+        adjacent_left=none,
+        adjacent_right=none,
+        speed_limit=np.full(2, np.nan),
+        kind=np.zeros(2, int),
+    )
+
+
+@pytest.mark.parametrize("degrees", [20, 45, 70])
+def test_who_drives_over_or_under_a_road_is_not_on_it(degrees):
+    lanes = crossing(np.radians(degrees))
+    along = np.linspace(-20, 20, 81)
+    position = np.stack([along, np.full(81, 0.5)], 1)  # half a metre left of the middle, right along the lane
+    assert (lanes.locate(position, np.zeros(81)).lane == 0).all()
+
+
+@pytest.mark.parametrize("length", [3.0, 4.0, 8.0, 200.0])
+def test_changes_are_seen_on_lanelets_of_any_length(length):
+    place = curve(None)
+    lanes = road(place, 2, int(400 / length) + 1, length)
+    position, _ = place(np.arange(0, 300, 6.0), np.where(np.arange(50) < 25, 0.0, WIDTH))  # 30 m/s at 5 Hz
+    found = lanes.locate(position, np.zeros(50))
+    assert np.flatnonzero(lane_changes(np.zeros(50, int), found, lanes)).tolist() == [25]
+
+
+def test_routes_of_a_loop_go_on_where_the_agent_is():
+    """A lane that leads into a ring and over its own beginning."""
+    angles = np.linspace(-np.pi / 2, np.pi, 60)
+    ring = np.stack([60 + 40 * np.cos(angles), 40 + 40 * np.sin(angles)], 1)
+    lines = [
+        np.stack([np.linspace(0, 60, 13), np.zeros(13)], 1),
+        ring,
+        np.stack([np.full(9, 20.0), np.linspace(40, -40, 9)], 1),  # down over the first lane at x = 20
+    ]
+
+    def beside(line, offset):
+        way = np.gradient(line, axis=0)
+        normal = np.stack([-way[:, 1], way[:, 0]], 1) / np.linalg.norm(way, axis=1, keepdims=True)
+        return line + offset * normal
+
+    none = np.full(3, -1)
+    lanes = LaneGraph(
+        np.arange(3),
+        [beside(line, 1.8) for line in lines],
+        [beside(line, -1.8) for line in lines],
+        lines,
+        [(1,), (2,), ()],
+        *(none,) * 4,
+        np.full(3, np.nan),
+        np.zeros(3, int),
+    ).check("loop")
+    x = np.arange(15.0, 30.0)
+    position, speed = np.stack([x, np.full(15, -0.3)], 1), np.full(15, 10.0)
+    route = Routes(lanes).of(position, speed, lanes.locate(position, np.zeros(15)), 4.0)
+    own = route.candidates[:, route.line == 1]
+    # From 12.5 m ahead (braking) to 64 m: never down the other side of the loop.
+    np.testing.assert_allclose(own[:, 0], np.stack([x + 12.5, np.zeros(15)], 1), atol=0.05)
+    assert (own[..., 0] > x[:, None]).all()
 
 
 def test_graphs_that_cannot_be_maps_are_refused():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -149,3 +150,11 @@ def test_missing_data_and_misspelt_keys_say_what_to_do(folder, tmp_path):
         data(tmp_path / "bare").generate(progress=False)
     with pytest.raises(cache.CacheError, match=r"epo generate data=roads"):
         data(folder).setup("fit")
+
+
+def test_of_several_at_once_one_makes_the_set_and_the_others_wait(folder):
+    READ.clear()
+    with ThreadPoolExecutor(3) as pool:
+        made = list(pool.map(lambda _: data(folder).generate(workers=1, progress=False), range(3)))
+    assert len(set(made)) == 1
+    assert len(READ) == 9

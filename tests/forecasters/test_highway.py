@@ -176,3 +176,9 @@ def test_models_from_before_there_were_maps_still_build():
     assert not {"candidates", "map"} & set(old)
     task = build_forecaster(old).task
     assert (task.candidates, task.map) == (1, False)
+
+
+def test_joint_probabilities_of_many_modes_and_agents_do_not_vanish():
+    model = forecaster({"name": "marginal", "modes": 64, "loss_weights": LOSS_WEIGHTS})
+    probabilities = model.predict(highway_scene(2, 32)).probabilities
+    torch.testing.assert_close(probabilities.sum(1), torch.ones(2))
