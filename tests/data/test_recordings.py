@@ -5,12 +5,13 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recordings import RecordedData
+from epo_lightning.data.recordings import RecordedData, _fingerprint
 from epo_lightning.data.tracks import Source
 from epo_lightning.registry import ConfigError, register
 
@@ -109,6 +110,23 @@ def test_the_set_depends_on_what_is_in_the_files(folder):
     assert data(folder, windows={"dt": 0.2, "radius": 50.0}).digest != before
     (folder / "a-0.road").write_text("3.0")
     assert data(folder).digest != before
+
+
+def test_fingerprints_see_every_byte_of_small_files_and_large_changes_of_large_ones(tmp_path):
+    file = tmp_path / "tracks.csv"
+    for size in (1, 1000, 900_000):
+        content = bytearray(np.random.default_rng(0).bytes(size))
+        file.write_bytes(content)
+        before = _fingerprint(file)
+        content[size // 2] ^= 1
+        file.write_bytes(content)
+        assert _fingerprint(file) != before
+    large = bytearray(20_000_000)
+    file.write_bytes(large)
+    before = _fingerprint(file)
+    large[9_000_000:10_000_000] = b"1" * 1_000_000
+    file.write_bytes(large)
+    assert _fingerprint(file) != before
 
 
 def test_a_split_without_scenes_is_an_error_that_says_where_they_went(folder):
