@@ -178,8 +178,7 @@ def extract(recording: Recording, recipe: Recipe) -> tuple[Extract | None, dict[
     located, changes = _on_lanes(clock, recording)
     moments, members = _choose(clock, changes, recipe, counts)
     if recording.lanes is not None:
-        on = _current(located.lane, clock, moments, members)
-        off = ((on < 0) & (members >= 0)).any(1)
+        off = ((located.lane[_rows(clock, moments, members)] < 0) & (members >= 0)).any(1)
         counts["an agent on no lane"] = int(off.sum())
         moments, members = moments[~off], members[~off]
     counts["scenes"] = len(moments)
@@ -209,9 +208,9 @@ def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.n
     return located, lane_changes(clock.owner, smooth, recording.lanes).cumsum()
 
 
-def _current(values: np.ndarray, clock: Stretches, moments: np.ndarray, members: np.ndarray) -> np.ndarray:
-    """What ``values`` of all rows are for the members of windows at their moments; anything for none."""
-    return values[clock.start[members] + moments[:, None] - clock.first[members]]
+def _rows(clock: Stretches, moments: Int[np.ndarray, " S"], members: Int[np.ndarray, "S N"]) -> Int[np.ndarray, "S N"]:
+    """The rows of windows' members at their moments; -1 for none."""
+    return np.where(members >= 0, clock.start[members] + moments[:, None] - clock.first[members], -1)
 
 
 def _choose(
@@ -220,7 +219,7 @@ def _choose(
     """Moments and members (stretches) of all windows that pass, the focal agent first, then by distance."""
     found_moments, found_members = [np.empty(0, dtype=int)], [np.empty((0, recipe.agents), dtype=int)]
     for moment, stretch, focal in _crowds(clock, recipe):
-        position = clock.now[_current(np.arange(len(clock.state)), clock, moment, stretch), :2]
+        position = clock.now[_rows(clock, moment, stretch), :2]
         distance = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
         distance[np.broadcast_to((stretch < 0)[:, None], distance.shape)] = np.inf
         everyone = np.arange(stretch.shape[1])
@@ -242,10 +241,10 @@ def _choose(
         found_members.append(members[once])
     moments, members = np.concatenate(found_moments), np.concatenate(found_members)
     if recipe.lane_change:
-        start, end = moments - recipe.history + 1, moments + recipe.horizon
-        before = np.maximum(start[:, None], clock.first[members])
-        after = np.minimum(end[:, None], (clock.first + clock.count - 1)[members])
-        offset = clock.start[members] - clock.first[members]
+        first, last = clock.first[members], (clock.first + clock.count - 1)[members]
+        before = np.clip((moments - recipe.history + 1)[:, None], first, last)
+        after = np.clip((moments + recipe.horizon)[:, None], first, last)
+        offset = clock.start[members] - first
         changed = ((changes[offset + after] > changes[offset + before]) & (members >= 0)).any(1)
         counts["no lane change"] += int((~changed).sum())
         moments, members = moments[changed], members[changed]
@@ -284,7 +283,7 @@ def _assemble(
     members: Int[np.ndarray, "S N"],
 ) -> Extract:
     """Gather what is known of the chosen agents at their moments."""
-    rows = np.where(members >= 0, _current(np.arange(len(clock.state)), clock, moments, members), -1)
+    rows = _rows(clock, moments, members)
     used, place = np.unique(rows, return_inverse=True)
     place = place.reshape(rows.shape)
     if used[0] < 0:

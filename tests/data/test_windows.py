@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -188,6 +189,24 @@ def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
         )
         scene, _ = scenes_of(dataclasses.replace(of, tracks=turned, lanes=None), recipe, "aligned")
         torch.testing.assert_close(scene.current[:, 0, 2], torch.zeros(len(scene.history)), rtol=0, atol=1e-5)
+
+
+def test_tracks_may_begin_and_end_when_they_like():
+    of = recording(seconds=20.0, vehicles=[*FOUR, (12, 90.0, 2, 24.0, None)])
+    lives = np.array([500, 500, 400, 350, 150])[of.tracks.agent]  # the last one leaves long before the others
+    kept = of.tracks.frame <= lives
+    parts = {n: getattr(of.tracks, n)[kept] for n in ("agent", "frame", "position", "heading", "velocity")}
+    of = dataclasses.replace(of, tracks=dataclasses.replace(of.tracks, **parts))
+    for complete, lane_change in itertools.product((True, False), repeat=2):
+        recipe = Recipe(agents=5, least_agents=1, radius=None, lane_change=lane_change, complete=complete)
+        scene, data = scenes_of(of, recipe)
+        for index, entry in enumerate(data.provenance(range(len(data)))):
+            present = scene.agent_mask[index].sum()
+            assert present == len(entry["tracks"])
+            last = {7: 500, 3: 500, 9: 400, 4: 350, 12: 150}
+            for track in entry["tracks"]:
+                assert entry["frame"] + (100 if complete else 0) <= last[track]
+        assert scene.finite.all()
 
 
 def test_neighbours_may_be_observed_in_part():
