@@ -66,7 +66,7 @@ class RecordedData(SceneDataModule):
         test_share: of the groups.
         val_share: of what remains, drawn by ``val_by``.
         val_by: ``recording`` or ``group``. Windows of one recording are never in two splits.
-        frame: ``fixed`` (axes of the recording) or ``aligned`` (x where the agents head on average).
+        frame: ``aligned`` (x where the agents head on average) or ``fixed`` (axes of the recording, as in the paper).
         shape: agents' outline in the overlap rates, ``box`` or ``disc``.
         scale: metres that an input of one of a network stands for.
         root: folder of the cache; None for $EPO_CACHE or ``cache``.
@@ -85,7 +85,7 @@ class RecordedData(SceneDataModule):
         test_share: float = 0.12,
         val_share: float = 0.18,
         val_by: str = "recording",
-        frame: str = "fixed",
+        frame: str = "aligned",
         shape: str = "box",
         scale: float = 20.0,
         root: str | None = None,

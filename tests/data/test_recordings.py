@@ -106,7 +106,7 @@ def test_what_was_extracted_before_an_error_is_not_extracted_again(folder, tmp_p
 def test_the_set_depends_on_what_is_in_the_files(folder):
     before = data(folder).digest
     assert data(folder).digest == before
-    assert data(folder, frame="aligned").digest != before
+    assert data(folder, frame="fixed").digest != before
     assert data(folder, windows={"dt": 0.2, "radius": 50.0}).digest != before
     (folder / "a-0.road").write_text("3.0")
     assert data(folder).digest != before

@@ -35,7 +35,7 @@ class SimulatedHighway(RecordedData):
         test: Sequence[str] | None = ("0",),
         val_share: float = 0.18,
         val_by: str = "recording",
-        frame: str = "fixed",
+        frame: str = "aligned",
         scale: float = 20.0,
         root: str | None = None,
         seed: int = 0,
