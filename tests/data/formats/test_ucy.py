@@ -56,9 +56,9 @@ def test_columns(tmp_path):
     assert tracks.velocity[1].tolist() == [0.0, -1.0]
     assert tracks.size.tolist() == [[0.5, 0.5]] * 3
     assert [KINDS[kind] for kind in tracks.kind] == ["pedestrian"] * 3
-    # The one who stops still faces where he walked; the one who starts already faces there; nobody knows of the third.
+    # The one who stops still faces where he walked; where the one who starts will go nobody knows, nor of the third.
     walked = np.arctan2(0.5, 1.0)
-    np.testing.assert_allclose(tracks.heading, [-np.pi / 2, -np.pi / 2, 0.0, walked, walked, walked])
+    np.testing.assert_allclose(tracks.heading, [0.0, -np.pi / 2, 0.0, walked, walked, walked])
 
 
 def test_order_of_rows_says_nothing(tmp_path):

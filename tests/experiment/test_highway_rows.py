@@ -61,7 +61,7 @@ def test_every_row_from_recordings_to_the_table(epo: Epo, tmp_path: Path, capsys
 def test_us101_gives_the_known_number_of_windows(epo: Epo, tmp_path: Path) -> None:
     """27 long scenes of which 21 are here gave 5931 windows, and 1640 with a lane change."""
     assert epo("generate", "data=us101", f"data.folder={SHARED / 'data' / 'us101'}", "progress=false", "workers=1") == 0
-    (folder,) = (tmp_path / "cache").iterdir()
+    (folder,) = (tmp_path / "cache").glob("us101-*")
     report = json.loads((folder / "manifest.json").read_text())["report"]
     parts = [report[part] for part in ("train", "val", "test")]
     scenes = sum(part["scenes"] for part in parts)
