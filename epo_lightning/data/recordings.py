@@ -153,9 +153,9 @@ class RecordedData(SceneDataModule):
                     f"data.test names the group {group!r}, which no recording has: {nearest(group, groups)}"
                 )
         rest = [source for source in sources if source.group not in chosen]
-        units = sorted({getattr(source, "name" if self.val_by == "recording" else "group") for source in rest})
-        held = set(draw.permutation(units)[: max(1, round(self.val_share * len(units)))].tolist())
         unit = "name" if self.val_by == "recording" else "group"
+        units = sorted({getattr(source, unit) for source in rest})
+        held = set(draw.permutation(units)[: max(1, round(self.val_share * len(units)))].tolist())
         found = {
             "train": [source for source in rest if getattr(source, unit) not in held],
             "val": [source for source in rest if getattr(source, unit) in held],
@@ -268,7 +268,7 @@ class RecordedData(SceneDataModule):
         origin[index] = whole.origin
         columns["recording"], columns["origin"] = index[whole.recording].astype(np.int32), origin
         tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in columns.items()}
-        return tensors, {**dict(counts), **_describe(whole, self.dt)}
+        return tensors, {**dict(counts), **_describe(whole)}
 
     def report(self) -> dict[str, Any]:
         """The report that the set was made with.
@@ -330,7 +330,7 @@ def _complete(file: Path) -> bool:
         return False
 
 
-def _describe(scenes: Extract, dt: float) -> dict[str, Any]:
+def _describe(scenes: Extract) -> dict[str, Any]:
     """Numbers for people who want to know what they train on."""
     speed = scenes.history[:, -1, 3]
     found: dict[str, Any] = {
