@@ -11,6 +11,7 @@ ROOT = Path(epo_lightning.__file__).parent
 FLOORS = {
     "scene": set(),
     "registry": set(),
+    "identity": set(),
     "run_folder": {"registry"},
     "optimizers": {"registry"},
     "losses": set(),
@@ -32,7 +33,7 @@ FLOORS = {
         "losses",
         "optimizers",
     },
-    "report": {"scene", "registry", "metrics", "run_folder"},
+    "report": {"scene", "registry", "metrics", "run_folder", "identity"},
 }
 """What each room may import, besides itself; `experiment` and `cli` stand on top of everything."""
 

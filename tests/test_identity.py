@@ -1,0 +1,74 @@
+"""A run's identity changes with what decides on its result, and with nothing else."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+
+from epo_lightning.experiment.compose import compose
+from epo_lightning.identity import differences, essence, identity, row_identity
+
+CONFIG = compose("train", ["experiment=rpi/v_lstm_epo"])
+
+
+def changed(key: str, value: Any) -> dict[str, Any]:
+    config = copy.deepcopy(CONFIG)
+    *sections, last = key.split(".")
+    section = config
+    for name in sections:
+        section = section[name]
+    section[last] = value
+    return config
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("solver.steps", 4), ("optimizer.lr", 0.1), ("trainer.max_epochs", 3), ("energy.own", ["goal"])),
+        *(("data.batch_size", 16), ("goal", "all"), ("forecaster.loss_weights.goal", 7.0), ("callbacks.patience", 2)),
+    ],
+)
+def test_what_decides_on_the_result_is_part_of_it(key: str, value: Any) -> None:
+    other = changed(key, value)
+    assert identity(other, "d") != identity(CONFIG, "d")
+    assert row_identity(other, "d") != row_identity(CONFIG, "d")
+    assert [found for found, _, _ in differences(CONFIG, other)] == [key]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(
+            ("title", "x"),
+            ("runs", "elsewhere"),
+            ("run_dir", "here"),
+            ("logger", {"wandb": {}}),
+            ("existing", "continue"),
+        ),
+        *(("trainer.threads", 8), ("trainer.devices", 2), ("trainer.accelerator", "gpu"), ("data.root", "/cache")),
+        *(("callbacks.progress", "bar"), ("budget", {"name": "other"}), ("experiment", "rpi/other")),
+    ],
+)
+def test_names_places_and_machines_are_not(key: str, value: Any) -> None:
+    other = changed(key, value)
+    assert identity(other, "d") == identity(CONFIG, "d")
+    assert differences(CONFIG, other) == []
+
+
+def test_rows_are_runs_without_their_seed() -> None:
+    other = changed("seed", 5)
+    assert identity(other, "d") != identity(CONFIG, "d")
+    assert row_identity(other, "d") == row_identity(CONFIG, "d")
+
+
+def test_data_counts_by_its_digest() -> None:
+    assert identity(CONFIG, "one") != identity(CONFIG, "other")
+    assert len(identity(CONFIG, "one")) == 16
+
+
+def test_the_order_of_keys_means_nothing() -> None:
+    shuffled = dict(reversed(CONFIG.items()))
+    assert identity(shuffled, "d") == identity(CONFIG, "d")
+    assert essence(shuffled) == essence(CONFIG)
