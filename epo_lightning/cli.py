@@ -168,7 +168,7 @@ def _help(arguments: Arguments) -> None:
                 "debug",
                 "sweeps",
             ):
-                words = " | ".join(sorted(options_of(instance, group)))
+                words = " | ".join(options_of(instance, group))
                 print(fill(words, 120, initial_indent=f"  {group + '=':<14}", subsequent_indent=" " * 16))
 
 
@@ -198,7 +198,7 @@ def _config(arguments: Arguments) -> None:
 
     settings = read(Settings, config)
     data, model = assembly.check(settings)
-    run = train.folder_for(settings, words)
+    run = train.folder_for(settings)
     print(f"{settings.title}: the configuration is sound")
     print(f"  parameters  {assembly.parameters(model)}")
     print(f"  data        {settings.data['name']}, digest {data.digest}")
@@ -244,7 +244,7 @@ def _sweep(arguments: Arguments) -> None:
         for job in listed:
             settings = read(Settings, compose.compose("train", job, arguments.extra))
             assembly.check(settings)
-            train.refuse_occupied(settings, train.folder_for(settings, job))
+            train.refuse_occupied(settings, train.folder_for(settings))
         print(f"{len(listed)} runs")
     compose.multirun("train", arguments.overrides, job_of_sweep, arguments.extra)
 

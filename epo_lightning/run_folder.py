@@ -4,12 +4,16 @@
 
     <run folder>/
         config.yaml            the resolved configuration: all that is needed to continue or evaluate the run
-        run.json               who, what, when: title, experiment, budget, seed, data digest, versions, parameters, status
+        run.json               who, what, when: title, experiment, budget, seed, data digest, versions, parameters, status;
+                               `identity` is what makes it this run and no other, `row` the same without its seed
         checkpoints/best.ckpt  the epoch with the smallest validation minSADE
         checkpoints/last.ckpt  the last finished epoch, with everything that continuing needs
         logs/metrics.csv       what was logged while training; TensorBoard's and W&B's files lie beside it
         metrics.json           scores on the test split, written by ``evaluate`` ({"split", "data", "checkpoint", "metrics"})
         metrics-val.json       the same on the validation split, if asked for
+        runtime.json           how long one joint forecast takes, if asked for
+        progress.json          how far the training is, and where it runs; there while it does
+        .lock                  locked as long as a process works on the run, by whoever dies released
 
 Files are replaced as a whole: a reader, or a kill at any moment, never meets half of one. ``metrics.json`` holds no time,
 path or version, so that two equal runs give the same bytes.
@@ -19,15 +23,25 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from epo_lightning.registry import ConfigError
 
-TRAINING, FINISHED = "training", "finished"
+TRAINING, FINISHED, FAILED = "training", "finished", "failed"
+State = Literal["waiting", "running", "interrupted", "failed", "finished"]
+"""Waiting: nothing is there yet. Interrupted: it was begun, nobody works on it, and it says of no error."""
+SILENCE = 600.0
+"""Seconds without a sign of life after which a run on another machine, whose locks may not be seen here, is interrupted."""
+
+
+LOCK = ".lock"
 
 
 def write_text(path: Path, text: str) -> None:
@@ -110,13 +124,21 @@ class RunFolder:
         """The checkpoint called ``which``: best, last, or a path of its own."""
         return self.checkpoints / f"{which}.ckpt" if which in ("best", "last") else Path(which).expanduser()
 
+    @property
+    def progress_file(self) -> Path:
+        return self.path / "progress.json"
+
     def metrics_file(self, split: str = "test") -> Path:
-        return self.path / ("metrics.json" if split == "test" else f"metrics-{split}.json")
+        """Where the scores on a split are; the measured time of a forecast for ``time``."""
+        names = {"test": "metrics.json", "time": "runtime.json"}
+        return self.path / names.get(split, f"metrics-{split}.json")
 
     @property
     def exists(self) -> bool:
-        """Whether anything was written here."""
-        return self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
+        """Whether anything was written here, besides the lock of somebody who is about to."""
+        if not self.path.is_dir():
+            return self.path.exists()
+        return any(entry.name != LOCK for entry in self.path.iterdir())
 
     @property
     def record(self) -> dict[str, Any]:
@@ -126,6 +148,65 @@ class RunFolder:
     @property
     def finished(self) -> bool:
         return self.record_file.is_file() and self.record.get("status") == FINISHED
+
+    @property
+    def state(self) -> State:
+        """What has become of the run."""
+        if not self.record_file.is_file():
+            return "running" if self.path.is_dir() and self.locked else "waiting"
+        status = self.record.get("status")
+        if status == FINISHED:
+            return "finished"
+        if self.locked:
+            return "running"
+        return "failed" if status == FAILED else "interrupted"
+
+    @property
+    def progress(self) -> dict[str, Any]:
+        """How far it is, as the process that trains it last said; empty where none did."""
+        try:
+            return read_json(self.progress_file)
+        except ConfigError:
+            return {}
+
+    @property
+    def locked(self) -> bool:
+        """Whether a process works on the run."""
+        if not (self.path / LOCK).exists():
+            return False
+        try:
+            with self.lock(wait=0.0):
+                pass
+        except (ConfigError, OSError):  # taken, or not ours to take
+            return True
+        progress = self.progress
+        elsewhere = progress.get("host", socket.gethostname()) != socket.gethostname()
+        return elsewhere and time.time() - float(progress.get("time", 0.0)) < SILENCE
+
+    @contextmanager
+    def lock(self, wait: float | None = 2.0) -> Iterator[None]:
+        """Keep every other process away from the run; a process that dies in whatever way lets go.
+
+        Args:
+            wait: seconds to wait for one that works on it; None waits as long as it takes.
+
+        Raises:
+            ConfigError: somebody else works on it still.
+        """
+        from filelock import FileLock, Timeout
+
+        self.path.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.path / LOCK)
+        try:
+            lock.acquire(timeout=-1 if wait is None else wait, poll_interval=0.2)
+        except Timeout:
+            progress = self.progress
+            who = f" (process {progress['process']} on {progress['host']})" if "process" in progress else ""
+            raise ConfigError(f"another process{who} works on {self.path}: wait for it, or stop it") from None
+        try:
+            yield
+        finally:
+            lock.release()
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration as plain Python values.

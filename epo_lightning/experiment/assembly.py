@@ -104,6 +104,7 @@ def quiet() -> None:
         ".*LeafSpec.*",
         ".*configure_optimizers.*returned .None.*",
         ".*Found .* module.s. in eval mode.*",
+        ".*The `srun` command is available.*",
         ".*number of training batches .* is smaller than the logging interval.*",
     ):
         warnings.filterwarnings("ignore", message=text)

@@ -6,12 +6,16 @@ composed here and checked before anything else happens, so that a misspelt word 
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from epo_lightning.identity import essence
 from epo_lightning.registry import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -45,18 +49,20 @@ def hydra(extra: Sequence[str] = ()) -> Iterator[Hydra]:
     from hydra.core.config_search_path import SearchPathQuery
     from hydra.core.global_hydra import GlobalHydra
 
-    from epo_lightning.experiment.sweeps_source import SweepsSource
+    from epo_lightning.experiment.sources import SweepsSource, TreeSource
 
     version.setbase("1.3")
     root = tree()
-    path = create_config_search_path(f"file://{root / 'conf'}")
+    for source in (TreeSource, SweepsSource):
+        SourcesRegistry.instance().register(source)
+    path = create_config_search_path(f"{TreeSource.scheme()}://{root / 'conf'}")
     # The group `sweeps` lies beside conf/, where somebody looks who wants a table of the paper.
-    SourcesRegistry.instance().register(SweepsSource)
     path.append("sweeps", f"{SweepsSource.scheme()}://{root}", SearchPathQuery(provider="main"))
     for folder in reversed(extra):
         if not Path(folder).is_dir():
             raise ConfigError(f"--config-dir {folder}: the folder does not exist")
-        path.prepend("command-line", f"file://{Path(folder).resolve()}", SearchPathQuery(provider="main"))
+        address = f"{TreeSource.scheme()}://{Path(folder).resolve()}"
+        path.prepend("command-line", address, SearchPathQuery(provider="main"))
     GlobalHydra.instance().clear()
     try:
         yield Hydra.create_main_hydra2("epo", path)
@@ -75,15 +81,50 @@ def compose(name: str, overrides: Sequence[str] = (), extra: Sequence[str] = ())
 
 
 def resolve(config: DictConfig) -> dict[str, Any]:
-    """Plain Python values, with every interpolation replaced and without Hydra's own part; adds ``experiment``.
+    """Plain Python values, with every interpolation replaced and without Hydra's own part.
+
+    Adds ``experiment``, and ``variant``: empty where nothing that matters differs from the experiment as it is written, at
+    its budget, and else six digits of a hash of what the run is without its seed.
 
     Raises:
         ConfigError: an interpolation that leads nowhere, or a value that is still missing.
     """
+    choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
+    values = _plain_values(config)
+    if choices.get("experiment"):
+        values["experiment"] = choices["experiment"]
+    if "trainer" in values:
+        own = essence({**values, "seed": None})
+        words = tuple(f"{group}={choices[group]}" for group in ("experiment", "budget") if choices.get(group))
+        same = own == _as_written(words, _search_path())
+        values["variant"] = "" if same else hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:6]
+    return values
+
+
+def _search_path() -> tuple[str, ...]:
+    from hydra.core.global_hydra import GlobalHydra
+
+    return tuple(entry.path for entry in GlobalHydra.instance().config_loader().get_search_path().get_path())
+
+
+@cache
+def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> dict[str, Any] | None:
+    """The essence of an experiment at its budget, without a seed; None where it cannot stand alone."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.types import RunMode
+
+    loader = GlobalHydra.instance().config_loader()
+    try:
+        config = loader.load_configuration("train", list(words), run_mode=RunMode.RUN)
+        return essence({**_plain_values(config), "seed": None})
+    except Exception:  # it needs a value that only the run at hand brings
+        return None
+
+
+def _plain_values(config: DictConfig) -> dict[str, Any]:
     from omegaconf import OmegaConf
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-    choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
     plain = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     try:
         values = OmegaConf.to_container(plain, resolve=True, throw_on_missing=True)
@@ -92,8 +133,6 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     except OmegaConfBaseException as error:
         raise ConfigError(_sentence(error)) from error
     assert isinstance(values, dict)
-    if choices.get("experiment"):
-        values["experiment"] = choices["experiment"]
     return {str(key): value for key, value in values.items()}
 
 
@@ -160,21 +199,17 @@ def _one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Itera
 def _missing_option(instance: Hydra, missing: str, message: str) -> str:
     """``experiment/rpi/v_lst`` is no file: name the files that are."""
     group, _, option = missing.removesuffix(".yaml").partition("/")
-    options = sorted(options_of(instance, group)) if option else []
+    options = options_of(instance, group) if option else []
     if not options:
         return f"unknown configuration {missing!r}: " + " ".join(message.split())
     return f"unknown option {group}={option}: {nearest(option, options)}"
 
 
-def options_of(instance: Hydra, group: str, prefix: str = "") -> Iterator[str]:
+def options_of(instance: Hydra, group: str) -> list[str]:
     """The options of a group, also those in folders within it: ``rpi/v_lstm`` for ``experiment``."""
     from hydra.core.object_type import ObjectType
 
-    loader = instance.config_loader
-    for option in loader.get_group_options(f"{group}/{prefix}".rstrip("/"), ObjectType.CONFIG):
-        yield prefix + option
-    for folder in loader.get_group_options(f"{group}/{prefix}".rstrip("/"), ObjectType.GROUP):
-        yield from options_of(instance, group, f"{prefix}{folder}/")
+    return sorted(set(instance.config_loader.get_group_options(group, ObjectType.CONFIG)))
 
 
 def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str]) -> str:

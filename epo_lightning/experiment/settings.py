@@ -126,7 +126,10 @@ class Settings:
     run_dir: str | None = None
     existing: Literal["error", "continue"] = "error"
     resume: str | None = None
+    score: Literal["test", "val", "time"] | None = None
+    sweep: str | None = None
     experiment: str | None = None
+    variant: str = ""
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**32:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
+import contextlib
 import platform
+import shlex
 import shutil
 import subprocess
 import time
@@ -19,88 +18,127 @@ from lightning.pytorch import LightningModule, Trainer, seed_everything
 
 from epo_lightning.experiment import assembly, callbacks
 from epo_lightning.experiment.compose import PACKAGE
+from epo_lightning.experiment.evaluate import evaluate
 from epo_lightning.experiment.settings import Settings, read
+from epo_lightning.identity import differences, identity, row_identity
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import FINISHED, RunFolder
+from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
 
-# What does not make it another run: these are in the folder's name, or do not touch the result.
-NOT_HASHED = ("experiment", "seed", "budget", "sweeps", "runs", "run_dir", "existing", "logger", "hydra", "title")
-NOT_HASHED_KEYS = ("trainer.threads", "callbacks.progress", "callbacks.refresh")
+NOT_IN_COMMAND = ("sweep=", "existing=", "run_dir=", "resume=")
+"""What a sweep adds to a command line on its own."""
 PACKAGES = ("epo_lightning", "torch", "lightning", "hydra-core", "omegaconf", "torchmetrics", "numpy", "numba")
 
 
-def folder_for(settings: Settings, overrides: Sequence[str]) -> RunFolder:
-    """``<runs>/<experiment>/<budget>-s<seed>``, and a hash of the other overrides where there are any."""
+def folder_for(settings: Settings) -> RunFolder:
+    """``<runs>/<experiment>/<budget>-s<seed>``, and its variant where it is not just that experiment and budget."""
     if settings.run_dir:
         return RunFolder(Path(settings.run_dir).expanduser())
-    keys = {text: text.lstrip("+~").split("=")[0].split("@")[0] for text in overrides}
-    special = sorted(t for t, key in keys.items() if key.split(".")[0] not in NOT_HASHED and key not in NOT_HASHED_KEYS)
-    suffix = "-" + hashlib.sha256("\n".join(special).encode()).hexdigest()[:6] if special else ""
     group = settings.experiment or f"custom/{settings.forecaster['name']}"
-    return RunFolder(Path(settings.runs).expanduser() / group / f"{settings.budget.name}-s{settings.seed}{suffix}")
+    name = f"{settings.budget.name}-s{settings.seed}" + (f"-{settings.variant}" if settings.variant else "")
+    return RunFolder(Path(settings.runs).expanduser() / group / name)
 
 
-def train(config: dict[str, Any], overrides: Sequence[str] = ()) -> tuple[RunFolder, dict[str, float]]:
-    """Train what ``config`` describes.
+def train(config: dict[str, Any], overrides: Sequence[str] = ()) -> RunFolder:
+    """Train what ``config`` describes, and score it if the configuration says so.
 
     Args:
         config: the resolved configuration of ``epo train``.
-        overrides: what the user changed; names the run folder and is written to run.json.
-
-    Returns:
-        the run folder and the last validation metrics of a run that was fitted (empty if it was finished already).
+        overrides: what the user changed; written to run.json.
 
     Raises:
-        ConfigError: the configuration cannot work, its data is missing, or the folder holds a run already.
+        ConfigError: the configuration cannot work, its data is missing, the folder holds a run already, or another process
+            works on it.
     """
     assembly.quiet()
     settings = read(Settings, config)
     assembly.check(settings)
-    run = folder_for(settings, overrides)
-    if run.exists:
-        refuse_occupied(settings, run)
-        if run.record_file.is_file():
-            if run.finished:
-                print(f"{settings.title}: {run.path} is finished, nothing to do")
-                return run, {}
-            return resume(run, config)
-    data = _ready(settings)
-    run.begin(config, _record(settings, data, overrides))
-    return run, _fit(settings, config, run)
+    run = folder_for(settings)
+    refuse_occupied(settings, run)
+    data = None if run.record_file.is_file() else _ready(settings)  # missing data is said before a folder is made
+    # In a sweep, whoever has the run already may finish it for us.
+    with run.lock(wait=None if settings.sweep else 2.0):
+        if not run.record_file.is_file():
+            refuse_occupied(settings, run)
+            run.begin(config, _record(settings, config, data or _ready(settings), overrides))
+            _fit(settings, config, run)
+        elif run.finished:
+            _refuse_other(run, config)
+        else:
+            _continue(run, config)
+        _score(settings, run)
+    return run
 
 
-def resume(run: RunFolder, expected: dict[str, Any] | None = None) -> tuple[RunFolder, dict[str, float]]:
+def resume(run: RunFolder) -> None:
     """Continue a run that was stopped, with its own configuration, from its last finished epoch.
 
-    Args:
-        expected: the configuration that the caller has in mind, where there is one; it must be the run's own.
-
     Raises:
-        ConfigError: the run is finished, or its checkpoint, data or configuration is not the one that it began with.
+        ConfigError: the run is finished, its checkpoint or data is not the one that it began with, or another process works
+            on it.
     """
     assembly.quiet()
-    config = run.config()
-    if expected is not None and (differing := _differences(_essence(config), _essence(expected))):
-        raise ConfigError(
-            f"{run.path} was begun with another configuration ({', '.join(differing[:5])}): "
-            f"continue it as it is with `epo train resume={run.path}`, or choose another run_dir"
-        )
-    settings = read(Settings, config)
     if run.finished:
         raise ConfigError(f"{run.path} is finished: score it with `epo evaluate run={run.path}`")
-    data = _ready(settings)
-    began_with = run.record.get("data_digest")
-    if began_with != data.digest:
+    with run.lock():
+        config = run.config()
+        _continue(run, config)
+        _score(read(Settings, config), run)
+
+
+def _continue(run: RunFolder, config: dict[str, Any]) -> None:
+    """Train on from the last finished epoch. ``config`` must be the run's own, wherever it may write and log now."""
+    _refuse_other(run, config)
+    last = run.checkpoint("last")
+    run.update(status=TRAINING, error=None)
+    _fit(read(Settings, config), config, run, last if last.is_file() else None)
+
+
+def _refuse_other(run: RunFolder, config: dict[str, Any]) -> None:
+    """A run goes on with the configuration and the data that it began with.
+
+    Raises:
+        ConfigError: one of them has changed; the message names the difference.
+    """
+    if differing := differences(run.config(), config):
+        shown = ", ".join(f"{key}: {there!r} there, {here!r} here" for key, there, here in differing[:5])
         raise ConfigError(
-            f"the data of {run.path} has changed since the run began (digest {began_with}, now {data.digest}): "
+            f"{run.path} was begun with another configuration ({shown}): "
+            f"continue it as it is with `epo train resume={run.path}`, or choose another run_dir"
+        )
+    began_with, digest = run.record.get("data_digest"), assembly.build_data(config["data"]).digest
+    if began_with != digest:
+        raise ConfigError(
+            f"the data of {run.path} has changed since the run began (digest {began_with}, now {digest}): "
             "bring back the data, or begin a new run"
         )
-    last = run.checkpoint("last")
-    return run, _fit(settings, config, run, last if last.is_file() else None)
 
 
-def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None = None) -> dict[str, float]:
-    """Train from the beginning, or from the checkpoint ``last``."""
+def _score(settings: Settings, run: RunFolder) -> None:
+    """Measure what the configuration asks for, unless that was done already."""
+    if settings.score is None or run.metrics_file(settings.score).is_file():
+        return
+    if settings.score == "time":
+        from epo_lightning.experiment.timing import measure
+
+        measure(run, settings)
+    else:
+        evaluate({"run": str(run.path), "split": settings.score})
+
+
+def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None = None) -> None:
+    """Train from the beginning, or from the checkpoint ``last``; an error is also left in run.json."""
+    try:
+        _train(settings, config, run, last)
+    except Exception as error:
+        with contextlib.suppress(OSError, ConfigError):  # the disk may be what failed
+            run.update(status=FAILED, error=f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
+        raise
+    finally:
+        with contextlib.suppress(OSError):
+            run.progress_file.unlink(missing_ok=True)
+
+
+def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None) -> None:
     started = time.monotonic()
     seed_everything(settings.seed, workers=True, verbose=False)
     data = _ready(settings)
@@ -131,7 +169,6 @@ def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path 
         best={settings.callbacks.monitor: score},
         seconds=round(run.record.get("seconds", 0.0) + time.monotonic() - started, 1),
     )
-    return metrics
 
 
 def _keep_unlearned(trainer: Trainer, model: LightningModule, data: Any, run: RunFolder) -> None:
@@ -212,26 +249,11 @@ def _occupied(run: RunFolder) -> str:
     )
 
 
-def _essence(config: dict[str, Any]) -> dict[str, Any]:
-    """The part of a configuration that decides on the result."""
-    ignored = ("existing", "run_dir", "runs", "resume", "logger")
-    return json.loads(json.dumps({key: value for key, value in config.items() if key not in ignored}))
-
-
-def _differences(one: Any, other: Any, where: str = "") -> list[str]:
-    if isinstance(one, dict) and isinstance(other, dict):
-        keys = sorted({*one, *other})
-        return [
-            found for key in keys for found in _differences(one.get(key), other.get(key), f"{where}.{key}".strip("."))
-        ]
-    same = one == other or (
-        isinstance(one, float) and isinstance(other, float) and math.isnan(one) and math.isnan(other)
-    )
-    return [] if same else [f"{where}: {one!r} there, {other!r} here"]
-
-
-def _record(settings: Settings, data: Any, overrides: Sequence[str]) -> dict[str, Any]:
+def _record(settings: Settings, config: dict[str, Any], data: Any, overrides: Sequence[str]) -> dict[str, Any]:
+    words = [word for word in overrides if not word.startswith(NOT_IN_COMMAND)]
     return {
+        "identity": identity(config, data.digest),
+        "row": row_identity(config, data.digest),
         "title": settings.title,
         "experiment": settings.experiment,
         "forecaster": settings.forecaster["name"],
@@ -240,7 +262,7 @@ def _record(settings: Settings, data: Any, overrides: Sequence[str]) -> dict[str
         "budget": settings.budget.name,
         "data": settings.data.get("dataset", settings.data["name"]),
         "data_digest": data.digest,
-        "command": " ".join(["epo", "train", *overrides]),
+        "command": shlex.join(["epo", "train", *words]),
         "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
         "git_commit": _commit(),

@@ -59,8 +59,7 @@ def train(config: dict[str, Any], overrides: Sequence[str]) -> float | None:
     """Train a run and say where it is."""
     from epo_lightning.experiment import train as training
 
-    run, _ = training.train(config, overrides)
-    return _trained(run)
+    return _trained(training.train(config, overrides))
 
 
 def resume(run: RunFolder) -> float | None:
