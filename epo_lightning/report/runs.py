@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, read_json
+
+TRAIN = "train one first, epo train experiment=rpi/v_lstm_epo"
+COPY = "copy the run folder again from where it was made, or move it away"
 
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """One run and its scores.
+    """One run and its scores on one split.
 
     Attributes:
         path: the run folder.
@@ -25,11 +29,16 @@ class EvaluatedRun:
         goal: who knows a given goal, ``energy`` or ``all``.
         budget: name of its budget.
         split: which part of the data it was evaluated on.
+        checkpoint: which of its checkpoints was evaluated.
         data_digest: digest of the data it was evaluated on.
         trained_digest: digest of the data it was trained on.
         metrics: scores by name, displacements in m.
-        git_commit: of the code, where known.
+        git_commit: of the code; the installed version where there was no checkout.
+        command: that made it.
         parameters: number of trained parameters, where known.
+        identity: hash of all that decides on its result.
+        row: the same without the seed: what the runs of one row of a table share.
+        config: its resolved configuration.
     """
 
     path: Path
@@ -42,11 +51,16 @@ class EvaluatedRun:
     goal: str
     budget: str
     split: str
+    checkpoint: str
     data_digest: str
     trained_digest: str
     metrics: Mapping[str, float]
     git_commit: str
+    command: str
     parameters: int | None
+    identity: str
+    row: str
+    config: Mapping[str, Any] = field(repr=False)
 
     @property
     def learned(self) -> bool:
@@ -54,64 +68,146 @@ class EvaluatedRun:
         return self.forecaster != "constant_velocity"
 
 
-def collect(folder: str | Path) -> list[EvaluatedRun]:
-    """All evaluated runs in and below a folder, in the order of their paths.
+def find_runs(folder: str | Path) -> list[RunFolder]:
+    """All runs in and below a folder, in the order of their paths.
+
+    Raises:
+        ConfigError: no folder, no run (with the command that makes one), or scores of a run that lost its records.
+    """
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise ConfigError(f"no folder {folder} to report on: {TRAIN}")
+    known = list(discover(folder))
+    for record in folder.rglob("run.json"):
+        _require_records(RunFolder(record.parent))
+    for config in folder.rglob("config.yaml"):  # a run that was killed before its record existed has no scores
+        if scored(RunFolder(config.parent)):
+            _require_records(RunFolder(config.parent))
+    if not known:
+        raise ConfigError(f"no run in or below {folder}: {TRAIN}")
+    return known
+
+
+def scored(run: RunFolder) -> list[Path]:
+    """The files with a run's scores: ``metrics.json`` of the test split first, then ``metrics-<split>.json``."""
+    files = [run.metrics_file(), *sorted(run.path.glob("metrics-*.json"))]
+    return [file for file in files if file.is_file()]
+
+
+def collect(runs: str | Path | Iterable[RunFolder]) -> list[EvaluatedRun]:
+    """All evaluated runs, one entry for every split that a run was evaluated on.
+
+    Args:
+        runs: run folders, or a folder in and below which they are looked for. Runs without scores are left out,
+            :func:`not_evaluated` names them.
 
     Raises:
         ConfigError: no folder, no run or no evaluated run (with the command that makes one), or a damaged file.
     """
-    folder = Path(folder).expanduser()
-    if not folder.is_dir():
-        raise ConfigError(f"no folder {folder} to report on: train a run first, epo train experiment=rpi/v_lstm_epo")
-    known = list(discover(folder))
-    evaluated = [run for run in known if run.metrics_file().is_file()]
+    where = f"in or below {runs}" if isinstance(runs, str | Path) else "of this report"
+    known = _listed(runs)
     if not known:
-        raise ConfigError(f"no run in or below {folder}: train one first, epo train experiment=rpi/v_lstm_epo")
-    if not evaluated:
-        raise ConfigError(
-            f"none of the {len(known)} runs in or below {folder} is evaluated: epo evaluate runs={folder} does it"
-        )
-    return [read_run(run) for run in evaluated]
+        raise ConfigError(f"no run {where}: {TRAIN}")
+    found = [evaluated for run in known for evaluated in read_run(run)]
+    if not found:
+        remedy = f"epo evaluate runs={runs}" if isinstance(runs, str | Path) else f"epo evaluate run={known[0].path}"
+        raise ConfigError(f"none of the {len(known)} runs {where} is evaluated: {remedy} does it")
+    return found
 
 
-def not_evaluated(folder: str | Path) -> list[Path]:
-    """Run folders in and below a folder that a report has to leave out."""
-    return [run.path for run in discover(Path(folder).expanduser()) if not run.metrics_file().is_file()]
+def not_evaluated(runs: str | Path | Iterable[RunFolder]) -> list[Path]:
+    """Run folders that a report has to leave out, because nothing was scored there yet."""
+    return [run.path for run in _listed(runs) if not scored(run)]
 
 
-def read_run(run: RunFolder) -> EvaluatedRun:
-    """Read one evaluated run folder.
+def _listed(runs: str | Path | Iterable[RunFolder]) -> list[RunFolder]:
+    return find_runs(runs) if isinstance(runs, str | Path) else list(runs)
+
+
+def read_run(run: RunFolder) -> list[EvaluatedRun]:
+    """Read one run folder: an entry for every split that it was evaluated on.
 
     Raises:
-        ConfigError: a file is missing or damaged, or lacks an entry; the message names both.
+        ConfigError: a file is missing or damaged, or lacks an entry; the message names both and says what to do.
     """
-    config, record, result = run.config(), run.record, read_json(run.metrics_file())
+    files = scored(run)
+    if not files:
+        return []
+    _require_records(run)
+    config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
+    return [_read_split(run, config, record, file) for file in files]
 
-    def entry(content: Any, file: Path, *keys: str) -> Any:
-        for key in keys:
-            content = content.get(key) if isinstance(content, Mapping) else None
-        if content is None:
-            raise ConfigError(f"{file} has no entry {'.'.join(keys)}: was it written by another version?")
-        return content
 
-    metrics = entry(result, run.metrics_file(), "metrics")
+def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, Any], file: Path) -> EvaluatedRun:
+    split = file.stem.removeprefix("metrics").removeprefix("-") or "test"
+    again = f"epo evaluate run={run.path} split={split} writes it again"
+    result = _sound(lambda: read_json(file), again)
+    metrics = _entry(result, file, again, "metrics")
     if not isinstance(metrics, Mapping) or not all(isinstance(value, int | float) for value in metrics.values()):
-        raise ConfigError(f"{run.metrics_file()}: metrics must be numbers by name")
-    digest = str(entry(result, run.metrics_file(), "data_digest"))
+        raise ConfigError(f"{file}: metrics must be numbers by name; {again}")
+    if result.get("split", split) != split:
+        raise ConfigError(f"{file} holds scores of the {result['split']} split, was it renamed? {again}")
+    digest = str(_entry(result, file, again, "data_digest"))
+
+    def setting(*keys: str) -> str:
+        return str(_entry(config, run.config_file, COPY, *keys))
+
+    def recorded(key: str) -> str:
+        return str(_entry(record, run.record_file, COPY, key))
+
+    seed = setting("seed")
+    if not seed.isdigit():
+        raise ConfigError(f"{run.config_file}: seed must be a whole number, not {seed!r}; {COPY}")
+    trained = recorded("data_digest")
+    _entry(config, run.config_file, COPY, "data", "name")
     return EvaluatedRun(
         path=run.path,
-        name=str(entry(config, run.config_file, "title")),
-        seed=int(entry(config, run.config_file, "seed")),
-        data=str(entry(config, run.config_file, "data", "dataset" if "dataset" in config.get("data", {}) else "name")),
-        backbone=str(entry(config, run.config_file, "backbone", "name")),
-        forecaster=str(entry(config, run.config_file, "forecaster", "name")),
+        name=setting("title"),
+        seed=int(seed),
+        data=str(config["data"].get("dataset") or config["data"]["name"]),
+        backbone=setting("backbone", "name"),
+        forecaster=setting("forecaster", "name"),
         experiment=str(config.get("experiment") or ""),
         goal=str(config.get("goal", "energy")),
-        budget=str(entry(config, run.config_file, "budget", "name")),
-        split=str(result.get("split", "test")),
+        budget=setting("budget", "name"),
+        split=split,
+        checkpoint=str(result.get("checkpoint", "best")),
         data_digest=digest,
-        trained_digest=str(record.get("data_digest") or digest),
+        trained_digest=trained,
         metrics={name: float(value) for name, value in metrics.items()},
-        git_commit=str(record.get("git_commit") or "unknown"),
+        git_commit=str(record.get("git_commit") or _version(record)),
+        command=recorded("command"),
         parameters=record.get("parameters"),
+        identity=identity(config, trained),
+        row=row_identity(config, trained),
+        config=config,
     )
+
+
+def _version(record: Mapping[str, Any]) -> str:
+    """An installed copy has no commit; its version says which code it was."""
+    versions = record.get("versions")
+    version = versions.get("epo_lightning") if isinstance(versions, Mapping) else None
+    return f"version {version}" if version else "unknown"
+
+
+def _entry(content: Any, file: Path, remedy: str, *keys: str) -> Any:
+    for key in keys:
+        content = content.get(key) if isinstance(content, Mapping) else None
+    if content is None:
+        raise ConfigError(f"{file} has no entry {'.'.join(keys)}: was it written by another version? {remedy}")
+    return content
+
+
+def _sound(read: Callable[[], dict[str, Any]], remedy: str) -> dict[str, Any]:
+    """What ``read`` reads; if it cannot, its error with what to do about it."""
+    try:
+        return read()
+    except ConfigError as error:
+        raise ConfigError(f"{error}; {remedy}") from error
+
+
+def _require_records(run: RunFolder) -> None:
+    for file in (run.config_file, run.record_file):
+        if not file.is_file():
+            raise ConfigError(f"the run folder {run.path} has no {file.name}: {COPY}")

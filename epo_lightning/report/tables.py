@@ -10,14 +10,20 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
+from epo_lightning.identity import differences
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.labels import labels, natural, value_text, varying
 from epo_lightning.report.paper import paper_values
 from epo_lightning.report.runs import EvaluatedRun
 
 FORECASTERS = ("marginal", "scene_consistent", "epo")
 """The order of rows within a group."""
+
+CONDITIONS = ("data", "trainer", "callbacks")
+"""Sections of the configuration that the learned rows of one table share; the others are what a table compares."""
 
 
 @dataclass(frozen=True)
@@ -41,26 +47,71 @@ class Cell:
         mean, deviation: over seeds; the sample standard deviation is None for a single seed.
         rank: 1 for the best of the group, 2 for the second, None for others and where there is nothing to rank.
         paper: the value in the paper.
+        n: number of seeds.
     """
 
     mean: float
     deviation: float | None
     rank: int | None = None
     paper: float | None = None
+    n: int = 1
+
+    @property
+    def difference(self) -> float | None:
+        """Ours minus the paper's."""
+        return None if self.paper is None else self.mean - self.paper
 
 
 @dataclass(frozen=True)
 class Row:
-    """All runs of one method."""
+    """All runs of one method.
+
+    Attributes:
+        name: its label: the title, with what tells it apart from other rows of that title.
+        group: its backbone and goal.
+        runs: one per seed, in the order of the seeds.
+        cells: by metric.
+        settings: by dotted key, those that tell it apart from other rows of the same title; empty for most rows.
+    """
 
     name: str
     group: tuple[str, str]
     runs: tuple[EvaluatedRun, ...]
     cells: Mapping[str, Cell]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """What it shares with rows that differ in settings only."""
+        return self.runs[0].name
+
+    @property
+    def forecaster(self) -> str:
+        return self.runs[0].forecaster
+
+    @property
+    def identity(self) -> str:
+        """What its runs share, and with no other row."""
+        return self.runs[0].row
+
+    @property
+    def data_digest(self) -> str:
+        """Digest of the data that it was evaluated on."""
+        return self.runs[0].data_digest
 
     @property
     def seeds(self) -> list[int]:
         return sorted(run.seed for run in self.runs)
+
+    @property
+    def commits(self) -> list[str]:
+        """Of the code that made its runs; one, or it was changed in between."""
+        return sorted({run.git_commit for run in self.runs})
+
+    @property
+    def commands(self) -> list[str]:
+        """One per run, in the order of the seeds."""
+        return [run.command for run in self.runs]
 
 
 @dataclass(frozen=True)
@@ -70,6 +121,19 @@ class Table:
     title: str
     columns: tuple[Column, ...]
     rows: tuple[Row, ...] = field(repr=False)
+
+    @property
+    def data(self) -> str:
+        return self.rows[0].runs[0].data
+
+    @property
+    def split(self) -> str:
+        return self.rows[0].runs[0].split
+
+    @property
+    def main(self) -> bool:
+        """Whether it is the table of all rows, of which the others show parts."""
+        return self.columns == MAIN
 
 
 MAIN = (
@@ -86,7 +150,7 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
     """For every data set and split: the main table, the subsets apart, and initial beside solved strategies.
 
     Raises:
-        ConfigError: rows of one table that were not made under the same conditions, or a row with the same seed twice.
+        ConfigError: rows of one table that were not made under the same conditions, or the same run twice.
     """
     parts: dict[tuple[str, str], list[EvaluatedRun]] = {}
     for run in runs:
@@ -123,17 +187,32 @@ def build_rows(runs: Sequence[EvaluatedRun]) -> tuple[Row, ...]:
     Raises:
         ConfigError: as :func:`build_tables`.
     """
-    require_same(runs, "data_digest (evaluated on)", lambda run: run.data_digest)
-    learned = [run for run in runs if run.learned]
-    require_same(learned, "data_digest (trained on)", lambda run: run.trained_digest)
-    require_same(learned, "budget", lambda run: run.budget)
-    members: dict[tuple[tuple[str, str], str, str], list[EvaluatedRun]] = {}
-    for run in runs:
-        members.setdefault((group_of(run), run.forecaster, run.name), []).append(run)
-    rows = [
-        _row(group, tuple(same)) for (group, _, _), same in sorted(members.items(), key=lambda item: _order(item[0]))
-    ]
+    require_comparable(runs)
+    rows = sorted(plain_rows(runs), key=_order)
     return tuple(_ranked(row, [other for other in rows if other.group == row.group]) for row in rows)
+
+
+def plain_rows(runs: Iterable[EvaluatedRun]) -> list[Row]:
+    """Runs -> rows with their labels, in the order in which they are met, not compared with each other.
+
+    Raises:
+        ConfigError: the same run twice, or runs of one row that lack each other's metrics.
+    """
+    members: dict[str, list[EvaluatedRun]] = {}
+    for run in runs:
+        members.setdefault(run.row, []).append(run)
+    rows = [_row(sorted(same, key=lambda run: run.seed)) for same in members.values()]
+    titles: dict[str, list[Row]] = {}
+    for row in rows:
+        titles.setdefault(row.title, []).append(row)
+    named: dict[str, Row] = {}
+    for title, same in titles.items():
+        config = same[0].runs[0].config
+        settings = varying([row.runs[0].config for row in same])
+        names = labels(title, settings, config, [row.identity for row in same])
+        for row, name, own in zip(same, names, settings, strict=True):
+            named[row.identity] = replace(row, name=name, settings=own)
+    return [named[row.identity] for row in rows]
 
 
 def group_of(run: EvaluatedRun) -> tuple[str, str]:
@@ -141,11 +220,37 @@ def group_of(run: EvaluatedRun) -> tuple[str, str]:
     return (run.backbone, run.goal) if run.learned else ("", "")
 
 
-def _order(key: tuple[tuple[str, str], str, str]) -> tuple[object, ...]:
+def _order(row: Row) -> tuple[object, ...]:
     """Groups by backbone, the paper's goal first, baselines without a backbone last; in a group as the paper does."""
-    (backbone, goal), forecaster, name = key
-    rank = FORECASTERS.index(forecaster) if forecaster in FORECASTERS else len(FORECASTERS)
-    return backbone == "", backbone, goal != "energy", goal, rank, name
+    backbone, goal = row.group
+    rank = FORECASTERS.index(row.forecaster) if row.forecaster in FORECASTERS else len(FORECASTERS)
+    return backbone == "", backbone, goal != "energy", goal, rank, row.title, natural(row.settings), row.name
+
+
+def require_comparable(runs: Sequence[EvaluatedRun]) -> None:
+    """Refuse runs that no table may compare: other data, budgets, checkpoints, lengths or sizes of training.
+
+    What may differ is what tables compare: backbone, forecaster, energy, solver, optimiser, goal and seed. Commits may
+    differ as well, they are shown.
+
+    Raises:
+        ConfigError: the message names the rows, and the key and values in which they differ.
+    """
+    require_same(runs, "data_digest (evaluated on)", lambda run: run.data_digest)
+    learned = [run for run in runs if run.learned]
+    require_same(learned, "data_digest (trained on)", lambda run: run.trained_digest)
+    require_same(learned, "budget", lambda run: run.budget)
+    require_same(learned, "checkpoint", lambda run: run.checkpoint)
+    found = {key for run in learned for key, _, _ in differences(learned[0].config, run.config)}
+    for key in sorted(key for key in found if key.split(".")[0] in CONDITIONS):
+        require_same(learned, key, lambda run, key=key: value_text(_setting(run.config, key)))  # type: ignore[misc]
+
+
+def _setting(config: Mapping[str, Any], key: str) -> Any:
+    value: Any = config
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value
 
 
 def require_same(runs: Iterable[EvaluatedRun], what: str, value: Callable[[EvaluatedRun], str]) -> None:
@@ -167,24 +272,30 @@ def require_same(runs: Iterable[EvaluatedRun], what: str, value: Callable[[Evalu
         )
 
 
-def _row(group: tuple[str, str], runs: tuple[EvaluatedRun, ...]) -> Row:
-    """Mean and deviation of every score that all runs of the row have."""
+def _row(runs: Sequence[EvaluatedRun]) -> Row:
+    """Mean and deviation of every score of the runs of a row."""
     first, by_seed = runs[0], dict[int, EvaluatedRun]()
     for run in runs:
         twin = by_seed.setdefault(run.seed, run)
         if twin is not run:
             raise ConfigError(
-                f"row {run.name!r} has seed {run.seed} twice, {twin.path} and {run.path}: move one of them away, "
-                "or give it a title of its own"
+                f"row {run.name!r} has seed {run.seed} twice, {twin.path} and {run.path} are the same run: "
+                "move one of them away"
             )
-    paper = paper_values(first.data, first.backbone, first.forecaster, first.goal, first.experiment)
+        for metric in {*first.metrics} ^ {*run.metrics}:
+            one, other = (first, run) if metric in first.metrics else (run, first)
+            raise ConfigError(
+                f"row {run.name!r}: {one.path} was scored by {metric} and {other.path} was not: "
+                f"epo evaluate run={other.path} split={run.split} scores it again"
+            )
+    steps = _setting(first.config, "solver.steps") if first.forecaster == "epo" else None
+    paper = paper_values(first.data, first.backbone, first.forecaster, first.goal, first.experiment, first.split, steps)
     cells = {}
     for metric in first.metrics:
-        values = [run.metrics[metric] for run in runs if metric in run.metrics]
-        if len(values) == len(runs):
-            deviation = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
-            cells[metric] = Cell(statistics.fmean(values), deviation, None, paper.get(metric))
-    return Row(first.name, group, runs, cells)
+        values = [run.metrics[metric] for run in runs]
+        deviation = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
+        cells[metric] = Cell(statistics.fmean(values), deviation, None, paper.get(metric), len(values))
+    return Row(first.name, group_of(first), tuple(runs), cells)
 
 
 def _ranked(row: Row, group: Sequence[Row]) -> Row:
@@ -196,5 +307,5 @@ def _ranked(row: Row, group: Sequence[Row]) -> Row:
         places = sorted(value for value in others if math.isfinite(value))
         own = round(cell.mean, digits) if math.isfinite(cell.mean) else math.nan
         rank = places.index(own) + 1 if len(group) > 1 and own in places else None
-        cells[metric] = Cell(cell.mean, cell.deviation, rank if rank in (1, 2) else None, cell.paper)
-    return Row(row.name, row.group, row.runs, cells)
+        cells[metric] = replace(cell, rank=rank if rank in (1, 2) else None)
+    return replace(row, cells=cells)

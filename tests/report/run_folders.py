@@ -26,22 +26,43 @@ def make_run(
     backbone: str = "v_lstm",
     goal: str = "energy",
     budget: str = "reduced",
+    data: str = "rpi",
     digest: str = "abc",
     trained_digest: str | None = None,
     split: str = "test",
+    experiment: str | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> RunFolder:
-    """Write a run folder, evaluated if there are metrics."""
+    """Write a run folder, evaluated if there are metrics; called again with another split, it is evaluated on both.
+
+    Args:
+        settings: values of the configuration by dotted key.
+    """
     config: dict[str, Any] = {
         "title": title,
+        "experiment": experiment,
         "seed": seed,
         "goal": goal,
         "budget": {"name": budget},
-        "data": {"name": "rpi", "batch_size": 32},
-        "backbone": {"name": backbone},
-        "forecaster": {"name": forecaster},
+        "data": {"name": data, "batch_size": 32},
+        "backbone": {"name": backbone, "width": 128},
+        "forecaster": {"name": forecaster, "note": title},  # what has another title differs in something
+        "solver": {"name": "levenberg_marquardt", "steps": 2},
+        "optimizer": {"name": "adam", "lr": 0.001},
+        "trainer": {"max_epochs": 10, "precision": "32-true", "threads": 1},
+        "callbacks": {"patience": None},
+    }
+    for key, value in (settings or {}).items():
+        section, last = key.split(".")
+        config[section][last] = value
+    record = {
+        "data_digest": trained_digest or digest,
+        "git_commit": "0123456789abcdef",
+        "parameters": 1234,
+        "command": f"epo train experiment={experiment} seed={seed}",
     }
     run = RunFolder(path)
-    run.begin(config, {"data_digest": trained_digest or digest, "git_commit": "0123456789abcdef", "parameters": 1234})
+    run.begin(config, record)
     if metrics is not None:
-        write_json(run.metrics_file(), {"data_digest": digest, "split": split, "metrics": dict(metrics)})
+        write_json(run.metrics_file(split), {"data_digest": digest, "split": split, "metrics": dict(metrics)})
     return run

@@ -86,10 +86,10 @@ def test_subsets_and_initial_strategies_have_tables_of_their_own(tmp_path: Path)
 
 def test_splits_are_tables_apart(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3), digest="abc")
-    make_run(tmp_path / "b", "V-LSTM", "marginal", scores(0.2), digest="xyz", split="hard")
+    make_run(tmp_path / "b", "V-LSTM", "marginal", scores(0.2), digest="xyz", split="val")
     assert [(table.title, len(table.rows)) for table in build_tables(collect(tmp_path))] == [
-        ("rpi, hard split", 1),
         ("rpi, test split", 1),
+        ("rpi, val split", 1),
     ]
 
 

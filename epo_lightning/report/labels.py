@@ -1,0 +1,97 @@
+"""What rows of the same title are called apart: the title, and the settings in which they differ."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from epo_lightning.identity import differences, essence
+
+MOST, LONGEST = 4, 24
+"""How many settings a label names, and how long the text of one value may be, before it becomes unreadable."""
+
+
+def varying(configs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Of every configuration, the settings that are not the same in all of them, seeds apart.
+
+    Returns:
+        As many mappings from a setting's dotted key to its value, all with the same keys in the same order.
+    """
+    first, *others = configs
+    found = [{key: (mine, theirs) for key, mine, theirs in differences(first, other)} for other in others]
+    keys = sorted({key for entry in found for key in entry} - {"seed"})
+    own = {key: next(entry[key][0] for entry in found if key in entry) for key in keys}
+    return [own, *({key: entry[key][1] if key in entry else own[key] for key in keys} for entry in found)]
+
+
+def short_keys(keys: Sequence[str], config: Mapping[str, Any]) -> dict[str, str]:
+    """Every key's shortest ending that no other setting of the configuration has: ``lr`` for ``optimizer.lr``."""
+    known = {*_keys(essence(config)), *keys}
+    return {key: next(ending for ending in _endings(key) if _is_alone(ending, known) or ending == key) for key in keys}
+
+
+def labels(
+    title: str, settings: Sequence[Mapping[str, Any]], config: Mapping[str, Any], rows: Sequence[str]
+) -> list[str]:
+    """The names of rows that share a title.
+
+    Args:
+        title: what they share.
+        settings: of every row, as :func:`varying` gives them.
+        config: a resolved configuration of one of them.
+        rows: their identities, named where settings would be too many or do not tell rows apart.
+    """
+    keys = short_keys(list(settings[0]), config)
+    names = [
+        ", ".join([title, *(f"{keys[key]}={_shown(value)}" for key, value in entry.items())]) for entry in settings
+    ]
+    if len(keys) > MOST:
+        names = [title] * len(settings)
+    return [name if names.count(name) == 1 else f"{name}, row {row[:8]}" for name, row in zip(names, rows, strict=True)]
+
+
+def word(key: str, value: Any) -> str:
+    """A setting as an override on a command line."""
+    return f"{key}={value_text(value)}"
+
+
+def value_text(value: Any) -> str:
+    """A value in the notation of overrides, which is nearly that of JSON."""
+    if isinstance(value, str) and value and all(letter.isalnum() or letter in "_-./" for letter in value):
+        return value
+    if isinstance(value, list):
+        return "[" + ",".join(map(value_text, value)) + "]"
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{value_text(entry)}" for key, entry in value.items()) + "}"
+    return json.dumps(value)
+
+
+def natural(settings: Mapping[str, Any]) -> tuple[tuple[int, float, str], ...]:
+    """A key that sorts settings with numbers as numbers."""
+    return tuple(
+        (0, float(value), "") if isinstance(value, int | float) else (1, 0.0, value_text(value))
+        for _, value in sorted(settings.items())
+    )
+
+
+def _shown(value: Any) -> str:
+    text = value_text(value)
+    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+
+
+def _keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from _keys(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}"
+
+
+def _endings(key: str) -> Iterator[str]:
+    parts = key.split(".")
+    return (".".join(parts[start:]) for start in range(len(parts) - 1, -1, -1))
+
+
+def _is_alone(ending: str, keys: set[str]) -> bool:
+    return sum(key == ending or key.endswith("." + ending) for key in keys) == 1
