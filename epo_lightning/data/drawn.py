@@ -1,0 +1,255 @@
+"""Scenes drawn at random in memory: for measuring time, smoke tests and checks where there is no data set.
+
+They have the shapes of real ones exactly, because the classes that read real records read these: what is drawn here are the
+tables, and :class:`~epo_lightning.data.rpi.scenes.RPIDataset` and :class:`~epo_lightning.data.scenes.RecordedScenes` make
+scenes of them. There is nothing worth learning in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from epo_lightning.data import cache
+from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
+from epo_lightning.data.routes import ACCELERATING, BEHIND, BEYOND, BRAKING, LINES, PER_LINE, POINTS
+from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
+from epo_lightning.data.scenes import RecordedScenes
+from epo_lightning.data.windows import MOST_AGENTS, SPACING, VECTORS, Recipe
+from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.scene import KINDS
+
+VERSION = 1
+"""Of the draws: raised whenever the same seed would give other scenes."""
+PARTS = ("train", "val", "test")
+LANE_WIDTH, LANES = 3.5, 4
+"""Width [m] and number of the road's lanes."""
+HEADWAY = 25.0
+"""Mean way [m] from a vehicle to the next on its lane."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What scenes are like: the sizes of a task, and how its tables are drawn.
+
+    Attributes:
+        agents: of a scene, unless told otherwise.
+        history, horizon, dt: steps H and K, and their length [s].
+        tables: from (scenes, agents, kind, generator) to the columns that records of this task have.
+        subsets, shape, scale, has_map: as in the task's own data module.
+    """
+
+    agents: int
+    history: int
+    horizon: int
+    dt: float
+    tables: Callable[[int, int, Kind, torch.Generator], dict[str, Tensor]]
+    subsets: tuple[str, ...] = ()
+    shape: str = "disc"
+    scale: float = 1.0
+    has_map: bool = False
+
+    @property
+    def time(self) -> Tensor:
+        """When the steps of history and future are [s]; the last step of the history is at zero."""
+        return self.dt * torch.arange(1 - self.history, self.horizon + 1, dtype=torch.float64)
+
+
+def _between(low: float, high: float, *shape: int, draw: torch.Generator) -> Tensor:
+    return low + (high - low) * torch.rand(shape, dtype=torch.float64, generator=draw)
+
+
+def _curves(start: Tensor, heading: Tensor, speed: Tensor, turn: Tensor, time: Tensor) -> Tensor:
+    """States [.., time, 4] of agents that drive on circles; ``start`` is where they are at time zero."""
+    angle = heading[..., None] + turn[..., None] * time
+    # The chord of an arc, which is also right for a straight line.
+    half = 0.5 * turn[..., None] * time
+    chord = speed[..., None] * time * torch.sinc(half / torch.pi)
+    middle = heading[..., None] + half
+    x, y = start[..., 0, None] + chord * middle.cos(), start[..., 1, None] + chord * middle.sin()
+    return torch.stack((x, y, angle, speed[..., None].expand_as(angle)), -1)
+
+
+def _walkers(scenes: int, agents: int, kind: Kind, draw: torch.Generator, apart: float) -> Tensor:
+    """States [scenes, agents, H + K, 4] of agents that walk past about the same place, ``apart`` [m] from each other."""
+    speed = _between(0.7, 1.5, scenes, agents, draw=draw)
+    heading = _between(-torch.pi, torch.pi, scenes, agents, draw=draw)
+    turn = _between(-0.1, 0.1, scenes, agents, draw=draw)
+    half = 0.5 * kind.horizon * kind.dt
+    way = torch.stack((heading.cos(), heading.sin()), -1)
+    start = _between(-apart, apart, scenes, agents, 2, draw=draw) - half * speed[..., None] * way
+    return _curves(start, heading, speed, turn, kind.time)
+
+
+def _rpi(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
+    """Records with two modes each: the robot and the pedestrian meet, and go on as they turn or the other way round."""
+    states = _walkers(scenes, agents, kind, draw, apart=0.5)
+    history, now = states[:, :, : kind.history], states[:, :, kind.history - 1]
+    turn = _between(-0.1, 0.1, scenes, 2, agents, draw=draw)
+    start, heading, speed = (
+        now[:, None, :, part].expand(-1, 2, *[-1] * dims) for part, dims in ((slice(2), 2), (2, 1), (3, 1))
+    )
+    futures = _curves(start, heading, speed, turn, kind.time[kind.history :])
+    return {
+        "history": history.float(),
+        "goals": futures[:, 0, :, -1, :2].float(),
+        "states": futures.float(),
+        "modes": torch.full((scenes,), 2),
+    }
+
+
+def _recorded(states: Tensor, present: Tensor, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
+    """The columns of an extract that has no map: every agent of every scene has a row of its own."""
+    scenes, agents = present.shape
+    rows = states.flatten(0, 1).float()
+    history, future = rows[:, : kind.history], rows[:, kind.history :]
+    member = torch.arange(scenes * agents, dtype=torch.int32).view(scenes, agents)
+    return {
+        "history": history,
+        "history_mask": torch.ones(history.shape[:2], dtype=torch.bool),
+        "future": future,
+        "future_mask": torch.ones(future.shape[:2], dtype=torch.bool),
+        "track": torch.arange(len(rows)),
+        "polylines": torch.zeros(0, VECTORS + 1, 2, dtype=torch.float64),
+        "agents": member.where(present, -1).int(),
+        "lanes": torch.zeros(scenes, 0, dtype=torch.int32),
+        "centre": torch.zeros(scenes, 2, dtype=torch.float64),
+        "direction": torch.zeros(scenes, dtype=torch.float64),
+        "recording": torch.zeros(scenes, dtype=torch.int32),
+        "frame": torch.arange(scenes),
+        "origin": torch.zeros(1, 2, dtype=torch.float64),
+    }
+
+
+def _pedestrians(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
+    """Two pedestrians or more of every scene are there."""
+    states = _walkers(scenes, agents, kind, draw, apart=3.0)
+    count = torch.randint(min(2, agents), agents + 1, (scenes, 1), generator=draw)
+    rows = scenes * agents
+    return {
+        **_recorded(states, torch.arange(agents) < count, kind, draw),
+        "size": torch.full((rows, 2), 0.5),
+        "kind": torch.full((rows,), KINDS.index("pedestrian")),
+    }
+
+
+def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
+    """Vehicles on a straight road, one behind the other on each lane; about a third of them changes lane meanwhile."""
+    rows, time = scenes * agents, kind.time
+    order = torch.rand(scenes, agents, dtype=torch.float64, generator=draw).argsort(1)
+    lane, place = order % LANES, order // LANES
+    along = HEADWAY * (place - 0.5 * ((agents - 1) // LANES)) + _between(-5.0, 5.0, scenes, agents, draw=draw)
+    # Who is on the same lane drives about as fast.
+    pace = _between(22.0, 33.0, scenes, LANES, draw=draw).gather(1, lane)
+    speed = pace + _between(-1.0, 1.0, scenes, agents, draw=draw)
+    acceleration = _between(-0.5, 0.5, scenes, agents, draw=draw)
+    side = torch.randint(-1, 2, (scenes, agents), generator=draw)
+    side = side.where(torch.rand(scenes, agents, generator=draw) < 0.5, 0)
+    side = ((lane + side).clamp(0, LANES - 1) - lane) * LANE_WIDTH
+    length = 4.0  # [s] that a change takes
+    begin = _between(-length / 2, length / 2, scenes, agents, draw=draw)
+    share = ((time - begin[..., None]) / length).clamp(0.0, 1.0)
+    x = along[..., None] + speed[..., None] * time + 0.5 * acceleration[..., None] * time**2
+    y = LANE_WIDTH * lane[..., None] + side[..., None] * 0.5 * (1.0 - (torch.pi * share).cos())
+    forwards = speed[..., None] + acceleration[..., None] * time
+    sideways = side[..., None] * 0.5 * torch.pi / length * (torch.pi * share).sin()
+    states = torch.stack((x, y, torch.atan2(sideways, forwards), torch.hypot(forwards, sideways)), -1)
+
+    now, pace = states[:, :, kind.history - 1].flatten(0, 1), speed.flatten()
+    until = kind.horizon * kind.dt
+    far = pace * until + 0.5 * ACCELERATING * until**2
+    near = pace * until - 0.5 * BRAKING * until**2
+    middle = LANE_WIDTH * (lane.flatten()[:, None] + torch.arange(1, -2, -1))  # left, own, right
+
+    def lines(start: Tensor, end: Tensor, points: int) -> Tensor:
+        """Points [rows, R, points, 2] on the three lines of every vehicle, from ``start`` to ``end`` metres ahead of it."""
+        ahead = start[:, None] + (end - start)[:, None] * torch.linspace(0.0, 1.0, points, dtype=torch.float64)
+        x = (now[:, :1] + ahead)[:, None].expand(-1, LINES, -1)
+        return torch.stack((x, middle[..., None].expand_as(x)), -1).float()
+
+    pieces = Recipe.lanes // LANES
+    across = LANE_WIDTH * torch.arange(LANES, dtype=torch.float64).repeat_interleave(pieces)
+    reach = SPACING * VECTORS * (torch.arange(pieces + 1) - pieces // 2 + 1.0)
+    ends = torch.stack((reach[:-1], reach[1:]), 1).repeat(LANES, 1)
+    points = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * torch.linspace(0.0, 1.0, VECTORS + 1)
+    truck = torch.rand(rows, generator=draw) < 0.2
+    return {
+        **_recorded(states, torch.ones(scenes, agents, dtype=torch.bool), kind, draw),
+        "size": torch.where(truck[:, None], torch.tensor([12.0, 2.5]), torch.tensor([4.6, 1.9])),
+        "kind": torch.where(truck, KINDS.index("truck"), KINDS.index("car")),
+        "candidates": lines(near, far, PER_LINE).flatten(1, 2),
+        "references": lines(torch.full_like(far, -BEHIND), far + BEYOND, POINTS),
+        "reference_speed": (pace + 2.0).float(),
+        "polylines": torch.stack((points.double(), across[:, None].expand(-1, VECTORS + 1)), -1),
+        "lanes": torch.arange(len(points), dtype=torch.int32).expand(scenes, -1),
+    }
+
+
+LIKE: Mapping[str, Kind] = {
+    "rpi": Kind(RPIData.num_agents, 19, RPIData.horizon, RPIData.dt, _rpi, RPIData.subsets),
+    "highway": Kind(
+        *(Recipe.agents, Recipe.history, Recipe.horizon, Recipe.dt, _highway), shape="box", scale=20.0, has_map=True
+    ),
+    "pedestrians": Kind(4, 8, 12, 0.4, _pedestrians, scale=5.0),
+}
+"""Tasks whose scenes can be drawn."""
+
+
+@register("data", "drawn")
+class DrawnData(SceneDataModule):
+    """Scenes drawn in memory, in the shapes of a task.
+
+    Args:
+        like: ``rpi`` (two discs with given goals), ``highway`` (vehicles, lanes and goal candidates) or ``pedestrians``
+            (no map, no goals).
+        agents: of a scene; None for the task's own number.
+        scenes: of each split.
+        seed: of the draws, and of the batches' order where a run sets no other.
+        batch_size: scenes per batch.
+    """
+
+    def __init__(
+        self, like: str = "highway", agents: int | None = None, scenes: int = 256, seed: int = 0, batch_size: int = 32
+    ) -> None:
+        super().__init__(batch_size, seed)
+        if like not in LIKE:
+            raise ConfigError(f"unknown data.like {like!r}: {nearest(str(like), LIKE)}")
+        self.like, self.kind = like, LIKE[like]
+        if agents is not None and not 1 <= agents <= MOST_AGENTS:
+            raise ConfigError(f"data.agents must be between 1 and {MOST_AGENTS}, or null for the task's, not {agents}")
+        if scenes < 1:
+            raise ConfigError(f"data.scenes must be 1 or more, not {scenes}")
+        self.num_agents, self.scenes = self.kind.agents if agents is None else agents, scenes
+        self.dt, self.horizon, self.subsets = self.kind.dt, self.kind.horizon, self.kind.subsets
+        self.shape, self.scale, self.has_map = self.kind.shape, self.kind.scale, self.kind.has_map
+        self.candidates = LINES * PER_LINE if self.has_map else int(like == "rpi")
+
+    @property
+    def digest(self) -> str:
+        """Hash of what the scenes are drawn from."""
+        drawn = {"drawn": VERSION, "like": self.like, "agents": self.num_agents, "scenes": self.scenes}
+        return cache.digest({**drawn, "seed": self.seed})[:16]
+
+    def generate(self, workers: int | None = None, progress: bool = True) -> Path:
+        """There is nothing to generate.
+
+        Raises:
+            ConfigError: always, and says what to do instead.
+        """
+        raise ConfigError(
+            "data=drawn is drawn in memory, there is nothing to generate: use it with epo train data=drawn"
+        )
+
+    def open(self, split: str) -> SceneDataset:
+        """The scenes of a split."""
+        draw = torch.Generator().manual_seed(len(PARTS) * self.seed + PARTS.index(split))
+        if self.like == "rpi":
+            # Every record is two scenes, one for each of its modes.
+            tables = self.kind.tables(-(-self.scenes // 2), self.num_agents, self.kind, draw)
+            return RPIDataset(tables, seed=self.seed)
+        tables = self.kind.tables(self.scenes, self.num_agents, self.kind, draw)
+        return RecordedScenes(tables, self.dt, "aligned", [split])

@@ -1,0 +1,115 @@
+"""Drawn scenes are those of the real data but for their numbers, and always the same ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from epo_lightning.data.drawn import DrawnData
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.compose import compose
+from epo_lightning.metrics.functional.overlap import overlapping_pairs
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import Scene
+
+FIXTURE = Path(__file__).parents[1] / "fixtures" / "exid_sim"
+REAL = {
+    "rpi": ("data=rpi", "data.games=3", "data.placements=1"),
+    "highway": ("data=exid", f"data.folder={FIXTURE}"),
+    "pedestrians": ("data=ucy",),
+}
+ATTRIBUTES = {"dt": None, "horizon": None, "num_agents": None, "subsets": (), "shape": "disc", "candidates": 1}
+ATTRIBUTES |= {"has_map": False, "scale": 1.0}
+"""What a data module says of its scenes, and what counts where it says nothing."""
+
+
+def real(like: str, root: Path):
+    return assembly.build_data(compose("generate", [*REAL[like], f"data.root={root}"])["data"])
+
+
+def drawn(like: str, split: str = "train", **options) -> Scene:
+    dataset = DrawnData(like, **options).open(split)
+    return dataset[torch.arange(len(dataset))]
+
+
+@pytest.mark.parametrize("like", REAL)
+def test_tasks_are_the_real_ones(like, tmp_path):
+    pretended, genuine = DrawnData(like), real(like, tmp_path)
+    for name, default in ATTRIBUTES.items():
+        assert getattr(pretended, name, default) == getattr(genuine, name, default), name
+    if like != "rpi":
+        assert pretended.kind.history == genuine.recipe.history
+
+
+@pytest.mark.parametrize("like", ["rpi", "highway"])
+def test_fields_shapes_and_types_are_the_real_ones(like, tmp_path):
+    module = real(like, tmp_path)
+    module.generate(workers=1, progress=False)
+    genuine, pretended = module.open("train")[torch.arange(2)], drawn(like)
+    for name, expected in vars(genuine).items():
+        found = getattr(pretended, name)
+        if isinstance(expected, torch.Tensor):
+            assert (found.shape[1:], found.dtype) == (expected.shape[1:], expected.dtype), name
+        else:
+            assert found == expected, name
+
+
+@pytest.mark.parametrize("like", REAL)
+@pytest.mark.parametrize("agents", [None, 1, 12])
+def test_scenes_make_sense(like, agents):
+    scene = drawn(like, agents=agents, scenes=64)
+    assert len(scene.history) == 64
+    assert scene.history.shape[1] == (agents or DrawnData(like).kind.agents)
+    assert scene.finite.all()
+    assert scene.agent_mask.any(1).all()
+    states = torch.cat((scene.history, scene.future), 2)[scene.agent_mask]
+    moved = states[:, 1:, :2] - states[:, :-1, :2]
+    assert (moved.norm(dim=-1) / scene.dt - states[:, 1:, 3]).abs().max() < 0.1
+    turned = torch.atan2(moved[..., 1], moved[..., 0]) - states[:, 1:, 2]
+    assert turned.cos().min() > 0.99
+    low, high = {"highway": (18.0, 37.0)}.get(like, (0.6, 1.6))
+    assert states[..., 3].min() > low
+    assert states[..., 3].max() < high
+
+
+def test_vehicles_rarely_begin_within_each_other_and_some_change_lane():
+    scene = drawn("highway", agents=12, scenes=64)
+    within = overlapping_pairs(scene.current[:, :, None], scene.size, scene.agent_mask, "box")
+    assert within.float().mean() < 0.005
+    drift = (scene.future[..., -1, 1] - scene.history[..., 0, 1]).abs()
+    assert 0.1 < (drift > 3.0).float().mean() < 0.9
+    last = scene.future[:, :, None, -1, :2]
+    assert (scene.goal_candidates - last).norm(dim=-1).amin(-1).median() < 5.0
+
+
+def test_the_seed_decides():
+    one, again, other, later = (
+        drawn("highway", split, seed=seed).history
+        for split, seed in (("train", 3), ("train", 3), ("train", 4), ("test", 3))
+    )
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+    assert not torch.equal(one, later)
+    options = ({}, {"seed": 1}, {"scenes": 8}, {"agents": 3}, {"like": "rpi"})
+    assert len({DrawnData(**each).digest for each in options}) == len(options)
+    assert DrawnData(batch_size=8).digest == DrawnData().digest == DrawnData(agents=4).digest
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"like": "highways"}, "did you mean 'highway'"),
+        ({"agents": 0}, "data.agents must be between 1 and 32"),
+        ({"scenes": 0}, "data.scenes must be 1 or more"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(options, message):
+    with pytest.raises(ConfigError, match=message):
+        DrawnData(**options)
+
+
+def test_there_is_nothing_to_generate():
+    with pytest.raises(ConfigError, match="nothing to generate"):
+        DrawnData().generate()
