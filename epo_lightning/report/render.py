@@ -1,35 +1,81 @@
-"""Tables -> a terminal (rich), Markdown and CSV."""
+"""Tables -> a terminal (rich), Markdown and CSV; :mod:`epo_lightning.report.latex` does LaTeX.
+
+The tables of comparisons and of best settings have no ranks and no second lines: they become a *sheet*, plain text in
+columns, which every format can show.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from epo_lightning.report.selection import BestSetting
+from epo_lightning.report.statistics import Comparisons
 from epo_lightning.report.tables import Cell, Column, Row, Table
 
 LEGEND = (
     "Displacements in m, minimum over the modes; overlap rates (OR) of the most likely joint mode; lower is better. "
-    "Mean ± standard deviation over n seeds; the paper's value in brackets. **Bold** is the best and <u>underlined</u> "
-    "the second best of the rows with the same backbone that know equally much. OR (JFP) is the share of scenes with "
-    "an overlap, as the paper defines its OR; OR (authors) counts overlapping pairs divided by agents, as the authors' "
-    "code does."
+    "Mean ± sample standard deviation over n seeds; in brackets the paper's value and ours minus the paper's. **Bold** is "
+    "the best and <u>underlined</u> the second best of the rows with the same backbone that know equally much. OR (JFP) "
+    "is the share of scenes with an overlap, as the paper defines its OR; OR (authors) counts overlapping pairs divided "
+    "by agents, as the authors' code does."
+)
+
+COMPARISON_LEGEND = (
+    "Differences of the scores of two rows, paired by seed: the first row minus the second, so that negative is better for "
+    "the first; n is the number of pairs. The interval covers the mean difference with 95 % confidence; p is that of the "
+    "two-sided paired t-test, not corrected for the number of comparisons. With three seeds such a test has little power: "
+    "a large p does not say that two rows are equally good."
 )
 
 CSV_HEADER = (
-    *("data", "split", "method", "backbone", "forecaster", "goal", "budget", "seeds"),
-    *("metric", "mean", "std", "paper"),
+    *("data", "split", "method", "backbone", "forecaster", "goal", "budget", "seeds", "n"),
+    *("metric", "mean", "std", "paper", "difference"),
+    *("row", "data_digest", "commits", "commands"),
 )
+COMPARISON_HEADER = (
+    *("data", "split", "method", "other", "metric", "difference", "low", "high", "p", "n", "seeds", "reason"),
+    *("row", "other_row", "data_digest"),
+)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Text in columns.
+
+    Attributes:
+        title: above it.
+        header: names of the columns.
+        lines: one text per column each.
+        left: how many columns from the left hold text; the others hold numbers.
+        ends: indices of lines below which a group ends.
+    """
+
+    title: str
+    header: tuple[str, ...]
+    lines: tuple[tuple[str, ...], ...]
+    left: int = 1
+    ends: frozenset[int] = field(default_factory=frozenset)
 
 
 def number(value: float, digits: int) -> str:
     """A number as tables print it; a dash where there is none."""
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def signed(value: float, digits: int) -> str:
+    """A difference as tables print it: with its sign, unless it rounds to zero."""
+    if math.isnan(value):
+        return number(value, digits)
+    rounded = round(value, digits)
+    return f"{rounded:+.{digits}f}" if rounded else number(0.0, digits)
 
 
 def own_text(cell: Cell, column: Column) -> str:
@@ -38,19 +84,81 @@ def own_text(cell: Cell, column: Column) -> str:
     return mean if cell.deviation is None else f"{mean} ± {number(cell.deviation, column.digits)}"
 
 
-def to_rich(table: Table) -> RichTable:
+def paper_text(row: Row, column: Column) -> str:
+    """The paper's value with the digits that it is printed with, or nothing."""
+    cell = row.cells.get(column.metric)
+    return "" if cell is None or cell.paper is None else number(cell.paper, column.digits - 1)
+
+
+def difference_text(row: Row, column: Column) -> str:
+    """Ours minus the paper's, or nothing."""
+    cell = row.cells.get(column.metric)
+    return "" if cell is None or cell.difference is None else signed(cell.difference, column.digits)
+
+
+def comparison_sheet(comparisons: Comparisons) -> Sheet:
+    """One line per pair of rows and metric."""
+    lines: list[tuple[str, ...]] = []
+    ends = set()
+    for pair in comparisons.pairs:
+        for place, column in enumerate(column for column in comparisons.columns if column.metric in pair.differences):
+            difference = pair.differences[column.metric]
+            pair_name = f"{pair.one.name} - {pair.other.name}" if not place else ""
+            mean = "" if difference.mean is None else signed(difference.mean, column.digits)
+            if difference.low is None or difference.high is None or difference.p is None:
+                interval, p = difference.reason, ""
+            else:
+                interval = f"{signed(difference.low, column.digits)} to {signed(difference.high, column.digits)}"
+                p = p_text(difference.p)
+            lines.append((pair_name, column.label, mean, interval, p, str(difference.n)))
+        ends.add(len(lines) - 1)
+    header = ("rows", "metric", "difference", "95 % interval", "p", "n")
+    return Sheet(comparisons.title, header, tuple(lines), 2, frozenset(ends))
+
+
+def p_text(p: float) -> str:
+    """A p-value; below a thousandth its size says nothing more."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def settings_sheet(best: Sequence[BestSetting]) -> Sheet:
+    """One line per experiment: its best score, of how many settings, and the words that train with it."""
+    lines = tuple(
+        (
+            entry.title,
+            entry.words,
+            own_text(entry.row.cells[entry.metric], Column(entry.metric, "")),
+            str(entry.row.cells[entry.metric].n),
+            str(entry.candidates),
+        )
+        for entry in best
+    )
+    metric = best[0].metric if best else "score"
+    return Sheet("Best settings, chosen on the validation split", ("row", "setting", metric, "n", "of"), lines, 2)
+
+
+def to_rich(table: Table | Sheet) -> RichTable:
     """For the terminal, where 80 columns have to do: deviations stand under their means, the paper's values below a row."""
     rich = RichTable(title=table.title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    if isinstance(table, Sheet):
+        for place, name in enumerate(table.header):
+            is_text = place < table.left
+            rich.add_column(name, justify="left" if is_text else "right", no_wrap=False, overflow="fold")
+        for index, line in enumerate(table.lines):
+            rich.add_row(*map(Text, line), end_section=index in table.ends)
+        return rich
     rich.add_column("method")  # the one column that may break its lines: half a number is worse than none
     rich.add_column("n", justify="right", no_wrap=True)
     for column in table.columns:
         rich.add_column(column.label.replace(" ", "\n"), justify="right", no_wrap=True, vertical="top")
-    for row, last in _with_ends(table.rows):
-        paper = [_paper_number(row, column) for column in table.columns]
+    for row, last in with_ends(table.rows):
+        paper = [paper_text(row, column) for column in table.columns]
         cells = (_rich_cell(row, column) for column in table.columns)
-        rich.add_row(row.name, str(len(row.runs)), *cells, end_section=last and not any(paper))
+        rich.add_row(Text(row.name), str(len(row.runs)), *cells, end_section=last and not any(paper))
         if any(paper):
-            rich.add_row("  paper", "", *paper, style="dim", end_section=last)
+            rich.add_row("  paper", "", *paper, style="dim")
+            differences = (difference_text(row, column) for column in table.columns)
+            rich.add_row("  ours - paper", "", *differences, style="dim", end_section=last)
     return rich
 
 
@@ -63,24 +171,27 @@ def _rich_cell(row: Row, column: Column) -> Text:
     return Text.assemble((number(cell.mean, column.digits), style), (deviation, "dim"))
 
 
-def _paper_number(row: Row, column: Column) -> str:
-    """The paper's value with the digits that it is printed with, or nothing."""
-    cell = row.cells.get(column.metric)
-    return "" if cell is None or cell.paper is None else number(cell.paper, column.digits - 1)
-
-
-def to_markdown(table: Table) -> str:
+def to_markdown(table: Table | Sheet) -> str:
     """A pipe table with its title; groups follow each other."""
-    lines = [
-        f"### {table.title}",
-        "",
-        "| method | n | " + " | ".join(column.label for column in table.columns) + " |",
-        "|:--|--:|" + "--:|" * len(table.columns),
-    ]
-    for row in table.rows:
-        cells = [_markdown_cell(row, column) for column in table.columns]
-        lines.append(f"| {row.name.replace('|', chr(92) + '|')} | {len(row.runs)} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    if isinstance(table, Sheet):
+        header, left, lines = table.header, table.left, [[_plain(text) for text in line] for line in table.lines]
+    else:
+        header, left = ("method", "n", *(column.label for column in table.columns)), 1
+        lines = [
+            [_plain(row.name), str(len(row.runs)), *(_markdown_cell(row, column) for column in table.columns)]
+            for row in table.rows
+        ]
+    rule = "|" + ":--|" * left + "--:|" * (len(header) - left)
+    rows = ["| " + " | ".join(line) + " |" for line in (header, *lines)]
+    return "\n".join([f"### {_plain(table.title)}", "", rows[0], rule, *rows[1:]]) + "\n"
+
+
+def _plain(text: str) -> str:
+    """Text in which nothing is markup."""
+    text = " ".join(text.split())
+    for special in "\\|*`[]":
+        text = text.replace(special, "\\" + special)
+    return text.replace("<", "&lt;")
 
 
 def _markdown_cell(row: Row, column: Column) -> str:
@@ -88,31 +199,55 @@ def _markdown_cell(row: Row, column: Column) -> str:
     if cell is None:
         return ""
     form = {1: "**{}**", 2: "<u>{}</u>"}.get(cell.rank or 0, "{}")
-    paper = _paper_number(row, column)
-    return form.format(own_text(cell, column)) + (f" ({paper})" if paper else "")
+    paper = paper_text(row, column)
+    return form.format(own_text(cell, column)) + (f" ({paper}, {difference_text(row, column)})" if paper else "")
 
 
 def to_csv(tables: Iterable[Table]) -> str:
     """All scores of all rows in full precision, one per line, shown in a table or not."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(CSV_HEADER)
+    lines: list[tuple[object, ...]] = []
     written: set[tuple[str, ...]] = set()
     for row in (row for table in tables for row in table.rows):
         run = row.runs[0]
-        key = (run.data, run.split, row.name, *row.group, run.forecaster)
+        key = (run.data, run.split, row.identity)
         if key in written:  # every table of a data set shows the same rows
             continue
         written.add(key)
         seeds = " ".join(map(str, row.seeds))
         same = (run.data, run.split, row.name, run.backbone, run.forecaster, run.goal, run.budget, seeds)
+        behind = (row.identity, row.data_digest, " ".join(row.commits), "; ".join(row.commands))
         for metric, cell in row.cells.items():
-            deviation = "" if cell.deviation is None else repr(cell.deviation)
-            writer.writerow((*same, metric, repr(cell.mean), deviation, "" if cell.paper is None else cell.paper))
+            values = (cell.mean, cell.deviation, cell.paper, cell.difference)
+            lines.append((*same, cell.n, metric, *map(_full, values), *behind))
+    return _csv(CSV_HEADER, lines)
+
+
+def comparisons_to_csv(comparisons: Iterable[Comparisons]) -> str:
+    """All comparisons in full precision, one metric per line."""
+    lines: list[tuple[object, ...]] = []
+    for pair in (pair for entry in comparisons for pair in entry.pairs):
+        run, seeds = pair.one.runs[0], " ".join(map(str, pair.seeds))
+        behind = (pair.one.identity, pair.other.identity, pair.one.data_digest)
+        for metric, found in pair.differences.items():
+            values = map(_full, (found.mean, found.low, found.high, found.p))
+            names = (run.data, run.split, pair.one.name, pair.other.name, metric)
+            lines.append((*names, *values, found.n, seeds, found.reason, *behind))
+    return _csv(COMPARISON_HEADER, lines)
+
+
+def _full(value: float | None) -> str:
+    return "" if value is None else repr(value)
+
+
+def _csv(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(lines)
     return text.getvalue()
 
 
-def _with_ends(rows: tuple[Row, ...]) -> Iterable[tuple[Row, bool]]:
+def with_ends(rows: tuple[Row, ...]) -> Iterable[tuple[Row, bool]]:
     """Every row, and whether it is the last of its group."""
     following = [*(row.group for row in rows[1:]), None]
     return ((row, row.group != after) for row, after in zip(rows, following, strict=True))

@@ -35,13 +35,15 @@ def test_markdown_by_hand(tmp_path: Path) -> None:
     lines = markdown.splitlines()
     assert "| method | n | ADE | FDE | SADE | SFDE | OR (JFP) | OR (authors) |" in lines
     assert (
-        "| V-LSTM | 1 | 0.300 (0.12) | 0.300 (0.20) | 0.300 (0.13) | 0.300 (0.23) | 0.0060 (0.006) | 0.0060 |" in lines
+        "| V-LSTM | 1 | 0.300 (0.12, +0.180) | 0.300 (0.20, +0.100) | 0.300 (0.13, +0.170) | 0.300 (0.23, +0.070) | "
+        "0.0060 (0.006, 0.0000) | 0.0060 |" in lines
     )
     assert (
-        "| V-LSTM + EPO | 2 | **0.030 ± 0.014** (0.03) | **0.030 ± 0.014** (0.08) | **0.030 ± 0.014** (0.03) | "
-        "**0.030 ± 0.014** (0.08) | **0.0000 ± 0.0000** (0.000) | **0.0000 ± 0.0000** |" in lines
+        "| V-LSTM + EPO | 2 | **0.030 ± 0.014** (0.03, 0.000) | **0.030 ± 0.014** (0.08, -0.050) | "
+        "**0.030 ± 0.014** (0.03, 0.000) | **0.030 ± 0.014** (0.08, -0.050) | **0.0000 ± 0.0000** (0.000, 0.0000) | "
+        "**0.0000 ± 0.0000** |" in lines
     )
-    assert "<u>0.100</u> (0.04)" in markdown
+    assert "<u>0.100</u> (0.04, +0.060)" in markdown
     assert lines.index("A reduced budget.") < lines.index("### rpi, test split")
     assert "| V-LSTM + EPO | rpi | test | reduced | 0, 1 | 1234 | 0123456789 | abc |" in lines
 
@@ -61,6 +63,7 @@ def test_terminal_shows_whole_numbers_in_80_columns(tmp_path: Path) -> None:
     row = lines.index(["V-LSTM", "+", "EPO", "2", "0.030", "0.030", "0.030", "0.030", "0.0000", "0.0000"])
     assert lines[row + 1] == ["±0.014"] * 4 + ["±0.0000"] * 2
     assert lines[row + 2] == ["paper", "0.03", "0.08", "0.03", "0.08", "0.000"]
+    assert lines[row + 3] == ["ours", "-", "paper", "0.000", "-0.050", "0.000", "-0.050", "0.0000"]
 
 
 def test_csv_holds_every_score_once_in_full_precision(tmp_path: Path) -> None:

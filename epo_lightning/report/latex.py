@@ -1,0 +1,161 @@
+r"""Tables -> LaTeX with booktabs, with what is behind the numbers as comments above.
+
+A document needs ``\usepackage{booktabs}``, nothing else.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from epo_lightning.report.render import Sheet, difference_text, number, paper_text, with_ends
+from epo_lightning.report.statistics import Comparisons
+from epo_lightning.report.tables import Column, Row, Table
+
+SPECIAL = {
+    **{letter: rf"\{letter}" for letter in "&%$#_{}"},
+    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
+    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"},
+    **{"±": r"$\pm$", "×": r"$\times$", "·": r"$\cdot$", "−": "$-$", "…": r"\dots{}", "–": "--", "—": "---"},
+    **{"α": r"$\alpha$", "β": r"$\beta$", "λ": r"$\lambda$", "µ": r"$\mu$", "μ": r"$\mu$", "σ": r"$\sigma$"},
+}
+
+CAPTION = (
+    "Displacements in m, minimum over the modes; lower is better. Mean $\\pm$ sample standard deviation over $n$ seeds; "
+    "below, the paper's value and ours minus the paper's. \\textbf{Bold} is the best and \\underline{underlined} the "
+    "second best of the rows with the same backbone that know equally much."
+)
+COMPARISON_CAPTION = (
+    "First row minus second row, paired by seed: negative is better for the first; $n$ pairs; two-sided paired t-test, "
+    "not corrected for the number of comparisons. With three seeds it has little power."
+)
+
+
+def latex_text(text: str) -> str:
+    """Text in which nothing is a command; letters that pdflatex does not know are given by their number."""
+    letters = (SPECIAL.get(letter) or _letter(letter) for letter in " ".join(text.split()))
+    return "".join(letters)
+
+
+def _letter(letter: str) -> str:
+    known = letter.isascii() or (ord(letter) < 256 and letter.isalpha())
+    return letter if known and letter.isprintable() else f"[U+{ord(letter):04X}]"
+
+
+def to_latex(table: Table, label: str | None = None) -> str:
+    """The main kind of table: rows x metrics, rules between the groups.
+
+    Args:
+        label: what ``\\ref`` calls it; made of the title if not given.
+    """
+    lines = []
+    for row, last in with_ends(table.rows):
+        cells = [_cell(row, column) for column in table.columns]
+        lines.append(_line([latex_text(row.name), str(len(row.runs)), *cells]))
+        if any(paper_text(row, column) for column in table.columns):
+            paper = [_paper(row, column) for column in table.columns]
+            lines.append(_line([r"\quad{\scriptsize paper}", "", *paper]))
+        if last and row is not table.rows[-1]:
+            lines.append(r"\midrule")
+    header = ["Method", "$n$", *(latex_text(column.label) for column in table.columns)]
+    caption = f"{latex_text(table.title)}. {CAPTION}"
+    return _float(
+        behind(table.rows), header, "lr" + "r" * len(table.columns), lines, caption, label or slug(table.title)
+    )
+
+
+def sheet_to_latex(
+    sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", label: str | None = None, small: str = r"\footnotesize"
+) -> str:
+    """A table of plain text.
+
+    Args:
+        rows: those that are behind its numbers, named in the comments.
+        caption: LaTeX that follows the title.
+        label: what ``\\ref`` calls it; made of the title if not given.
+        small: the size of its letters.
+    """
+    lines = []
+    for index, line in enumerate(sheet.lines):
+        lines.append(_line([latex_text(text) for text in line]))
+        if index in sheet.ends and index + 1 < len(sheet.lines):
+            lines.append(r"\midrule")
+    columns = "l" * sheet.left + "r" * (len(sheet.header) - sheet.left)
+    caption = f"{latex_text(sheet.title)}. {caption}".strip()
+    header = [latex_text(text) for text in sheet.header]
+    return _float(behind(rows), header, columns, lines, caption, label or slug(sheet.title), small)
+
+
+def comparisons_to_latex(comparisons: Comparisons, label: str | None = None) -> str:
+    """The paired comparisons of a table."""
+    from epo_lightning.report.render import comparison_sheet
+
+    rows = {row.identity: row for pair in comparisons.pairs for row in (pair.one, pair.other)}
+    return sheet_to_latex(comparison_sheet(comparisons), list(rows.values()), COMPARISON_CAPTION, label)
+
+
+def behind(rows: Sequence[Row]) -> list[str]:
+    """What the numbers of rows stand on, one text per line: n, seeds, data, commits and commands."""
+    lines = []
+    for row in rows:
+        seeds = " ".join(map(str, row.seeds))
+        lines.append(
+            f"{row.name}: n = {len(row.runs)} (seeds {seeds}), budget {row.runs[0].budget}, data {row.data_digest}, "
+            f"commit {' '.join(row.commits)}, row {row.identity}"
+        )
+        lines += [f"  {command}" for command in row.commands]
+    return [" ".join(line.splitlines()) for line in lines]
+
+
+def slug(title: str) -> str:
+    """``tab:`` and the letters and digits of a title."""
+    return "tab:" + "-".join(re.findall(r"[a-z0-9]+", title.lower()))
+
+
+def _cell(row: Row, column: Column) -> str:
+    cell = row.cells.get(column.metric)
+    if cell is None:
+        return ""
+    form = {1: r"\textbf{%s}", 2: r"\underline{%s}"}.get(cell.rank or 0, "%s")
+    deviation = "" if cell.deviation is None else rf"\,{{\scriptsize$\pm$\,{number(cell.deviation, column.digits)}}}"
+    return form % number(cell.mean, column.digits) + deviation
+
+
+def _paper(row: Row, column: Column) -> str:
+    paper = paper_text(row, column)
+    difference = difference_text(row, column).replace("-", "$-$").replace("+", "$+$")
+    return rf"{{\scriptsize {paper} ({difference})}}" if paper else ""
+
+
+def _line(cells: Sequence[str]) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+def _float(
+    comments: Sequence[str],
+    header: Sequence[str],
+    columns: str,
+    lines: Sequence[str],
+    caption: str,
+    label: str,
+    small: str = r"\footnotesize",
+) -> str:
+    return "\n".join(
+        [
+            *(f"% {comment}" for comment in comments),
+            r"\begin{table}[tbp]",
+            r"\centering",
+            rf"\caption{{{caption}}}",
+            rf"\label{{{label}}}",
+            rf"{small}\setlength{{\tabcolsep}}{{3pt}}",
+            rf"\begin{{tabular}}{{{columns}}}",
+            r"\toprule",
+            _line(header),
+            r"\midrule",
+            *lines,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+    )

@@ -1,0 +1,94 @@
+"""The best setting of a search: chosen by validation scores alone, and how to train with it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.labels import natural, word
+from epo_lightning.report.runs import EvaluatedRun
+from epo_lightning.report.tables import Row, plain_rows, require_comparable
+
+
+@dataclass(frozen=True)
+class BestSetting:
+    """Which setting of an experiment is best.
+
+    Attributes:
+        row: its runs and scores.
+        metric: by which it was chosen, on the validation split.
+        words: overrides that train with it: ``experiment=rpi/v_lstm optimizer.lr=0.0005``.
+        candidates: how many settings it was chosen from.
+        left_out: labels of settings that lack seeds or have no finite score.
+    """
+
+    row: Row
+    metric: str
+    words: str
+    candidates: int
+    left_out: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        return self.row.title
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        return self.row.settings
+
+
+def best_settings(runs: Iterable[EvaluatedRun], split: str = "val", metric: str = "minSADE") -> list[BestSetting]:
+    """Of every experiment with several settings, the one with the lowest mean over seeds.
+
+    A setting with fewer seeds than another is no candidate: a mean over one lucky seed must not win.
+
+    Args:
+        runs: of a search; scores on other splits are not looked at.
+        split: the validation split, no other.
+        metric: the lowest is the best.
+
+    Raises:
+        ConfigError: another split, no score of the metric, settings that cannot be compared, or none of them complete.
+    """
+    if split != "val":
+        raise ConfigError(
+            f"settings are chosen on the validation split, not on split={split}: whatever is chosen on the test split has "
+            "seen it; score the runs with `epo evaluate runs=<folder> split=val`"
+        )
+    experiments: dict[tuple[str, str, str], list[EvaluatedRun]] = {}
+    for run in runs:
+        if run.split == split:
+            experiments.setdefault((run.data, run.experiment, run.name), []).append(run)
+    if not experiments:
+        raise ConfigError("no run was scored on the validation split: epo evaluate runs=<folder> split=val does it")
+    searched = [(members, plain_rows(members)) for _, members in sorted(experiments.items())]
+    return [_best(members, rows, metric) for members, rows in searched if len(rows) > 1]
+
+
+def _best(runs: list[EvaluatedRun], rows: list[Row], metric: str) -> BestSetting:
+    require_comparable(runs)
+    for row in rows:
+        if metric not in row.cells:
+            raise ConfigError(
+                f"{row.runs[0].path} was not scored by {metric}, which shall choose the setting; it has "
+                f"{', '.join(row.cells)}"
+            )
+    seeds = {seed for row in rows for seed in row.seeds}
+    whole = [row for row in rows if {*row.seeds} == seeds and math.isfinite(row.cells[metric].mean)]
+    if not whole:
+        raise ConfigError(
+            f"no setting of {rows[0].title!r} has finite scores for all seeds {sorted(seeds)}: finish the search first"
+        )
+    best = min(whole, key=lambda row: (row.cells[metric].mean, natural(row.settings)))
+    left_out = tuple(row.name for row in rows if row not in whole)
+    return BestSetting(best, metric, _words(best), len(whole), left_out)
+
+
+def _words(row: Row) -> str:
+    run = row.runs[0]
+    parts = [f"data={run.data}", f"backbone={run.backbone}", f"forecaster={run.forecaster}"]
+    chosen = [f"experiment={run.experiment}"] if run.experiment else parts
+    return " ".join([*chosen, *(word(key, value) for key, value in row.settings.items())])

@@ -1,0 +1,116 @@
+"""Is the difference between two rows more than luck? Paired comparisons over the seeds that both rows have.
+
+Seed by seed, two rows see the same batches in the same order, so the differences of their scores say more than the
+difference of their means. The test is Student's paired t-test, two-sided.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from epo_lightning.report.tables import Column, Row, Table
+
+CONFIDENCE = 0.95
+EQUAL = 1e-9
+"""Differences that vary less than this, relative to the scores, vary by rounding only."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How much smaller or larger one row's score is than another's.
+
+    Attributes:
+        n: number of pairs, one for each seed that both rows have.
+        mean: of the differences, one minus other: negative where the one is better. None without a pair.
+        low, high: bounds of its 95 % confidence interval.
+        p: two-sided p-value of the paired t-test.
+        reason: why there is no interval and no p-value; empty where there are.
+    """
+
+    n: int
+    mean: float | None = None
+    low: float | None = None
+    high: float | None = None
+    p: float | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One row against another, metric by metric."""
+
+    one: Row
+    other: Row
+    differences: Mapping[str, Difference]
+
+    @property
+    def seeds(self) -> list[int]:
+        """Those that both rows have."""
+        return sorted({*self.one.seeds} & {*self.other.seeds})
+
+
+@dataclass(frozen=True)
+class Comparisons:
+    """All comparisons of a table."""
+
+    title: str
+    columns: tuple[Column, ...]
+    pairs: tuple[Comparison, ...] = field(repr=False)
+
+
+def compare(one: Sequence[float], other: Sequence[float]) -> Difference:
+    """Compare scores that come in pairs.
+
+    Args:
+        one, other: as many scores each; those at the same place are a pair.
+    """
+    differences = [a - b for a, b in zip(one, other, strict=True)]
+    n = len(differences)
+    if not n:
+        return Difference(0, reason="no common seed")
+    if not all(map(math.isfinite, differences)):
+        return Difference(n, reason="a score is not a finite number")
+    mean = statistics.fmean(differences)
+    if n < 2:
+        return Difference(n, mean, reason="a single common seed, a test needs two")
+    if max(differences) - min(differences) <= EQUAL * max(map(abs, (*one, *other))):
+        return Difference(n, mean, reason="the same difference for every seed")
+    from scipy.special import stdtr, stdtrit  # distribution of Student's t and its quantiles; a slow import
+
+    error = statistics.stdev(differences) / math.sqrt(n)
+    reach = error * float(stdtrit(n - 1, (1 + CONFIDENCE) / 2))
+    return Difference(n, mean, mean - reach, mean + reach, 2 * float(stdtr(n - 1, -abs(mean) / error)))
+
+
+def compare_rows(one: Row, other: Row, metrics: Sequence[str]) -> Comparison:
+    """Compare two rows over the seeds that both have, in every metric that both have."""
+    scores = [{run.seed: run.metrics for run in row.runs} for row in (one, other)]
+    seeds = sorted({*scores[0]} & {*scores[1]})
+    return Comparison(
+        one,
+        other,
+        {
+            metric: compare(*([of[seed][metric] for seed in seeds] for of in scores))
+            for metric in metrics
+            if metric in one.cells and metric in other.cells
+        },
+    )
+
+
+def build_comparisons(tables: Sequence[Table]) -> list[Comparisons]:
+    """For every main table: each +EPO row against each +SC row of its group, which share backbone and goal."""
+    found = []
+    for table in (table for table in tables if table.main):
+        metrics = [column.metric for column in table.columns]
+        pairs = tuple(
+            compare_rows(one, other, metrics)
+            for one in table.rows
+            for other in table.rows
+            if (one.forecaster, other.forecaster) == ("epo", "scene_consistent") and one.group == other.group
+        )
+        if pairs:
+            found.append(Comparisons(f"{table.title}: +EPO against +SC, seed by seed", table.columns, pairs))
+    return found
