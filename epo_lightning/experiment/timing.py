@@ -1,0 +1,93 @@
+"""How long one joint forecast takes: network and layer, one scene at a time, as it would be deployed."""
+
+from __future__ import annotations
+
+import platform
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from epo_lightning.experiment.evaluate import open_checkpoint, open_data
+from epo_lightning.experiment.settings import Settings
+from epo_lightning.run_folder import RunFolder, write_json
+
+SAMPLES, WARM_UP = 100, 10
+"""Scenes that are measured, as in the paper, and forecasts before that, while caches and compilers settle."""
+
+
+def measure(run: RunFolder, settings: Settings, forecaster: Any = None) -> dict[str, Any]:
+    """Time joint forecasts of single scenes of the test split, and write the run's ``runtime.json``.
+
+    Nothing but the forecast is timed: the scene is on its device already, and no metric is computed.
+
+    Args:
+        run: a finished run, trained or not.
+        settings: of the run.
+        forecaster: to measure instead of the run's best checkpoint.
+
+    Raises:
+        ConfigError: the checkpoint or the data is missing or has changed.
+    """
+    device = _device(settings.trainer.accelerator)
+    torch.set_num_threads(settings.trainer.threads)
+    forecaster = forecaster or open_checkpoint(settings, run.checkpoint("best"))
+    forecaster = forecaster.to(device).eval()
+    data = open_data(run, settings)
+    split = data.dataset("test")
+    # A split with fewer scenes than samples is gone through more than once.
+    scenes = [split[torch.tensor([index % len(split)])].to(device) for index in range(SAMPLES)]
+    seconds = []
+    with torch.no_grad():
+        for number in range(-WARM_UP, SAMPLES):
+            _wait(device)
+            started = time.perf_counter()
+            forecast = forecaster(scenes[number])
+            _wait(device)
+            if number >= 0:
+                seconds.append(time.perf_counter() - started)
+    solver = getattr(forecaster, "solver", None)
+    measured = {
+        "agents": scenes[0].history.shape[1],
+        "steps": None if solver is None else solver.for_test().steps,
+        "modes": forecast.states.shape[1],
+        "batch": 1,
+        "samples": SAMPLES,
+        "seconds": {
+            "mean": statistics.fmean(seconds),
+            "median": statistics.median(seconds),
+            "p10": float(np.percentile(seconds, 10)),
+            "p90": float(np.percentile(seconds, 90)),
+        },
+        "device": device.type,
+        "machine": _machine(device),
+        "threads": settings.trainer.threads,
+        "data_digest": data.digest,
+    }
+    write_json(run.metrics_file("time"), measured)
+    return measured
+
+
+def _device(accelerator: str) -> torch.device:
+    return torch.device("cuda" if accelerator != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _wait(device: torch.device) -> None:
+    """A GPU works on while Python is ahead of it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _machine(device: torch.device) -> str:
+    """The name of the processor that computes."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
