@@ -1,23 +1,24 @@
 r"""Tables -> LaTeX with booktabs, with what is behind the numbers as comments above.
 
-A document needs ``\usepackage{booktabs}``, nothing else.
+A document needs ``\usepackage{booktabs,graphicx}``: a table that is wider than its column is made smaller.
 """
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 
-from epo_lightning.report.render import Sheet, difference_text, number, paper_text, with_ends
+from epo_lightning.report.render import Sheet, comparison_sheet, difference_text, number, paper_text, with_ends
 from epo_lightning.report.statistics import Comparisons
 from epo_lightning.report.tables import Column, Row, Table
 
 SPECIAL = {
     **{letter: rf"\{letter}" for letter in "&%$#_{}"},
-    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
-    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"},
-    **{"±": r"$\pm$", "×": r"$\times$", "·": r"$\cdot$", "−": "$-$", "…": r"\dots{}", "–": "--", "—": "---"},
-    **{"α": r"$\alpha$", "β": r"$\beta$", "λ": r"$\lambda$", "µ": r"$\mu$", "μ": r"$\mu$", "σ": r"$\sigma$"},
+    **{letter: f"{{{letter}}}" for letter in "[]*"},  # at the beginning of a line they would belong to the line before
+    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", '"': "''"},
+    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", "±": r"$\pm$", "…": r"\dots{}"},
+    **{"\N{MULTIPLICATION SIGN}": r"$\times$", "\N{MINUS SIGN}": "$-$", "\N{EN DASH}": "--"},
 }
 
 CAPTION = (
@@ -33,13 +34,13 @@ COMPARISON_CAPTION = (
 
 def latex_text(text: str) -> str:
     """Text in which nothing is a command; letters that pdflatex does not know are given by their number."""
-    letters = (SPECIAL.get(letter) or _letter(letter) for letter in " ".join(text.split()))
-    return "".join(letters)
+    return "".join(SPECIAL.get(letter) or _letter(letter) for letter in " ".join(text.split()))
 
 
 def _letter(letter: str) -> str:
-    known = letter.isascii() or (ord(letter) < 256 and letter.isalpha())
-    return letter if known and letter.isprintable() else f"[U+{ord(letter):04X}]"
+    base = unicodedata.normalize("NFD", letter)[0]  # a letter with an accent is known where the letter is
+    known = (letter.isascii() and letter.isprintable()) or (ord(letter) < 256 and base.isascii() and base.isalpha())
+    return letter if known or letter in "ßæøÆØ" else f"{{[}}U+{ord(letter):04X}{{]}}"
 
 
 def to_latex(table: Table, label: str | None = None) -> str:
@@ -52,8 +53,8 @@ def to_latex(table: Table, label: str | None = None) -> str:
     for row, last in with_ends(table.rows):
         cells = [_cell(row, column) for column in table.columns]
         lines.append(_line([latex_text(row.name), str(len(row.runs)), *cells]))
-        if any(paper_text(row, column) for column in table.columns):
-            paper = [_paper(row, column) for column in table.columns]
+        paper = [_paper(row, column) for column in table.columns]
+        if any(paper):
             lines.append(_line([r"\quad{\scriptsize paper}", "", *paper]))
         if last and row is not table.rows[-1]:
             lines.append(r"\midrule")
@@ -64,16 +65,13 @@ def to_latex(table: Table, label: str | None = None) -> str:
     )
 
 
-def sheet_to_latex(
-    sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", label: str | None = None, small: str = r"\footnotesize"
-) -> str:
+def sheet_to_latex(sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", label: str | None = None) -> str:
     """A table of plain text.
 
     Args:
         rows: those that are behind its numbers, named in the comments.
         caption: LaTeX that follows the title.
         label: what ``\\ref`` calls it; made of the title if not given.
-        small: the size of its letters.
     """
     lines = []
     for index, line in enumerate(sheet.lines):
@@ -83,13 +81,11 @@ def sheet_to_latex(
     columns = "l" * sheet.left + "r" * (len(sheet.header) - sheet.left)
     caption = f"{latex_text(sheet.title)}. {caption}".strip()
     header = [latex_text(text) for text in sheet.header]
-    return _float(behind(rows), header, columns, lines, caption, label or slug(sheet.title), small)
+    return _float(behind(rows), header, columns, lines, caption, label or slug(sheet.title))
 
 
 def comparisons_to_latex(comparisons: Comparisons, label: str | None = None) -> str:
     """The paired comparisons of a table."""
-    from epo_lightning.report.render import comparison_sheet
-
     rows = {row.identity: row for pair in comparisons.pairs for row in (pair.one, pair.other)}
     return sheet_to_latex(comparison_sheet(comparisons), list(rows.values()), COMPARISON_CAPTION, label)
 
@@ -138,7 +134,6 @@ def _float(
     lines: Sequence[str],
     caption: str,
     label: str,
-    small: str = r"\footnotesize",
 ) -> str:
     return "\n".join(
         [
@@ -147,14 +142,15 @@ def _float(
             r"\centering",
             rf"\caption{{{caption}}}",
             rf"\label{{{label}}}",
-            rf"{small}\setlength{{\tabcolsep}}{{3pt}}",
-            rf"\begin{{tabular}}{{{columns}}}",
+            r"\footnotesize\setlength{\tabcolsep}{3pt}",
+            rf"\sbox0{{\begin{{tabular}}{{{columns}}}",
             r"\toprule",
             _line(header),
             r"\midrule",
             *lines,
             r"\bottomrule",
-            r"\end{tabular}",
+            r"\end{tabular}}",
+            r"\ifdim\wd0>\linewidth\resizebox{\linewidth}{!}{\usebox0}\else\usebox0\fi",
             r"\end{table}",
             "",
         ]
