@@ -1,8 +1,8 @@
 """Batches of scenes for Lightning: data sets that are indexed by whole batches, and an order that can be resumed.
 
 All records of a split stay in memory; a batch is one ``index_select``. That is faster than any worker process here, so
-there are none. The order of an epoch depends on (seed, epoch) alone: a run that goes on at the beginning of an epoch sees
-exactly what it would have seen without the pause.
+there are none. A batch is what an optimisation step sees, on however many devices. The order of an epoch depends on
+(seed, epoch) alone: a run that goes on at the beginning of an epoch sees exactly what it would have seen without the pause.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ class BatchSampler(DistributedSampler):
     """Index tensors of the batches of an epoch.
 
     Lightning calls ``set_epoch`` of a loader's sampler before each epoch, with the epoch that a checkpoint restored; the
-    order follows from the seed and that number. Under distributed training rank r of n takes every n-th index from r on;
-    being a DistributedSampler only tells Lightning not to put one of its own in this one's place.
+    order follows from the seed and that number. Under distributed training rank r of n takes every n-th index of every
+    batch from r on, so that the ranks' shares are together the batch of one process; being a DistributedSampler only tells
+    Lightning not to put one of its own in this one's place.
 
     Args:
         dataset: is told the epoch as well.
-        batch_size: scenes per batch and rank.
+        batch_size: scenes per batch, of all ranks together.
         shuffle: whether the order is random; then also an incomplete last batch is dropped.
         seed: of the order.
     """
@@ -56,8 +57,9 @@ class BatchSampler(DistributedSampler):
             super().set_epoch(epoch)
             self.scenes.set_epoch(epoch)
 
-    def indices(self) -> Tensor:
-        """All indices of this rank in this epoch, in order."""
+    def __iter__(self) -> Iterator[Tensor]:
+        # A generator, so that the order is drawn with the first batch: a resumed Lightning asks for the iterator before
+        # it says which epoch it is.
         count = len(self.scenes)
         if self.shuffle:
             order = torch.randperm(count, generator=epoch_generator(self.seed, self.epoch))
@@ -65,20 +67,28 @@ class BatchSampler(DistributedSampler):
             order = torch.arange(count)
         rank, world = _rank()
         if self.shuffle:
-            order = order[: count - count % world]
-        return order[rank::world]
-
-    def __iter__(self) -> Iterator[Tensor]:
-        # A generator, so that the order is drawn with the first batch: a resumed Lightning asks for the iterator before
-        # it says which epoch it is.
-        yield from self.indices().split(self.batch_size)[: len(self)]
+            check_share(self.batch_size, world)
+        shares = (batch[rank::world] for batch in order.split(self.batch_size)[: len(self)])
+        # A last batch of fewer scenes than ranks leaves some ranks without any.
+        yield from (share for share in shares if len(share))
 
     def __len__(self) -> int:
-        rank, world = _rank()
+        """Batches of the epoch, the same on every rank."""
         count = len(self.scenes)
-        if self.shuffle:
-            return count // world // self.batch_size
-        return -(-len(range(rank, count, world)) // self.batch_size)
+        return count // self.batch_size if self.shuffle else -(-count // self.batch_size)
+
+
+def check_share(batch_size: int, world: int) -> None:
+    """A step is the mean over ranks, which is the mean over scenes only if all have the same number of them.
+
+    Raises:
+        ConfigError: the batch cannot be divided evenly.
+    """
+    if batch_size % world:
+        raise ConfigError(
+            f"data.batch_size is {batch_size}, which trainer.devices={world} do not divide evenly: it is the number of "
+            "scenes of a step on all devices together"
+        )
 
 
 def epoch_generator(seed: int, epoch: int) -> torch.Generator:

@@ -3,23 +3,73 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import torch
+import torch.distributed as dist
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 
+class _Sum(torch.autograd.Function):
+    """The sum of a tensor over all processes, for which each of them is a part of one loss."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor) -> Tensor:
+        tensor = tensor.clone()
+        dist.all_reduce(tensor)
+        return tensor
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        gradient = gradient.clone()
+        dist.all_reduce(gradient)
+        return gradient
+
+
 class _MaskedBatchNorm(nn.BatchNorm1d):
-    """Batch normalisation whose statistics are those of existing agents alone."""
+    """Batch normalisation whose statistics are those of existing agents alone, and of all processes of a training.
+
+    Rows may be spread over processes in any way: the result is that of one process with all of them.
+    """
 
     def forward(self, features: Tensor, mask: Tensor | None = None) -> Tensor:
         rows = features.flatten(0, -2)
-        if mask is None or not self.training:
+        if not self.training:
             return super().forward(rows).view_as(features)
+        alone = not (dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1)
+        normalise = super().forward if alone else self._together
+        if mask is None:
+            return normalise(rows).view_as(features)
         present = mask.flatten()
         normalised = torch.zeros_like(rows)
-        normalised[present] = super().forward(rows[present])
+        normalised[present] = normalise(rows[present])
         return normalised.view_as(features)
+
+    def _together(self, rows: Tensor) -> Tensor:
+        """What ``nn.BatchNorm1d`` does with the rows of all processes, for those of this one."""
+        assert self.running_mean is not None
+        assert self.running_var is not None
+        assert self.num_batches_tracked is not None
+        assert self.momentum is not None
+        rank, world = dist.get_rank(), dist.get_world_size()
+        values = rows.to(self.running_mean.dtype)
+        count = values.new_full((1,), len(values))
+        own = values.sum(0) / count.clamp_min(1)
+        parts = torch.cat([count, own, (values - own).square().sum(0)])
+        # One exchange: everybody adds their part to zeros in their own row. Means and squares around them are put together
+        # afterwards, because a difference of large sums would lose the digits that this is about.
+        table = _Sum.apply(torch.stack([parts if r == rank else torch.zeros_like(parts) for r in range(world)]))
+        counts, means, squares = table.split([1, values.shape[1], values.shape[1]], 1)
+        total = counts.sum().clamp_min(1)
+        mean = (counts * means).sum(0) / total
+        square = (squares + counts * (means - mean).square()).sum(0)
+        with torch.no_grad():
+            self.num_batches_tracked += 1
+            self.running_mean.lerp_(mean, self.momentum)
+            self.running_var.lerp_(square / (total - 1).clamp_min(1), self.momentum)
+        normalised = (values - mean) * (square / total + self.eps).rsqrt()
+        return (normalised * self.weight + self.bias).to(rows.dtype)
 
 
 class MLP(nn.Module):

@@ -8,9 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.strategies import Strategy
 
+from epo_lightning.data.datamodule import check_share
+from epo_lightning.experiment import logs
 from epo_lightning.experiment.settings import PARTS, Settings, TrainerSettings, check_part, check_types
 from epo_lightning.forecasters import build_forecaster, check_model
 from epo_lightning.registry import ConfigError, build
@@ -63,7 +67,10 @@ def check(settings: Settings) -> tuple[Any, LightningModule]:
     Raises:
         ConfigError: what is wrong, in one sentence.
     """
+    logs.check(settings.logger)
     data = build_data(settings.data)
+    devices = settings.trainer.devices
+    check_share(getattr(data, "batch_size", devices), devices)
     model = describe_model(settings, data)
     check_model(model)
     for kind in PARTS[1:]:
@@ -106,14 +113,20 @@ def quiet() -> None:
         ".*Found .* module.s. in eval mode.*",
         ".*The `srun` command is available.*",
         ".*number of training batches .* is smaller than the logging interval.*",
+        ".*It is recommended to use .self.log.*sync_dist=True.*",  # the metrics are sums over all processes already
     ):
         warnings.filterwarnings("ignore", message=text)
 
 
 def build_trainer(
-    settings: TrainerSettings, run: RunFolder, callbacks: Sequence[Callback], loggers: Sequence[Logger], bar: bool
+    settings: TrainerSettings,
+    run: RunFolder,
+    callbacks: Sequence[Callback],
+    loggers: Sequence[Logger],
+    bar: bool,
+    strategy: Strategy | None = None,
 ) -> Trainer:
-    """Lightning's trainer for one run.
+    """Lightning's trainer for one run, on one device unless a ``strategy`` says how to train on several.
 
     Raises:
         ConfigError: a device or precision that this machine does not have.
@@ -123,7 +136,10 @@ def build_trainer(
         return Trainer(
             default_root_dir=run.path,
             accelerator=settings.accelerator,
-            devices=settings.devices,
+            devices=1 if strategy is None else settings.devices,
+            strategy=strategy or "auto",
+            # Lightning's own idea of a Slurm job is one that catches its signals and counts its tasks.
+            plugins=[LightningEnvironment()] if strategy is None else None,
             precision=settings.precision,  # type: ignore[arg-type]
             max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,
             max_steps=settings.max_steps,

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
 
-from epo_lightning.experiment import assembly, callbacks
+from epo_lightning.experiment import assembly, callbacks, distributed, logs
 from epo_lightning.experiment.compose import PACKAGE
 from epo_lightning.experiment.evaluate import evaluate
 from epo_lightning.experiment.settings import Settings, read
@@ -53,13 +53,15 @@ def train(config: dict[str, Any], overrides: Sequence[str] = ()) -> RunFolder:
     settings = read(Settings, config)
     assembly.check(settings)
     run = folder_for(settings)
+    if distributed.followed(settings.trainer.devices, run):
+        return run
     refuse_occupied(settings, run)
-    data = None if run.record_file.is_file() else _ready(settings)  # missing data is said before a folder is made
+    data = None if run.record_file.is_file() else ready(settings)  # missing data is said before a folder is made
     # In a sweep, whoever has the run already may finish it for us.
     with run.lock(wait=None if settings.sweep else 2.0):
         if not run.record_file.is_file():
             refuse_occupied(settings, run)
-            run.begin(config, _record(settings, config, data or _ready(settings), overrides))
+            run.begin(config, _record(settings, config, data or ready(settings), overrides))
             _fit(settings, config, run)
         elif run.finished:
             _refuse_other(run, config)
@@ -77,6 +79,8 @@ def resume(run: RunFolder) -> None:
             on it.
     """
     assembly.quiet()
+    if distributed.followed(read(Settings, run.config()).trainer.devices, run):
+        return
     if run.finished:
         raise ConfigError(f"{run.path} is finished: score it with `epo evaluate run={run.path}`")
     with run.lock():
@@ -141,24 +145,23 @@ def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path 
 def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None) -> None:
     started = time.monotonic()
     seed_everything(settings.seed, workers=True, verbose=False)
-    data = _ready(settings)
+    data = ready(settings)
     model = assembly.build_model(settings, data)
     step = _steps_in(last, model) if last else 0
-    loggers = callbacks.logs(settings.logger, run, settings.title, config, step)
-    watchers = callbacks.watchers(settings.callbacks, run, settings.title)
-    bar = any(isinstance(watcher, callbacks.TQDMProgressBar) for watcher in watchers)
-    trainer = assembly.build_trainer(settings.trainer, run, watchers, loggers, bar)
-    run.update(parameters=assembly.parameters(model))
-    try:
-        if assembly.parameters(model):
+    with logs.open_logs(settings, config, run, step) as loggers:
+        watchers = callbacks.watchers(settings.callbacks, run, settings.title)
+        bar = any(isinstance(watcher, callbacks.TQDMProgressBar) for watcher in watchers)
+        learns = assembly.parameters(model) > 0 and settings.trainer.max_steps != 0
+        strategy = distributed.strategy(settings.trainer.devices, run, config, last) if learns else None
+        trainer = assembly.build_trainer(settings.trainer, run, watchers, loggers, bar, strategy)
+        run.update(parameters=assembly.parameters(model))
+        if learns:
             trainer.fit(model, assembly.as_data(data), ckpt_path=last, weights_only=True)
         else:
             _keep_unlearned(trainer, model, data, run)
-    finally:
-        callbacks.close(loggers)
-    if trainer.interrupted:
-        raise KeyboardInterrupt
-    _check_learned(run, trainer)
+        if trainer.interrupted:
+            raise KeyboardInterrupt
+        _check_learned(run, trainer)
     metrics = {key: float(value) for key, value in trainer.callback_metrics.items() if key.startswith("val/")}
     best = [w.best_model_score for w in watchers if getattr(w, "monitor", None) and hasattr(w, "best_model_score")]
     score = float(best[0]) if best and best[0] is not None else metrics.get(settings.callbacks.monitor)
@@ -172,7 +175,7 @@ def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Pat
 
 
 def _keep_unlearned(trainer: Trainer, model: LightningModule, data: Any, run: RunFolder) -> None:
-    """A forecaster without parameters is validated once and kept like any other."""
+    """What does not learn, for lack of parameters or of steps, is validated once and kept like any other."""
     trainer.validate(model, assembly.as_data(data), verbose=False)
     run.checkpoints.mkdir(parents=True, exist_ok=True)
     trainer.save_checkpoint(run.checkpoint("last"))
@@ -187,7 +190,7 @@ def _check_learned(run: RunFolder, trainer: Trainer) -> None:
         )
 
 
-def _ready(settings: Settings) -> Any:
+def ready(settings: Settings) -> Any:
     """The data module with its training data found and verified."""
     data = assembly.build_data(settings.data)
     data.order_seed = settings.seed

@@ -102,7 +102,8 @@ class Forecaster(LightningModule):
         total = torch.stack([weight * value for weight, value in terms.values()]).sum()
         values = {f"train/{name}": value.detach() for name, (_, value) in terms.items()}
         size = len(scene.history)
-        self.log_dict({"train/loss": total.detach(), **values}, on_step=False, on_epoch=True, batch_size=size)
+        values = {"train/loss": total.detach(), **values}
+        self.log_dict(values, on_step=False, on_epoch=True, batch_size=size, sync_dist=True)
         return total
 
     def validation_step(self, scene: Scene, _: int) -> None:

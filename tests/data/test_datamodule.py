@@ -164,18 +164,28 @@ def test_a_resumed_run_sees_what_it_would_have_seen(data, tmp_path, targets):
     assert len({tuple(ids) for _, ids, _ in whole}) > len(whole) // 2
 
 
-def test_ranks_share_the_samples(data, monkeypatch):
-    dataset = RPIDataset(records(51), "executed")
-    for shuffle in (True, False):
-        shares = []
-        for rank in range(2):
-            monkeypatch.setattr(datamodule, "_rank", lambda rank=rank: (rank, 2))
-            sampler = BatchSampler(dataset, 8, shuffle, 0)
-            batches = list(sampler)
-            assert len(batches) == len(sampler)
-            shares.append(torch.cat(batches).tolist())
-        assert not set(shares[0]) & set(shares[1])
-        assert len(shares[0]) + len(shares[1]) == (48 if shuffle else 51)
+@pytest.mark.parametrize("world", [2, 4])
+@pytest.mark.parametrize("shuffle", [True, False])
+def test_the_shares_of_ranks_are_the_batches_of_one_process(monkeypatch, shuffle, world):
+    sampler = BatchSampler(RPIDataset(records(51), "executed"), 8, shuffle, 0)
+    whole = [batch.tolist() for batch in sampler]
+    assert len(whole) == len(sampler) == (6 if shuffle else 7)
+    shares = []
+    for rank in range(world):
+        monkeypatch.setattr(datamodule, "_rank", lambda rank=rank: (rank, world))
+        assert len(sampler) == len(whole)
+        shares.append([batch.tolist() for batch in sampler])
+        assert all(len(batch) == 8 // world for batch in shares[-1][:6])
+        assert all(shares[-1]), "nobody is given an empty batch"
+    for number, batch in enumerate(whole):
+        parts = [index for share in shares if number < len(share) for index in share[number]]
+        assert sorted(batch) == sorted(parts)
+
+
+def test_a_batch_that_ranks_cannot_share_evenly_is_refused(monkeypatch):
+    monkeypatch.setattr(datamodule, "_rank", lambda: (0, 3))
+    with pytest.raises(ConfigError, match=r"data\.batch_size is 8, which trainer\.devices=3 do not divide evenly"):
+        next(iter(BatchSampler(RPIDataset(records(51), "executed"), 8, shuffle=True, seed=0)))
 
 
 @pytest.mark.parametrize(

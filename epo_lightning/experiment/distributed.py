@@ -1,0 +1,345 @@
+"""Training on several devices of one machine: a process for each, and together the numbers of one.
+
+The leader, rank 0, is the process that was asked to train: a command line, a job of a sweep, a worker of any launcher. It
+starts the followers itself and tells them, through the store at which all meet, what to train; so they need neither Hydra
+nor the leader's command line. Followers only compute: the run folder, its lock, the logs and the terminal are the leader's.
+They end when it ends, in whatever way, and it fails when one of them does. Nothing is left behind for the next job of the
+same process: no variable of the environment, no port, no process group.
+
+Where Slurm has started a task for each device, these tasks are the processes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import IO, Any
+
+import torch
+import torch.distributed as dist
+from lightning.fabric.plugins import ClusterEnvironment
+from lightning.pytorch import seed_everything
+from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
+from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.strategies.launchers.launcher import _Launcher
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
+
+HOST = "127.0.0.1"
+PATIENCE = 600.0
+"""Seconds until processes that do not find each other give up."""
+GRACE = 10.0
+"""Seconds that a process has to end on its own, or to be seen dead."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Which of a run's processes this is.
+
+    Attributes:
+        rank: 0 leads.
+        world: number of processes.
+        port: where they meet; 0 if the leader may choose, because it starts the others.
+    """
+
+    rank: int = 0
+    world: int = 1
+    port: int = 0
+
+    @property
+    def leads(self) -> bool:
+        return self.rank == 0
+
+
+def here(devices: int) -> Place:
+    """The place of this process in a run on so many devices: the leader's, except in the further tasks of a Slurm step.
+
+    Raises:
+        ConfigError: Slurm has started another number of tasks, or some on other machines.
+    """
+    tasks = int(os.environ.get("SLURM_STEP_NUM_TASKS", "1"))
+    if devices == 1 or tasks == 1:
+        return Place(world=devices)
+    if tasks != devices or os.environ.get("SLURM_STEP_NUM_NODES", "1") != "1":
+        raise ConfigError(
+            f"trainer.devices is {devices}, but Slurm has started {tasks} tasks on "
+            f"{os.environ.get('SLURM_STEP_NUM_NODES', '1')} nodes: ask for one node, with one task or one for each device"
+        )
+    return Place(int(os.environ["SLURM_PROCID"]), devices, 15000 + int(os.environ.get("SLURM_JOB_ID", "0")) % 10000)
+
+
+def strategy(devices: int, run: RunFolder, config: Mapping[str, Any], last: Path | None) -> DDP | None:
+    """The leader's way to train on ``devices``; None on one.
+
+    Args:
+        config: the resolved configuration, which followers build the same forecaster and data from.
+        last: the checkpoint that the run continues from.
+    """
+    if devices == 1:
+        return None
+    task = {"run": str(run.path.resolve()), "config": dict(config), "last": str(last.resolve()) if last else None}
+    return DDP(here(devices), task=json.dumps(task))
+
+
+def followed(devices: int, run: RunFolder) -> bool:
+    """Whether this process is one of the followers that Slurm has started, and has now done its part of the run.
+
+    Raises:
+        ConfigError: see :func:`here` and :func:`follow`.
+    """
+    place = here(devices)
+    if not place.leads:
+        follow(place, run)
+    return not place.leads
+
+
+def follow(place: Place, run: RunFolder | None = None) -> None:
+    """Train what the leader trains.
+
+    Args:
+        run: where the leader may also turn out to have nothing to do.
+
+    Raises:
+        ConfigError: there is no leader.
+    """
+    store = _find(place, run)
+    if store is None:
+        return
+    from epo_lightning.experiment import assembly, callbacks, train
+    from epo_lightning.experiment.settings import Settings, read
+
+    task = json.loads(store.get("task"))
+    settings, run = read(Settings, task["config"]), RunFolder(Path(task["run"]))
+    assembly.quiet()
+    seed_everything(settings.seed, workers=True, verbose=False)
+    data = train.ready(settings)
+    model = assembly.build_model(settings, data)
+    watchers = callbacks.watchers(settings.callbacks, run, settings.title)
+    # Those that decide, or belong to the checkpoint; none that writes or prints.
+    deciding = [w for w in watchers if isinstance(w, Checkpoint | EarlyStopping | callbacks.RandomStates)]
+    trainer = assembly.build_trainer(settings.trainer, run, deciding, [], bar=False, strategy=DDP(place, store))
+    trainer.fit(model, assembly.as_data(data), ckpt_path=task["last"], weights_only=True)
+
+
+def _find(place: Place, run: RunFolder | None) -> dist.TCPStore | None:
+    """The leader's store; None if the run is over without one."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return dist.TCPStore(HOST, place.port, is_master=False, timeout=timedelta(seconds=GRACE))
+        except (dist.DistNetworkError, dist.DistStoreError) as error:
+            if run is not None and run.finished:
+                return None
+            if time.monotonic() > deadline:
+                raise ConfigError(f"process {place.rank} of {place.world} finds no leader: {error}") from error
+
+
+class DDP(DDPStrategy):
+    """Lightning's DDP, among processes that meet at a store of their own.
+
+    Args:
+        store: where to meet; the leader opens one.
+        task: what the leader tells the followers.
+    """
+
+    def __init__(self, place: Place, store: dist.TCPStore | None = None, task: str = "") -> None:
+        super().__init__(cluster_environment=_Machine(place))
+        self.place = place
+        self.processes = _Processes(place, store, task)
+
+    def _configure_launcher(self) -> None:
+        self._launcher = self.processes
+
+    def setup_distributed(self) -> None:
+        """Meet. Unlike Lightning's own this leaves the random state as it is, and the environment too."""
+        self.set_world_ranks()
+        self._process_group_backend = self._get_process_group_backend()
+        on_gpu = self.root_device.type != "cpu"
+        dist.init_process_group(
+            self._process_group_backend,
+            store=self.processes.meet(),
+            rank=self.place.rank,
+            world_size=self.place.world,
+            timeout=self._timeout,
+            device_id=self.root_device if on_gpu else None,
+        )
+
+
+class _Machine(ClusterEnvironment):
+    """Ranks from the place, nothing from the environment."""
+
+    def __init__(self, place: Place) -> None:
+        super().__init__()
+        self._place = place
+
+    creates_processes_externally = True
+    main_address = HOST
+
+    @property
+    def main_port(self) -> int:
+        return self._place.port
+
+    @staticmethod
+    def detect() -> bool:
+        return False
+
+    def world_size(self) -> int:
+        return self._place.world
+
+    def set_world_size(self, size: int) -> None:
+        pass
+
+    def global_rank(self) -> int:
+        return self._place.rank
+
+    def set_global_rank(self, rank: int) -> None:
+        pass
+
+    def local_rank(self) -> int:
+        return self._place.rank
+
+    def node_rank(self) -> int:
+        return 0
+
+
+class _Processes(_Launcher):
+    """Starts the followers around a training, and ends them after it."""
+
+    is_interactive_compatible = True
+
+    def __init__(self, place: Place, store: dist.TCPStore | None, task: str) -> None:
+        self._place, self._store, self._task = place, store, task
+        self._followers: list[tuple[subprocess.Popen[bytes], IO[bytes]]] = []
+        self._over = threading.Event()
+
+    def launch(self, function: Callable[..., Any], *args: Any, trainer: Any = None, **kwargs: Any) -> Any:
+        """Call ``function`` in company.
+
+        Raises:
+            RuntimeError: one of the others has failed.
+        """
+        try:
+            if self._place.leads:
+                self._start()
+            result = function(*args, **kwargs)
+            self._wait()
+            return result
+        except (RuntimeError, ValueError) as error:  # what torch raises when the others fall silent
+            self._wait(patience=1.0)
+            raise (self._failure() or error) from error
+        finally:
+            self._end()
+
+    def kill(self, signum: Any) -> None:
+        """Lightning's handler of SIGTERM asks for it. It would then broadcast amid whatever is under way, and never end."""
+        raise SIGTERMException
+
+    def meet(self) -> dist.TCPStore:
+        """The store, as soon as everybody is there.
+
+        Raises:
+            RuntimeError: somebody does not come.
+        """
+        assert self._store is not None
+        self._store.set(f"here/{self._place.rank}", "")
+        everybody = [f"here/{rank}" for rank in range(self._place.world)]
+        deadline = time.monotonic() + PATIENCE
+        while not self._store.check(everybody):
+            if failure := self._failure():
+                raise failure
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"not all {self._place.world} processes of the run came within {PATIENCE:.0f} s")
+            time.sleep(0.02)
+        return self._store
+
+    def _start(self) -> None:
+        """Open the store, and start the followers unless Slurm did."""
+        # Bound before anybody is told of it, so two runs never choose the same port.
+        self._store = dist.TCPStore(
+            HOST, self._place.port, is_master=True, wait_for_workers=False, timeout=timedelta(seconds=PATIENCE)
+        )
+        self._store.set("task", self._task)
+        if self._place.port:
+            return
+        for rank in range(1, self._place.world):
+            errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+            words = [str(rank), str(self._place.world), str(self._store.port)]
+            process = subprocess.Popen(
+                [sys.executable, "-m", "epo_lightning.experiment.distributed", *words],
+                # Lightning and W&B look at LOCAL_RANK for who may speak. The path finds what was found here.
+                env={**os.environ, "LOCAL_RANK": str(rank), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                stdin=subprocess.PIPE,  # it ends when this is closed, as it is when this process dies
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+                start_new_session=True,  # Ctrl-C is for the leader
+            )
+            self._followers.append((process, errors))
+        threading.Thread(target=self._watch, args=(self._over,), daemon=True, name="epo-followers").start()
+
+    def _watch(self, over: threading.Event) -> None:
+        """NCCL, other than gloo, does not notice by itself that a process has died."""
+        while not over.wait(1.0):
+            if self._failure() and dist.is_initialized() and dist.get_backend() == "nccl":
+                torch.distributed.distributed_c10d._get_default_group().abort()
+                return
+
+    def _failure(self) -> RuntimeError | None:
+        """What became of the first follower that failed."""
+        for rank, (process, errors) in enumerate(self._followers, 1):
+            code = process.poll()
+            if code:
+                errors.seek(0)
+                said = errors.read().decode(errors="replace").strip()
+                how = f"was killed by signal {-code}" if code < 0 else f"ended with exit status {code}"
+                reason = f": {said.splitlines()[-1]}" if said else ""
+                return RuntimeError(f"process {rank} of the run's {self._place.world} {how}{reason}")
+        return None
+
+    def _wait(self, patience: float = GRACE) -> None:
+        """Give followers time to end, or one of them to turn out to have failed."""
+        deadline = time.monotonic() + patience
+        while time.monotonic() < deadline and not self._failure():
+            if all(process.poll() is not None for process, _ in self._followers):
+                break
+            time.sleep(0.02)
+
+    def _end(self) -> None:
+        """Leave the process as it was before."""
+        self._over.set()
+        for process, errors in self._followers:
+            process.kill()
+            process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+            errors.close()
+        self._followers = []
+        if dist.is_initialized():
+            dist.destroy_process_group()
+        self._store = None
+
+
+def _end_with(leader: int) -> None:
+    """End this process when the other end of the pipe ``leader`` is closed."""
+
+    def wait() -> None:
+        while os.read(leader, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True, name="epo-leader").start()
+
+
+if __name__ == "__main__":
+    _end_with(sys.stdin.fileno())
+    follow(Place(*map(int, sys.argv[1:])))
