@@ -1,26 +1,19 @@
-"""What watches a training run: random states, progress, and where the log goes."""
+"""What watches a training run: random states and progress."""
 
 from __future__ import annotations
 
-import csv
 import math
-import os
 import random
-import socket
 import sys
 import time
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint, TQDMProgressBar
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 
-from epo_lightning.experiment.settings import CallbackSettings, CSVSettings, LoggerSettings, WandbSettings
+from epo_lightning.experiment.settings import CallbackSettings
 from epo_lightning.run_folder import RunFolder
 
 
@@ -132,84 +125,3 @@ def watchers(settings: CallbackSettings, run: RunFolder, title: str) -> list[Cal
     elif style == "lines":
         found.append(EpochLines(title, settings.monitor))
     return found
-
-
-class CSVLog(CSVLogger):
-    """``logs/metrics.csv``; a continued run keeps the rows up to the step it continues from."""
-
-    def __init__(self, run: RunFolder, settings: CSVSettings, continued_from: int = 0) -> None:
-        kept = _rows(run.logs / "metrics.csv", continued_from) if continued_from else []
-        (run.logs / "metrics.csv").unlink(missing_ok=True)
-        super().__init__(run.path, name=run.logs.name, version="", flush_logs_every_n_steps=settings.flush)
-        if kept:
-            self.experiment.metrics = kept
-            self.save()
-
-
-def _rows(path: Path, until: int) -> list[dict[str, Any]]:
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [{key: value for key, value in row.items() if key and value} for row in csv.DictReader(file)]
-    return [row for row in rows if str(row.get("step", "")).isdigit() and int(row["step"]) < until]
-
-
-def logs(settings: LoggerSettings, run: RunFolder, title: str, config: dict[str, Any], step: int = 0) -> list[Logger]:
-    """The chosen loggers; the CSV file is always among them.
-
-    Args:
-        step: the optimisation step that a continued run starts from.
-    """
-    run.logs.mkdir(parents=True, exist_ok=True)
-    found: list[Logger] = [CSVLog(run, settings.csv, step)]
-    if settings.tensorboard is not None:
-        board = TensorBoardLogger(run.path, name=run.logs.name, version="tensorboard", default_hp_metric=False)
-        if settings.tensorboard.hyperparameters and not step:
-            # The HPARAMS tab stays empty unless a metric is named together with the parameters.
-            board.log_hyperparams(config, {"val/minSADE": math.nan})
-        found.append(board)
-    if settings.wandb is not None:
-        found.append(_wandb(settings.wandb, run, title, config))
-    return found
-
-
-def _wandb(settings: WandbSettings, run: RunFolder, title: str, config: dict[str, Any]) -> WandbLogger:
-    offline = settings.mode == "offline" or (settings.mode == "auto" and not _wandb_answers())
-    if offline:
-        print(f"W&B: offline; send it later with `wandb sync {run.logs / 'wandb' / 'wandb'}/offline-run-*`")
-    folder = run.logs / "wandb"
-    folder.mkdir(parents=True, exist_ok=True)
-    os.environ.setdefault("WANDB_SILENT", "true")
-    logger = WandbLogger(
-        name=f"{title} (seed {config['seed']})",
-        save_dir=folder,
-        project=settings.project,
-        entity=settings.entity,
-        tags=list(settings.tags),
-        offline=offline,
-    )
-    logger.experiment.config.update(config, allow_val_change=True)
-    return logger
-
-
-def _wandb_answers(patience: float = 2.0) -> bool:
-    """Whether W&B can be used online. With a key but no network its own start takes two minutes before it gives up."""
-    if not os.environ.get("WANDB_API_KEY"):
-        return False
-    server = urlsplit(os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai"))
-    try:
-        port = server.port or (80 if server.scheme == "http" else 443)
-        socket.create_connection((server.hostname or "", port), timeout=patience).close()
-    except OSError:
-        return False
-    return True
-
-
-def close(loggers: Sequence[Logger]) -> None:
-    """End every log, so that a second run in the same process starts its own."""
-    for logger in loggers:
-        logger.save()
-        if isinstance(logger, WandbLogger):
-            import wandb
-
-            wandb.finish()

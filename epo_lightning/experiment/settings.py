@@ -68,24 +68,53 @@ class CallbackSettings:
 class CSVSettings:
     """``conf/logger/csv.yaml``"""
 
-    flush: int = 100
+    flush: int = 1
+
+    def __post_init__(self) -> None:
+        if self.flush < 1:
+            raise ConfigError(f"logger.csv.flush must be 1 or more, not {self.flush}")
 
 
 @dataclass(frozen=True)
-class TensorBoardSettings:
+class DashboardSettings:
+    """What all dashboards can be told."""
+
+    pictures: int = 0
+    patience: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.pictures < 0 or self.patience < 0:
+            raise ConfigError(
+                "pictures and patience of a logger must be 0 or more, "
+                f"not pictures={self.pictures}, patience={self.patience:g}"
+            )
+
+
+@dataclass(frozen=True)
+class TensorBoardSettings(DashboardSettings):
     """``conf/logger/tensorboard.yaml``"""
 
     hyperparameters: bool = True
 
 
 @dataclass(frozen=True)
-class WandbSettings:
+class WandbSettings(DashboardSettings):
     """``conf/logger/wandb.yaml``"""
 
     project: str = "epo_lightning"
     mode: Literal["auto", "offline", "online"] = "auto"
     entity: str | None = None
     tags: Sequence[str] = ()
+    artifacts: bool = False
+
+
+@dataclass(frozen=True)
+class MLflowSettings(DashboardSettings):
+    """``conf/logger/mlflow.yaml``"""
+
+    uri: str | None = None
+    experiment: str = "epo_lightning"
+    artifacts: bool = False
 
 
 @dataclass(frozen=True)
@@ -95,6 +124,7 @@ class LoggerSettings:
     csv: CSVSettings = field(default_factory=CSVSettings)
     tensorboard: TensorBoardSettings | None = None
     wandb: WandbSettings | None = None
+    mlflow: MLflowSettings | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,107 @@
+"""The guard between a training and its dashboards: whatever a dashboard does, the training goes on at its own pace.
+
+A thread of its own talks to each dashboard and takes rows from a queue. An exception there, a queue that has grown too long
+or an end that is never reached switches that dashboard off for the run, with one warning. The training only ever puts
+rows into a queue.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lightning.pytorch.loggers import Logger
+
+from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Row
+
+BEHIND = 20_000
+"""So many rows a dashboard may be behind: less than a hundred megabytes."""
+
+
+class Aside(Logger):
+    """A dashboard as a Lightning logger that never raises and never waits, but at the end.
+
+    Args:
+        dashboard: whom to tell.
+        patience: seconds that the end of the run waits for it.
+        past: rows that were logged before this process began.
+    """
+
+    def __init__(self, dashboard: Dashboard, patience: float = 10.0, past: Sequence[Row] = ()) -> None:
+        super().__init__()
+        self.dashboard, self.patience = dashboard, patience
+        self.off: str | None = None
+        self._past = past
+        self._queue: queue.Queue[Row | Ending] = queue.Queue(BEHIND)
+        # A daemon: a dashboard that never answers must not keep the process from ending.
+        self._thread = threading.Thread(target=self._work, name=dashboard.label, daemon=True)
+        self._thread.start()
+
+    @property
+    def name(self) -> str:
+        return self.dashboard.label
+
+    @property
+    def version(self) -> str:
+        return self.dashboard.facts.id
+
+    def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
+        """The dashboard has the whole configuration already."""
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        self._put((step or 0, dict(metrics)))
+
+    def close(self, ending: Ending) -> None:
+        """Tell how the run ended; waits at most ``patience`` seconds for the dashboard."""
+        self._put(ending)
+        self._thread.join(0.0 if self.off else self.patience)
+        if self._thread.is_alive():
+            self._switch_off(f"it did not answer for {self.patience:g} s")
+
+    def _put(self, item: Row | Ending) -> None:
+        if self.off:
+            return
+        try:
+            self._queue.put_nowait(item)
+        except queue.Full:
+            self._switch_off(f"it is {BEHIND} rows behind")
+
+    def _work(self) -> None:
+        try:
+            self.dashboard.open()
+            self.dashboard.log(self._past)
+            while not self.off:
+                rows, ending = self._waiting()
+                self.dashboard.log(rows)
+                if ending:
+                    self.dashboard.close(ending)
+                    return
+        except BaseException as error:  # nothing that happens here is the training's business, SystemExit included
+            self._switch_off(" ".join(f"{type(error).__name__}: {error}".split())[:300])
+
+    def _waiting(self) -> tuple[list[Row], Ending | None]:
+        """All rows that have come up, at least one, or the ending."""
+        rows: list[Row] = []
+        while True:
+            try:
+                item = self._queue.get(block=not rows)
+            except queue.Empty:
+                return rows, None
+            if isinstance(item, Ending):
+                return rows, item
+            rows.append(item)
+
+    def _switch_off(self, why: str) -> None:
+        if self.off:
+            return
+        self.off = why
+        folder = self.dashboard.facts.folder
+        print(
+            f"{self.dashboard.label}: switched off for this run ({why}). The run goes on, and its log is whole in "
+            f"{folder / 'logs' / 'metrics.csv'}: `epo evaluate run={folder}` fills the dashboard when it is back",
+            file=sys.stderr,
+            flush=True,
+        )

@@ -1,0 +1,76 @@
+"""What a dashboard is told about a run, and what it has to be able to do."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+Row = tuple[int, Mapping[str, float]]
+"""An optimisation step and what was measured at it."""
+ARTIFACTS = ("config.yaml", "run.json", "checkpoints/best.ckpt")
+"""What can be given to a dashboard that keeps files."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Who a run is.
+
+    Args:
+        id: the same for all processes that work on the run, and nobody else's.
+        name: how people call it.
+        group: the label of the sweep that it belongs to.
+        config: the resolved configuration, as far as it describes the run and not the place where it lies.
+        tags: what a table needs behind a number: identity, data_digest, commit.
+        folder: the run folder.
+    """
+
+    id: str
+    name: str
+    group: str | None
+    config: Mapping[str, Any]
+    tags: Mapping[str, str]
+    folder: Path
+
+    def parameters(self) -> dict[str, Any]:
+        """The configuration with one dotted name per value."""
+        return dict(_flat(self.config))
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    found: list[tuple[str, Any]] = []
+    for key, value in values.items():
+        found += _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(f"{prefix}{key}", value)]
+    return found
+
+
+@dataclass(frozen=True)
+class Ending:
+    """What is left to say when a run ends: its scores, its pictures, and whether it failed."""
+
+    failed: bool = False
+    summary: Mapping[str, float] = field(default_factory=dict)
+    pictures: Sequence[Path] = ()
+
+
+class Dashboard(ABC):
+    """One dashboard of one run. Its methods may raise and may be slow: they are called aside from the training."""
+
+    label: ClassVar[str]
+
+    def __init__(self, facts: Facts) -> None:
+        self.facts = facts
+
+    @abstractmethod
+    def open(self) -> None:
+        """Begin the run, or go on where another process stopped."""
+
+    @abstractmethod
+    def log(self, rows: Sequence[Row]) -> None:
+        """Add rows; of a continued run, the first ones may be there already."""
+
+    @abstractmethod
+    def close(self, ending: Ending) -> None:
+        """Say how it ended and wait until everything has arrived."""

@@ -1,0 +1,118 @@
+"""MLflow: a database on this machine that ``mlflow server`` shows, or a server that is told of it by MLFLOW_TRACKING_URI."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import re
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+from epo_lightning.experiment.dashboards.base import ARTIFACTS, Dashboard, Ending, Facts, Row
+from epo_lightning.experiment.settings import MLflowSettings
+from epo_lightning.registry import ConfigError
+
+SQLITE = "sqlite:///"
+
+
+def check() -> None:
+    """Whether MLflow is there.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    if find_spec("mlflow") is None:
+        raise ConfigError("logger=[mlflow] needs MLflow: pip install 'epo_lightning[mlflow]', or leave it out")
+
+
+class MLflow(Dashboard):
+    """See the module. A run is found again by its tag ``run``; rows that are there are not written twice."""
+
+    label = "MLflow"
+
+    def __init__(self, facts: Facts, settings: MLflowSettings, runs: Path) -> None:
+        super().__init__(facts)
+        self._settings = settings
+        default = f"{SQLITE}{runs.expanduser().resolve() / 'mlflow.db'}"
+        self._uri = settings.uri or os.environ.get("MLFLOW_TRACKING_URI") or default
+        self._known: dict[str, tuple[int, float]] = {}  # last step and value of each metric
+        self._last = 0
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """SQLite has one writer at a time, and MLflow makes its tables without asking who else does."""
+        if not self._uri.startswith(SQLITE):
+            yield
+            return
+        from filelock import FileLock
+
+        path = Path(self._uri.removeprefix(SQLITE))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{path}.lock"):
+            yield
+
+    def open(self) -> None:
+        os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+        for chatty in ("mlflow", "alembic"):
+            logging.getLogger(chatty).setLevel(logging.WARNING)
+        from mlflow import MlflowClient
+
+        with self._alone():
+            self._client = MlflowClient(self._uri)
+            place = None if not self._uri.startswith(SQLITE) else self._artifacts()
+            name = self.facts.group or self._settings.experiment
+            experiment = self._client.get_experiment_by_name(name)
+            key = experiment.experiment_id if experiment else self._client.create_experiment(name, place)
+            found = self._client.search_runs([key], f"tags.run = '{self.facts.id}'", max_results=1)
+            if found:
+                self._run = found[0].info.run_id
+                self._client.update_run(self._run, status="RUNNING")
+                self._known = {name: self._latest(name) for name in found[0].data.metrics}
+            else:
+                tags = {"run": self.facts.id, "folder": str(self.facts.folder), **self.facts.tags}
+                self._run = self._client.create_run(key, tags=tags, run_name=self.facts.name).info.run_id
+                self._parameters()
+
+    def _artifacts(self) -> str:
+        """Beside the database; MLflow's own choice is the folder in which a process happens to run."""
+        return (Path(self._uri.removeprefix(SQLITE)).parent / "mlflow").as_uri()
+
+    def _latest(self, name: str) -> tuple[int, float]:
+        return max((point.step, point.value) for point in self._client.get_metric_history(self._run, name))
+
+    def _parameters(self) -> None:
+        from mlflow.entities import Param
+
+        values = [Param(key, str(value)[:500]) for key, value in self.facts.parameters().items()]
+        for first in range(0, len(values), 100):  # no more in one call
+            self._client.log_batch(self._run, params=values[first : first + 100])
+
+    def log(self, rows: Sequence[Row]) -> None:
+        self._last = max([self._last, *(step for step, _ in rows)])
+        self._write((step, name, value) for step, metrics in rows for name, value in metrics.items())
+
+    def _write(self, points: Iterable[tuple[int, str, float]]) -> None:
+        """Add the points that come after what is known of their metric."""
+        from mlflow.entities import Metric
+
+        now = int(time.time() * 1000)
+        named = [(step, re.sub(r"[^\w/. -]", "_", name), value) for step, name, value in points]
+        fresh = [Metric(name, v, now, step) for step, name, v in named if step > self._known.get(name, (-1, 0.0))[0]]
+        if fresh:
+            with self._alone():
+                for first in range(0, len(fresh), 1000):  # no more in one call
+                    self._client.log_batch(self._run, metrics=fresh[first : first + 1000])
+
+    def close(self, ending: Ending) -> None:
+        self._write((self._last, name, value) for name, value in ending.summary.items() if not math.isnan(value))
+        with self._alone():
+            for path in ending.pictures[: self._settings.pictures]:
+                self._client.log_artifact(self._run, str(path), "pictures")
+            if self._settings.artifacts and not ending.failed:
+                for name in ARTIFACTS:
+                    self._client.log_artifact(self._run, str(self.facts.folder / name))
+            self._client.set_terminated(self._run, "FAILED" if ending.failed else "FINISHED")

@@ -1,0 +1,183 @@
+"""A run's log: ``logs/metrics.csv`` in its folder, which is the truth, and the dashboards that are told the same.
+
+Only the CSV file may fail a run (a full disk, say). Dashboards are told aside (:mod:`.dashboards.aside`), and what one of
+them has missed can be told again from the folder (:func:`publish`).
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.utilities import rank_zero_only
+
+from epo_lightning.experiment.dashboards import mlflow
+from epo_lightning.experiment.dashboards.aside import Aside
+from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
+from epo_lightning.experiment.dashboards.mlflow import MLflow
+from epo_lightning.experiment.dashboards.tensorboard import TensorBoard
+from epo_lightning.experiment.dashboards.wandb import WandB
+from epo_lightning.experiment.settings import DashboardSettings, LoggerSettings, Settings, read
+from epo_lightning.identity import SECTIONS, identity
+from epo_lightning.run_folder import RunFolder, read_json
+
+
+class CSVLog(CSVLogger):
+    """``logs/metrics.csv``; a continued run keeps the rows up to the step it continues from."""
+
+    def __init__(self, run: RunFolder, flush: int, continued_from: int = 0) -> None:
+        kept = _read(run.logs / "metrics.csv", continued_from) if continued_from else []
+        (run.logs / "metrics.csv").unlink(missing_ok=True)
+        super().__init__(run.path, name=run.logs.name, version="")
+        self._flush = flush
+        if kept:
+            self.experiment.metrics = kept
+            self.save()
+
+    def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
+        super().log_metrics(dict(metrics), step)
+        if len(self.experiment.metrics) >= self._flush:
+            self.save()
+
+
+def _read(path: Path, until: float = float("inf")) -> list[dict[str, Any]]:
+    """The rows of a metrics.csv below step ``until``, as text and without empty entries."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = [{key: value for key, value in row.items() if key and value} for row in csv.DictReader(file)]
+    return [row for row in rows if str(row.get("step", "")).isdigit() and int(row["step"]) < until]
+
+
+def rows(run: RunFolder) -> list[Row]:
+    """Everything in the run's metrics.csv."""
+    return [
+        (int(row["step"]), {key: float(value) for key, value in row.items() if key != "step"})
+        for row in _read(run.logs / "metrics.csv")
+    ]
+
+
+def scores(run: RunFolder, monitor: str) -> dict[str, float]:
+    """A run in a few numbers: ``best/...``, the validation scores where ``monitor`` was smallest, and ``test/...``."""
+    validated = [metrics for _, metrics in rows(run) if monitor in metrics and metrics[monitor] == metrics[monitor]]
+    best = min(validated, key=lambda metrics: metrics[monitor], default={})
+    found = {f"best/{name[4:]}": value for name, value in best.items() if name.startswith("val/")}
+    if run.metrics_file().is_file():
+        found |= {f"test/{name}": float(value) for name, value in read_json(run.metrics_file())["metrics"].items()}
+    return found
+
+
+def check(settings: LoggerSettings) -> None:
+    """Whether the chosen dashboards are installed.
+
+    Raises:
+        ConfigError: what is missing.
+    """
+    if settings.mlflow is not None:
+        mlflow.check()
+
+
+@contextmanager
+def open_logs(settings: Settings, config: Mapping[str, Any], run: RunFolder, step: int = 0) -> Iterator[list[Logger]]:
+    """The loggers of a run, the CSV file first; closed at the end, as failed where an exception ended it.
+
+    Of several processes that train one run together, only the first has any.
+
+    Args:
+        config: the resolved configuration.
+        step: the optimisation step that a continued run starts from.
+    """
+    if getattr(rank_zero_only, "rank", 0):
+        yield []
+        return
+    run.logs.mkdir(parents=True, exist_ok=True)
+    file = CSVLog(run, settings.logger.csv.flush, step)
+    dashboards = _dashboards(settings, config, run)
+    failed = True
+    try:
+        yield [file, *dashboards]
+        file.save()
+        failed = False
+    finally:
+        if failed:
+            with suppress(OSError):  # what went wrong first is the better message
+                file.save()
+        _close(dashboards, settings, run, failed)
+
+
+def publish(run: RunFolder) -> None:
+    """Tell a run's dashboards again all that its folder holds: after an evaluation, or when a dashboard was away."""
+    config = run.config()
+    settings = read(Settings, config)
+    _close(_dashboards(settings, config, run), settings, run, failed=False)
+
+
+def _dashboards(settings: Settings, config: Mapping[str, Any], run: RunFolder) -> list[Aside]:
+    chosen = settings.logger
+    if chosen.tensorboard is None and chosen.wandb is None and chosen.mlflow is None:
+        return []
+    facts, past = _facts(settings, config, run), rows(run)
+    made: list[tuple[Dashboard, DashboardSettings]] = []
+    if chosen.tensorboard is not None:
+        made.append((TensorBoard(facts, chosen.tensorboard), chosen.tensorboard))
+    if chosen.wandb is not None:
+        made.append((WandB(facts, chosen.wandb), chosen.wandb))
+    if chosen.mlflow is not None:
+        made.append((MLflow(facts, chosen.mlflow, Path(settings.runs)), chosen.mlflow))
+    return [Aside(dashboard, section.patience, past) for dashboard, section in made]
+
+
+def _facts(settings: Settings, config: Mapping[str, Any], run: RunFolder) -> Facts:
+    record = run.record
+    key = record.get("identity") or identity(config, str(record.get("data_digest")))
+    # Together with the second in which it began: the same run begun again, say with corrected code, is another line.
+    began = "".join(filter(str.isdigit, str(record.get("began", ""))))
+    sweep = Path(settings.sweep).name if settings.sweep else None
+    return Facts(
+        id=f"{key}-{began}",
+        name=f"{settings.title} (seed {settings.seed})",
+        group=sweep,
+        config={name: config.get(name) for name in ("title", "experiment", "budget", *SECTIONS)},
+        tags={
+            "identity": key,
+            "data_digest": str(record.get("data_digest")),
+            "commit": str(record.get("git_commit")),
+        },
+        folder=run.path,
+    )
+
+
+def _close(dashboards: Sequence[Aside], settings: Settings, run: RunFolder, failed: bool) -> None:
+    if not dashboards:
+        return
+    chosen = (settings.logger.tensorboard, settings.logger.wandb, settings.logger.mlflow)
+    count = 0 if failed else max(section.pictures for section in chosen if section is not None)
+    pictures = _pictures(settings, run, count) if count else []
+    ending = Ending(failed, scores(run, settings.callbacks.monitor), pictures)
+    for dashboard in dashboards:
+        dashboard.close(ending)
+
+
+def _pictures(settings: Settings, run: RunFolder, count: int) -> list[Path]:
+    """Forecasts of the best checkpoint on the validation split, in ``logs/figures``; drawn once."""
+    from epo_lightning.experiment import assembly
+    from epo_lightning.experiment.evaluate import open_checkpoint
+    from epo_lightning.experiment.predict import choose, draw, forecast_of
+    from epo_lightning.experiment.settings import PredictSettings
+
+    if drawn := sorted((run.logs / "figures").glob("*.png")):
+        return drawn
+    try:
+        forecaster = open_checkpoint(settings, run.checkpoint("best"))
+        data = assembly.build_data(settings.data)
+        scenes, _ = choose(data, "val", max(64, count))
+        request = PredictSettings(run=str(run.path), out=str(run.logs), split="val", figures=count)
+        return [path for path, _ in draw(request, settings.title, forecaster, scenes, forecast_of(forecaster, scenes))]
+    except Exception as error:  # pictures are for people to look at: no run fails for them
+        print(f"{run.path}: no pictures ({type(error).__name__}: {error})", file=sys.stderr)
+        return []
