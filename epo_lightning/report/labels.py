@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +12,9 @@ from epo_lightning.identity import differences, essence
 
 MOST, LONGEST = 4, 24
 """How many settings a label names, and how long the text of one value may be, before it becomes unreadable."""
+
+PLAIN, OTHER = re.compile(r"[\w./-]+"), re.compile(r"[-\d._e]+|true|false|null|nan|inf", re.IGNORECASE)
+"""Text that needs no quotes, and text that would be read as something else without them."""
 
 
 def varying(configs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -52,19 +57,22 @@ def labels(
 
 
 def word(key: str, value: Any) -> str:
-    """A setting as an override on a command line."""
-    return f"{key}={value_text(value)}"
+    """A setting as an override on a command line, quoted where a shell would need it."""
+    return shlex.quote(f"{key}={value_text(value)}")
 
 
 def value_text(value: Any) -> str:
     """A value in the notation of overrides, which is nearly that of JSON."""
-    if isinstance(value, str) and value and all(letter.isalnum() or letter in "_-./" for letter in value):
-        return value
+    if isinstance(value, str):
+        bare = PLAIN.fullmatch(value) and not OTHER.fullmatch(value)
+        # Between quotes only those backslashes are special that stand before a quote.
+        escaped = re.sub(r'(\\*)("|\Z)', lambda found: 2 * found[1] + found[2].replace('"', r"\""), value)
+        return value if bare else f'"{escaped}"'
     if isinstance(value, list):
         return "[" + ",".join(map(value_text, value)) + "]"
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{value_text(entry)}" for key, entry in value.items()) + "}"
-    return json.dumps(value)
+    return repr(value) if isinstance(value, float) else json.dumps(value)
 
 
 def natural(settings: Mapping[str, Any]) -> tuple[tuple[int, float, str], ...]:

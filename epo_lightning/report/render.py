@@ -18,7 +18,7 @@ from rich.text import Text
 
 from epo_lightning.report.selection import BestSetting
 from epo_lightning.report.statistics import Comparisons
-from epo_lightning.report.tables import Cell, Column, Row, Table
+from epo_lightning.report.tables import Cell, Column, Row, Table, distinct
 
 LEGEND = (
     "Displacements in m, minimum over the modes; overlap rates (OR) of the most likely joint mode; lower is better. "
@@ -206,13 +206,8 @@ def _markdown_cell(row: Row, column: Column) -> str:
 def to_csv(tables: Iterable[Table]) -> str:
     """All scores of all rows in full precision, one per line, shown in a table or not."""
     lines: list[tuple[object, ...]] = []
-    written: set[tuple[str, ...]] = set()
-    for row in (row for table in tables for row in table.rows):
+    for row in distinct(tables):
         run = row.runs[0]
-        key = (run.data, run.split, row.identity)
-        if key in written:  # every table of a data set shows the same rows
-            continue
-        written.add(key)
         seeds = " ".join(map(str, row.seeds))
         same = (run.data, run.split, row.name, run.backbone, run.forecaster, run.goal, run.budget, seeds)
         behind = (row.identity, row.data_digest, " ".join(row.commits), "; ".join(row.commands))

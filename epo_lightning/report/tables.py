@@ -175,6 +175,15 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
     return tables
 
 
+def distinct(tables: Iterable[Table]) -> list[Row]:
+    """The rows of all tables, each once: the tables of one data set and split show the same rows."""
+    rows: dict[tuple[str, str, str], Row] = {}
+    for table in tables:
+        for row in table.rows:
+            rows.setdefault((table.data, table.split, row.identity), row)
+    return list(rows.values())
+
+
 def _shown(title: str, columns: tuple[Column, ...], rows: Sequence[Row]) -> list[Table]:
     """The table of those rows that have all of the columns, if there are any."""
     having = tuple(row for row in rows if all(column.metric in row.cells for column in columns))

@@ -1,0 +1,84 @@
+"""Rows of the same title are told apart by what differs, in words that an override would use."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given
+from hypothesis import strategies as st
+
+from epo_lightning.report.labels import labels, natural, short_keys, varying, word
+
+texts = st.text(st.characters(codec="ascii", min_codepoint=32, exclude_characters="\x7f"), min_size=1)
+plain = st.none() | st.booleans() | st.integers(-1000, 10**6) | st.floats(allow_nan=False) | texts
+CONFIG: dict[str, Any] = {
+    "backbone": {"name": "v_lstm", "width": 128},
+    "solver": {"name": "lm", "steps": 2},
+    "data": {"windows": {"history": 10}},
+    "seed": 1,
+}
+
+
+def changed(section: str, **values: Any) -> dict[str, Any]:
+    return {**CONFIG, section: {**CONFIG[section], **values}}
+
+
+@given(plain | st.lists(plain, max_size=3))
+def test_words_are_read_as_the_value_that_they_stand_for(value: Any) -> None:
+    (argument,) = shlex.split(word("optimizer.lr", value))
+    override = OverridesParser.create().parse_override(argument)
+    assert override.key_or_group == "optimizer.lr"
+
+    def bare(read: Any) -> Any:
+        return [bare(entry) for entry in read] if isinstance(read, list) else getattr(read, "text", read)
+
+    read = bare(override.value())
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_what_varies_by_hand() -> None:
+    four, wide = changed("solver", steps=4), changed("backbone", width=64)
+    assert varying([CONFIG, four, wide]) == [
+        {"backbone.width": 128, "solver.steps": 2},
+        {"backbone.width": 128, "solver.steps": 4},
+        {"backbone.width": 64, "solver.steps": 2},
+    ]
+    assert varying([CONFIG]) == [{}]
+    assert varying([CONFIG, {**CONFIG, "seed": 2, "title": "x"}]) == [{}, {}]
+
+
+def test_keys_are_as_short_as_they_can_be() -> None:
+    keys = ["solver.steps", "solver.name", "data.windows.history"]
+    assert short_keys(keys, CONFIG) == {
+        "solver.steps": "steps",
+        "solver.name": "solver.name",
+        "data.windows.history": "history",
+    }
+
+
+def test_labels_by_hand() -> None:
+    settings = [{"solver.steps": steps, "solver.name": name} for steps, name in ((2, "lm"), (4, "x" * 40))]
+    assert labels("V", settings, CONFIG, ["aaaa", "bbbb"]) == [
+        "V, steps=2, solver.name=lm",
+        f"V, steps=4, solver.name={'x' * 23}…",
+    ]
+    assert labels("V", [{}], CONFIG, ["aaaa"]) == ["V"]
+
+
+def test_rows_that_settings_do_not_name_are_named_by_their_identity() -> None:
+    rows = ["0123456789abcdef", "fedcba9876543210"]
+    many = [{f"solver.k{number}": number + row for number in range(5)} for row in range(2)]
+    assert labels("V", many, CONFIG, rows) == ["V, row 01234567", "V, row fedcba98"]
+    long = [{"solver.name": "x" * 50 + end} for end in "ab"]
+    first, second = labels("V", long, CONFIG, rows)
+    assert first != second
+
+
+@pytest.mark.parametrize("values", [[2, 4, 12], [7, "a", "b", None], [0.0005, 0.01, 1]])
+def test_numbers_sort_as_numbers(values: list[Any]) -> None:
+    settings = [{"solver.steps": value} for value in values]
+    assert sorted([*settings[1:], settings[0]], key=natural) == settings

@@ -1,0 +1,110 @@
+"""The best setting of a search: by validation scores, over all seeds, with the words that train with it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.render import settings_sheet, to_markdown
+from epo_lightning.report.runs import collect
+from epo_lightning.report.selection import BestSetting, best_settings
+
+from .run_folders import make_run, scores
+
+
+def search(
+    folder: Path, values: dict[tuple[float, int], list[float]], title: str = "V-LSTM", split: str = "val"
+) -> None:
+    """Runs of learning rate x width, a score per seed."""
+    experiment = f"rpi/{title.lower().replace('-', '_').replace(' + ', '_')}"
+    forecaster = "scene_consistent" if "SC" in title else "marginal"
+    for (lr, width), of_seeds in values.items():
+        for seed, value in enumerate(of_seeds):
+            make_run(
+                folder / f"{title}-{lr}-{width}-{seed}",
+                title,
+                forecaster,
+                scores(value),
+                seed=seed,
+                split=split,
+                experiment=experiment,
+                settings={"optimizer.lr": lr, "backbone.width": width},
+            )
+
+
+def best(folder: Path) -> list[BestSetting]:
+    return best_settings(collect(folder))
+
+
+def test_the_lowest_mean_over_seeds_wins_by_hand(tmp_path: Path) -> None:
+    # Means 0.25, 0.20, 0.21: the best single seed (0.10) is not that of the best mean.
+    search(tmp_path, {(0.001, 64): [0.10, 0.40], (0.0005, 64): [0.19, 0.21], (0.0005, 128): [0.20, 0.22]})
+    search(tmp_path, {(0.001, 64): [0.5, 0.5], (0.001, 128): [0.3, 0.3]}, title="V-LSTM + SC")
+    plain, sc = best(tmp_path)
+    assert plain.words == "experiment=rpi/v_lstm backbone.width=64 optimizer.lr=0.0005"
+    assert plain.settings == {"backbone.width": 64, "optimizer.lr": 0.0005}
+    assert plain.row.cells["minSADE"].mean == pytest.approx(0.20)
+    assert (plain.row.cells["minSADE"].n, plain.candidates, plain.left_out) == (2, 3, ())
+    assert sc.words == "experiment=rpi/v_lstm_sc backbone.width=128"
+    table = to_markdown(settings_sheet([plain, sc]))
+    assert f"| V-LSTM | {plain.words} | 0.200 ± 0.014 | 2 | 3 |" in table
+
+
+def test_the_test_split_never_chooses(tmp_path: Path) -> None:
+    search(tmp_path, {(0.001, 64): [0.1], (0.0005, 64): [0.2]}, split="test")
+    with pytest.raises(ConfigError, match="chosen on the validation split, not on split=test"):
+        best_settings(collect(tmp_path), split="test")
+    with pytest.raises(ConfigError, match=r"no run was scored on the validation split.*split=val"):
+        best(tmp_path)
+
+
+def test_test_scores_beside_are_not_looked_at(tmp_path: Path) -> None:
+    search(tmp_path, {(0.001, 64): [0.1], (0.0005, 64): [0.9]}, split="test")
+    search(tmp_path, {(0.001, 64): [0.4], (0.0005, 64): [0.3]})
+    (found,) = best(tmp_path)
+    assert found.settings == {"optimizer.lr": 0.0005}
+
+
+def test_a_lucky_seed_and_a_failed_training_do_not_win(tmp_path: Path) -> None:
+    search(tmp_path, {(0.001, 64): [0.3, 0.3], (0.01, 64): [0.1], (0.1, 64): [math.nan, 0.1]})
+    (found,) = best(tmp_path)
+    assert found.words == "experiment=rpi/v_lstm optimizer.lr=0.001"
+    assert (found.candidates, found.left_out) == (1, ("V-LSTM, lr=0.01", "V-LSTM, lr=0.1"))
+
+
+def test_an_unfinished_search_chooses_nothing(tmp_path: Path) -> None:
+    search(tmp_path, {(0.1, 64): [0.3], (0.01, 64): [math.nan]})
+    make_run(
+        tmp_path / "late", "V-LSTM", "marginal", scores(1), seed=7, split="val", experiment="rpi/v_lstm",
+        settings={"optimizer.lr": 1.0, "backbone.width": 64},
+    )  # fmt: skip
+    with pytest.raises(ConfigError, match=r"no setting of 'V-LSTM' has finite scores for all seeds \[0, 7\]"):
+        best(tmp_path)
+
+
+def test_a_metric_that_was_not_scored_is_named(tmp_path: Path) -> None:
+    search(tmp_path, {(0.1, 64): [0.3], (0.01, 64): [0.2]})
+    with pytest.raises(ConfigError, match=r"was not scored by minXYZ.*minADE"):
+        best_settings(collect(tmp_path), metric="minXYZ")
+
+
+def test_settings_of_other_budgets_are_not_compared(tmp_path: Path) -> None:
+    search(tmp_path, {(0.1, 64): [0.3]})
+    make_run(tmp_path / "long", "V-LSTM", "marginal", scores(0.1), split="val", budget="long", experiment="rpi/v_lstm")
+    with pytest.raises(ConfigError, match=r"differ in budget \(long: V-LSTM; reduced: V-LSTM\)"):
+        best(tmp_path)
+
+
+def test_experiments_without_a_choice_are_left_out(tmp_path: Path) -> None:
+    search(tmp_path, {(0.1, 64): [0.3, 0.2]})
+    assert best(tmp_path) == []
+
+
+def test_words_without_an_experiment_name_the_parts(tmp_path: Path) -> None:
+    for number, steps in enumerate((2, 4)):
+        make_run(tmp_path / str(steps), "own", "epo", scores(number), split="val", settings={"solver.steps": steps})
+    (found,) = best(tmp_path)
+    assert found.words == "data=rpi backbone=v_lstm forecaster=epo solver.steps=2"
