@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
@@ -17,34 +19,55 @@ class Backbone(nn.Module):
     width: int
 
 
+@dataclass(eq=False, repr=False)
 class PolylineBackbone(Backbone):
     """Histories and lanes as polyline features of one width; how they interact is left to the subclass.
 
-    Args:
-        history: encoder of the agents' histories.
-        lanes: encoder of the lanes; None where the data has no map.
-        width: size of all features.
+    The fields are what each of the paper's backbones is configured with; a subclass may add some of its own.
+
+    Attributes:
+        history_width: size of the history encoder's features.
+        history_depth: number of its layers.
+        width: size of the features z that leave the global interaction graph.
+        lane_width, lane_depth: size and number of the lane encoder's layers.
+        dropout: share of the histories' features, and of what attention gathers, that is left out in training.
+        scale: metres that an input of one stands for.
         goal_input: whether a given goal is also an input of the network (``goal=all``), not of the energy alone.
+        map_input: whether the data has a map.
     """
 
-    def __init__(
-        self, history: LSTMHistory | TransformerHistory, lanes: LanePolylines | None, width: int, goal_input: bool
-    ) -> None:
+    history_width: int = 64
+    history_depth: int = 3
+    width: int = 128
+    lane_width: int = 64
+    lane_depth: int = 3
+    dropout: float = 0.0
+    scale: float = 1.0
+    goal_input: bool = False
+    map_input: bool = False
+
+    def __post_init__(self) -> None:
         super().__init__()
-        if not history.scale > 0:
-            raise ValueError(f"scale must be positive, not {history.scale}: the metres that an input of one stands for")
-        self.width = width
+        if not self.scale > 0:
+            raise ValueError(f"scale must be positive, not {self.scale}: the metres that an input of one stands for")
+        history = self.history_encoder()
+        lanes = LanePolylines(self.lane_width, self.lane_depth, self.scale) if self.map_input else None
         self.history = history
-        self.to_graph = nn.Linear(history.width, width)
-        self.goal_to_graph = nn.Linear(2, width) if goal_input else None
+        self.to_graph = nn.Linear(history.width, self.width)
+        self.goal_to_graph = nn.Linear(2, self.width) if self.goal_input else None
         self.lanes = lanes
-        self.lane_to_graph = None if lanes is None else nn.Linear(lanes.width, width)
+        self.lane_to_graph = None if lanes is None else nn.Linear(lanes.width, self.width)
+        self.left_out = nn.Dropout(self.dropout)
+
+    def history_encoder(self) -> LSTMHistory | TransformerHistory:
+        """What reads the agents' histories: an LSTM, unless a subclass says otherwise."""
+        return LSTMHistory(self.history_width, self.history_depth, self.scale)
 
     def agent_features(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
         """What each agent did, and its goal where that is given to the network."""
-        features = self.to_graph(self.history(scene))
+        features = self.to_graph(self.left_out(self.history(scene)))
         if self.goal_to_graph is not None:
-            features = features + self.goal_to_graph(given_goals(scene) / self.history.scale)
+            features = features + self.goal_to_graph(given_goals(scene) / self.scale)
         return features
 
     def lane_features(self, scene: Scene) -> tuple[Float[Tensor, "B L {self.width}"], Bool[Tensor, "B L"]]:

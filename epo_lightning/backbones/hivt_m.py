@@ -2,51 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.backbones.base import PolylineBackbone
 from epo_lightning.encoders.history import TransformerHistory
 from epo_lightning.encoders.interaction import TwoStageAttention
-from epo_lightning.encoders.polyline import LanePolylines
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 
 
 @register("backbone", "hivt_m")
+@dataclass(eq=False, repr=False)
 class HiVTM(PolylineBackbone):
     """Hierarchical Vector Transformer, modified: each agent alone through a transformer, then VIBES's two stages.
 
     In HiVT itself the transformer already sees lanes and other agents; the paper moves both to the global graph (Appendix
     C.1, "Agent History Encoder").
 
-    Args:
-        history_width: size of the transformer's tokens.
-        history_depth: number of transformer layers.
-        history_heads: heads of their attention.
-        width: size of the features z that leave the global interaction graph.
-        lane_width, lane_depth: size and number of the lane encoder's layers.
-        scale: metres that an input of one stands for.
-        goal_input: whether a given goal is also an input of the network (``goal=all``), not of the energy alone.
-        map_input: whether the data has a map.
+    Attributes:
+        history_heads: heads of the transformer's attention.
     """
 
-    def __init__(
-        self,
-        history_width: int = 64,
-        history_depth: int = 3,
-        history_heads: int = 4,
-        width: int = 128,
-        lane_width: int = 64,
-        lane_depth: int = 3,
-        scale: float = 1.0,
-        goal_input: bool = False,
-        map_input: bool = False,
-    ) -> None:
-        history = TransformerHistory(history_width, history_depth, history_heads, scale)
-        lanes = LanePolylines(lane_width, lane_depth, scale) if map_input else None
-        super().__init__(history, lanes, width, goal_input)
-        self.interaction = TwoStageAttention(width, map_input)
+    history_heads: int = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.interaction = TwoStageAttention(self.width, self.map_input, self.dropout)
+
+    def history_encoder(self) -> TransformerHistory:
+        return TransformerHistory(self.history_width, self.history_depth, self.history_heads, self.scale)
 
     def forward(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
         """Features z_i of all agents."""

@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.backbones.base import PolylineBackbone
-from epo_lightning.encoders.history import LSTMHistory
 from epo_lightning.encoders.interaction import Attention
-from epo_lightning.encoders.polyline import LanePolylines
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 
 
 @register("backbone", "v_lstm")
+@dataclass(eq=False, repr=False)
 class VLSTM(PolylineBackbone):
-    """Vector-LSTM: each history through an LSTM, then one layer of attention (Appendix C.1, "Global Interaction").
+    """Vector-LSTM: each history through an LSTM, then one layer of attention (Appendix C.1, "Global Interaction")."""
 
-    Args:
-        history_width: size of the LSTM's hidden state.
-        history_depth: number of stacked LSTM layers.
-        width: size of the features z that leave the global interaction graph.
-        lane_width, lane_depth: size and number of the lane encoder's layers.
-        scale: metres that an input of one stands for.
-        goal_input: whether a given goal is also an input of the network (``goal=all``), not of the energy alone.
-        map_input: whether the data has a map.
-    """
-
-    def __init__(
-        self,
-        history_width: int = 64,
-        history_depth: int = 3,
-        width: int = 128,
-        lane_width: int = 64,
-        lane_depth: int = 3,
-        scale: float = 1.0,
-        goal_input: bool = False,
-        map_input: bool = False,
-    ) -> None:
-        history = LSTMHistory(history_width, history_depth, scale)
-        lanes = LanePolylines(lane_width, lane_depth, scale) if map_input else None
-        super().__init__(history, lanes, width, goal_input)
-        self.interaction = Attention(width)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.interaction = Attention(self.width, self.dropout)
 
     def forward(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
         """Features z_i of all agents."""

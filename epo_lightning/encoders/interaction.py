@@ -14,13 +14,15 @@ class Attention(nn.Module):
 
     Args:
         width: size of the features, in and out.
+        dropout: share of what is gathered that is left out in training.
     """
 
-    def __init__(self, width: int = 128) -> None:
+    def __init__(self, width: int = 128, dropout: float = 0.0) -> None:
         super().__init__()
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(width, width)
         self.value = nn.Linear(width, width)
+        self.left_out = nn.Dropout(dropout)
         self.scale = 1.0 / math.sqrt(width)
 
     def forward(
@@ -30,7 +32,7 @@ class Attention(nn.Module):
         scores = self.query(features) @ self.key(sources).mT * self.scale
         # A large negative number instead of -inf keeps a scene without any source finite.
         gathered = scores.masked_fill(~mask[:, None, :], -1e9).softmax(-1) @ self.value(sources)
-        return features + torch.where(mask.any(-1)[:, None, None], gathered, 0.0)
+        return features + torch.where(mask.any(-1)[:, None, None], self.left_out(gathered), 0.0)
 
 
 class TwoStageAttention(nn.Module):
@@ -39,12 +41,13 @@ class TwoStageAttention(nn.Module):
     Args:
         width: size of the features, in and out.
         map_input: whether there are lanes to look at; without them the second stage is all there is.
+        dropout: of both stages.
     """
 
-    def __init__(self, width: int = 128, map_input: bool = True) -> None:
+    def __init__(self, width: int = 128, map_input: bool = True, dropout: float = 0.0) -> None:
         super().__init__()
-        self.to_lanes = Attention(width) if map_input else None
-        self.to_agents = Attention(width)
+        self.to_lanes = Attention(width, dropout) if map_input else None
+        self.to_agents = Attention(width, dropout)
 
     def forward(
         self,

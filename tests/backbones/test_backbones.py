@@ -69,6 +69,7 @@ def test_a_larger_unit_and_a_larger_world_look_the_same(name):
     ("changes", "message"),
     [
         ({"scale": 0.0}, "scale must be positive"),
+        ({"dropout": 1.5}, "dropout probability has to be between 0 and 1"),
         ({"lane_depth": 0}, "one layer or more"),
         ({"name": "hivt_m", "history_heads": 5}, "not a multiple of twice the 5 heads"),
         ({"name": "hivt_m", "history_depth": 0}, "one layer or more"),
@@ -77,3 +78,24 @@ def test_a_larger_unit_and_a_larger_world_look_the_same(name):
 def test_sizes_that_cannot_work_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         build("backbone", {"name": "v_lstm", **changes}, map_input=True)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_dropout_leaves_out_features_in_training_only(name):
+    scene = random_scene(2, 3, lanes=4)
+    plain, leaky = (build("backbone", {"name": name, "dropout": share}, map_input=True) for share in (0.0, 0.5))
+    leaky.load_state_dict(plain.state_dict())
+    assert torch.equal(leaky.eval()(scene), plain.eval()(scene))
+    leaky.train()
+    assert not torch.equal(leaky(scene), leaky(scene))
+    gates = [module for module in leaky.modules() if isinstance(module, torch.nn.Dropout)]
+    assert {gate.p for gate in gates} == {0.5}
+    assert len(gates) == (2 if name == "v_lstm" else 3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_without_dropout_training_draws_no_random_number(name):
+    backbone, scene = build("backbone", {"name": name}, map_input=True).train(), random_scene(2, 3, lanes=4)
+    before = torch.get_rng_state()
+    assert torch.equal(backbone(scene), backbone(scene))
+    assert torch.equal(torch.get_rng_state(), before)
