@@ -268,16 +268,16 @@ def require_same(runs: Iterable[EvaluatedRun], what: str, value: Callable[[Evalu
     Raises:
         ConfigError: the runs differ; the message names their rows and values.
     """
-    rows: dict[str, list[str]] = {}
+    having: dict[str, list[EvaluatedRun]] = {}
     for run in runs:
-        names = rows.setdefault(value(run), [])
-        if run.name not in names:
-            names.append(run.name)
-    if len(rows) > 1:
-        found = "; ".join(f"{entry}: {', '.join(names)}" for entry, names in sorted(rows.items()))
+        having.setdefault(value(run), []).append(run)
+    if len(having) > 1:
+        rows = {entry: ", ".join(dict.fromkeys(run.name for run in same)) for entry, same in sorted(having.items())}
+        found = "; ".join(f"{entry}: {names}" for entry, names in rows.items())
+        paths = ", ".join(str(same[0].path) for _, same in sorted(having.items()))
         raise ConfigError(
             f"rows of one table differ in {what} ({found}): report on a folder whose runs share it, "
-            "or run the missing ones"
+            f"or run the missing ones; such runs are {paths}"
         )
 
 

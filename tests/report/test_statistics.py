@@ -17,7 +17,7 @@ from epo_lightning.report.tables import build_tables
 
 from .run_folders import make_run, scores
 
-numbers = st.floats(0, 100, allow_nan=False)
+numbers = st.integers(0, 10**8).map(lambda number: number / 1e6)  # SciPy's variance of tiny numbers is zero
 
 
 def test_three_pairs_by_hand() -> None:

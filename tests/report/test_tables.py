@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
+import re
+import shutil
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
+from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.runs import collect
-from epo_lightning.report.tables import Cell, Row, build_tables
+from epo_lightning.report.runs import collect, find_runs, not_evaluated
+from epo_lightning.report.tables import Cell, Row, build_tables, distinct
+from epo_lightning.run_folder import RunFolder, write_json
 
 from .run_folders import make_run, scores
 
@@ -99,12 +107,41 @@ def test_splits_are_tables_apart(tmp_path: Path) -> None:
         ({"digest": "xyz"}, r"data_digest \(evaluated on\) \(abc: V-LSTM; xyz: V-LSTM \+ EPO\)"),
         ({"trained_digest": "xyz"}, r"data_digest \(trained on\) \(abc: V-LSTM; xyz: V-LSTM \+ EPO\)"),
         ({"budget": "paper"}, r"budget \(paper: V-LSTM \+ EPO; reduced: V-LSTM\)"),
+        ({"settings": {"data.batch_size": 64}}, r"data\.batch_size \(32: V-LSTM; 64: V-LSTM \+ EPO\)"),
+        ({"settings": {"trainer.max_epochs": 20}}, r"trainer\.max_epochs \(10: V-LSTM; 20: V-LSTM \+ EPO\)"),
+        ({"settings": {"trainer.max_steps": 9}}, r"trainer\.max_steps \(9: V-LSTM \+ EPO; null: V-LSTM\)"),
+        ({"settings": {"trainer.precision": "bf16"}}, r"trainer\.precision \(32-true: V-LSTM; bf16: V-LSTM \+ EPO\)"),
+        ({"settings": {"callbacks.patience": 5}}, r"callbacks\.patience \(5: V-LSTM \+ EPO; null: V-LSTM\)"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(tmp_path: Path, differing: dict[str, str], message: str) -> None:
+def test_what_cannot_be_compared_is_refused(tmp_path: Path, differing: dict[str, Any], message: str) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3))
     make_run(tmp_path / "b", "V-LSTM + EPO", "epo", scores(0.1), **differing)
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(ConfigError, match=message) as refused:
+        build_tables(collect(tmp_path))
+    assert str(tmp_path / "a") in str(refused.value)
+    assert str(tmp_path / "b") in str(refused.value)
+
+
+def test_what_tables_compare_may_differ(tmp_path: Path) -> None:
+    make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3), settings={"optimizer.lr": 0.01})
+    differing = {"solver.steps": 8, "backbone.width": 64, "trainer.threads": 4, "data.root": "/elsewhere"}
+    run = make_run(tmp_path / "b", "VIBES + EPO", "epo", scores(0.1), backbone="vibes", goal="all", settings=differing)
+    run.update(git_commit="fedcba9876543210")
+    for seed in (1, 2):
+        make_run(tmp_path / f"a{seed}", "V-LSTM", "marginal", scores(0.3), seed=seed, settings={"optimizer.lr": 0.01})
+    rows = rows_of(tmp_path)
+    assert {name: (row.cells["minADE"].n, row.commits) for name, row in rows.items()} == {
+        "V-LSTM": (3, ["0123456789abcdef"]),
+        "VIBES + EPO": (1, ["fedcba9876543210"]),
+    }
+
+
+def test_scores_of_different_checkpoints_are_not_compared(tmp_path: Path) -> None:
+    make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3))
+    last = make_run(tmp_path / "b", "V-LSTM + EPO", "epo", None)
+    write_json(last.metrics_file(), {"data_digest": "abc", "checkpoint": "last", "metrics": scores(0.1)})
+    with pytest.raises(ConfigError, match=r"checkpoint \(best: V-LSTM; last: V-LSTM \+ EPO\)"):
         build_tables(collect(tmp_path))
 
 
@@ -117,11 +154,113 @@ def test_constant_velocity_has_no_budget_but_the_same_test_data(tmp_path: Path) 
         rows_of(tmp_path)
 
 
-def test_a_seed_counts_once(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        make_run(tmp_path / name, "V-LSTM", "marginal", scores(0.3), seed=4)
-    with pytest.raises(ConfigError, match=r"'V-LSTM' has seed 4 twice, .*a and .*b"):
+def test_a_run_counts_once(tmp_path: Path) -> None:
+    make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3), seed=4)
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    with pytest.raises(ConfigError, match=r"'V-LSTM' has seed 4 twice, .*a and .*b are the same run"):
         build_tables(collect(tmp_path))
+
+
+def test_rows_of_one_title_are_told_apart_by_what_differs(tmp_path: Path) -> None:
+    for steps in (1, 12, 2):
+        for seed in (0, 1):
+            options: dict[str, Any] = {"seed": seed, "settings": {"solver.steps": steps}}
+            make_run(tmp_path / f"{steps}-{seed}", "V-LSTM + EPO", "epo", scores(1 / steps), **options)
+    make_run(tmp_path / "sc", "V-LSTM + SC", "scene_consistent", scores(0.3), settings={"optimizer.lr": 0.1})
+    rows = rows_of(tmp_path)
+    epo = [f"V-LSTM + EPO, steps={steps}" for steps in (1, 2, 12)]
+    assert list(rows) == ["V-LSTM + SC", *epo]
+    assert [rows[name].settings for name in epo] == [{"solver.steps": steps} for steps in (1, 2, 12)]
+    assert {rows[name].title for name in epo} == {"V-LSTM + EPO"}
+    assert [rows[name].cells["minADE"].n for name in epo] == [2, 2, 2]
+    # Table 1 is of two steps.
+    assert [rows[name].cells["minSADE"].paper for name in epo] == [None, 0.03, None]
+
+
+def test_the_same_runs_under_two_titles_are_one_row(tmp_path: Path) -> None:
+    make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3))
+    make_run(tmp_path / "b", "V-LSTM", "marginal", scores(0.3), seed=1)
+    config = (tmp_path / "b" / "config.yaml").read_text().replace("title: V-LSTM", "title: Other")
+    (tmp_path / "b" / "config.yaml").write_text(config)
+    (row,) = rows_of(tmp_path).values()
+    assert row.seeds == [0, 1]
+
+
+def test_the_figure_over_steps_has_the_papers_validation_values(tmp_path: Path) -> None:
+    initial = {"initial/minSADE": 0.06, "initial/minSFDE": 0.1}
+    for steps in (4, 5):
+        folder = tmp_path / str(steps)
+        make_run(folder, "V-LSTM + EPO", "epo", scores(0.04) | initial, split="val", settings={"solver.steps": steps})
+    rows = rows_of(tmp_path)
+    four, five = rows["V-LSTM + EPO, steps=4"].cells, rows["V-LSTM + EPO, steps=5"].cells
+    assert (four["minSADE"].paper, four["initial/minSADE"].paper, four["minADE"].paper) == (0.038, 0.065, None)
+    assert four["minSADE"].difference == pytest.approx(0.04 - 0.038)
+    assert (five["minSADE"].paper, five["minSADE"].difference) == (None, None)
+
+
+def test_runs_of_one_row_have_the_same_scores(tmp_path: Path) -> None:
+    make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3) | {"minXYZ": 1.0})
+    make_run(tmp_path / "b", "V-LSTM", "marginal", scores(0.3), seed=1)
+    with pytest.raises(ConfigError, match=r"a was scored by minXYZ and .*b was not: epo evaluate run=.*b split=test"):
+        build_tables(collect(tmp_path))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.floats(0, 1e3), min_size=1, max_size=5))
+def test_means_and_deviations_as_numpy(tmp_path: Path, values: list[float]) -> None:
+    folder = tmp_path / "runs"
+    shutil.rmtree(folder, ignore_errors=True)
+    for seed, value in enumerate(values):
+        make_run(folder / str(seed), "V-LSTM", "marginal", scores(value), seed=seed)
+    cell = rows_of(folder)["V-LSTM"].cells["minSADE"]
+    assert cell.n == len(values)
+    assert cell.mean == pytest.approx(np.mean(values))
+    assert cell.difference == pytest.approx(np.mean(values) - 0.13)
+    if len(values) == 1:
+        assert cell.deviation is None
+    else:
+        assert cell.deviation == pytest.approx(np.std(values, ddof=1), abs=1e-9)
+
+
+def test_every_number_has_its_command_commit_data_and_identity(tmp_path: Path) -> None:
+    run = make_run(tmp_path, "V-LSTM", "marginal", scores(0.3), seed=3, experiment="rpi/v_lstm", trained_digest="t")
+    (found,) = collect(tmp_path)
+    assert (found.command, found.git_commit) == ("epo train experiment=rpi/v_lstm seed=3", "0123456789abcdef")
+    assert (found.data_digest, found.trained_digest) == ("abc", "t")
+    assert found.config == run.config()
+    assert (found.identity, found.row) == (identity(run.config(), "t"), row_identity(run.config(), "t"))
+    run.update(git_commit=None, versions={"epo_lightning": "0.1.0"}, identity="forged", row="forged")
+    (found,) = collect(tmp_path)
+    assert found.git_commit == "version 0.1.0"
+    assert found.row == row_identity(run.config(), "t")
+
+
+def test_a_run_stands_in_the_table_of_each_split_that_it_was_scored_on(tmp_path: Path) -> None:
+    make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3))
+    make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.2), split="val")
+    make_run(tmp_path / "b", "V-LSTM + SC", "scene_consistent", scores(0.1), split="val")
+    tables = build_tables(collect(tmp_path))
+    assert [(table.split, [row.cells["minADE"].mean for row in table.rows]) for table in tables] == [
+        ("test", [0.3]),
+        ("val", [0.2, 0.1]),
+    ]
+    assert len(distinct([*tables, *tables])) == 3
+
+
+def test_a_report_may_be_on_chosen_runs(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / name, name, "epo", scores(0.1)) for name in ("a", "b", "c")]
+    waiting = RunFolder(tmp_path / "waiting")
+    begun = make_run(tmp_path / "begun", "begun", "epo", None)
+    chosen = [runs[2], waiting, begun, runs[0]]
+    assert [run.name for run in collect(chosen)] == ["c", "a"]
+    assert not_evaluated(chosen) == [waiting.path, begun.path]
+    assert [run.path.name for run in find_runs(tmp_path)] == ["a", "b", "begun", "c"]
+    with pytest.raises(ConfigError, match=r"no run of this report: .*epo train"):
+        collect([])
+    with pytest.raises(
+        ConfigError, match=rf"none of the 2 runs of this report is evaluated: epo evaluate run={begun.path}"
+    ):
+        collect([waiting, begun])
 
 
 def test_collect_says_what_is_missing_and_what_to_run(tmp_path: Path) -> None:
@@ -136,18 +275,43 @@ def test_collect_says_what_is_missing_and_what_to_run(tmp_path: Path) -> None:
     assert [run.path.name for run in collect(tmp_path)] == ["b"]
 
 
+AGAIN = r"epo evaluate run=.*a split=test writes it again"
+COPY = r"copy the run folder again"
+
+
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
-        ("metrics.json", '{"metrics": {', "metrics.json is not JSON"),
-        ("metrics.json", '{"metrics": {"minADE": 1.0}}', "metrics.json has no entry data_digest"),
-        ("metrics.json", '{"data_digest": "a", "metrics": {"minADE": "x"}}', "metrics must be numbers"),
-        ("config.yaml", "a: [", "config.yaml is not YAML"),
-        ("config.yaml", "title: x", "config.yaml has no entry seed"),
+        ("metrics.json", '{"metrics": {', f"metrics.json is not JSON.*{AGAIN}"),
+        ("metrics.json", "", f"metrics.json is not JSON.*{AGAIN}"),
+        ("metrics.json", '{"metrics": {"minADE": 1.0}}', f"metrics.json has no entry data_digest.*{AGAIN}"),
+        ("metrics.json", '{"data_digest": "a", "metrics": {"minADE": "x"}}', f"metrics must be numbers.*{AGAIN}"),
+        ("metrics.json", '{"data_digest": "a", "split": "val", "metrics": {}}', f"scores of the val split.*{AGAIN}"),
+        ("config.yaml", "a: [", f"config.yaml is not YAML.*{COPY}"),
+        ("config.yaml", "title: x", f"config.yaml has no entry seed.*{COPY}"),
+        ("config.yaml", "title: x\nseed: one", f"config.yaml: seed must be a whole number, not 'one'.*{COPY}"),
+        ("config.yaml", b"title: \xff", f"config.yaml is not text.*{COPY}"),
+        ("run.json", "{", f"run.json is not JSON.*{COPY}"),
+        ("run.json", "{}", f"run.json has no entry data_digest.*{COPY}"),
+        ("run.json", '{"data_digest": "abc"}', f"run.json has no entry command.*{COPY}"),
+        ("run.json", None, f"a has no run.json.*{COPY}"),
+        ("config.yaml", None, f"a has no config.yaml.*{COPY}"),
     ],
 )
-def test_damaged_files_are_named(tmp_path: Path, file: str, content: str, message: str) -> None:
+def test_damaged_files_are_named(tmp_path: Path, file: str, content: str | bytes | None, message: str) -> None:
+    make_run(tmp_path / "b", "V-LSTM + SC", "scene_consistent", scores(0.3))
     run = make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3))
-    (run.path / file).write_text(content)
-    with pytest.raises(ConfigError, match=message):
-        collect(tmp_path)
+    if content is None:
+        (run.path / file).unlink()
+    else:
+        (run.path / file).write_bytes(content if isinstance(content, bytes) else content.encode())
+    for runs in (tmp_path, [run]):
+        with pytest.raises(ConfigError) as refused:
+            collect(runs)
+        assert re.search(message, str(refused.value), re.DOTALL)
+
+
+def test_a_run_that_was_killed_before_it_began_is_no_damage(tmp_path: Path) -> None:
+    make_run(tmp_path / "b", "V-LSTM + SC", "scene_consistent", scores(0.3))
+    (make_run(tmp_path / "a", "V-LSTM", "marginal", None).path / "run.json").unlink()
+    assert [run.path.name for run in collect(tmp_path)] == ["b"]

@@ -1,0 +1,133 @@
+"""Tables, comparisons and best settings in the terminal, in Markdown and as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from epo_lightning.report.render import (
+    Sheet,
+    comparison_sheet,
+    comparisons_to_csv,
+    p_text,
+    settings_sheet,
+    signed,
+    to_csv,
+    to_markdown,
+    to_rich,
+)
+from epo_lightning.report.runs import collect
+from epo_lightning.report.selection import best_settings
+from epo_lightning.report.statistics import build_comparisons
+from epo_lightning.report.tables import build_tables
+
+from .run_folders import make_run, scores
+
+
+def pairs(folder: Path) -> None:
+    """Three seeds of both rows; EPO is better by 1, 2 and 3."""
+    for seed in range(3):
+        make_run(folder / f"sc{seed}", "V-LSTM + SC", "scene_consistent", scores(2.0 + 2 * seed), seed=seed)
+        make_run(folder / f"e{seed}", "V-LSTM + EPO", "epo", scores(1.0 + seed), seed=seed, experiment="rpi/v_lstm_epo")
+
+
+def printed(table: Sheet, width: int = 80) -> str:
+    console = Console(file=io.StringIO(), width=width)
+    console.print(to_rich(table))
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_comparison_by_hand_in_every_format(tmp_path: Path) -> None:
+    pairs(tmp_path)
+    (comparisons,) = build_comparisons(build_tables(collect(tmp_path)))
+    sheet = comparison_sheet(comparisons)
+    # The numbers of test_three_pairs_by_hand.
+    assert sheet.lines[0] == ("V-LSTM + EPO - V-LSTM + SC", "ADE", "-2.000", "-4.484 to +0.484", "0.074", "3")
+    assert sheet.lines[1][:2] == ("", "FDE")
+    assert sheet.lines[4] == ("", "OR (JFP)", "0.0000", "the same difference for every seed", "", "3")
+    lines = to_markdown(sheet).splitlines()
+    assert lines[0] == "### rpi, test split: +EPO against +SC, seed by seed"
+    assert lines[2:4] == ["| rows | metric | difference | 95 % interval | p | n |", "|:--|:--|--:|--:|--:|--:|"]
+    assert lines[4] == "| V-LSTM + EPO - V-LSTM + SC | ADE | -2.000 | -4.484 to +0.484 | 0.074 | 3 |"
+    first, *_, last = csv.DictReader(io.StringIO(comparisons_to_csv([comparisons])))
+    assert (first["method"], first["other"], first["metric"]) == ("V-LSTM + EPO", "V-LSTM + SC", "minADE")
+    assert float(first["difference"]) == -2.0
+    assert float(first["p"]) == pytest.approx(0.07418, abs=1e-5)
+    assert (first["n"], first["seeds"], first["reason"]) == ("3", "0 1 2", "")
+    assert (last["p"], last["reason"]) == ("", "the same difference for every seed")
+
+
+def test_the_terminal_shows_a_comparison_in_80_columns(tmp_path: Path) -> None:
+    pairs(tmp_path)
+    (comparisons,) = build_comparisons(build_tables(collect(tmp_path)))
+    text = printed(comparison_sheet(comparisons))
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= 80
+    words = text.split()
+    for expected in ("-2.000", "-4.484", "+0.484", "0.074"):
+        assert expected in words
+
+
+def test_best_settings_say_how_to_train_with_them(tmp_path: Path) -> None:
+    for lr, value in ((0.1, 0.4), (0.01, 0.3)):
+        make_run(
+            tmp_path / str(lr), "V-LSTM", "marginal", scores(value), split="val", experiment="rpi/v_lstm",
+            settings={"optimizer.lr": lr},
+        )  # fmt: skip
+    sheet = settings_sheet(best_settings(collect(tmp_path)))
+    assert sheet.header == ("row", "setting", "minSADE", "n", "of")
+    assert sheet.lines == (("V-LSTM", "experiment=rpi/v_lstm optimizer.lr=0.01", "0.300", "1", "2"),)
+    assert "optimizer.lr=0.01" in printed(sheet)
+    assert settings_sheet([]).lines == ()
+
+
+def test_csv_has_what_is_behind_every_number(tmp_path: Path) -> None:
+    pairs(tmp_path)
+    records = list(csv.DictReader(io.StringIO(to_csv(build_tables(collect(tmp_path))))))
+    assert len(records) == 2 * 6
+    epo = next(r for r in records if r["method"] == "V-LSTM + EPO" and r["metric"] == "minSADE")
+    assert (epo["n"], float(epo["mean"]), float(epo["std"]), float(epo["paper"])) == ("3", 2.0, 1.0, 0.03)
+    assert float(epo["difference"]) == 2.0 - 0.03
+    assert (epo["data_digest"], epo["commits"]) == ("abc", "0123456789abcdef")
+    assert epo["commands"].split("; ") == [f"epo train experiment=rpi/v_lstm_epo seed={seed}" for seed in range(3)]
+    assert len({record["row"] for record in records}) == 2
+    single = next(r for r in records if r["metric"] == "overlap_authors")
+    assert (single["paper"], single["difference"]) == ("", "")
+
+
+def test_markdown_titles_are_no_markup(tmp_path: Path) -> None:
+    make_run(tmp_path, "a|b *c* <u> `d` [e]", "epo", scores(0.1))
+    row = to_markdown(build_tables(collect(tmp_path))[0]).splitlines()[4]
+    assert row.startswith(r"| a\|b \*c\* &lt;u> \`d\` \[e\] | 1 |")
+
+
+def test_titles_are_no_markup_of_the_terminal(tmp_path: Path) -> None:
+    make_run(tmp_path, "[red]x[/] [/nothing]", "epo", scores(0.1))
+    (table,) = build_tables(collect(tmp_path))
+    console = Console(file=io.StringIO(), width=160)
+    console.print(to_rich(table))
+    assert "[red]x[/] [/nothing]" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0.000"), (-0.0004, "0.000"), (0.0004, "0.000"), (-0.25, "-0.250"), (0.25, "+0.250"), (math.nan, "-")],
+)
+def test_differences_have_a_sign_unless_they_round_to_zero(value: float, text: str) -> None:
+    assert signed(value, 3) == text
+
+
+@given(st.floats(-1e6, 1e6))
+def test_signed_numbers_are_read_back(value: float) -> None:
+    assert float(signed(value, 4)) == pytest.approx(value, abs=0.5001e-4)
+
+
+def test_small_p_values_are_not_printed_as_zero() -> None:
+    assert [p_text(p) for p in (0.5, 0.0712, 0.001, 0.00099, 0.0)] == ["0.500", "0.071", "0.001", "< 0.001", "< 0.001"]
