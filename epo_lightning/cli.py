@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from epo_lightning.registry import ConfigError, nearest
@@ -22,11 +23,12 @@ epo - energy-based potential games for multi-agent motion forecasting
 
   epo generate                               make the data set
   epo train experiment=rpi/v_lstm_epo        train a row of the paper's table
-  epo train -m sweeps=rpi_main               train all rows, with seeds
+  epo sweep rpi_main                         train and score all rows, with seeds, or what is missing of them
+  epo sweep status rpi_main                  how far they are
   epo train resume=<run folder>              continue after a kill
   epo evaluate runs=runs                     score finished runs on the test split
   epo predict run=<run folder> out=<folder>  write and draw forecasts
-  epo report runs=runs out=report            the table beside the paper's values
+  epo report rpi_main                        the table beside the paper's values, figures, and a page of it all
   epo config experiment=rpi/v_lstm_epo       print the resolved configuration
   epo config check experiment=...            check it, without loading anything
 
@@ -34,6 +36,7 @@ Everything after the verb is a Hydra override, key=value. `epo <verb> --help` li
 
 Options
   -m, --multirun        run every combination of comma-separated values (epo train -m seed=0,1,2)
+  --stop-on-failure     epo sweep: begin no further run when one has failed
   --config-dir FOLDER   look for configurations here first
   --traceback           show where an error came from
   --version
@@ -43,6 +46,7 @@ Options
 VERBS = {
     "generate": "make a data set and print its report",
     "train": "train a forecaster into a run folder",
+    "sweep": "train and score all runs of a table or figure; `epo sweep status` looks at them",
     "evaluate": "score runs on the test split",
     "predict": "write and draw a run's forecasts",
     "report": "tables and figures of evaluated runs",
@@ -57,6 +61,7 @@ class Arguments:
     verb: str
     overrides: list[str] = field(default_factory=list)
     multirun: bool = False
+    stop_on_failure: bool = False
     help: bool = False
     extra: list[str] = field(default_factory=list)
 
@@ -74,13 +79,15 @@ def parse(words: Sequence[str]) -> Arguments:
             found.help = True
         elif word in ("-m", "--multirun"):
             found.multirun = True
+        elif word == "--stop-on-failure":
+            found.stop_on_failure = True
         elif word == "--config-dir" or word.startswith("--config-dir="):
             folder = word.partition("=")[2] or next(rest, "")
             if not folder:
                 raise ConfigError("--config-dir needs a folder")
             found.extra.append(folder)
         elif word.startswith("-"):
-            known = ("--multirun", "--config-dir", "--traceback", "--version", "--help")
+            known = ("--multirun", "--stop-on-failure", "--config-dir", "--traceback", "--version", "--help")
             raise ConfigError(f"unknown option {word}: {nearest(word, known)}")
         elif not found.verb:
             if word not in VERBS:
@@ -88,6 +95,8 @@ def parse(words: Sequence[str]) -> Arguments:
             found.verb = word
         else:
             found.overrides.append(word)
+    if found.stop_on_failure and found.verb != "sweep":
+        raise ConfigError("--stop-on-failure belongs to epo sweep")
     return found
 
 
@@ -129,8 +138,10 @@ def _run(words: Sequence[str]) -> None:
         _help(arguments)
     elif arguments.verb == "config":
         _config(arguments)
-    elif arguments.multirun:
+    elif arguments.verb == "sweep":
         _sweep(arguments)
+    elif arguments.multirun:
+        _multirun(arguments)
     else:
         _single(arguments)
 
@@ -230,7 +241,7 @@ def _resume(folder: str, others: Sequence[str]) -> None:
     verbs.resume(RunFolder.open(folder))
 
 
-def _sweep(arguments: Arguments) -> None:
+def _multirun(arguments: Arguments) -> None:
     """Check every job, then let Hydra launch them."""
     if arguments.verb != "train":
         raise ConfigError(f"epo {arguments.verb} takes no -m: give it runs=<folder> to work on several runs")
@@ -249,6 +260,29 @@ def _sweep(arguments: Arguments) -> None:
     compose.multirun("train", arguments.overrides, job_of_sweep, arguments.extra)
 
 
+def _sweep(arguments: Arguments) -> None:
+    """``epo sweep <name> [overrides]`` and ``epo sweep status <name> [overrides]``."""
+    words = list(arguments.overrides)
+    looking = bool(words) and words[0] == "status"
+    words = words[1:] if looking else words
+    from epo_lightning.experiment.compose import hydra, options_of
+
+    with hydra(arguments.extra) as instance:
+        known = options_of(instance, "sweeps")
+    if not words or "=" in words[0]:
+        raise ConfigError(f"which sweep? `epo sweep {'status ' if looking else ''}<name>`; known: {', '.join(known)}")
+    name, *overrides = words
+    from epo_lightning.experiment import sweeping
+
+    if looking:
+        sweeping.show(name, overrides)
+        return
+    if name not in known:
+        raise ConfigError(f"unknown sweep {name!r}: {nearest(name, known)}")
+    if not sweeping.run(name, overrides, arguments.extra, job_of_sweep, arguments.stop_on_failure):
+        raise SystemExit(1)
+
+
 def job_of_sweep(config: DictConfig) -> float | None:
     """One job of a sweep; at module level, so that launchers can send it to other processes.
 
@@ -263,7 +297,12 @@ def job_of_sweep(config: DictConfig) -> float | None:
 
     whole = OmegaConf.merge({"hydra": HydraConfig.get()}, config)
     OmegaConf.set_struct(whole, False)
-    return verbs.train(resolve(whole), list(HydraConfig.get().overrides.task))  # type: ignore[arg-type]
+    values, overrides = resolve(whole), list(HydraConfig.get().overrides.task)  # type: ignore[arg-type]
+    if values.get("sweep"):
+        from epo_lightning.experiment.sweep import Sweep
+
+        return Sweep(Path(values["sweep"])).work(values, overrides)
+    return verbs.train(values, overrides)
 
 
 if __name__ == "__main__":

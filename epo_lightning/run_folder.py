@@ -42,6 +42,7 @@ SILENCE = 600.0
 
 
 LOCK = ".lock"
+HEADER = "# The resolved configuration of this run.\n"
 
 
 def write_text(path: Path, text: str) -> None:
@@ -135,10 +136,13 @@ class RunFolder:
 
     @property
     def exists(self) -> bool:
-        """Whether anything was written here, besides the lock of somebody who is about to."""
+        """Whether anything was written here; not what somebody leaves who was killed before the run had begun."""
         if not self.path.is_dir():
             return self.path.exists()
-        return any(entry.name != LOCK for entry in self.path.iterdir())
+        entries = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}
+        if entries == {self.config_file.name}:
+            return not self.config_file.read_text(encoding="utf-8", errors="replace").startswith(HEADER)
+        return bool(entries)
 
     @property
     def record(self) -> dict[str, Any]:
@@ -231,7 +235,7 @@ class RunFolder:
         import yaml
 
         text = yaml.safe_dump(dict(config), sort_keys=False, default_flow_style=None, width=120)
-        write_text(self.config_file, "# The resolved configuration of this run.\n" + text)
+        write_text(self.config_file, HEADER + text)
         write_json(self.record_file, {**record, "status": TRAINING})
 
     def update(self, **changes: Any) -> None:

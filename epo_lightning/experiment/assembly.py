@@ -14,7 +14,8 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies import Strategy
 
 from epo_lightning.data.datamodule import check_share
-from epo_lightning.experiment import logs
+from epo_lightning.experiment import debugging, logs
+from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.settings import PARTS, Settings, TrainerSettings, check_part, check_types
 from epo_lightning.forecasters import build_forecaster, check_model
 from epo_lightning.registry import ConfigError, build
@@ -139,7 +140,7 @@ def build_trainer(
             devices=1 if strategy is None else settings.devices,
             strategy=strategy or "auto",
             # Lightning's own idea of a Slurm job is one that catches its signals and counts its tasks.
-            plugins=[LightningEnvironment()] if strategy is None else None,
+            plugins=[WholeCheckpoints(), *([LightningEnvironment()] if strategy is None else [])],
             precision=settings.precision,  # type: ignore[arg-type]
             max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,
             max_steps=settings.max_steps,
@@ -149,7 +150,7 @@ def build_trainer(
             limit_val_batches=settings.limit_val_batches,
             log_every_n_steps=settings.log_every,
             deterministic=settings.deterministic,
-            callbacks=list(callbacks),
+            callbacks=[*callbacks, *debugging.watchers(settings, run)],
             logger=list(loggers),
             enable_progress_bar=bar,
             enable_model_summary=False,
@@ -160,7 +161,7 @@ def build_trainer(
         raise ConfigError(f"trainer: {' '.join(str(error).split())}") from error
 
 
-def as_data(data: Any) -> LightningDataModule:
-    """The data module, typed for Lightning."""
+def as_data(data: Any, overfit_batches: int = 0) -> LightningDataModule:
+    """The data module for Lightning: all of it, or only the first batches of the training split."""
     assert isinstance(data, LightningDataModule)
-    return data
+    return debugging.FewBatches(data, overfit_batches) if overfit_batches else data

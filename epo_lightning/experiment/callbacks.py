@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import random
+import socket
 import sys
 import time
 from typing import Any
@@ -14,7 +17,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint, TQDMProgressBar
 
 from epo_lightning.experiment.settings import CallbackSettings
-from epo_lightning.run_folder import RunFolder
+from epo_lightning.run_folder import RunFolder, write_json
 
 
 class RandomStates(Callback):
@@ -89,6 +92,43 @@ class EpochLines(Callback):
         )
 
 
+class Progress(Callback):
+    """Tell whoever looks at the run folder how far the training is: ``progress.json``, every few seconds."""
+
+    def __init__(self, run: RunFolder, every: float = 2.0) -> None:
+        self._run, self._every = run, every
+        self._began = self._told = -math.inf
+        self._from_step = 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._began, self._from_step = time.monotonic(), trainer.global_step
+        self._tell(trainer)
+
+    def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
+        self._tell(trainer)
+
+    def on_validation_batch_end(self, trainer: Trainer, *_: Any) -> None:
+        self._tell(trainer)
+
+    def _tell(self, trainer: Trainer) -> None:
+        now = time.monotonic()
+        if now - self._told < self._every or not trainer.is_global_zero or not math.isfinite(self._began):
+            return
+        self._told = now
+        steps = trainer.estimated_stepping_batches
+        content = {
+            "step": trainer.global_step,
+            "from_step": self._from_step,
+            "steps": int(steps) if math.isfinite(steps) else None,
+            "seconds": now - self._began,
+            "host": socket.gethostname(),
+            "process": os.getpid(),
+            "time": time.time(),
+        }
+        with contextlib.suppress(OSError):  # what matters says itself when the disk is full
+            write_json(self._run.progress_file, content)
+
+
 def watchers(settings: CallbackSettings, run: RunFolder, title: str) -> list[Callback]:
     """The callbacks of a run.
 
@@ -106,7 +146,7 @@ def watchers(settings: CallbackSettings, run: RunFolder, title: str) -> list[Cal
     last = ModelCheckpoint(
         run.checkpoints, filename="last", save_on_train_epoch_end=True, every_n_epochs=1, enable_version_counter=False
     )
-    found: list[Callback] = [RandomStates(), best, last]
+    found: list[Callback] = [RandomStates(), Progress(run), best, last]
     if settings.patience is not None:
         stopping = EarlyStopping(
             settings.monitor,
@@ -116,7 +156,7 @@ def watchers(settings: CallbackSettings, run: RunFolder, title: str) -> list[Cal
             check_on_train_epoch_end=False,
             check_finite=False,
         )
-        found.insert(1, stopping)
+        found.insert(2, stopping)
     style = settings.progress
     if style == "auto":
         style = "bar" if sys.stdout.isatty() else "lines"

@@ -23,6 +23,14 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 PACKAGE = Path(__file__).resolve().parents[1]
+PLUGINS = {
+    "hydra/launcher/joblib": "local",
+    "hydra/launcher/submitit_slurm": "slurm",
+    "hydra/launcher/submitit_local": "slurm",
+    "hydra/launcher/ray": "ray",
+    "hydra/sweeper/optuna": "search",
+}
+"""Options that come with another package, and the extra that installs it."""
 
 
 def tree() -> Path:
@@ -153,6 +161,31 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
         return [[str(text) for text in job] for batch in batches for job in batch]
 
 
+def launch(
+    name: str,
+    overrides: Sequence[str],
+    jobs: Sequence[list[str]],
+    task: Callable[[DictConfig], Any],
+    extra: Sequence[str],
+) -> None:
+    """Hand these jobs to the launcher that the configuration chooses; what becomes of them is for their task to say."""
+    from hydra._internal.callbacks import Callbacks
+    from hydra.core.plugins import Plugins
+    from hydra.types import HydraContext
+
+    with hydra(extra) as instance, _one_sentence(instance, name, overrides):
+        config = _composed(instance, name, overrides, multirun=True)
+        callbacks = Callbacks(config)
+        launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=HydraContext(config_loader=instance.config_loader, callbacks=callbacks),
+            task_function=task,
+            config=config,
+        )
+        callbacks.on_multirun_start(config=config, config_name=name)
+        launcher.launch(jobs, initial_job_idx=0)
+        callbacks.on_multirun_end(config=config, config_name=name)
+
+
 def multirun(name: str, overrides: Sequence[str], task: Callable[[DictConfig], Any], extra: Sequence[str] = ()) -> Any:
     """Hand the sweep to Hydra's own sweeper and launcher."""
     with hydra(extra) as instance, _one_sentence(instance, name, overrides):
@@ -198,6 +231,11 @@ def _one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Itera
 
 def _missing_option(instance: Hydra, missing: str, message: str) -> str:
     """``experiment/rpi/v_lst`` is no file: name the files that are."""
+    if missing.removesuffix(".yaml") in PLUGINS:
+        package = PLUGINS[missing.removesuffix(".yaml")]
+        return (
+            f"{missing.removesuffix('.yaml')} is a plugin that is not installed: pip install 'epo_lightning[{package}]'"
+        )
     group, _, option = missing.removesuffix(".yaml").partition("/")
     options = options_of(instance, group) if option else []
     if not options:

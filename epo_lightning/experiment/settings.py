@@ -34,6 +34,9 @@ class TrainerSettings:
     limit_val_batches: int | float = 1.0
     log_every: int = 50
     deterministic: bool = True
+    overfit_batches: int = 0
+    detect_anomaly: bool = False
+    profiler: bool = False
 
     def __post_init__(self) -> None:
         if (self.max_epochs is None or self.max_epochs < 0) and self.max_steps < 0:
@@ -43,6 +46,11 @@ class TrainerSettings:
                 raise ConfigError(f"trainer.{name} must be 1 or more, not {getattr(self, name)}")
         if self.validate_steps is not None and self.validate_steps < 1:
             raise ConfigError(f"trainer.validate_steps must be 1 or more, or null, not {self.validate_steps}")
+        if self.overfit_batches < 0 or (self.overfit_batches and self.devices > 1):
+            raise ConfigError(
+                f"trainer.overfit_batches={self.overfit_batches} on {self.devices} device(s): it takes 0 for all batches, or "
+                "1 or more of them on one device"
+            )
         for name in ("limit_train_batches", "limit_val_batches"):
             value = getattr(self, name)
             if value <= 0 or (isinstance(value, float) and value > 1):
@@ -221,7 +229,8 @@ class ReportSettings:
     """``epo report``"""
 
     runs: str = "runs"
-    out: str = "report"
+    sweep: str | None = None
+    out: str | None = None
 
 
 Section = typing.TypeVar("Section")

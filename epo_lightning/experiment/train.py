@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import platform
 import shlex
 import shutil
@@ -15,6 +16,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from epo_lightning.experiment import assembly, callbacks, distributed, logs
 from epo_lightning.experiment.compose import PACKAGE
@@ -24,8 +26,8 @@ from epo_lightning.identity import differences, identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
 
-NOT_IN_COMMAND = ("sweep=", "existing=", "run_dir=", "resume=")
-"""What a sweep adds to a command line on its own."""
+NOT_IN_COMMAND = ("sweep=", "existing=", "runs=", "run_dir=", "resume=")
+"""Words of a command line that say nothing of what was trained."""
 PACKAGES = ("epo_lightning", "torch", "lightning", "hydra-core", "omegaconf", "torchmetrics", "numpy", "numba")
 
 
@@ -64,7 +66,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = ()) -> RunFolder:
             run.begin(config, _record(settings, config, data or ready(settings), overrides))
             _fit(settings, config, run)
         elif run.finished:
-            _refuse_other(run, config)
+            refuse_other(run, config)
         else:
             _continue(run, config)
         _score(settings, run)
@@ -91,13 +93,13 @@ def resume(run: RunFolder) -> None:
 
 def _continue(run: RunFolder, config: dict[str, Any]) -> None:
     """Train on from the last finished epoch. ``config`` must be the run's own, wherever it may write and log now."""
-    _refuse_other(run, config)
+    refuse_other(run, config)
     last = run.checkpoint("last")
     run.update(status=TRAINING, error=None)
     _fit(read(Settings, config), config, run, last if last.is_file() else None)
 
 
-def _refuse_other(run: RunFolder, config: dict[str, Any]) -> None:
+def refuse_other(run: RunFolder, config: dict[str, Any]) -> None:
     """A run goes on with the configuration and the data that it began with.
 
     Raises:
@@ -156,15 +158,12 @@ def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Pat
         trainer = assembly.build_trainer(settings.trainer, run, watchers, loggers, bar, strategy)
         run.update(parameters=assembly.parameters(model))
         if learns:
-            trainer.fit(model, assembly.as_data(data), ckpt_path=last, weights_only=True)
+            trainer.fit(model, assembly.as_data(data, settings.trainer.overfit_batches), ckpt_path=last, weights_only=True)
         else:
             _keep_unlearned(trainer, model, data, run)
         if trainer.interrupted:
             raise KeyboardInterrupt
-        _check_learned(run, trainer)
-    metrics = {key: float(value) for key, value in trainer.callback_metrics.items() if key.startswith("val/")}
-    best = [w.best_model_score for w in watchers if getattr(w, "monitor", None) and hasattr(w, "best_model_score")]
-    score = float(best[0]) if best and best[0] is not None else metrics.get(settings.callbacks.monitor)
+        score = _best_score(run, trainer, settings.callbacks.monitor)
     run.update(
         status=FINISHED,
         epochs=trainer.current_epoch,
@@ -182,12 +181,21 @@ def _keep_unlearned(trainer: Trainer, model: LightningModule, data: Any, run: Ru
     shutil.copyfile(run.checkpoint("last"), run.checkpoint("best"))
 
 
-def _check_learned(run: RunFolder, trainer: Trainer) -> None:
-    if not run.checkpoint("best").is_file():
+def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:
+    """The smallest validation score.
+
+    Raises:
+        ConfigError: there is no finite one.
+    """
+    best = [w.best_model_score for w in trainer.checkpoint_callbacks if isinstance(w, ModelCheckpoint) and w.monitor]
+    score = next((float(value) for value in best if value is not None), None)
+    score = float(trainer.callback_metrics.get(monitor, math.nan)) if score is None else score
+    if not math.isfinite(score):
         raise ConfigError(
             f"{run.path}: {trainer.global_step} steps without a single finite validation score; look at "
             f"{run.logs / 'metrics.csv'}, and try a smaller optimizer.lr, or optimizer.clip=1"
         )
+    return score
 
 
 def ready(settings: Settings) -> Any:

@@ -1,0 +1,245 @@
+"""A sweep: many runs started by one command, of which each is trained once, however often the command is given.
+
+::
+
+    <runs>/sweeps/<label>/
+        sweep.json       the command, and every run: its overrides, its folder (relative to <runs>) and its identity
+        found/           the same of runs that a searching sweeper thought of, one file each
+        failures/        tracebacks of what went wrong in the last attempt, one file each
+        .lock            locked as long as the sweep runs
+        report/          written by ``epo report <name>``
+
+The label is the sweep's name, with a hash of further overrides where there are any. The runs themselves lie where they
+would lie without a sweep, so that two sweeps share what is the same run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import socket
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment import train as training
+from epo_lightning.experiment.settings import Settings, read
+from epo_lightning.identity import identity
+from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_json, write_text
+
+State = Literal["waiting", "running", "interrupted", "failed", "done"]
+BESIDE = (
+    *("hydra", "logger", "existing", "runs", "sweep", "sweeps"),
+    *("callbacks.progress", "callbacks.refresh"),
+    *("trainer.accelerator", "trainer.devices", "trainer.share", "trainer.threads"),
+)
+"""Overrides that do not make it another sweep: where and how visibly it runs."""
+
+
+class RunFailed(RuntimeError):
+    """A run of a sweep failed; all that is known of it is in the message, so that it can travel between processes."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep.
+
+    Attributes:
+        overrides: what it was started with.
+        run: where it lies.
+        identity: what makes it this run.
+        title, seed: how to call it.
+        score: what is measured when it is trained; None for nothing.
+    """
+
+    overrides: tuple[str, ...]
+    run: RunFolder
+    identity: str
+    title: str
+    seed: int
+    score: str | None
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any], overrides: Sequence[str]) -> Job:
+        """The job of a resolved configuration, which is checked; touches no file.
+
+        Raises:
+            ConfigError: as :func:`assembly.check`.
+        """
+        settings = read(Settings, config)
+        data, _ = assembly.check(settings)
+        run = training.folder_for(settings)
+        return cls(tuple(overrides), run, identity(config, data.digest), settings.title, settings.seed, settings.score)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The record of a sweep, read from its folder."""
+
+    folder: Path
+
+    @classmethod
+    def of(cls, name: str, overrides: Sequence[str], runs: str | Path) -> Sweep:
+        """The sweep that a command line means; it may not have begun yet."""
+        return cls(Path(runs).expanduser().absolute() / "sweeps" / label(name, overrides))
+
+    @classmethod
+    def find(cls, name: str, overrides: Sequence[str], runs: str | Path) -> Sweep:
+        """A sweep that has begun: the one with these overrides; without any, the latest of that name or label.
+
+        Raises:
+            ConfigError: there is none; the message names those that there are.
+        """
+        home = Path(runs).expanduser().absolute() / "sweeps"
+        known = {path.parent.name: cls(path.parent) for path in sorted(home.glob("*/sweep.json"))}
+        exact = label(name, overrides)
+        if exact in known and (exact != name or not any(found.startswith(f"{name}-") for found in known)):
+            return known[exact]
+        alike = [sweep for sweep in known.values() if sweep.record.get("name") == name or sweep.folder.name == name]
+        if not alike or exact != name:
+            hint = nearest(exact, known) if known else f"none has begun; `epo sweep {name}` begins it"
+            raise ConfigError(f"no sweep {exact} below {home}: {hint}")
+        return max(alike, key=lambda sweep: sweep.record.get("began", ""))
+
+    @property
+    def label(self) -> str:
+        return self.folder.name
+
+    @property
+    def root(self) -> Path:
+        """The folder that all runs lie below."""
+        return self.folder.parents[1]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The contents of sweep.json."""
+        return read_json(self.folder / "sweep.json")
+
+    @property
+    def jobs(self) -> list[Job]:
+        """All of its runs; of a sweep that searches, those that it has thought of so far."""
+        found = [read_json(path) for path in sorted((self.folder / "found").glob("*.json"))]
+        return [self._job(entry) for entry in [*self.record.get("jobs", []), *found]]
+
+    def _job(self, entry: Mapping[str, Any]) -> Job:
+        run = RunFolder(Path(os.path.relpath(self.root / entry["folder"])))
+        return Job(tuple(entry["overrides"]), run, entry["identity"], entry["title"], entry["seed"], entry["score"])
+
+    def _entry(self, job: Job) -> dict[str, Any]:
+        return {
+            "overrides": list(job.overrides),
+            "folder": os.path.relpath(job.run.path.absolute(), self.root),
+            "identity": job.identity,
+            "title": job.title,
+            "seed": job.seed,
+            "score": job.score,
+        }
+
+    def state(self, job: Job) -> State:
+        """What has become of a run, its scores included."""
+        state = job.run.state
+        if state == "finished":
+            if job.score is None or job.run.metrics_file(job.score).is_file():
+                return "done"
+            state = "running" if job.run.locked else "interrupted"
+        return "failed" if state in ("waiting", "interrupted") and self._failure(job).is_file() else state
+
+    def error(self, job: Job) -> str:
+        """Why a run failed, in one line; empty if it did not."""
+        try:
+            lines = self._failure(job).read_text(encoding="utf-8").strip().splitlines()
+        except OSError:
+            return str(job.run.record.get("error") or "") if job.run.record_file.is_file() else ""
+        return lines[0] if lines else ""
+
+    def _failure(self, job: Job) -> Path:
+        return self.folder / "failures" / f"{self._key(job)}.txt"
+
+    def _key(self, job: Job) -> str:
+        return self._entry(job)["folder"].replace(os.sep, "__")
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep a second start of the same sweep away.
+
+        Raises:
+            ConfigError: it runs already.
+        """
+        from filelock import FileLock, Timeout
+
+        self.folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.folder / LOCK)
+        try:
+            lock.acquire(timeout=0.5, poll_interval=0.1)
+        except Timeout:
+            record = self.record if (self.folder / "sweep.json").is_file() else {}
+            who = f" (process {record['process']} on {record['host']})" if "process" in record else ""
+            raise ConfigError(
+                f"the sweep {self.label} runs already{who}: see `epo sweep status {self.label}`, or give this one "
+                "another place with runs=<folder>"
+            ) from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def begin(
+        self, name: str, command: str, overrides: Sequence[str], jobs: Sequence[Job], stop_on_failure: bool
+    ) -> None:
+        """Write down what is about to run; failures of earlier attempts are forgotten."""
+        for job in jobs:
+            self._failure(job).unlink(missing_ok=True)
+        content = {
+            "name": name,
+            "label": self.label,
+            "command": command,
+            "overrides": list(overrides),
+            "directory": str(Path.cwd()),
+            "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "process": os.getpid(),
+            "host": socket.gethostname(),
+            "stop_on_failure": stop_on_failure,
+            "jobs": [self._entry(job) for job in jobs],
+        }
+        write_json(self.folder / "sweep.json", content)
+
+    def work(self, config: Mapping[str, Any], overrides: Sequence[str]) -> float | None:
+        """Train and score one of the runs, in whatever process a launcher chose.
+
+        Returns:
+            the best validation score; None for a run that was left alone because another one failed.
+
+        Raises:
+            RunFailed: the run failed; the sweep's folder holds the traceback.
+        """
+        record = self.record
+        with contextlib.suppress(OSError):  # a worker on another machine may start anywhere
+            os.chdir(record["directory"])
+        if record["stop_on_failure"] and any((self.folder / "failures").glob("*.txt")):
+            return None
+        job = Job.of(config, overrides)
+        if not record["jobs"]:
+            write_json(self.folder / "found" / f"{self._key(job)}.json", self._entry(job))
+        try:
+            run = training.train(dict(config), overrides)
+        except Exception as error:
+            message = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            write_text(self._failure(job), f"{message}\n\n{traceback.format_exc()}")
+            raise RunFailed(f"{job.title}, seed {job.seed}: {message}") from None
+        return next(iter(run.record.get("best", {}).values()), None)
+
+
+def label(name: str, overrides: Sequence[str]) -> str:
+    """``name``, and six digits of a hash of the overrides that decide on results, where there are any."""
+    keys = {word: word.lstrip("+~").split("=")[0].split("@")[0] for word in overrides}
+    special = sorted(
+        word for word, key in keys.items() if key.split(".")[0].split("/")[0] not in BESIDE and key not in BESIDE
+    )
+    return name + ("-" + hashlib.sha256("\n".join(special).encode()).hexdigest()[:6] if special else "")

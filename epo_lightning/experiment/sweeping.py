@@ -1,0 +1,85 @@
+"""``epo sweep``: find out what is missing, have it done by a launcher, and say what became of it."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from epo_lightning.experiment import assembly, compose
+from epo_lightning.experiment import train as training
+from epo_lightning.experiment.sweep import Job, Sweep
+from epo_lightning.experiment.watch import news, status, summary
+from epo_lightning.registry import ConfigError
+
+
+def run(
+    name: str, overrides: Sequence[str], extra: Sequence[str], task: Callable[..., Any], stop_on_failure: bool
+) -> bool:
+    """Run what is missing of a sweep: new runs, and those that were interrupted or failed, from their last checkpoint.
+
+    Args:
+        name: of the file in ``sweeps/``.
+        overrides: of every run.
+        extra: folders that are searched for configurations first.
+        task: of the jobs; launchers send it to other processes, so it is a function at the level of a module.
+        stop_on_failure: begin no further run when one has failed.
+
+    Returns:
+        whether all runs are done.
+
+    Raises:
+        ConfigError: a mistake in the configuration of any run, before the first one begins; or the sweep runs already.
+    """
+    assembly.quiet()
+    for word in overrides:
+        if word.split("=")[0] in ("run_dir", "resume", "sweep", "sweeps"):
+            raise ConfigError(f"{word} makes no sense in a sweep, whose runs have folders of their own: leave it out")
+    runs = _value_of("runs", overrides) or "runs"
+    sweep = Sweep.of(name, overrides, runs)
+    words = [f"sweeps={name}", *overrides]
+    # Absolute, because a worker on another machine may start in any folder.
+    words += [f"sweep={sweep.folder}", f"runs={sweep.root}", f"hydra.sweep.dir={sweep.folder}", "existing=continue"]
+    words += ["hydra/hydra_logging=none"]  # the news say it better
+    listed = {}
+    for words_of_job in compose.jobs("train", words, extra):
+        config = compose.compose("train", words_of_job, extra)
+        job = Job.of(config, words_of_job)
+        if job.run.record_file.is_file():
+            training.refuse_other(job.run, config)
+        elif job.run.exists:
+            raise ConfigError(
+                f"{job.run.path} exists and is not a run folder: move it away, or choose another runs=<folder>"
+            )
+        listed.setdefault(job.run.path, job)
+    with sweep.lock():
+        jobs = list(listed.values())
+        states = [sweep.state(job) for job in jobs]
+        sweep.begin(name, shlex.join(["epo", "sweep", name, *overrides]), overrides, jobs, stop_on_failure)
+        if jobs:
+            print(f"{sweep.label}: {summary(Counter(states))}", flush=True)
+        missing = [list(job.overrides) for job, state in zip(jobs, states, strict=True) if state != "done"]
+        with news(sweep):
+            if missing:
+                compose.launch("train", words, missing, task, extra)
+            elif not jobs:  # a sweeper that chooses as it goes
+                compose.multirun("train", words, task, extra)
+        counts = status(sweep)
+    done = counts["done"] == counts.total()
+    if done:
+        print(f"next: epo report {sweep.label}" + (f" runs={runs}" if runs != "runs" else ""))
+    return done
+
+
+def show(name: str, overrides: Sequence[str]) -> None:
+    """Print the state of every run of a sweep that has begun.
+
+    Raises:
+        ConfigError: there is none of that name and overrides.
+    """
+    status(Sweep.find(name, overrides, _value_of("runs", overrides) or "runs"))
+
+
+def _value_of(key: str, overrides: Sequence[str]) -> str | None:
+    return next((word.partition("=")[2] for word in reversed(overrides) if word.startswith(f"{key}=")), None)

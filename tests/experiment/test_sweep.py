@@ -1,0 +1,213 @@
+"""Sweeps: every run once, whatever happens in between; failures seen; nothing lost, nothing done twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from experiment.conftest import TINY, Epo
+
+from epo_lightning.experiment.compose import compose, jobs
+from epo_lightning.experiment.sweep import Sweep, label
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder, write_json
+
+SWEEP = ("sweep", "rpi_main", *TINY, "seed=0,1", "score=test")
+ROWS = ("const_vel", "v_lstm", "v_lstm_sc", "v_lstm_epo")
+SRC = Path(__file__).parents[2]
+
+
+def the_sweep(runs: str = "runs") -> Sweep:
+    (record,) = Path(runs).glob("sweeps/*/sweep.json")
+    return Sweep(record.parent.absolute())
+
+
+def marks(sweep: Sweep) -> dict[str, tuple[float, float]]:
+    """When each run's last checkpoint and scores were written."""
+    return {
+        str(job.run.path): (
+            job.run.checkpoint("last").stat().st_mtime_ns,
+            job.run.metrics_file().stat().st_mtime_ns,
+        )
+        for job in sweep.jobs
+    }
+
+
+def test_a_sweep_trains_and_scores_every_run_once(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo(*SWEEP) == 0
+    sweep = the_sweep()
+    assert len(sweep.jobs) == 8
+    assert {sweep.state(job) for job in sweep.jobs} == {"done"}
+    assert {job.run.path.parent.name for job in sweep.jobs} == set(ROWS)
+    assert all(job.identity == job.run.record["identity"] for job in sweep.jobs)
+    out = capsys.readouterr().out
+    assert "8 runs: 8 done" in out
+    assert "[8/8]" in out
+    before = marks(sweep)
+    assert epo(*SWEEP) == 0
+    assert marks(sweep) == before, "a finished run was run again"
+    # What is missing, and only that, is done.
+    first, second = sweep.jobs[2].run, sweep.jobs[3].run
+    first.metrics_file().unlink()
+    second.update(status="training")
+    second.metrics_file().unlink()
+    assert [sweep.state(job) for job in sweep.jobs].count("interrupted") == 2
+    capsys.readouterr()
+    assert epo("sweep", "status", "rpi_main") == 0
+    assert "6 done, 2 interrupted" in capsys.readouterr().out
+    assert epo(*SWEEP) == 0
+    assert {sweep.state(job) for job in sweep.jobs} == {"done"}
+    assert {path for path, mark in marks(sweep).items() if mark != before[path]} == {str(first.path), str(second.path)}
+
+
+def test_a_failed_run_is_said_and_does_not_stop_the_others(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    words = (*SWEEP, "optimizer.lr=1e25")
+    assert epo(*words) == 1
+    sweep = the_sweep()
+    states = [sweep.state(job) for job in sweep.jobs]
+    assert states.count("failed") == 6
+    assert states.count("done") == 2, "constant velocity learns nothing, so nothing can go wrong"
+    captured = capsys.readouterr()
+    assert captured.out.count("FAILED") == 6
+    assert "without a single finite validation score" in captured.out
+    assert "Traceback" not in captured.out + captured.err
+    failures = sorted((sweep.folder / "failures").iterdir())
+    assert len(failures) == 6
+    assert "Traceback" in failures[0].read_text()
+    assert all(job.run.record["status"] == "failed" for job in sweep.jobs if sweep.state(job) == "failed")
+
+
+def test_a_sweep_stops_at_a_failure_if_asked_to(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo(*SWEEP, "optimizer.lr=1e25", "--stop-on-failure") == 1
+    assert "2 done, 1 failed, 5 waiting" in capsys.readouterr().out
+
+
+def test_two_starts_of_a_sweep_do_not_meet(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm") == 0
+    with the_sweep().lock():
+        assert epo("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm") == 2
+    message = capsys.readouterr().err
+    assert "runs already (process" in message
+    assert "epo sweep status" in message
+
+
+def test_two_processes_do_not_train_the_same_run(epo: Epo, refused: Callable[..., str]) -> None:
+    words = ("train", "experiment=rpi/v_lstm", *TINY, "run_dir=run")
+    assert epo(*words) == 0
+    run = RunFolder(Path("run"))
+    run.update(status="training")
+    assert run.state == "interrupted"
+    with run.lock():
+        assert run.state == "running"
+        assert "another process" in refused("train", "resume=run")
+    assert run.state == "interrupted"
+
+
+def test_what_was_killed_before_it_had_begun_begins_again(epo: Epo) -> None:
+    words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm")
+    assert epo(*words) == 0
+    (job,) = the_sweep().jobs
+    for path in sorted(job.run.path.rglob("*"), reverse=True):
+        if path.name != "config.yaml":
+            path.rmdir() if path.is_dir() else path.unlink()
+    (job.run.path / ".run.json-abc").touch()
+    assert the_sweep().state(job) == "waiting"
+    assert epo(*words) == 0
+    assert the_sweep().state(job) == "done"
+
+
+def test_damaged_runs_are_named_before_anything_runs(epo: Epo, refused: Callable[..., str]) -> None:
+    words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm")
+    assert epo(*words) == 0
+    (job,) = the_sweep().jobs
+    record = job.run.record_file.read_text()
+    job.run.record_file.write_text(record[:40])
+    assert "run.json is not JSON" in refused(*words)
+    job.run.record_file.write_text(record)
+    config = job.run.config_file.read_text()
+    job.run.config_file.write_text(config.replace("lr: 0.001", "lr: 0.5"))
+    assert "optimizer.lr: 0.5 there, 0.001 here" in refused(*words)
+    job.run.config_file.write_text(config)
+    job.run.update(data_digest="other")
+    assert "data" in refused(*words)
+
+
+def test_mistakes_in_sweeps_are_refused(refused: Callable[..., str]) -> None:
+    assert "'rpi_main'" in refused("sweep", "rpi_mian")
+    assert "rpi_main" in refused("sweep")
+    assert "'seed'" in refused("sweep", "rpi_main", "sede=1")
+    assert "none has begun" in refused("sweep", "status", "rpi_main")
+    assert "run_dir" in refused("sweep", "rpi_main", "run_dir=x")
+    assert "belongs to epo sweep" in refused("train", "--stop-on-failure")
+
+
+def test_the_latest_sweep_of_a_name_is_found(tmp_path: Path) -> None:
+    for name, began in (("rpi_main-aaaaaa", "2026-01-01"), ("rpi_main-bbbbbb", "2026-02-01"), ("other", "2026-03-01")):
+        write_json(tmp_path / "sweeps" / name / "sweep.json", {"name": name.partition("-")[0], "began": began})
+    assert Sweep.find("rpi_main", [], tmp_path).label == "rpi_main-bbbbbb"
+    assert Sweep.find("rpi_main-aaaaaa", [], tmp_path).label == "rpi_main-aaaaaa"
+    with pytest.raises(ConfigError, match="rpi_main-bbbbbb"):
+        Sweep.find("rpi_main", ["budget=short"], tmp_path)
+    with pytest.raises(ConfigError, match="no sweep rpi_mai "):
+        Sweep.find("rpi_mai", [], tmp_path)
+
+
+def test_labels_say_what_is_run_and_not_where() -> None:
+    assert label("steps", []) == label("steps", ["logger=[wandb]", "hydra/launcher=local", "runs=x"]) == "steps"
+    assert label("steps", ["seed=1"]) == label("steps", ["seed=1", "trainer.threads=2"]) != "steps"
+    assert label("steps", ["a=1", "b=2"]) == label("steps", ["b=2", "a=1"])
+
+
+def test_run_folders_are_named_by_what_they_mean() -> None:
+    def variant(*words: str) -> str:
+        return compose("train", ["experiment=rpi/v_lstm_epo", *words])["variant"]
+
+    assert variant() == variant("solver.steps=2") == variant("seed=7") == variant("budget=short") == ""
+    assert variant("solver.steps=3") == variant("solver.steps=3", "seed=4", "logger=[tensorboard]") != ""
+    assert variant("solver.steps=3") != variant("solver.steps=4")
+
+
+def test_globs_find_experiments_in_folders() -> None:
+    listed = jobs("train", ["experiment=glob('rpi/*')", "seed=1,2,3"])
+    assert ["experiment=rpi/v_lstm_epo", "seed=2"] in listed
+    assert len(listed) == 3 * len(list((SRC / "conf" / "experiment" / "rpi").glob("*.yaml")))
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_five_times_ends_as_if_it_had_not_been(tmp_path: Path) -> None:
+    environment = {**os.environ, "EPO_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(SRC)}
+    program = [sys.executable, "-m", "epo_lightning.cli"]
+    data = ["data.games=10", "data.placements=1"]
+    subprocess.run([*program, "generate", *data, "progress=false"], cwd=tmp_path, env=environment, check=True)
+    words = [*program, "sweep", "rpi_main", *data, "budget=smoke", "trainer.max_epochs=12", "score=test"]
+
+    began = time.monotonic()
+    subprocess.run([*words, "runs=whole"], cwd=tmp_path, env=environment, check=True)
+    lasted = time.monotonic() - began
+
+    rng = random.Random(0)
+    finished: dict[str, int] = {}
+    for _ in range(5):
+        process = subprocess.Popen([*words, "runs=parts"], cwd=tmp_path, env=environment)
+        time.sleep(rng.uniform(0.3, 0.9) * lasted)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        for path in (tmp_path / "parts").glob("rpi/*/*/metrics.json"):
+            finished.setdefault(str(path), path.stat().st_mtime_ns)
+    subprocess.run([*words, "runs=parts"], cwd=tmp_path, env=environment, check=True)
+
+    whole = {path.relative_to(tmp_path / "whole"): path for path in (tmp_path / "whole").glob("rpi/*/*/metrics.json")}
+    assert len(whole) == 12
+    for name, path in whole.items():
+        assert (tmp_path / "parts" / name).read_bytes() == path.read_bytes(), name
+    assert finished, "no kill came late enough to find a finished run"
+    assert all(Path(path).stat().st_mtime_ns == mark for path, mark in finished.items()), "a finished run ran again"
+    assert json.loads((tmp_path / "parts").glob("sweeps/*/sweep.json").__next__().read_text())["name"] == "rpi_main"
