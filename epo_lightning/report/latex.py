@@ -75,7 +75,8 @@ def sheet_to_latex(sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", la
     """
     lines = []
     for index, line in enumerate(sheet.lines):
-        lines.append(_line([latex_text(text) for text in line]))
+        numbers = (re.sub(r"(?<!\w)-(?=\d)", "$-$", latex_text(text)) for text in line[sheet.left :])
+        lines.append(_line([*map(latex_text, line[: sheet.left]), *numbers]))
         if index in sheet.ends and index + 1 < len(sheet.lines):
             lines.append(r"\midrule")
     columns = "l" * sheet.left + "r" * (len(sheet.header) - sheet.left)
@@ -142,7 +143,7 @@ def _float(
             r"\centering",
             rf"\caption{{{caption}}}",
             rf"\label{{{label}}}",
-            r"\footnotesize\setlength{\tabcolsep}{3pt}",
+            r"\smallskip\footnotesize\setlength{\tabcolsep}{3pt}",
             rf"\sbox0{{\begin{{tabular}}{{{columns}}}",
             r"\toprule",
             _line(header),

@@ -17,7 +17,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from epo_lightning.report.selection import BestSetting
-from epo_lightning.report.statistics import Comparisons
+from epo_lightning.report.statistics import Comparisons, Difference
 from epo_lightning.report.tables import Cell, Column, Row, Table, distinct
 
 LEGEND = (
@@ -97,23 +97,31 @@ def difference_text(row: Row, column: Column) -> str:
 
 
 def comparison_sheet(comparisons: Comparisons) -> Sheet:
-    """One line per pair of rows and metric."""
+    """One line per pair of rows and metric; a single line for a pair without two common seeds."""
     lines: list[tuple[str, ...]] = []
     ends = set()
     for pair in comparisons.pairs:
-        for place, column in enumerate(column for column in comparisons.columns if column.metric in pair.differences):
-            difference = pair.differences[column.metric]
-            pair_name = f"{pair.one.name} - {pair.other.name}" if not place else ""
-            mean = "" if difference.mean is None else signed(difference.mean, column.digits)
-            if difference.low is None or difference.high is None or difference.p is None:
-                interval, p = difference.reason, ""
-            else:
-                interval = f"{signed(difference.low, column.digits)} to {signed(difference.high, column.digits)}"
-                p = p_text(difference.p)
-            lines.append((pair_name, column.label, mean, interval, p, str(difference.n)))
+        name = f"{pair.one.name} - {pair.other.name}"
+        if len(pair.seeds) < 2:  # what cannot be tested, the table itself shows as well
+            reason = next((found.reason for found in pair.differences.values()), "no common metric")
+            lines.append((name, "all", "", reason, "", str(len(pair.seeds))))
+        else:
+            columns = [column for column in comparisons.columns if column.metric in pair.differences]
+            texts = [(column.label, *_difference_texts(pair.differences[column.metric], column)) for column in columns]
+            names = [name, *("" for _ in texts[1:])]
+            lines += [(first, *line) for first, line in zip(names, texts, strict=True)]
         ends.add(len(lines) - 1)
     header = ("rows", "metric", "difference", "95 % interval", "p", "n")
     return Sheet(comparisons.title, header, tuple(lines), 2, frozenset(ends))
+
+
+def _difference_texts(found: Difference, column: Column) -> tuple[str, str, str, str]:
+    """Mean, interval or why there is none, p-value and number of pairs."""
+    mean = "" if found.mean is None else signed(found.mean, column.digits)
+    if found.low is None or found.high is None or found.p is None:
+        return mean, found.reason, "", str(found.n)
+    interval = f"{signed(found.low, column.digits)} to {signed(found.high, column.digits)}"
+    return mean, interval, p_text(found.p), str(found.n)
 
 
 def p_text(p: float) -> str:

@@ -75,9 +75,9 @@ def compare(one: Sequence[float], other: Sequence[float]) -> Difference:
         return Difference(n, reason="a score is not a finite number")
     mean = statistics.fmean(differences)
     if n < 2:
-        return Difference(n, mean, reason="a single common seed, a test needs two")
+        return Difference(n, mean, reason="one common seed, two are needed")
     if max(differences) - min(differences) <= EQUAL * max(map(abs, (*one, *other))):
-        return Difference(n, mean, reason="the same difference for every seed")
+        return Difference(n, mean, reason="equal for every seed")
     from scipy.special import stdtr, stdtrit  # distribution of Student's t and its quantiles; a slow import
 
     error = statistics.stdev(differences) / math.sqrt(n)

@@ -185,9 +185,9 @@ def distinct(tables: Iterable[Table]) -> list[Row]:
 
 
 def _shown(title: str, columns: tuple[Column, ...], rows: Sequence[Row]) -> list[Table]:
-    """The table of those rows that have all of the columns, if there are any."""
+    """The table of those rows that have all of the columns, ranked among themselves, if there are any."""
     having = tuple(row for row in rows if all(column.metric in row.cells for column in columns))
-    return [Table(title, columns, having)] if columns and having else []
+    return [Table(title, columns, _with_ranks(having))] if columns and having else []
 
 
 def build_rows(runs: Sequence[EvaluatedRun]) -> tuple[Row, ...]:
@@ -197,8 +197,7 @@ def build_rows(runs: Sequence[EvaluatedRun]) -> tuple[Row, ...]:
         ConfigError: as :func:`build_tables`.
     """
     require_comparable(runs)
-    rows = sorted(plain_rows(runs), key=_order)
-    return tuple(_ranked(row, [other for other in rows if other.group == row.group]) for row in rows)
+    return _with_ranks(sorted(plain_rows(runs), key=_order))
 
 
 def plain_rows(runs: Iterable[EvaluatedRun]) -> list[Row]:
@@ -307,14 +306,18 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
     return Row(first.name, group_of(first), tuple(runs), cells)
 
 
+def _with_ranks(rows: Sequence[Row]) -> tuple[Row, ...]:
+    return tuple(_ranked(row, [other for other in rows if other.group == row.group]) for row in rows)
+
+
 def _ranked(row: Row, group: Sequence[Row]) -> Row:
     """Mark the best and the second best; what prints the same ranks the same, and a row alone is not ranked."""
     cells = {}
     for metric, cell in row.cells.items():
         digits = Column(metric, "").digits
-        others = {round(other.cells[metric].mean, digits) for other in group if metric in other.cells}
-        places = sorted(value for value in others if math.isfinite(value))
+        means = [other.cells[metric].mean for other in group if metric in other.cells]
+        places = sorted({round(mean, digits) for mean in means if math.isfinite(mean)})
         own = round(cell.mean, digits) if math.isfinite(cell.mean) else math.nan
-        rank = places.index(own) + 1 if len(group) > 1 and own in places else None
+        rank = places.index(own) + 1 if len(means) > 1 and own in places else None
         cells[metric] = replace(cell, rank=rank if rank in (1, 2) else None)
     return replace(row, cells=cells)

@@ -51,7 +51,7 @@ def test_comparison_by_hand_in_every_format(tmp_path: Path) -> None:
     # The numbers of test_three_pairs_by_hand.
     assert sheet.lines[0] == ("V-LSTM + EPO - V-LSTM + SC", "ADE", "-2.000", "-4.484 to +0.484", "0.074", "3")
     assert sheet.lines[1][:2] == ("", "FDE")
-    assert sheet.lines[4] == ("", "OR (JFP)", "0.0000", "the same difference for every seed", "", "3")
+    assert sheet.lines[4] == ("", "OR (JFP)", "0.0000", "equal for every seed", "", "3")
     lines = to_markdown(sheet).splitlines()
     assert lines[0] == "### rpi, test split: +EPO against +SC, seed by seed"
     assert lines[2:4] == ["| rows | metric | difference | 95 % interval | p | n |", "|:--|:--|--:|--:|--:|--:|"]
@@ -61,7 +61,18 @@ def test_comparison_by_hand_in_every_format(tmp_path: Path) -> None:
     assert float(first["difference"]) == -2.0
     assert float(first["p"]) == pytest.approx(0.07418, abs=1e-5)
     assert (first["n"], first["seeds"], first["reason"]) == ("3", "0 1 2", "")
-    assert (last["p"], last["reason"]) == ("", "the same difference for every seed")
+    assert (last["p"], last["reason"]) == ("", "equal for every seed")
+
+
+def test_a_pair_without_two_common_seeds_has_one_line(tmp_path: Path) -> None:
+    make_run(tmp_path / "sc", "V-LSTM + SC", "scene_consistent", scores(0.2))
+    make_run(tmp_path / "a", "V-LSTM + EPO", "epo", scores(0.1))
+    make_run(tmp_path / "b", "V-LSTM + EPO, no init", "epo", scores(0.1), seed=1)
+    (comparisons,) = build_comparisons(build_tables(collect(tmp_path)))
+    assert comparison_sheet(comparisons).lines == (
+        ("V-LSTM + EPO - V-LSTM + SC", "all", "", "one common seed, two are needed", "", "1"),
+        ("V-LSTM + EPO, no init - V-LSTM + SC", "all", "", "no common seed", "", "0"),
+    )
 
 
 def test_the_terminal_shows_a_comparison_in_80_columns(tmp_path: Path) -> None:

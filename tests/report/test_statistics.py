@@ -71,8 +71,8 @@ def test_the_other_way_round_only_signs_change(pairs: list[tuple[float, float]])
     ("one", "other", "expected"),
     [
         ([], [], Difference(0, reason="no common seed")),
-        ([1.0], [3.0], Difference(1, -2.0, reason="a single common seed, a test needs two")),
-        ([1.0, 2.0], [1.0, 2.0], Difference(2, 0.0, reason="the same difference for every seed")),
+        ([1.0], [3.0], Difference(1, -2.0, reason="one common seed, two are needed")),
+        ([1.0, 2.0], [1.0, 2.0], Difference(2, 0.0, reason="equal for every seed")),
         ([1.0, math.nan], [1.0, 2.0], Difference(2, reason="a score is not a finite number")),
         ([1.0, math.inf], [1.0, math.inf], Difference(2, reason="a score is not a finite number")),
     ],
@@ -86,7 +86,7 @@ def test_where_no_test_is_possible_the_reason_is_said(
 def test_differences_that_vary_by_rounding_do_not_vary() -> None:
     one, other = [0.3, 0.2, 0.7], [0.2, 0.1, 0.6]  # 0.1 each, but for the last bits
     assert len({a - b for a, b in zip(one, other, strict=True)}) > 1
-    assert compare(one, other).reason == "the same difference for every seed"
+    assert compare(one, other).reason == "equal for every seed"
 
 
 def test_epo_against_sc_of_the_same_backbone_and_goal_over_common_seeds(tmp_path: Path) -> None:
@@ -111,10 +111,8 @@ def test_epo_against_sc_of_the_same_backbone_and_goal_over_common_seeds(tmp_path
     # Differences -0.01, -0.03, -0.04: mean -0.08 / 3.
     assert lstm.differences["minSADE"].mean == pytest.approx(-0.08 / 3)
     assert lstm.differences["minSADE"].n == 3
-    assert lstm.differences["overlap_jfp"].reason == "the same difference for every seed"
-    assert vibes.differences["minSADE"] == Difference(
-        1, pytest.approx(-0.1), reason="a single common seed, a test needs two"
-    )
+    assert lstm.differences["overlap_jfp"].reason == "equal for every seed"
+    assert vibes.differences["minSADE"] == Difference(1, pytest.approx(-0.1), reason="one common seed, two are needed")
 
 
 def test_every_variant_is_compared(tmp_path: Path) -> None:

@@ -90,6 +90,9 @@ def test_subsets_and_initial_strategies_have_tables_of_their_own(tmp_path: Path)
     assert len(main.rows) == len(apart.rows) == 2
     assert [row.name for row in solved.rows] == ["V-LSTM + EPO"]
     assert [solved.rows[0].cells[column.metric].mean for column in solved.columns] == [0.7, 0.1, 0.9, 0.1]
+    assert {solved.rows[0].cells[column.metric].rank for column in solved.columns} == {None}  # alone there
+    assert main.rows[1].cells["minSADE"].rank == 1
+    assert main.rows[1].cells["initial/minSADE"].rank is None
 
 
 def test_splits_are_tables_apart(tmp_path: Path) -> None:
