@@ -11,6 +11,7 @@ import torch
 from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins import DoublePrecision
 from lightning.pytorch.strategies import Strategy
 
 from epo_lightning.data.datamodule import check_share
@@ -119,6 +120,13 @@ def quiet() -> None:
         warnings.filterwarnings("ignore", message=text)
 
 
+class _Double(DoublePrecision):
+    """Double precision of scenes, which are frozen data classes: Lightning's own refuses these."""
+
+    def convert_input(self, data: Any) -> Any:
+        return data.to(torch.double)
+
+
 def build_trainer(
     settings: TrainerSettings,
     run: RunFolder,
@@ -133,6 +141,7 @@ def build_trainer(
         ConfigError: a device or precision that this machine does not have.
     """
     torch.set_num_threads(settings.threads)
+    double = settings.precision == "64-true"
     try:
         return Trainer(
             default_root_dir=run.path,
@@ -140,8 +149,12 @@ def build_trainer(
             devices=1 if strategy is None else settings.devices,
             strategy=strategy or "auto",
             # Lightning's own idea of a Slurm job is one that catches its signals and counts its tasks.
-            plugins=[WholeCheckpoints(), *([LightningEnvironment()] if strategy is None else [])],
-            precision=settings.precision,  # type: ignore[arg-type]
+            plugins=[
+                WholeCheckpoints(),
+                *([LightningEnvironment()] if strategy is None else []),
+                *([_Double()] if double else []),
+            ],
+            precision=None if double else settings.precision,  # type: ignore[arg-type]
             max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,
             max_steps=settings.max_steps,
             check_val_every_n_epoch=settings.validate_every if settings.validate_steps is None else None,
