@@ -9,9 +9,12 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.evaluate import open_checkpoint, open_data
 from epo_lightning.experiment.predict import choose, eventful, forecast_of, is_traffic, pairs, spread
 from epo_lightning.experiment.settings import ReportSettings, Settings, read
+from epo_lightning.experiment.sweep import Sweep
 from epo_lightning.registry import ConfigError
-from epo_lightning.report import build_tables, collect, write_report
-from epo_lightning.run_folder import RunFolder, discover
+from epo_lightning.report import Report, build_tables, collect, write_report
+from epo_lightning.report.runs import scored
+from epo_lightning.report.write import is_timed
+from epo_lightning.run_folder import RunFolder
 
 SCENES, GAMES = 4, 512
 """How many scenes are drawn, and over how many the distribution of learned weights is taken."""
@@ -19,18 +22,58 @@ SCENES, GAMES = 4, 512
 ORDER = ("constant_velocity", "marginal", "scene_consistent", "epo")
 
 
-def report(settings: ReportSettings) -> str:
-    """Print the tables; write results.md, results.csv and figures/.
+def report(settings: ReportSettings) -> Path:
+    """Print the tables; write results, figures and index.html.
+
+    Returns:
+        the folder of the report.
 
     Raises:
-        ConfigError: no evaluated run below the folder, or one that cannot be read.
+        ConfigError: no such sweep, no evaluated run, or one that cannot be read.
     """
     assembly.quiet()
-    runs, out = Path(settings.runs).expanduser(), Path(settings.out).expanduser()
-    build_tables(collect(runs))  # whatever cannot be reported is said before anything is drawn
-    evaluated = [run for run in discover(runs) if run.metrics_file().is_file()]
-    drawn = draw(evaluated, out / "figures")
-    return write_report(runs, out, figures=drawn, preface=preface(evaluated))
+    sweep = Sweep.find(settings.sweep, (), settings.runs) if settings.sweep else None
+    subject = of_sweep(sweep) if sweep else Report.of_folder(settings.runs)
+    out = Path(settings.out or (sweep.folder / "report" if sweep else "report")).expanduser()
+    build_tables(subject.evaluated)  # whatever cannot be reported is said before anything is drawn
+    evaluated = [RunFolder(path) for path in dict.fromkeys(run.path for run in subject.evaluated)]
+    drawn = draw(evaluated, out / "figures") if evaluated else []
+    write_report(subject, out, figures=drawn, preface=preface(subject.runs))
+    return out
+
+
+def of_sweep(sweep: Sweep) -> Report:
+    """The runs of a sweep, by what the sweep measures: scores on another split belong to another report.
+
+    Raises:
+        ConfigError: none of them is done, or one cannot be read.
+    """
+    jobs = sweep.jobs
+    done = [job for job in jobs if scored(job.run) or is_timed(job.run)]
+    if not done:
+        raise ConfigError(
+            f"none of the {len(jobs)} runs of the sweep {sweep.label} is done: see `epo sweep status {sweep.label}`"
+        )
+    splits = {job.run.path: job.score for job in jobs}
+    with_scores = [job.run for job in done if scored(job.run)]
+    evaluated = [
+        run
+        for run in (collect(with_scores) if with_scores else ())
+        if splits[run.path] is None or run.split == splits[run.path]
+    ]
+    measured = {run.path for run in evaluated} | {job.run.path for job in done if is_timed(job.run)}
+    left_out = []
+    for job in jobs:
+        if job.run.path not in measured:
+            state, error = sweep.state(job), sweep.error(job)
+            left_out.append((str(job.run.path), f"{state}: {error}" if state == "failed" and error else state))
+    return Report(
+        title=sweep.label,
+        command=f"epo report {sweep.label}",
+        runs=tuple(job.run for job in jobs if job.run.path in measured),
+        evaluated=tuple(evaluated),
+        left_out=tuple(left_out),
+    )
 
 
 def preface(runs: Iterable[RunFolder]) -> str:

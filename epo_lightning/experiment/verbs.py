@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 from epo_lightning.experiment.settings import (
@@ -104,8 +103,7 @@ def report(config: dict[str, Any], overrides: Sequence[str]) -> None:
     settings = check("report", config)
     from epo_lightning.experiment.report import report as write
 
-    write(settings)
-    print(f"wrote {Path(settings.out) / 'results.md'}")
+    print(f"wrote {write(settings) / 'index.html'}")
 
 
 def _print_report(report: dict[str, Any], indent: str = "  ") -> None:

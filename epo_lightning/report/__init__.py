@@ -2,6 +2,6 @@
 
 from epo_lightning.report.runs import EvaluatedRun, collect
 from epo_lightning.report.tables import build_tables
-from epo_lightning.report.write import write_report
+from epo_lightning.report.write import Report, write_report
 
-__all__ = ["EvaluatedRun", "build_tables", "collect", "write_report"]
+__all__ = ["EvaluatedRun", "Report", "build_tables", "collect", "write_report"]

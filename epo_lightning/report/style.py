@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -60,6 +62,27 @@ def save(figure: Figure, path: str | Path) -> Path:
     with whole(path, ".png") as temporary:
         figure.savefig(temporary, dpi=DPI, bbox_inches="tight", pad_inches=0.08, metadata={"Software": None})
     return Path(path)
+
+
+def svg(figure: Figure, name: str) -> str:
+    """A figure as a piece of HTML: an <svg> without a size of its own, whose text is text.
+
+    Args:
+        name: begins all ids, so that several figures live in one page.
+    """
+    FigureCanvasAgg(figure)
+    text = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(
+            text, format="svg", transparent=True, bbox_inches="tight", pad_inches=0.04, metadata={"Date": None}
+        )
+    drawing = text.getvalue()
+    drawing = drawing[drawing.index("<svg") :]
+    # The page chooses fonts; a style sheet within the drawing would rule over all of the page.
+    for superfluous in (r"<metadata>.*?</metadata>", r"<style.*?</style>", r"font-family: [^;\"]*; "):
+        drawing = re.sub(superfluous, "", drawing, flags=re.DOTALL)
+    drawing = re.sub(r'\b(id="|href="#|url\(#)', rf"\g<1>{name}-", drawing)
+    return re.sub(r'^<svg[^>]*?(viewBox="[^"]*")[^>]*>', r'<svg \1 aria-hidden="true" focusable="false">', drawing)
 
 
 @contextmanager

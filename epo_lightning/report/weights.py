@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
 from torch import Tensor
 
 from epo_lightning.report.style import AGENT_COLORS, AGENTS, save, style
@@ -82,6 +84,11 @@ def _draw(axes: Axes, weights: Mapping[str, Tensor], colors: Sequence[str] = AGE
     before = axes.get_xlim() if axes.get_xscale() == "log" else (np.inf, -np.inf)
     axes.set_xscale("log")
     axes.set_xlim(min(before[0], 10 ** (low - margin)), max(before[1], 10 ** (high + margin)))
+    # Powers of ten alone, but a narrow panel that holds one of them needs a second number to be read.
+    tens = math.log10(axes.get_xlim()[1]) // 1 - math.log10(axes.get_xlim()[0]) // 1
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if tens > 1 else (1.0, 3.0)))
+    axes.xaxis.set_major_formatter(LogFormatterMathtext() if tens > 1 else FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_yticks(range(len(weights)), list(weights))
     axes.set_ylim(len(weights) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")

@@ -1,34 +1,101 @@
-"""The report: tables, how they were made, and figures, in one folder."""
+"""The report: tables, how they were made, figures and the page that shows it all, in one folder."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
-from epo_lightning.report.render import LEGEND, to_csv, to_markdown, to_rich
-from epo_lightning.report.runs import EvaluatedRun, collect, not_evaluated
-from epo_lightning.report.tables import Table, build_tables
-from epo_lightning.run_folder import write_text
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.latex import comparisons_to_latex, sheet_to_latex, to_latex
+from epo_lightning.report.made import Made, how_made
+from epo_lightning.report.render import (
+    COMPARISON_LEGEND,
+    LEGEND,
+    Sheet,
+    comparison_sheet,
+    comparisons_to_csv,
+    settings_sheet,
+    to_csv,
+    to_markdown,
+    to_rich,
+)
+from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, scored
+from epo_lightning.report.selection import BestSetting, best_settings
+from epo_lightning.report.statistics import build_comparisons
+from epo_lightning.report.tables import build_tables
+from epo_lightning.report.timings import read_timings
+from epo_lightning.run_folder import RunFolder, write_text
+
+PAPER_IN_LEGEND = "; in brackets the paper's value and ours minus the paper's"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What is reported on.
+
+    Attributes:
+        title: above everything.
+        command: that writes the report.
+        runs: all run folders that have scores or were timed.
+        evaluated: what was scored in them.
+        left_out: the other run folders, and why they are left out.
+    """
+
+    title: str
+    command: str
+    runs: tuple[RunFolder, ...]
+    evaluated: tuple[EvaluatedRun, ...]
+    left_out: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def of_folder(cls, folder: str | Path) -> Report:
+        """All runs in and below a folder.
+
+        Raises:
+            ConfigError: as :func:`~epo_lightning.report.collect`.
+        """
+        known = find_runs(folder)
+        runs = [run for run in known if scored(run) or is_timed(run)]
+        # Runs that were only timed are worth a report; without any of them, collect says what is missing.
+        only_timed = runs and not any(map(scored, runs))
+        return cls(
+            title=Path(folder).expanduser().resolve().name,
+            command=f"epo report runs={folder}",
+            runs=tuple(runs),
+            evaluated=() if only_timed else tuple(collect(folder)),
+            left_out=tuple((str(run.path), why_left_out(run)) for run in known if run not in runs),
+        )
+
+
+def is_timed(run: RunFolder) -> bool:
+    """Whether it was measured how long the run's forecasts take."""
+    return run.metrics_file("time").is_file()
+
+
+def why_left_out(run: RunFolder) -> str:
+    """The state of a run that has no scores."""
+    return f"not evaluated yet: epo evaluate run={run.path}" if run.state == "finished" else run.state
 
 
 def write_report(
-    runs: str | Path,
+    report: Report,
     out: str | Path,
     figures: Sequence[str | Path] = (),
     preface: str = "",
     console: Console | None = None,
 ) -> str:
-    """Report on all evaluated runs in and below a folder: print the tables, write ``results.md`` and ``results.csv``.
+    """Print the tables; write ``results.md``, ``.csv`` and ``.tex``, ``index.html`` and the figures of many runs.
 
-    Nothing is written unless everything could be read.
+    Nothing is written unless everything could be read, and every file is written as a whole.
 
     Args:
-        runs: folder of run folders.
+        report: what to report on.
         out: folder of the report.
-        figures: pictures that results.md shows; links are relative to ``out``.
+        figures: pictures that were drawn already.
         preface: Markdown that stands before the tables, for what a reader has to know first.
         console: where to print; the terminal by default.
 
@@ -36,59 +103,99 @@ def write_report(
         The text of results.md.
 
     Raises:
-        ConfigError: as :func:`~epo_lightning.report.collect` and :func:`~epo_lightning.report.build_tables`.
+        ConfigError: as :func:`~epo_lightning.report.build_tables`.
     """
-    runs, out = Path(runs).expanduser(), Path(out).expanduser()
-    tables = build_tables(collect(runs))
+    from epo_lightning.report.charts import charts_of
+    from epo_lightning.report.page import Content, page
+    from epo_lightning.report.style import save
+
+    out = Path(out).expanduser()
+    tables = build_tables(report.evaluated)
+    timings, notes = read_timings(report.runs)
+    comparisons = build_comparisons(tables)
+    compared = [comparison_sheet(entry) for entry in comparisons]
+    best, hint = _best(report.evaluated)
+    settings = [settings_sheet(best)] if best else []
+    notes += [hint] if hint else []
+    made, charts = how_made(tables, timings), charts_of(tables, timings)
+    has_paper = any(cell.paper is not None for table in tables for row in table.rows for cell in row.cells.values())
+    legend = LEGEND if has_paper else LEGEND.replace(PAPER_IN_LEGEND, "")
+
+    shown: list[Sheet] = [*settings, *compared]
+    links = [f"figures/{chart.name}.png" for chart in charts] + [os.path.relpath(figure, out) for figure in figures]
     markdown = "\n".join(
         part
         for part in (
-            "# Results\n",
+            f"# Results: {report.title}\n",
             preface.strip() + "\n" if preface.strip() else "",
+            *(note + "\n" for note in notes),
             *(to_markdown(table) for table in tables),
-            LEGEND + "\n",
-            how_made(tables, runs),
-            *(f"![{Path(figure).stem}]({os.path.relpath(figure, out)})\n" for figure in figures),
+            legend + "\n" if tables else "",
+            *(to_markdown(sheet) for sheet in shown),
+            COMPARISON_LEGEND + "\n" if compared else "",
+            _how_made(made, report),
+            *(f"![{Path(link).stem}]({link})\n" for link in links),
         )
         if part
     )
-    write_text(out / "results.md", markdown)
-    write_text(out / "results.csv", to_csv(tables))
+    content = Content(
+        title=report.title,
+        command=report.command,
+        preface=preface,
+        legend=legend.replace("in brackets", "below"),
+        comparison_legend=COMPARISON_LEGEND,
+        tables=tables,
+        comparisons=compared,
+        settings=settings,
+        charts=charts,
+        pictures=[Path(figure) for figure in figures],
+        made=made,
+        left_out=report.left_out,
+        notes=notes,
+    )
+    files = {"results.md": markdown, "index.html": page(content)}
+    if tables:
+        files["results.csv"] = to_csv(tables)
+        latex = [*map(to_latex, tables), *map(comparisons_to_latex, comparisons), *map(sheet_to_latex, settings)]
+        files["results.tex"] = "\n".join(latex)
+    if comparisons:
+        files["comparisons.csv"] = comparisons_to_csv(comparisons)
+
+    for chart in charts:
+        save(chart.draw(chart.wide, True), out / "figures" / f"{chart.name}.png")
+    for name, text in files.items():
+        write_text(out / name, text)
     console = console or Console()
-    for table in tables:
+    for table in (*tables, *shown):
         console.print(to_rich(table))
     return markdown
 
 
-def how_made(tables: Sequence[Table], folder: Path) -> str:
+def _best(runs: Sequence[EvaluatedRun]) -> tuple[list[BestSetting], str]:
+    """The best settings where there was a search, and what is in the way of choosing them."""
+    validated = [run for run in runs if run.split == "val"]
+    try:
+        return (best_settings(validated), "") if validated else ([], "")
+    except ConfigError as error:  # a search that is not finished yet
+        return [], f"No setting was chosen: {error}"
+
+
+def _how_made(rows: Sequence[Made], report: Report) -> str:
     """What somebody needs to judge the tables, and to make them again."""
     lines = [
         "### How this was made",
         "",
-        "| method | data | split | budget | seeds | parameters | commit | data digest |",
-        "|:--|:--|:--|:--|:--|--:|:--|:--|",
+        "| method | of | budget | n | seeds | parameters | commit | data digest |",
+        "|:--|:--|:--|--:|:--|--:|:--|:--|",
+        *(
+            f"| {row.name} | {row.what} | {row.budget} | {len(row.runs)} | {row.seeds} | {row.parameters} | "
+            f"{row.commits} | {row.digests} |"
+            for row in rows
+        ),
+        "",
     ]
-    shown = dict.fromkeys(
-        (row.name, first.data, first.split, *_conditions(row.runs), first.data_digest)
-        for table in tables
-        for row in table.rows
-        for first in row.runs[:1]
-    )
-    lines += ["| " + " | ".join(entry) + " |" for entry in shown]
-    lines += ["", f"Made of the runs in `{folder}` by `epo report runs={folder}`."]
-    if missing := not_evaluated(folder):
-        lines.append(f"Left out, not evaluated yet: {', '.join(f'`{path}`' for path in missing)}.")
+    commands = {run.folder: f"- `{run.folder}`: `{run.command}`" for row in rows for run in row.runs}
+    lines += [*commands.values(), "", f"Written by `{report.command}`."]
+    if report.left_out:
+        lines += ["", "Left out:", "", *(f"- `{folder}`: {state}" for folder, state in report.left_out)]
     return "\n".join([*lines, ""])
-
-
-def _short(commit: str) -> str:
-    """Enough of a commit to find it; ``+`` says that files had been changed since."""
-    return commit[:10] + ("+" if commit.endswith("+") else "")
-
-
-def _conditions(runs: Sequence[EvaluatedRun]) -> tuple[str, str, str, str]:
-    """Budget, seeds, parameters and commits of a row; what learns nothing has no budget."""
-    parameters = ", ".join(sorted({"-" if run.parameters is None else str(run.parameters) for run in runs}))
-    commits = ", ".join(sorted({_short(run.git_commit) for run in runs}))
-    budget = runs[0].budget if runs[0].learned else "-"
-    return budget, ", ".join(str(seed) for seed in sorted(run.seed for run in runs)), parameters, commits

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import csv
 import io
+import math
+import resource
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from rich.console import Console
 
 from epo_lightning.registry import ConfigError
-from epo_lightning.report import write_report
+from epo_lightning.report import Report, write_report
+from epo_lightning.report.write import PAPER_IN_LEGEND
+from epo_lightning.run_folder import write_json
 
+from .page_runs import over_runtime, over_steps, rows_with_seeds
 from .run_folders import make_run, scores
 
 
@@ -24,7 +30,7 @@ def three_rows(folder: Path) -> None:
 
 def report(runs: Path, out: Path, **options: object) -> tuple[str, str]:
     console = Console(file=io.StringIO(), width=160)
-    markdown = write_report(runs, out, console=console, **options)  # type: ignore[arg-type]
+    markdown = write_report(Report.of_folder(runs), out, console=console, **options)  # type: ignore[arg-type]
     return markdown, console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -45,7 +51,9 @@ def test_markdown_by_hand(tmp_path: Path) -> None:
     )
     assert "<u>0.100</u> (0.04, +0.060)" in markdown
     assert lines.index("A reduced budget.") < lines.index("### rpi, test split")
-    assert "| V-LSTM + EPO | rpi | test | reduced | 0, 1 | 1234 | 0123456789 | abc |" in lines
+    assert "| V-LSTM + EPO | rpi, test split | reduced | 2 | 0, 1 | 1234 | 0123456789 | abc |" in lines
+    assert f"- `{tmp_path}/runs/e1`: `epo train experiment=None seed=1`" in lines
+    assert f"Written by `epo report runs={tmp_path}/runs`." in lines
 
 
 def test_terminal_shows_whole_numbers_in_80_columns(tmp_path: Path) -> None:
@@ -56,7 +64,7 @@ def test_terminal_shows_whole_numbers_in_80_columns(tmp_path: Path) -> None:
             tmp_path / f"runs/g{seed}", "V-LSTM + EPO, goal known", "epo", scores(0.5) | subsets, seed=seed, goal="all"
         )
     console = Console(file=io.StringIO(), width=80)
-    write_report(tmp_path / "runs", tmp_path / "out", console=console)
+    write_report(Report.of_folder(tmp_path / "runs"), tmp_path / "out", console=console)
     printed = console.file.getvalue()  # type: ignore[attr-defined]
     assert "…" not in printed
     lines = [line.split() for line in printed.splitlines()]
@@ -83,8 +91,46 @@ def test_csv_holds_every_score_once_in_full_precision(tmp_path: Path) -> None:
 
 def test_figures_are_linked_from_the_report(tmp_path: Path) -> None:
     three_rows(tmp_path / "runs")
-    markdown, _ = report(tmp_path / "runs", tmp_path / "out", figures=[tmp_path / "out" / "figures" / "joint.png"])
+    picture = tmp_path / "out" / "figures" / "joint.png"
+    picture.parent.mkdir(parents=True)
+    Image.new("RGB", (30, 20)).save(picture)
+    markdown, _ = report(tmp_path / "runs", tmp_path / "out", figures=[picture])
     assert "![joint](figures/joint.png)" in markdown
+
+
+def test_the_legend_speaks_of_the_paper_where_it_has_values(tmp_path: Path) -> None:
+    three_rows(tmp_path / "ours")
+    make_run(tmp_path / "other" / "m", "V-LSTM", "marginal", scores(0.3), data="highway_sim")
+    assert PAPER_IN_LEGEND in report(tmp_path / "ours", tmp_path / "out")[0]
+    assert "the paper's value" not in report(tmp_path / "other", tmp_path / "out")[0]
+
+
+def test_latex_and_comparisons_lie_beside(tmp_path: Path) -> None:
+    rows_with_seeds(tmp_path / "runs")
+    report(tmp_path / "runs", tmp_path / "out")
+    latex = (tmp_path / "out" / "results.tex").read_text()
+    assert latex.count("\\begin{tabular}") == 3  # all rows, initial and solved, comparisons
+    compared = list(csv.DictReader((tmp_path / "out" / "comparisons.csv").open()))
+    assert {(line["method"], line["other"], line["n"]) for line in compared} == {("V-LSTM + EPO", "V-LSTM + SC", "3")}
+
+
+def test_a_search_ends_in_its_best_setting_or_says_why_not(tmp_path: Path) -> None:
+    over_steps(tmp_path / "runs")
+    assert "solver.steps=8 | 0.040" in report(tmp_path / "runs", tmp_path / "out")[0]
+    for run in (tmp_path / "runs").glob("S*-s1"):
+        metrics = scores(math.nan) | {"initial/minSADE": 0.1, "initial/minSFDE": 0.1}
+        write_json(run / "metrics-val.json", {"data_digest": "abc", "split": "val", "metrics": metrics})
+    markdown, _ = report(tmp_path / "runs", tmp_path / "out")
+    assert "No setting was chosen: no setting of 'V-LSTM + EPO' has finite scores" in markdown
+
+
+def test_runs_that_were_only_timed_are_a_report(tmp_path: Path) -> None:
+    over_runtime(tmp_path / "runs")
+    markdown, _ = report(tmp_path / "runs", tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["figures", "index.html", "results.md"]
+    assert "![runtime](figures/runtime.png)" in markdown
+    folder = tmp_path / "runs" / "N12-S8-M4"
+    assert f"- `{folder}`: `epo train experiment=None seed=0`" in markdown
 
 
 def test_runs_that_are_left_out_and_changed_code_are_said(tmp_path: Path) -> None:
@@ -93,8 +139,13 @@ def test_runs_that_are_left_out_and_changed_code_are_said(tmp_path: Path) -> Non
     late = make_run(tmp_path / "runs" / "late", "Late", "epo", None)
     make_run(tmp_path / "runs" / "m", "V-LSTM", "marginal", scores(0.3)).update(git_commit="0123456789abcdef+")
     markdown, _ = report(tmp_path / "runs", tmp_path / "out")
-    assert f"Left out, not evaluated yet: `{late.path}`." in markdown
-    assert "| V-LSTM | rpi | test | reduced | 0 | 1234 | 0123456789+ | abc |" in markdown
+    assert f"- `{late.path}`: interrupted" in markdown
+    late.update(status="finished")
+    assert (
+        f"- `{late.path}`: not evaluated yet: epo evaluate run={late.path}"
+        in report(tmp_path / "runs", tmp_path / "out")[0]
+    )
+    assert "| V-LSTM | rpi, test split | reduced | 1 | 0 | 1234 | 0123456789+ | abc |" in markdown
 
 
 def test_nothing_is_overwritten_by_a_report_that_fails(tmp_path: Path) -> None:
@@ -107,3 +158,30 @@ def test_nothing_is_overwritten_by_a_report_that_fails(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no run"):
         report(tmp_path / "out", tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_full_disk_leaves_no_half_of_a_file(tmp_path: Path) -> None:
+    rows_with_seeds(tmp_path / "runs")
+    report(tmp_path / "runs", tmp_path / "before")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    largest = (tmp_path / "before" / "index.html").stat().st_size
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest - 1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            report(tmp_path / "runs", tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    left = [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+    assert tmp_path / "out" / "index.html" not in left
+    for path in left:
+        assert path.read_bytes() == (tmp_path / "before" / path.relative_to(tmp_path / "out")).read_bytes()
+
+
+def test_equal_runs_give_equal_bytes(tmp_path: Path) -> None:
+    rows_with_seeds(tmp_path / "runs")
+    for name in ("one", "two"):
+        report(tmp_path / "runs", tmp_path / name)
+    files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*") if path.is_file())
+    assert len(files) == 6
+    for path in files:
+        assert (tmp_path / "one" / path).read_bytes() == (tmp_path / "two" / path).read_bytes()

@@ -1,0 +1,201 @@
+"""What a report draws of many runs: figures with a title, a caption and the numbers behind them, for files and the page."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from epo_lightning.report.curves import (
+    Curve,
+    StepsCurve,
+    draw_learning,
+    draw_steps,
+    learning_curves,
+    look,
+    steps_curves,
+    steps_names,
+)
+from epo_lightning.report.made import distinct
+from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
+from epo_lightning.report.runtime import draw_modes, heat_map
+from epo_lightning.report.tables import Row, Table
+from epo_lightning.report.timings import Timing, grid, over_modes, places, time
+
+Size = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Key:
+    """One entry of a legend: what a line means, and how it looks."""
+
+    label: str
+    color: str
+    dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One figure.
+
+    Attributes:
+        section: where it belongs.
+        name: of its file.
+        title, caption: what it shows, and how to read it.
+        draw: of a size [inch], with or without a legend.
+        wide, narrow: sizes for a page and for a phone.
+        legend: entry i is the line whose id is ``row<i>-line``.
+        header, numbers: the data behind it, as text.
+        notes: what is missing.
+    """
+
+    section: str
+    name: str
+    title: str
+    caption: str
+    draw: Callable[[Size, bool], Figure]
+    wide: Size
+    narrow: Size
+    legend: tuple[Key, ...]
+    header: tuple[str, ...]
+    numbers: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+
+
+LEARNING, STEPS, RUNTIMES = "Learning curves", "S curve", "Runtime"
+
+
+def charts_of(tables: Sequence[Table], timings: Sequence[Timing]) -> list[Chart]:
+    """All that can be drawn of these tables and timings."""
+    return [*_learning(tables), *_steps(tables), *_runtimes(timings)]
+
+
+def _learning(tables: Sequence[Table]) -> Iterable[Chart]:
+    """One chart per data set; a row that was evaluated on two splits learned once."""
+    by_data: dict[str, dict[tuple[object, ...], Row]] = {}
+    for row in distinct(tables):
+        by_data.setdefault(row.runs[0].data, {}).setdefault(tuple(run.path for run in row.runs), row)
+    for data, rows in by_data.items():
+        curves, notes = learning_curves(rows.values())
+        if curves:
+            yield Chart(
+                section=LEARNING,
+                name="learning_curves" + (f"_{_word(data)}" if len(by_data) > 1 else ""),
+                title=f"Learning curves, {data}",
+                caption="minSADE on the validation split while training: mean over seeds, with a band from the best "
+                "to the worst seed. A line ends where the first of its seeds stopped.",
+                draw=lambda size, legend, curves=curves: draw_learning(curves, size, legend),  # type: ignore[misc]
+                wide=(7.4, 3.9),
+                narrow=(4.0, 3.5),
+                legend=tuple(Key(curve.name, look(i)[0], look(i)[1] != "-") for i, curve in enumerate(curves)),
+                header=("row", "seeds", "last step", "minSADE there", "smallest mean", "at step"),
+                numbers=tuple(_summary(curve) for curve in curves),
+                notes=tuple(notes),
+            )
+
+
+def _summary(curve: Curve) -> tuple[str, ...]:
+    best = min(range(len(curve.x)), key=lambda i: curve.mean[i])
+    return (
+        curve.name,
+        str(curve.seeds),
+        str(curve.x[-1]),
+        f"{curve.mean[-1]:.4f}",
+        f"{curve.mean[best]:.4f}",
+        str(curve.x[best]),
+    )
+
+
+def _steps(tables: Sequence[Table]) -> Iterable[Chart]:
+    curves = steps_curves(distinct(tables))
+    for number, curve in enumerate(curves, 1):
+        first = curve.split
+        yield Chart(
+            section=STEPS,
+            name="steps" + (f"_{number}" if len(curves) > 1 else ""),
+            title=f"{curve.name} over optimisation steps, {first}",
+            caption="minSADE of what the game's solution predicts (optimised) and of what the network alone predicts "
+            "(initial): mean over seeds, with a band from the best to the worst."
+            + (" Dashed: the paper's figure, on its RPI validation split." if curve.paper else ""),
+            draw=lambda size, legend, curve=curve: draw_steps(curve, size, legend),  # type: ignore[misc]
+            wide=(7.4, 3.7),
+            narrow=(4.0, 3.3),
+            legend=tuple(Key(*entry) for entry in steps_names(curve)),
+            header=("S", "seeds", "optimised [m]", "initial [m]"),
+            numbers=tuple(_of_steps(curve)),
+        )
+
+
+def _of_steps(curve: StepsCurve) -> Iterable[tuple[str, ...]]:
+    initial = {} if curve.initial is None else dict(zip(curve.initial.x, curve.initial.mean, strict=True))
+    for steps, mean in zip(curve.optimised.x, curve.optimised.mean, strict=True):
+        yield (
+            str(steps),
+            str(curve.optimised.seeds),
+            f"{mean:.4f}",
+            f"{initial[steps]:.4f}" if steps in initial else "-",
+        )
+
+
+def _runtimes(timings: Sequence[Timing]) -> Iterable[Chart]:
+    found = places(timings)
+    for number, (where, members) in enumerate(found.items(), 1):
+        suffix = f"_{number}" if len(found) > 1 else ""
+        header = ("N", "S", "M", "mean", "median", "10% to 90%", "samples", "run")
+        numbers = tuple(_of_timing(timing) for timing in sorted(members, key=_position))
+        modes, seconds = grid(members)
+        if len(seconds) > 1:
+            yield Chart(
+                section=RUNTIMES,
+                name=f"runtime{suffix}",
+                title=f"Runtime over agents and steps: {where}",
+                caption=f"Mean time of one joint forecast with M = {modes} modes. Below it the paper's, with M = 4, "
+                "on its own machine.",
+                draw=lambda size, _, seconds=seconds: heat_map(seconds, RUNTIME, size),  # type: ignore[misc]
+                wide=(7.0, 4.4),
+                narrow=(4.0, 4.4),
+                legend=(),
+                header=header,
+                numbers=numbers,
+            )
+        (agents, steps), by_modes = over_modes(members)
+        if len(by_modes) > 1:
+            paper = RUNTIME_MODES if (agents, steps) == (4, 2) else {}
+            yield Chart(
+                section=RUNTIMES,
+                name=f"runtime_modes{suffix}",
+                title=f"Runtime over modes: {where}",
+                caption=f"Mean time of one joint forecast with N = {agents} agents"
+                + (f" and S = {steps} steps." if steps is not None else ".")
+                + (" The paper's own two panels differ where they meet (N = 4, S = 2, M = 4)." if paper else ""),
+                draw=lambda size, legend, values=by_modes, paper=paper: draw_modes(values, paper, size, legend),  # type: ignore[misc]
+                wide=(7.0, 2.9),
+                narrow=(4.0, 2.9),
+                legend=(Key("here", "#0072B2"), *([Key("paper", "#8A8A8A", True)] if paper else [])),
+                header=header,
+                numbers=numbers,
+            )
+
+
+def _position(timing: Timing) -> tuple[int, int, int, str]:
+    return timing.agents, timing.steps or 0, timing.modes, str(timing.run.path)
+
+
+def _of_timing(timing: Timing) -> tuple[str, ...]:
+    return (
+        str(timing.agents),
+        "-" if timing.steps is None else str(timing.steps),
+        str(timing.modes),
+        time(timing.mean),
+        time(timing.median),
+        f"{time(timing.p10)} to {time(timing.p90)}",
+        str(timing.samples),
+        str(timing.run.path),
+    )
+
+
+def _word(text: str) -> str:
+    """A piece of a file's name."""
+    return re.sub(r"\W+", "_", text)

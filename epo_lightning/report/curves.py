@@ -1,0 +1,276 @@
+"""Curves over many runs: how rows learn, and what more optimisation steps bring (the paper's S curve)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
+
+from epo_lightning.identity import essence
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.paper import STEPS
+from epo_lightning.report.style import MODES, VEHICLES, style
+from epo_lightning.report.tables import Row
+
+METRIC = "val/minSADE"
+"""What training watches."""
+SIZE = (7.4, 3.7)
+"""Width and height of a chart [inch]."""
+DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
+"""More rows than colours are told apart by how their lines are dashed."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One quantity of one row, over training steps or optimisation steps.
+
+    Attributes:
+        name: of the row.
+        x: where it was measured.
+        mean, low, high: over the seeds: mean, smallest and largest value at every ``x``.
+        seeds: how many.
+    """
+
+    name: str
+    x: tuple[int, ...]
+    mean: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    seeds: int
+
+    @classmethod
+    def over_seeds(cls, name: str, values: Mapping[int, Sequence[float]]) -> Curve:
+        """From all values by where they were measured."""
+        x = tuple(sorted(values))
+        return cls(
+            name,
+            x,
+            tuple(statistics.fmean(values[at]) for at in x),
+            tuple(min(values[at]) for at in x),
+            tuple(max(values[at]) for at in x),
+            max(len(entry) for entry in values.values()),
+        )
+
+
+@dataclass(frozen=True)
+class StepsCurve:
+    """The S curve of rows that differ in nothing but their optimisation steps.
+
+    Attributes:
+        name: of the row with the fewest steps, which stands for all.
+        split: on which data, and which part of it.
+        optimised, initial: minSADE over S of what the game's solution and of what the network alone predicts.
+        paper: the paper's curves belong beside it.
+    """
+
+    name: str
+    split: str
+    optimised: Curve
+    initial: Curve | None
+    paper: bool = False
+
+
+def learning_curves(rows: Iterable[Row], metric: str = METRIC) -> tuple[list[Curve], list[str]]:
+    """The validation score of every row over training steps, and a note for each row that cannot be shown.
+
+    A row's curve ends where the first of its seeds stopped, so that its mean is always over all of them.
+    """
+    curves, notes = [], []
+    for row in rows:
+        if not any(run.learned for run in row.runs):
+            continue
+        try:
+            logs = [read_log(run.path / "logs" / "metrics.csv", metric) for run in row.runs]
+        except ConfigError as error:
+            notes.append(f"{row.name} is left out: {error}")
+            continue
+        shared = set.intersection(*(set(log) for log in logs))
+        if shared:
+            curves.append(Curve.over_seeds(row.name, {step: [log[step] for log in logs] for step in shared}))
+        else:
+            notes.append(f"{row.name} is left out: its seeds share no step at which they were validated")
+    return curves, notes
+
+
+def read_log(file: Path, metric: str) -> dict[int, float]:
+    """The values of one column by training step; of a step that was logged twice, the later one.
+
+    Raises:
+        ConfigError: the file is missing, or holds no whole line with this column.
+    """
+    try:
+        text = file.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ConfigError(f"cannot read {file} ({error.strerror})") from error
+    values: dict[int, float] = {}
+    # What follows the last line break was being written when the run was stopped.
+    for record in csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1])):
+        try:
+            step, value = int(record["step"] or ""), float(record[metric] or "")
+        except (KeyError, ValueError, TypeError):
+            continue
+        if math.isfinite(value):
+            values[step] = value
+    if not values:
+        raise ConfigError(f"{file} holds no {metric} of any step")
+    return values
+
+
+def draw_learning(curves: Sequence[Curve], size: tuple[float, float] = SIZE, legend: bool = True) -> Figure:
+    """One line per row, and a band from its smallest to its largest seed.
+
+    Lines and bands have the ids ``row<i>-line`` and ``row<i>-band``, by which a page can hide them.
+
+    Raises:
+        ValueError: there is no curve.
+    """
+    if not curves:
+        raise ValueError("learning curves of no row: nothing to draw")
+    with style():
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots()
+        for i, curve in enumerate(curves):
+            color, dashes = look(i)
+            marker = "o" if len(curve.x) == 1 else ""
+            _line(
+                axes, curve, f"row{i}", 0.16 if len(curves) < 5 else 0.08, color=color, ls=dashes, lw=1.7, marker=marker
+            )
+        everything = [value for curve in curves for value in (*curve.low, *curve.high)]
+        if min(everything) > 0 and max(everything) > 5 * min(everything):
+            _logarithmic(axes)
+        axes.set_xlabel("training steps")
+        axes.set_ylabel("minSADE, validation [m]")
+        axes.margins(x=0.02)
+        _plain(axes)
+        if legend:
+            figure.legend(loc="outside lower center", ncols=min(3, len(curves)), fontsize=8)
+        return figure
+
+
+def look(i: int) -> tuple[str, str | tuple[int, tuple[float, float]]]:
+    """Colour and dashes of the i-th row."""
+    return VEHICLES[i % len(VEHICLES)], DASHES[i // len(VEHICLES) % len(DASHES)]  # type: ignore[return-value]
+
+
+def steps_curves(rows: Iterable[Row]) -> list[StepsCurve]:
+    """Rows that differ in nothing but ``solver.steps``, joined to curves over S."""
+    series: dict[str, dict[int, list[Row]]] = {}
+    for row in rows:
+        if "minSADE" not in row.cells or row.runs[0].forecaster != "epo":
+            continue
+        same = essence(row.runs[0].config)
+        steps = (same.get("solver") or {}).pop("steps", None)
+        if isinstance(steps, int):
+            # The data are those of the table; a seed is not part of a row.
+            key = json.dumps([row.runs[0].data, row.runs[0].split, {**same, "seed": None}], sort_keys=True)
+            series.setdefault(key, {}).setdefault(steps, []).append(row)
+    curves = []
+    for members in series.values():
+        if len(members) < 2:
+            continue
+        runs = {steps: [run for row in same for run in row.runs] for steps, same in sorted(members.items())}
+        first = members[min(members)][0]
+        solved = {steps: [run.metrics["minSADE"] for run in group] for steps, group in runs.items()}
+        initial = {
+            steps: values
+            for steps, group in runs.items()
+            if (values := [run.metrics["initial/minSADE"] for run in group if "initial/minSADE" in run.metrics])
+        }
+        curves.append(
+            StepsCurve(
+                name=first.title,
+                split=f"{first.runs[0].data}, {first.runs[0].split} split",
+                optimised=Curve.over_seeds(first.name, solved),
+                initial=Curve.over_seeds(first.name, initial) if initial else None,
+                paper=(first.runs[0].data, first.runs[0].backbone) == ("rpi", "v_lstm"),
+            )
+        )
+    return curves
+
+
+def draw_steps(curve: StepsCurve, size: tuple[float, float] = SIZE, legend: bool = True) -> Figure:
+    """minSADE of optimised and initial strategies over the optimisation steps S, the paper's dashed beside them.
+
+    The ids are those of :func:`draw_learning`: rows 0 and 1 are ours, 2 and 3 the paper's.
+    """
+    names = steps_names(curve)
+    with style():
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots()
+        ours = {"lw": 1.9, "marker": "o", "ms": 5}
+        _line(axes, curve.optimised, "row0", 0.16, label=names[0][0], color=names[0][1], **ours)
+        if curve.initial is not None:
+            _line(axes, curve.initial, "row1", 0.16, label=names[1][0], color=names[1][1], **ours)
+        if curve.paper:
+            for which, (label, color, _) in enumerate(names[-2:]):
+                axes.plot(
+                    list(STEPS),
+                    [values[("minSADE", "initial/minSADE")[which]] for values in STEPS.values()],
+                    color=color,
+                    lw=1.2,
+                    ls=(0, (4, 3)),
+                    marker="o",
+                    ms=4.5,
+                    mfc="white",
+                    label=label,
+                    gid=f"row{2 + which}-line",
+                )
+        axes.set_xscale("log", base=2)
+        ticks = sorted({int(x) for line in axes.lines for x in line.get_xdata()})  # type: ignore[union-attr, call-overload]
+        axes.set_xticks(ticks, [str(tick) for tick in ticks])
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_xlabel("optimisation steps S")
+        axes.set_ylabel("minSADE [m]")
+        axes.margins(x=0.06, y=0.12)
+        _plain(axes)
+        if legend:
+            figure.legend(loc="outside lower center", ncols=2, fontsize=8)
+        return figure
+
+
+def steps_names(curve: StepsCurve) -> list[tuple[str, str, bool]]:
+    """Label, colour and whether it is dashed, of every line of an S curve in the order of their ids."""
+    ours = [("optimised", MODES[1], False)] + ([("initial", MODES[0], False)] if curve.initial is not None else [])
+    return ours + ([("paper, optimised", MODES[1], True), ("paper, initial", MODES[0], True)] if curve.paper else [])
+
+
+def _line(axes: Axes, curve: Curve, gid: str, shade: float, label: str | None = None, **options: object) -> Line2D:
+    """A mean with its band; a band of one seed would be a line on a line."""
+    if curve.seeds > 1:
+        axes.fill_between(
+            curve.x,
+            curve.low,
+            curve.high,
+            color=str(options["color"]),
+            alpha=shade,
+            lw=0,
+            gid=f"{gid}-band",
+        )
+    drawn = axes.plot(curve.x, curve.mean, label=label or curve.name, gid=f"{gid}-line", **options)  # type: ignore[arg-type]
+    return drawn[0]
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A logarithmic axis whose ticks are read as what they are."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    low, high = axes.get_ylim()
+    ticks = [m * 10.0**e for e in range(-6, 6) for m in (1, 2, 5) if low <= m * 10.0**e <= high]
+    if ticks:
+        axes.set_yticks(ticks)
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_minor_locator(NullLocator())
+
+
+def _plain(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,192 @@
+"""The report as one HTML file, which needs nothing else: no network, no other file, no server."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from epo_lightning.report.charts import Chart
+from epo_lightning.report.made import Made, distinct
+from epo_lightning.report.render import Sheet, difference_text, number, own_text, paper_text, signed, with_ends
+from epo_lightning.report.style import svg
+from epo_lightning.report.tables import Row, Table
+
+WIDEST, COLORS = 1500, 128
+"""Pictures are scaled down to this many pixels and reduced to this many colours: a page should be small enough to mail."""
+
+SCENES, WEIGHTS = "Scenes", "Learned weights"
+
+
+@dataclass(frozen=True)
+class Content:
+    """All that a page shows.
+
+    Attributes:
+        title: of the page.
+        command: that writes it again.
+        preface, legend, comparison_legend: Markdown, of which bold, underlined and code is understood.
+        tables, comparisons, settings: in their order; the latter two as text in columns.
+        charts: with their section.
+        pictures: PNG files.
+        made: how every row was made.
+        left_out: run folders that were left out, and why.
+        notes: on what could not be shown.
+    """
+
+    title: str
+    command: str
+    preface: str
+    legend: str
+    comparison_legend: str
+    tables: Sequence[Table]
+    comparisons: Sequence[Sheet]
+    settings: Sequence[Sheet]
+    charts: Sequence[Chart]
+    pictures: Sequence[Path]
+    made: Sequence[Made]
+    left_out: Sequence[tuple[str, str]]
+    notes: Sequence[str] = ()
+
+
+def page(content: Content) -> str:
+    """The whole page. Equal runs give equal pages: its date is that of the newest run."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    folder = Path(__file__).parent
+    environment = Environment(
+        loader=FileSystemLoader(folder),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["marked"] = lambda text: Markup(_marked(text))
+    rows = distinct(content.tables)
+    places = {id(row): place for place, row in enumerate(rows)}
+    by_runs = {_key(row): place for place, row in enumerate(rows)}
+    cells: list[dict[str, Any]] = []
+    tables = [_table(table, cells, lambda row: places.get(id(row), by_runs[_key(row)])) for table in content.tables]
+    pictures = [(path, picture_uri(path)) for path in content.pictures]
+    scenes = [(_caption(path), uri) for path, uri in pictures if "weights" not in path.stem]
+    weights = [(_caption(path), uri) for path, uri in pictures if "weights" in path.stem]
+    charts: dict[str, list[dict[str, Any]]] = {}
+    for chart in content.charts:
+        charts.setdefault(chart.section, []).append(_drawn(chart))
+    return environment.get_template("page.html.j2").render(
+        content=content,
+        css=Markup((folder / "page.css").read_text(encoding="utf-8")),
+        js=Markup((folder / "page.js").read_text(encoding="utf-8")),
+        tables=tables,
+        charts=charts,
+        scenes=scenes,
+        weights=weights,
+        behind={"rows": [_behind(row) for row in rows], "cells": cells},
+        newest=max((run.began for made in content.made for run in made.runs), default="")[:10],
+        runs=len({run.folder for made in content.made for run in made.runs}),
+        data=list(dict.fromkeys(made.what.split(", ")[0] for made in content.made)),
+    )
+
+
+def _key(row: Row) -> tuple[object, ...]:
+    return (row.runs[0].split, *(run.path for run in row.runs))
+
+
+def _table(table: Table, cells: list[dict[str, Any]], place: Any) -> dict[str, Any]:
+    """Rows of cells; what stands behind a cell goes to ``cells``, where the page finds it by its number."""
+    rows = []
+    for row, last in with_ends(table.rows):
+        shown: list[dict[str, Any] | None] = []
+        for column in table.columns:
+            cell = row.cells.get(column.metric)
+            if cell is None:
+                shown.append(None)
+                continue
+            paper, difference = paper_text(row, column), difference_text(row, column)
+            mean, _, deviation = own_text(cell, column).partition(" ± ")
+            shown.append(
+                {
+                    "mean": mean,
+                    "deviation": deviation,
+                    "value": repr(cell.mean),
+                    "rank": {1: "best", 2: "second"}.get(cell.rank or 0, ""),
+                    "paper": paper,
+                    "difference": difference,
+                    "index": len(cells),
+                }
+            )
+            cells.append(
+                {
+                    "row": place(row),
+                    "what": f"{column.label}, {table.data}, {table.split} split",
+                    "mean": number(cell.mean, 6),
+                    "std": None if cell.deviation is None else number(cell.deviation, 6),
+                    "n": cell.n,
+                    "paper": paper or None,
+                    "difference": None if cell.difference is None else signed(cell.difference, 6),
+                    "values": [number(run.metrics[column.metric], 6) for run in row.runs],
+                }
+            )
+        rows.append({"name": row.name, "n": len(row.runs), "cells": shown, "last": last})
+    return {"title": table.title, "columns": [column.label for column in table.columns], "rows": rows}
+
+
+def _behind(row: Row) -> dict[str, Any]:
+    """What the page says of every cell of a row."""
+    return {
+        "name": row.name,
+        "runs": [
+            {
+                "seed": run.seed,
+                "command": run.command,
+                "commit": run.git_commit,
+                "digest": run.data_digest,
+                "trained": run.trained_digest if run.trained_digest != run.data_digest else "",
+                "folder": str(run.path),
+            }
+            for run in row.runs
+        ],
+    }
+
+
+def _drawn(chart: Chart) -> dict[str, Any]:
+    from markupsafe import Markup
+
+    return {
+        "chart": chart,
+        "wide": Markup(svg(chart.draw(chart.wide, False), f"{chart.name}-wide")),
+        "narrow": Markup(svg(chart.draw(chart.narrow, False), f"{chart.name}-narrow")),
+    }
+
+
+def picture_uri(path: Path) -> str:
+    """A PNG as a data URI, small enough for a page."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        small = image.convert("RGB")
+        if small.width > WIDEST:
+            small = small.resize((WIDEST, round(small.height * WIDEST / small.width)), Image.Resampling.LANCZOS)
+        small = small.quantize(COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        file = io.BytesIO()
+        small.save(file, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def _caption(path: Path) -> str:
+    return path.stem.replace("_", " ").capitalize()
+
+
+def _marked(text: str) -> str:
+    """Escaped text in which ``**bold**``, ``<u>underlined</u>`` and code in backticks are marked up."""
+    from markupsafe import escape
+
+    text = str(escape(text))
+    text = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", text)
+    text = re.sub(r"&lt;u&gt;(.+?)&lt;/u&gt;", r"<u>\1</u>", text)
+    return re.sub(r"`(.+?)`", r"<code>\1</code>", text)

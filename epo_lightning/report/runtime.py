@@ -1,0 +1,149 @@
+"""How long a forecast takes, drawn beside the paper's figure: a map over agents N and steps S, a line over modes M."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap, LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator
+
+from epo_lightning.report.paper import RUNTIME
+from epo_lightning.report.style import MODES, style
+from epo_lightning.report.timings import time
+
+BLUES = LinearSegmentedColormap.from_list("calm", ["#EEF5FB", "#C6DBEF", "#6BAED6", "#2171B5", "#0B3F7A"])
+"""Light for fast, dark for slow, as in the paper."""
+
+
+def heat_map(
+    seconds: Mapping[tuple[int, int | None], float],
+    paper: Mapping[tuple[int, int], float] = RUNTIME,
+    size: tuple[float, float] = (6.4, 4.4),
+) -> Figure:
+    """Runtime over agents (across) and steps (downwards): ours and, where it has one, the paper's below it.
+
+    Args:
+        seconds: (N, S) -> mean; S is None for a forecaster without a game.
+        paper: the same from the paper.
+        size: width and height [inch].
+
+    Raises:
+        ValueError: there is no timing.
+    """
+    if not seconds:
+        raise ValueError("a heat map of no timing: nothing to draw")
+    agents = sorted({n for n, _ in seconds})
+    steps: list[int | None] = sorted({s for _, s in seconds}, key=lambda s: -1 if s is None else s)
+    values = np.array([[seconds.get((n, s), math.nan) for n in agents] for s in steps])
+    low, high = np.nanmin(values), np.nanmax(values)
+    if high < 2 * low:  # equal runtimes should look equal
+        low, high = low / 2, high * 2
+    norm = LogNorm(low, high)
+    with style():
+        height = min(size[1], 0.75 + 0.72 * len(steps))
+        figure = Figure(figsize=(size[0], height), layout="constrained")
+        axes = figure.subplots()
+        axes.pcolormesh(
+            np.ma.masked_invalid(values), cmap=BLUES, norm=norm, edgecolors="white", lw=2, gid="keep-mesh", snap=True
+        )
+        for row, s in enumerate(steps):
+            for column, n in enumerate(agents):
+                if (own := seconds.get((n, s))) is None:
+                    continue
+                theirs = None if s is None else paper.get((n, s))
+                color = "white" if norm(own) > 0.55 else "#16324F"
+                at, gid = (column + 0.5, row + 0.5), f"keep-{n}-{s}"
+                if theirs is None:
+                    axes.text(*at, time(own), ha="center", va="center", color=color, weight="bold", gid=gid)
+                    continue
+                axes.annotate(
+                    time(own),
+                    at,
+                    (0, 1),
+                    textcoords="offset points",
+                    ha="center",
+                    va="bottom",
+                    color=color,
+                    weight="bold",
+                    gid=gid,
+                )
+                axes.annotate(
+                    f"paper {time(theirs)}",
+                    at,
+                    (0, -2),
+                    textcoords="offset points",
+                    ha="center",
+                    va="top",
+                    color=color,
+                    fontsize=7.5,
+                    gid=f"{gid}-paper",
+                )
+        axes.set_xticks(np.arange(len(agents)) + 0.5, [str(n) for n in agents])
+        axes.set_yticks(np.arange(len(steps)) + 0.5, ["no game" if s is None else str(s) for s in steps])
+        axes.invert_yaxis()
+        axes.set_xlabel("agents N")
+        axes.set_ylabel("optimisation steps S")
+        axes.tick_params(length=0)
+        axes.grid(visible=False)
+        axes.spines[:].set_visible(False)
+        return figure
+
+
+def draw_modes(
+    seconds: Mapping[int, float],
+    paper: Mapping[int, float],
+    size: tuple[float, float] = (6.4, 2.9),
+    legend: bool = True,
+) -> Figure:
+    """Runtime over the number of modes M, the paper's dashed beside it where it has one.
+
+    Raises:
+        ValueError: there is no timing.
+    """
+    if not seconds:
+        raise ValueError("runtime over modes of no timing: nothing to draw")
+    with style():
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots()
+        axes.plot(
+            list(seconds),
+            list(seconds.values()),
+            color=MODES[1],
+            lw=1.9,
+            marker="o",
+            ms=5,
+            label="here",
+            gid="row0-line",
+        )
+        if paper:
+            axes.plot(
+                list(paper),
+                list(paper.values()),
+                color="#8A8A8A",
+                lw=1.2,
+                ls=(0, (4, 3)),
+                marker="o",
+                ms=4.5,
+                mfc="white",
+                label="paper",
+                gid="row1-line",
+            )
+        axes.set_yscale("log")
+        everything = [*seconds.values(), *paper.values()]
+        low, high = min(everything) / 1.8, max(everything) * 1.8
+        axes.set_ylim(low, high)
+        ticks = [m * 10.0**e for e in range(-7, 4) for m in (1, 3) if low <= m * 10.0**e <= high]
+        axes.set_yticks(ticks)
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: time(value)))
+        marks = sorted({*seconds, *paper})
+        axes.set_xticks(marks, [str(mark) for mark in marks])
+        axes.set_xlabel("modes M")
+        axes.set_ylabel("runtime")
+        axes.spines[["top", "right"]].set_visible(False)
+        if legend:
+            figure.legend(loc="outside lower center", ncols=2, fontsize=8)
+        return figure

@@ -1,0 +1,120 @@
+"""How long a forecast takes, read from runs that were timed, over agents N, optimisation steps S and modes M."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder, read_json
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long one trained row takes for a forecast.
+
+    Attributes:
+        where: what was timed and on what: timings with the same words compare.
+        agents, steps, modes: N, S (None for a forecaster that solves no game) and M.
+        samples: how often it was measured.
+        mean, median, p10, p90: seconds.
+        run: the run folder.
+    """
+
+    where: str
+    agents: int
+    steps: int | None
+    modes: int
+    samples: int
+    mean: float
+    median: float
+    p10: float
+    p90: float
+    run: RunFolder
+
+
+def read_timings(runs: Iterable[RunFolder]) -> tuple[list[Timing], list[str]]:
+    """Every runtime.json of the runs that have one, and a note for each that cannot be read."""
+    timings, notes = [], []
+    for run in runs:
+        if run.metrics_file("time").is_file():
+            try:
+                timings.append(_read(run))
+            except ConfigError as error:
+                notes.append(str(error))
+    return timings, notes
+
+
+def _read(run: RunFolder) -> Timing:
+    file = run.metrics_file("time")
+    content, config = read_json(file), run.config()
+    try:
+        seconds = {name: float(content["seconds"][name]) for name in ("mean", "median", "p10", "p90")}
+        if not all(math.isfinite(value) and value > 0 for value in seconds.values()):
+            raise ValueError("seconds must be positive numbers")
+        threads, batch = int(content["threads"]), int(content["batch"])
+        where = [
+            f"{config['data'].get('dataset', config['data']['name'])}, {config['backbone']['name']}",
+            f"{content['machine']} ({content['device']}, {threads} thread{'s' if threads > 1 else ''})",
+            *([f"batches of {batch}"] if batch > 1 else []),
+        ]
+        steps = content["steps"]
+        return Timing(
+            where=", ".join(where),
+            agents=int(content["agents"]),
+            steps=None if steps is None else int(steps),
+            modes=int(content["modes"]),
+            samples=int(content["samples"]),
+            run=run,
+            **seconds,
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ConfigError(
+            f"{file} is not what `score=time` writes ({type(error).__name__}: {error}): time the run again"
+        ) from error
+
+
+def places(timings: Sequence[Timing]) -> dict[str, list[Timing]]:
+    """Timings that compare with each other, by what was timed and on what."""
+    found: dict[str, list[Timing]] = {}
+    for timing in timings:
+        found.setdefault(timing.where, []).append(timing)
+    return dict(sorted(found.items()))
+
+
+def grid(timings: Sequence[Timing]) -> tuple[int, dict[tuple[int, int | None], float]]:
+    """The number of modes that was timed with the most (N, S), and the mean seconds of each of these."""
+    sizes = Counter(modes for modes, _, _ in {(t.modes, t.agents, t.steps) for t in timings})
+    modes = max(sizes, key=lambda m: (sizes[m], m))
+    return modes, _means({t: (t.agents, t.steps) for t in timings if t.modes == modes})
+
+
+def over_modes(timings: Sequence[Timing]) -> tuple[tuple[int, int | None], dict[int, float]]:
+    """The (N, S) that was timed with the most numbers of modes, and the mean seconds for each M."""
+    sizes = Counter((n, s) for _, n, s in {(t.modes, t.agents, t.steps) for t in timings})
+    n, s = max(sizes, key=lambda key: (sizes[key], key[0], key[1] or 0))
+    found = _means({t: t.modes for t in timings if (t.agents, t.steps) == (n, s)})
+    return (n, s), dict(sorted(found.items()))
+
+
+def _means(keys: Mapping[Timing, Any]) -> dict[Any, float]:
+    """Mean over the runs with the same key: seeds."""
+    groups: dict[Any, list[float]] = {}
+    for timing, key in keys.items():
+        groups.setdefault(key, []).append(timing.mean)
+    return {key: statistics.fmean(values) for key, values in groups.items()}
+
+
+def time(seconds: float) -> str:
+    """Seconds as people say them: two digits, from microseconds to seconds."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        # Two digits may round up to a thousand: 0.9996 s are 1 s.
+        if float(f"{seconds:.2g}") >= size or unit == "µs":
+            value = float(f"{seconds / size:.2g}")
+            digits = 0 if value >= 10 else 1
+            return f"{value:.{digits}f} {unit}" if value >= 1 else f"{value:.2g} {unit}"
+    raise AssertionError("unreachable")
