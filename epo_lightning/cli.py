@@ -94,7 +94,8 @@ def parse(words: Sequence[str]) -> Arguments:
                 raise ConfigError(f"unknown verb {word!r}: {nearest(word, VERBS)}")
             found.verb = word
         else:
-            found.overrides.append(word)
+            # Hydra would take a bare nan for the number.
+            found.overrides.append("debug='nan'" if word == "debug=nan" else word)
     if found.stop_on_failure and found.verb != "sweep":
         raise ConfigError("--stop-on-failure belongs to epo sweep")
     return found
