@@ -15,7 +15,7 @@ from lightning.pytorch.plugins import DoublePrecision
 from lightning.pytorch.strategies import Strategy
 
 from epo_lightning.data.datamodule import check_share
-from epo_lightning.experiment import debugging, logs
+from epo_lightning.experiment import debugging, gpus, logs
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.settings import PARTS, Settings, TrainerSettings, check_part, check_types
 from epo_lightning.forecasters import build_forecaster, check_model
@@ -146,7 +146,7 @@ def build_trainer(
         return Trainer(
             default_root_dir=run.path,
             accelerator=settings.accelerator,
-            devices=1 if strategy is None else settings.devices,
+            devices=gpus.devices(settings) if strategy or settings.devices == 1 else 1,
             strategy=strategy or "auto",
             # Lightning's own idea of a Slurm job is one that catches its signals and counts its tasks.
             plugins=[

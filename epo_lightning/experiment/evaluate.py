@@ -52,7 +52,7 @@ def _score(run: RunFolder, settings: EvaluateSettings) -> dict[str, float]:
     torch.set_num_threads(of_run.trainer.threads)
     trainer = Trainer(
         accelerator=of_run.trainer.accelerator,
-        devices=1,
+        devices=gpus.devices(of_run.trainer) if of_run.trainer.devices == 1 else 1,
         precision=of_run.trainer.precision,  # type: ignore[arg-type]
         deterministic=of_run.trainer.deterministic,
         inference_mode=False,  # the layer differentiates its energy also when it only forecasts

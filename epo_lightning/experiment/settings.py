@@ -26,6 +26,7 @@ class TrainerSettings:
     max_steps: int = -1
     accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
     devices: int = 1
+    share: int = 1
     precision: str = "32-true"
     threads: int = 1
     validate_every: int = 1
@@ -41,7 +42,7 @@ class TrainerSettings:
     def __post_init__(self) -> None:
         if (self.max_epochs is None or self.max_epochs < 0) and self.max_steps < 0:
             raise ConfigError("trainer.max_epochs and trainer.max_steps are both open: the run would never end")
-        for name in ("threads", "devices", "validate_every", "log_every"):
+        for name in ("threads", "devices", "share", "validate_every", "log_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"trainer.{name} must be 1 or more, not {getattr(self, name)}")
         if self.validate_steps is not None and self.validate_steps < 1:

@@ -18,7 +18,7 @@ import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from epo_lightning.experiment import assembly, callbacks, distributed, logs
+from epo_lightning.experiment import assembly, callbacks, distributed, gpus, logs
 from epo_lightning.experiment.compose import PACKAGE
 from epo_lightning.experiment.evaluate import evaluate
 from epo_lightning.experiment.settings import Settings, read
@@ -60,7 +60,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = ()) -> RunFolder:
     refuse_occupied(settings, run)
     data = None if run.record_file.is_file() else ready(settings)  # missing data is said before a folder is made
     # In a sweep, whoever has the run already may finish it for us.
-    with run.lock(wait=None if settings.sweep else 2.0):
+    with run.lock(wait=None if settings.sweep else 2.0), gpus.placed(settings.trainer):
         if not run.record_file.is_file():
             refuse_occupied(settings, run)
             run.begin(config, _record(settings, config, data or ready(settings), overrides))
@@ -85,10 +85,11 @@ def resume(run: RunFolder) -> None:
         return
     if run.finished:
         raise ConfigError(f"{run.path} is finished: score it with `epo evaluate run={run.path}`")
-    with run.lock():
-        config = run.config()
+    config = run.config()
+    settings = read(Settings, config)
+    with run.lock(), gpus.placed(settings.trainer):
         _continue(run, config)
-        _score(read(Settings, config), run)
+        _score(settings, run)
 
 
 def _continue(run: RunFolder, config: dict[str, Any]) -> None:

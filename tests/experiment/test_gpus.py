@@ -1,0 +1,39 @@
+"""Places on GPUs, which this needs none of: they are files."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+
+from epo_lightning.experiment.gpus import devices, place, placed
+from epo_lightning.experiment.settings import TrainerSettings
+
+
+def test_empty_gpus_come_first_and_then_those_with_company(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        taken = [stack.enter_context(place(["a", "b"], 2, tmp_path)) for _ in range(4)]
+    assert taken == [0, 1, 0, 1]
+    with place(["a", "b"], 2, tmp_path) as number:
+        assert number == 0, "places are given back"
+
+
+def test_who_finds_no_place_waits_for_one(tmp_path: Path) -> None:
+    got = threading.Event()
+
+    def wait() -> None:
+        with place(["a"], 1, tmp_path):
+            got.set()
+
+    waiting = threading.Thread(target=wait)
+    with place(["a"], 1, tmp_path):
+        waiting.start()
+        assert not got.wait(1.0)
+    assert got.wait(5.0)
+    waiting.join()
+
+
+def test_cpus_are_not_handed_out() -> None:
+    settings = TrainerSettings(accelerator="cpu", devices=3)
+    with placed(settings):
+        assert devices(settings) == 3
