@@ -63,7 +63,7 @@ def test_fair_twins_differ_in_the_goal_only(row: str) -> None:
 
 
 @pytest.mark.parametrize("budget", names(CONF / "budget"))
-@pytest.mark.parametrize("debug", [[], *([f"debug={name}"] for name in names(CONF / "debug"))])
+@pytest.mark.parametrize("debug", [[], *([f"debug='{name}'"] for name in names(CONF / "debug"))])
 def test_budgets_and_debugging_compose(budget: str, debug: list[str]) -> None:
     settings = read(Settings, compose("train", ["experiment=rpi/v_lstm_epo", f"budget={budget}", *debug]))
     assert settings.budget.name == budget
