@@ -9,7 +9,7 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 
 import epo_lightning
-from epo_lightning.experiment import assembly, logs
+from epo_lightning.experiment import assembly, gpus, logs
 from epo_lightning.experiment.settings import EvaluateSettings, Settings, read
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, write_json
