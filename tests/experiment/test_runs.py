@@ -180,19 +180,6 @@ def test_a_sweep_trains_every_row_and_the_report_shows_them(epo: Epo, capsys: py
     assert sorted(path.name for path in Path.cwd().iterdir()) == ["out", "runs"]
 
 
-@pytest.mark.parametrize("logger", ["logger=[tensorboard]", "logger=[csv,tensorboard]"])
-def test_tensorboard_is_an_option(epo: Epo, logger: str) -> None:
-    assert epo("train", ROW, *TINY, "run_dir=run", logger) == 0
-    assert list(Path("run/logs/tensorboard").glob("events.*"))
-    assert Path("run/logs/metrics.csv").is_file()
-
-
-def test_wandb_works_offline(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("WANDB_API_KEY", raising=False)
-    assert epo("train", ROW, *TINY, "run_dir=run", "logger=[wandb]") == 0
-    assert list(Path("run/logs/wandb").rglob("*.wandb"))
-
-
 def test_files_are_replaced_as_a_whole(tmp_path: Path) -> None:
     file = tmp_path / "metrics.json"
     write_json(file, {"a": 1})

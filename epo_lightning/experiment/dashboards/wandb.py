@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import netrc
 import os
-import socket
+import ssl
+import subprocess
 from collections.abc import Sequence
 from typing import Any
+from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
-from urllib.request import getproxies, proxy_bypass
+from urllib.request import Request, urlopen
 
 from epo_lightning.experiment.dashboards.base import ARTIFACTS, Dashboard, Ending, Facts, Row
 from epo_lightning.experiment.settings import WandbSettings
 
+STEP = "trainer/global_step"
+"""The axis of all curves. W&B's own step only counts rows: joined after a `wandb sync`, it says nothing."""
 QUIET = {
     "console": "off",  # what is printed belongs to the terminal
     "silent": True,
@@ -20,24 +25,23 @@ QUIET = {
     "disable_code": True,
     "save_code": False,
     "x_save_requirements": False,  # run.json has the versions that matter
-    "init_timeout": 20.0,
+    "x_transaction_log_flush_interval": 1.0,  # seconds of which a kill may take the rows
     "finish_timeout_raises": True,
 }
 """What W&B would do by itself and what costs time at every start, or prints into other runs' lines."""
 
 
 class WandB(Dashboard):
-    """See the module.
-
-    Its step is the optimisation step. A continued run tells all of its rows again: online, those that W&B has are left
-    out; offline, each process leaves a folder of the same run, each one whole up to its end.
-    """
+    """See the module. A continued run tells those of its rows that W&B has not got, neither there nor in earlier folders."""
 
     label = "W&B"
 
     def __init__(self, facts: Facts, settings: WandbSettings) -> None:
         super().__init__(facts)
         self._settings = settings
+        self._logs = (facts.folder / "logs").resolve()  # W&B's service keeps the working folder of its first run
+        self._told = -1  # the last step that is there already
+        self._last = -1
 
     def open(self) -> None:
         os.environ.setdefault("WANDB_SILENT", "true")  # its service process reads nothing else
@@ -46,8 +50,10 @@ class WandB(Dashboard):
             wanted = os.environ.get("WANDB_MODE", "auto")
         if wanted not in ("auto", "online"):
             self._begin(wanted)
-        elif not has_key() or not (wanted == "online" or answers()):
-            self._offline("no key" if not has_key() else "the server does not answer")
+        elif not has_key():
+            self._offline("no key")
+        elif wanted == "auto" and not answers():
+            self._offline("the server does not answer")
         else:
             try:
                 self._begin("online")
@@ -56,12 +62,13 @@ class WandB(Dashboard):
 
     def _offline(self, why: str) -> None:
         self._begin("offline")
-        folders = self.facts.folder / "logs" / "wandb" / f"offline-run-*-{self.facts.id}"
+        folders = self.facts.folder / "logs" / "wandb" / f"offline-run-*-{self.facts.id}*"
         print(f"W&B: offline ({why}); send it later: wandb sync {folders}")
 
     def _begin(self, mode: str) -> None:
         import wandb
 
+        told_here = self._told_here()
         self._run: Any = wandb.init(
             project=self._settings.project,
             entity=self._settings.entity,
@@ -72,30 +79,59 @@ class WandB(Dashboard):
             job_type="train",
             tags=list(self._settings.tags),
             config={**self.facts.config, **self.facts.tags},
-            dir=(self.facts.folder / "logs").resolve(),  # W&B's service keeps the working folder of its first run
+            dir=self._logs,
             reinit="create_new",  # several runs of one process are several runs
-            settings=wandb.Settings(mode=mode, finish_timeout=0.8 * self._settings.patience, **QUIET),  # type: ignore[arg-type]
+            settings=wandb.Settings(
+                mode=mode,  # type: ignore[arg-type]
+                init_timeout=max(self._settings.patience, 1.0),
+                finish_timeout=max(0.8 * self._settings.patience, 0.1),  # 0 would be for ever
+                **QUIET,  # type: ignore[arg-type]
+            ),
         )
+        self._run.define_metric(STEP)
+        self._run.define_metric("*", step_metric=STEP)
+        self._told = int(self._run.summary.get(STEP, -1)) if mode == "online" else told_here
+
+    def _told_here(self) -> int:
+        """The last step in the files that earlier processes of the run have left."""
+        from wandb.util import get_core_path
+
+        told = -1
+        for file in self._logs.glob(f"wandb/*run-*-{self.facts.id}*/run-{self.facts.id}.wandb"):
+            words = [get_core_path(), "leet", "inspect", "--no-observability", "--summary", "--json"]
+            words += ["--run-file", str(file), str(self._logs / "wandb")]
+            try:
+                read = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True).stdout
+                told = max(told, int(json.loads(read)["summary"][STEP]))
+            except (OSError, subprocess.SubprocessError, ValueError, KeyError):
+                continue  # nothing in it, or not to be read: a row told twice is the smaller evil
+        return told
 
     def log(self, rows: Sequence[Row]) -> None:
-        known = self._run.step
         for step, metrics in rows:
-            if step >= known:
-                self._run.log(dict(metrics), step=step)
+            if step > self._told:
+                self._run.log({**metrics, STEP: step})
+                self._last = step
 
     def close(self, ending: Ending) -> None:
+        pictures = ending.pictures[: self._settings.pictures]
+        if self._last >= 0 and pictures:
+            import wandb
+
+            images = {f"forecasts/{path.stem}": wandb.Image(str(path)) for path in pictures}
+            self._run.log({**images, STEP: self._last})
+        self._run.summary.update(dict(ending.summary))
+        if self._last >= 0 and self._settings.artifacts and not ending.failed:
+            self._artifact()
+        self._run.finish(exit_code=int(ending.failed))
+
+    def _artifact(self) -> None:
         import wandb
 
-        pictures = ending.pictures[: self._settings.pictures]
-        if pictures:
-            self._run.log({path.stem: wandb.Image(str(path)) for path in pictures})
-        self._run.summary.update(dict(ending.summary))
-        if self._settings.artifacts and not ending.failed:
-            artifact = wandb.Artifact(f"run-{self.facts.id}", "model")
-            for name in ARTIFACTS:
-                artifact.add_file(str((self.facts.folder / name).resolve()), policy="immutable")  # no copy of its own
-            self._run.log_artifact(artifact)
-        self._run.finish(exit_code=int(ending.failed))
+        artifact = wandb.Artifact(f"run-{self.facts.id}", "model")
+        for name in ARTIFACTS:  # immutable: W&B makes no copy of its own
+            artifact.add_file(str((self.facts.folder / name).resolve()), policy="immutable")
+        self._run.log_artifact(artifact)
 
 
 def server() -> str:
@@ -119,13 +155,12 @@ def has_key() -> bool:
 
 def answers(patience: float = 2.0) -> bool:
     """Whether W&B can be reached. With a key but no network its own start takes two minutes before it gives up."""
-    target = urlsplit(server())
-    proxy = getproxies().get(target.scheme)
-    if proxy and not proxy_bypass(target.hostname or ""):
-        target = urlsplit(proxy if "//" in proxy else f"//{proxy}")
     try:
-        port = target.port or (443 if target.scheme == "https" else 80)
-        socket.create_connection((target.hostname or "", port), timeout=patience).close()
-    except OSError:
+        urlopen(Request(server(), method="HEAD"), timeout=patience).close()
+    except HTTPError:
+        return True
+    except URLError as error:
+        return isinstance(error.reason, ssl.SSLError)  # its certificate is W&B's business
+    except (OSError, ValueError):
         return False
     return True

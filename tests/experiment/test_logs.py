@@ -1,0 +1,437 @@
+"""Logs: the CSV file is the truth, dashboards are told the same, and none of them can disturb a run."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from experiment import tiny
+from experiment.conftest import TINY, Epo
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+
+from epo_lightning.experiment import logs
+from epo_lightning.experiment.callbacks import RandomStates
+from epo_lightning.experiment.dashboards import aside
+from epo_lightning.experiment.dashboards.aside import Aside
+from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
+from epo_lightning.experiment.dashboards.tensorboard import TensorBoard
+from epo_lightning.experiment.settings import Settings, TensorBoardSettings, read
+from epo_lightning.run_folder import RunFolder, discover
+
+ROW = "experiment=rpi/v_lstm_sc"
+STEP = "trainer/global_step"
+
+
+@pytest.fixture(autouse=True)
+def no_account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Nobody's key, server or database is used."""
+    for name in ("WANDB_API_KEY", "WANDB_BASE_URL", "WANDB_MODE", "MLFLOW_TRACKING_URI"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
+
+
+@pytest.fixture
+def stopped(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Train four epochs and fail at the beginning of the third."""
+
+    def train(*words: str) -> None:
+        starts: list[int] = []
+        original = RandomStates.on_train_epoch_start
+
+        def stop(self: RandomStates, trainer: Any, module: Any) -> None:
+            starts.append(1)
+            if len(starts) == 3:
+                raise RuntimeError("power failure")
+            original(self, trainer, module)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(RandomStates, "on_train_epoch_start", stop)
+            with pytest.raises(RuntimeError, match="power failure"):
+                epo("train", ROW, *TINY, "trainer.max_epochs=4", *words)
+
+    return train
+
+
+def in_file(run: str, name: str) -> list[tuple[int, float]]:
+    """What metrics.csv says."""
+    with Path(run, "logs", "metrics.csv").open(newline="") as file:
+        return [(int(row["step"]), float(row[name])) for row in csv.DictReader(file) if row[name]]
+
+
+def best_in_file(run: str) -> float:
+    return min(value for _, value in in_file(run, "val/minSADE"))
+
+
+def wandb_folders(run: str) -> list[dict[str, Any]]:
+    """What W&B's own reader finds in the offline folders of a run, the oldest first."""
+    files = sorted(Path(run).glob("logs/wandb/offline-run-*/*.wandb"))
+    words = [sys.executable, "-m", "wandb", "leet", "inspect", "--summary", "--json"]
+    found = [subprocess.run([*words, file], capture_output=True, text=True, check=True).stdout for file in files]
+    return [json.loads(text) for text in found]
+
+
+def wandb_history(run: str) -> list[tuple[int, float]]:
+    """Step and validation score of every row in the offline folders, in the order in which `wandb sync` sends them."""
+    points = []
+    for file in sorted(Path(run).glob("logs/wandb/offline-run-*/*.wandb")):
+        words = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", file]
+        for line in subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines():
+            record = json.loads(line)
+            if record["type"] != "history":
+                continue
+            row = record["history"]["item"]
+            if "val/minSADE" in row:
+                points.append((int(row[STEP]), float(row["val/minSADE"])))
+    return points
+
+
+def events(run: str) -> EventAccumulator:
+    found = EventAccumulator(str(Path(run, "logs")), size_guidance={"scalars": 0})
+    return found.Reload()
+
+
+def hyperparameters(run: str) -> Any:
+    content = events(run).SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    return HParamsPluginData.FromString(content).session_start_info.hparams
+
+
+# CSV
+
+
+def test_the_file_holds_every_row_at_once_and_a_full_disk_is_an_error(epo: Epo) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run") == 0
+    run = RunFolder.open("run")
+    settings = read(Settings, run.config())
+    with pytest.raises(OSError, match="No space left"), logs.open_logs(settings, run.config(), run) as (file,):
+        file.log_metrics({"a": 1.0}, 0)
+        assert "1.0" in (run.logs / "metrics.csv").read_text()
+        (run.logs / "metrics.csv").unlink()
+        (run.logs / "metrics.csv").symlink_to("/dev/full")
+        file.log_metrics({"a": 2.0}, 1)
+
+
+def test_only_the_first_of_several_processes_logs(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run") == 0
+    run, before = RunFolder.open("run"), Path("run/logs/metrics.csv").read_bytes()
+    monkeypatch.setattr(logs.rank_zero_only, "rank", 1)
+    with logs.open_logs(read(Settings, run.config()), run.config(), run) as loggers:
+        assert loggers == []
+    assert Path("run/logs/metrics.csv").read_bytes() == before
+
+
+# TensorBoard
+
+
+@pytest.mark.parametrize("logger", ["logger=[tensorboard]", "logger=[csv,tensorboard]"])
+def test_tensorboard_shows_what_the_file_holds(epo: Epo, logger: str) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run", logger) == 0
+    for name in ("val/minSADE", "train/loss"):
+        points = [(event.step, event.value) for event in events("run").Scalars(name)]
+        assert points == [(step, pytest.approx(value)) for step, value in in_file("run", name)]
+    (best,) = events("run").Scalars("best/minSADE")
+    assert best.value == pytest.approx(best_in_file("run"))
+    shown = hyperparameters("run")
+    assert shown["optimizer.lr"].number_value == 1e-3
+    assert shown["forecaster.name"].string_value == "scene_consistent"
+
+
+def test_tensorboard_has_no_point_twice_after_a_stop(epo: Epo, stopped: Callable[..., None]) -> None:
+    stopped("run_dir=run", "logger=[tensorboard]")
+    Path("run/logs/events.out.tfevents.0.lost").write_bytes(b"")  # from a process before that
+    assert epo("train", "resume=run") == 0
+    points = [(event.step, event.value) for event in events("run").Scalars("val/minSADE")]
+    assert points == [(step, pytest.approx(value)) for step, value in in_file("run", "val/minSADE")]
+    assert len(points) == 4
+    assert len(list(Path("run/logs").glob("events.*"))) == 1
+
+
+def test_scores_on_the_test_split_reach_the_dashboard(epo: Epo) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run", "logger=[tensorboard]") == 0
+    assert epo("evaluate", "run=run") == 0
+    measured = json.loads(Path("run/metrics.json").read_text())["metrics"]["minSADE"]
+    assert events("run").Scalars("test/minSADE")[0].value == pytest.approx(measured)
+    assert len(events("run").Scalars("val/minSADE")) == 2
+
+
+# W&B
+
+
+def test_every_run_of_a_sweep_has_its_own_id_name_configuration_and_summary_in_wandb(epo: Epo) -> None:
+    assert epo("train", "-m", ROW, *TINY, "logger=[wandb]", "seed=0,1,2") == 0
+    runs = [str(run.path) for run in discover("runs")]
+    folders = [wandb_folders(run) for run in runs]
+    assert [len(found) for found in folders] == [1, 1, 1]
+    shown = [found[0] for found in folders]
+    assert len({run["run_id"] for run in shown}) == 3
+    assert [run["run_id"].split("-")[0] for run in shown] == [RunFolder(Path(run)).record["identity"] for run in runs]
+    assert [run["name"] for run in shown] == [f"V-LSTM + SC (seed {seed})" for seed in range(3)]
+    assert [run["config"]["seed"] for run in shown] == [0, 1, 2]
+    assert {run["config"]["data_digest"] for run in shown} == {"tiny-64-0"}
+    for run, found in zip(runs, shown, strict=True):
+        assert found["summary"]["best/minSADE"] == pytest.approx(best_in_file(run))
+        assert found["summary"][STEP] == 7
+        assert found["exit_code"] == 0
+    assert group_of(runs[0]) == ("rpi/v_lstm_sc", "train")
+
+
+def group_of(run: str) -> tuple[str, str]:
+    (file,) = Path(run).glob("logs/wandb/offline-run-*/*.wandb")
+    words = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", file]
+    for line in subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines():
+        record = json.loads(line)
+        if record["type"] == "run":
+            return record["run"]["run_group"], record["run"]["job_type"]
+    raise AssertionError("no run in the file")
+
+
+def test_a_stopped_run_goes_on_in_the_same_run_of_wandb(epo: Epo, stopped: Callable[..., None]) -> None:
+    stopped("run_dir=run", "logger=[wandb]")
+    assert [folder["exit_code"] for folder in wandb_folders("run")] == [1]
+    assert epo("train", "resume=run") == 0
+    assert [folder["exit_code"] for folder in wandb_folders("run")] == [1, 0]
+    assert len({folder["run_id"] for folder in wandb_folders("run")}) == 1
+    assert wandb_history("run") == [(step, pytest.approx(value)) for step, value in in_file("run", "val/minSADE")]
+
+
+def test_pictures_and_the_checkpoint_can_be_sent_along(epo: Epo) -> None:
+    options = ("logger.wandb.pictures=2", "logger.wandb.artifacts=true")
+    assert epo("train", ROW, *TINY, "run_dir=run", "logger=[wandb]", *options) == 0
+    assert list(Path("run/logs/figures").glob("*.png"))
+    (folder,) = wandb_folders("run")
+    assert (
+        folder["summary"]["forecasts/joint_predictions"]["_type"] == "images/separated"
+        or folder["summary"]["forecasts/joint_predictions"]["format"] == "png"
+    )
+    (file,) = Path("run").glob("logs/wandb/offline-run-*/*.wandb")
+    assert str(Path("run/checkpoints/best.ckpt").resolve()).encode() in file.read_bytes()
+
+
+# MLflow
+
+
+def client(database: str = "runs/mlflow.db") -> Any:
+    from mlflow import MlflowClient
+
+    return MlflowClient(f"sqlite:///{Path(database).resolve()}")
+
+
+def test_mlflow_keeps_name_parameters_tags_and_scores_through_a_stop(epo: Epo, stopped: Callable[..., None]) -> None:
+    pytest.importorskip("mlflow")
+    stopped("run_dir=runs/one", "logger=[mlflow]")
+    there = client()
+    experiment = there.get_experiment_by_name("epo_lightning")
+    (run,) = there.search_runs([experiment.experiment_id])
+    assert run.info.status == "FAILED"
+    assert epo("train", "resume=runs/one") == 0
+    assert epo("evaluate", "run=runs/one") == 0
+    (run,) = there.search_runs([experiment.experiment_id])
+    record = RunFolder(Path("runs/one")).record
+    assert (run.info.run_name, run.info.status) == ("V-LSTM + SC (seed 0)", "FINISHED")
+    assert run.data.params["optimizer.lr"] == "0.001"
+    assert (run.data.tags["identity"], run.data.tags["data_digest"]) == (record["identity"], "tiny-64-0")
+    assert run.data.tags["commit"] == str(record["git_commit"])
+    points = [(point.step, point.value) for point in there.get_metric_history(run.info.run_id, "val/minSADE")]
+    assert sorted(points) == [(step, pytest.approx(value)) for step, value in in_file("runs/one", "val/minSADE")]
+    assert run.data.metrics["best/minSADE"] == pytest.approx(best_in_file("runs/one"))
+    measured = json.loads(Path("runs/one/metrics.json").read_text())["metrics"]["minSADE"]
+    assert run.data.metrics["test/minSADE"] == pytest.approx(measured)
+
+
+def test_a_missing_mlflow_is_said_before_anything_is_made(
+    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "mlflow", None)
+    assert "pip install 'epo_lightning[mlflow]'" in refused("train", ROW, *TINY, "logger=[mlflow]")
+
+
+@pytest.mark.slow
+def test_several_processes_share_one_database(tmp_path: Path) -> None:
+    pytest.importorskip("mlflow")
+    program = [sys.executable, str(Path(tiny.__file__).resolve())]
+    words = ["train", ROW, *TINY, "logger=[mlflow]", "logger.mlflow.patience=60"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    processes = [
+        subprocess.Popen(
+            [*program, *words, f"seed={seed}"], cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
+        )
+        for seed in range(4)
+    ]
+    complaints = [process.communicate(timeout=240)[1] for process in processes]
+    assert [process.returncode for process in processes] == [0] * 4, "\n".join(complaints)
+    assert not any("switched off" in text for text in complaints), "\n".join(complaints)
+    there = client(str(tmp_path / "runs/mlflow.db"))
+    runs = there.search_runs([there.get_experiment_by_name("epo_lightning").experiment_id])
+    assert sorted(run.info.run_name for run in runs) == [f"V-LSTM + SC (seed {seed})" for seed in range(4)]
+    assert all(run.data.metrics["best/minSADE"] > 0 and run.info.status == "FINISHED" for run in runs)
+
+
+# All of them
+
+
+def test_dashboards_change_nothing_in_a_run(epo: Epo) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=alone") == 0
+    assert epo("train", ROW, *TINY, "run_dir=watched", "logger=[csv,tensorboard,wandb,mlflow]") == 0
+    one, other = (torch.load(f"{run}/checkpoints/last.ckpt", weights_only=True) for run in ("alone", "watched"))
+    assert all(torch.equal(value, other["state_dict"][key]) for key, value in one["state_dict"].items())
+    assert Path("alone/logs/metrics.csv").read_text() == Path("watched/logs/metrics.csv").read_text()
+
+
+class Bad(Dashboard):
+    """Fails or hangs at one of its methods."""
+
+    label = "Bad"
+    where, how = "", ""
+    release = threading.Event()
+
+    def __init__(self, facts: Facts, settings: object = None) -> None:
+        super().__init__(facts)
+        self.told: list[Row] = []
+        self.ended: Ending | None = None
+
+    def _here(self, where: str) -> None:
+        if where != self.where:
+            return
+        if self.how == "hangs":
+            self.release.wait()
+        elif self.how == "exits":
+            sys.exit(3)
+        else:
+            raise OSError(28, "No space left on device")
+
+    def open(self) -> None:
+        self._here("open")
+
+    def log(self, rows: Sequence[Row]) -> None:
+        self._here("log")
+        self.told += rows
+
+    def close(self, ending: Ending) -> None:
+        self._here("close")
+        self.ended = ending
+
+
+@pytest.fixture
+def bad(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Bad]]:
+    """TensorBoard replaced by a dashboard that does not work."""
+    monkeypatch.setattr(Bad, "release", threading.Event())
+    monkeypatch.setattr(logs, "TensorBoard", Bad)
+    yield Bad
+    Bad.release.set()
+
+
+@pytest.mark.parametrize("how", ["raises", "hangs", "exits"])
+@pytest.mark.parametrize("where", ["open", "log", "close"])
+def test_a_bad_dashboard_stops_nothing(
+    epo: Epo, bad: type[Bad], where: str, how: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bad, "where", where)
+    monkeypatch.setattr(bad, "how", how)
+    words = ("logger=[tensorboard]", "logger.tensorboard.patience=0.5")
+    assert epo("train", ROW, *TINY, "run_dir=run", *words) == 0
+    assert RunFolder(Path("run")).finished
+    assert len(in_file("run", "val/minSADE")) == 2
+    warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Bad")]
+    assert len(warnings) == 1
+    assert "switched off for this run" in warnings[0]
+    assert {"raises": "No space left", "hangs": "did not answer for 0.5 s", "exits": "SystemExit"}[how] in warnings[0]
+    assert "epo evaluate run=run" in warnings[0]
+
+
+def test_the_runs_of_a_sweep_are_a_group(epo: Epo, bad: type[Bad]) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run", "logger=[tensorboard]") == 0
+    run = RunFolder.open("run")
+    config = run.config() | {"sweep": "runs/sweeps/ours"}
+    with logs.open_logs(read(Settings, config), config, run) as (_, logger):
+        told = logger.dashboard.facts
+    assert (told.group, told.name) == ("ours", "V-LSTM + SC (seed 0)")
+    assert told.parameters()["optimizer.lr"] == 1e-3
+
+
+def facts(folder: Path) -> Facts:
+    return Facts("id", "name", None, {"a": {"b": 1, "c": [1, 2]}}, {}, folder)
+
+
+def test_a_dashboard_that_cannot_keep_up_is_dropped(
+    bad: type[Bad], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bad, "where", "open")
+    monkeypatch.setattr(bad, "how", "hangs")
+    monkeypatch.setattr(aside, "BEHIND", 50)
+    logger = Aside(Bad(facts(tmp_path)), patience=60.0)
+    began = time.monotonic()
+    for step in range(1000):
+        logger.log_metrics({"a": 1.0}, step)
+    logger.close(Ending())
+    assert time.monotonic() - began < 5
+    assert capsys.readouterr().err.count("50 rows behind") == 1
+
+
+def test_a_slow_dashboard_gets_every_row_in_order_and_costs_the_run_nothing(tmp_path: Path) -> None:
+    class Slow(Bad):
+        def log(self, rows: Sequence[Row]) -> None:
+            time.sleep(0.2)
+            super().log(rows)
+
+    dashboard = Slow(facts(tmp_path))
+    logger = Aside(dashboard, patience=30.0, past=[(0, {"a": 0.0})])
+    began = time.monotonic()
+    for step in range(1, 2000):
+        logger.log_metrics({"a": float(step)}, step)
+    assert time.monotonic() - began < 1.5
+    logger.close(Ending(summary={"best/a": 1.0}))
+    assert [step for step, _ in dashboard.told] == list(range(2000))
+    assert dashboard.ended == Ending(summary={"best/a": 1.0})
+    assert logger.off is None
+
+
+def test_what_a_dashboard_has_missed_is_told_again_by_an_evaluation(
+    epo: Epo, bad: type[Bad], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(bad, "where", "open")
+        assert epo("train", ROW, *TINY, "run_dir=run", "logger=[tensorboard]") == 0
+    monkeypatch.setattr(logs, "TensorBoard", TensorBoard)
+    assert epo("evaluate", "run=run") == 0
+    assert len(events("run").Scalars("val/minSADE")) == 2
+
+
+@pytest.mark.skipif(not Path("/proc/mounts").is_file(), reason="mounts are made as on Linux")
+def test_a_full_disk_under_wandb_stops_nothing(
+    epo: Epo, stopped: Callable[..., None], capfd: pytest.CaptureFixture[str]
+) -> None:
+    stopped("run_dir=run", "logger=[csv]")
+    config = Path("run/config.yaml")
+    config.write_text(config.read_text().replace("logger:", "logger:\n  wandb: {mode: offline, patience: 5}\n ", 1))
+    folder = Path("run/logs/wandb")
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", folder], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("mounting a tiny disk needs root")
+    try:
+        assert epo("train", "resume=run") == 0
+        left = subprocess.run(["df", "--output=avail", folder], capture_output=True, text=True, check=True).stdout
+        assert left.split()[-1] == "0", "the disk was to be full"
+    finally:
+        subprocess.run(["umount", "--lazy", folder], check=True)
+    assert RunFolder(Path("run")).finished
+    assert len(in_file("run", "val/minSADE")) == 4
+
+
+def test_hyperparameters_are_plain_values(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    board = TensorBoard(facts(tmp_path), TensorBoardSettings())
+    board.open()
+    board.close(Ending(summary={"best/a": 2.0}))
+    shown = hyperparameters(str(tmp_path))
+    assert (shown["a.b"].number_value, shown["a.c"].string_value) == (1.0, "[1, 2]")
