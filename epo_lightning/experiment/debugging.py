@@ -1,8 +1,9 @@
-"""What helps when training does not: a few batches to learn by heart, where the time goes, and the first number that is none."""
+"""What helps when training does not: few batches to learn by heart, where the time goes, where the first bad number is."""
 
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import islice
@@ -65,7 +66,7 @@ class Profile(Callback):
     """PyTorch's profile of a few training steps, as a table of the most expensive operations and a trace.
 
     Args:
-        folder: where ``operations.txt`` and ``trace.json`` are written.
+        folder: where ``operations.txt`` and ``trace.json.gz`` are written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -99,14 +100,16 @@ class Profile(Callback):
         order = "self_cuda_time_total" if torch.cuda.is_available() else "self_cpu_time_total"
         table = operations.table(sort_by=order, row_limit=ROWS, max_name_column_width=60)
         steps = self._steps - WARM_UP
-        write_text(self.folder / "operations.txt", f"{steps} training steps, the most expensive operations first\n{table}")
-        running.export_chrome_trace(str(self.folder / "trace.json"))
+        write_text(
+            self.folder / "operations.txt", f"{steps} training steps, the most expensive operations first\n{table}"
+        )
+        running.export_chrome_trace(str(self.folder / "trace.json.gz"))
         print(f"profile of {steps} training steps: {self.folder / 'operations.txt'}")
-        print(f"trace: {self.folder / 'trace.json'}, for chrome://tracing or https://ui.perfetto.dev")
+        print(f"trace: {self.folder / 'trace.json.gz'}, for https://ui.perfetto.dev or chrome://tracing")
 
 
 class NonFinite(Callback):
-    """Stop at the first number of a training step that is not finite: in what a module returns, in the loss or in a gradient.
+    """Stop at the first number of a training step that is not finite: in a module's output, in the loss or in a gradient.
 
     Raises:
         ConfigError: from the step in which it happens; names the step, the module, loss term or parameter, and the scenes.
@@ -160,11 +163,14 @@ class NonFinite(Callback):
     def _operation(self, forecaster: LightningModule) -> str:
         """The operation whose derivative is the first that is no number, found by doing the step once more."""
         try:
-            with torch.autograd.set_detect_anomaly(True):
+            with torch.autograd.set_detect_anomaly(True), warnings.catch_warnings(record=True) as noted:
+                warnings.simplefilter("always")
                 terms = forecaster.losses(self._scene, forecaster(self._scene))  # type: ignore[operator]
                 torch.stack([weight * value for weight, value in terms.values()]).sum().backward()
         except RuntimeError as error:
-            return f": {str(error).splitlines()[0].rstrip('.')}"
+            # PyTorch warns of the lines of code that led to the operation; the last one is where it was done.
+            places = [line.strip() for each in noted for line in str(each.message).splitlines() if "File " in line]
+            return f": {str(error).splitlines()[0].rstrip('.')}" + (f" ({places[-1]})" if places else "")
         return ""
 
     def _stop(self, what: str, rows: list[int] | None = None) -> None:
