@@ -222,12 +222,15 @@ def _single(arguments: Arguments) -> None:
     if arguments.verb == "train" and resumed:
         _resume(resumed[-1].partition("=")[2], [word for word in arguments.overrides if word not in resumed])
         return
+    words = list(arguments.overrides)
+    if arguments.verb == "report" and words and "=" not in words[0]:
+        words[0] = f"sweep={words[0]}"
     from epo_lightning.experiment.compose import compose
 
-    config = compose(arguments.verb, arguments.overrides, arguments.extra)
+    config = compose(arguments.verb, words, arguments.extra)
     from epo_lightning.experiment import verbs
 
-    verbs.RUN[arguments.verb](config, arguments.overrides)
+    verbs.RUN[arguments.verb](config, words)
 
 
 def _resume(folder: str, others: Sequence[str]) -> None:

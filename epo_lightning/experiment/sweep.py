@@ -202,6 +202,7 @@ class Sweep:
             "command": command,
             "overrides": list(overrides),
             "directory": str(Path.cwd()),
+            "cache": os.environ.get("EPO_CACHE"),
             "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "process": os.getpid(),
             "host": socket.gethostname(),
@@ -220,8 +221,11 @@ class Sweep:
             RunFailed: the run failed; the sweep's folder holds the traceback.
         """
         record = self.record
-        with contextlib.suppress(OSError):  # a worker on another machine may start anywhere
+        # A worker on another machine may have started anywhere, and knows nothing of our environment.
+        with contextlib.suppress(OSError):
             os.chdir(record["directory"])
+        if record["cache"]:
+            os.environ.setdefault("EPO_CACHE", record["cache"])
         if record["stop_on_failure"] and any((self.folder / "failures").glob("*.txt")):
             return None
         job = Job.of(config, overrides)
