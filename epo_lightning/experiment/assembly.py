@@ -55,7 +55,9 @@ def build_model(settings: Settings, data: Any) -> LightningModule:
     Raises:
         ConfigError: an unknown part or key, or sizes that do not fit together.
     """
-    return build_forecaster(describe_model(settings, data))
+    model = build_forecaster(describe_model(settings, data))
+    # Lightning converts it too, but only after it has read a checkpoint into it.
+    return model.double() if settings.trainer.precision == "64-true" else model
 
 
 def parameters(model: torch.nn.Module) -> int:
