@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.evaluate import open_checkpoint, open_data
@@ -12,14 +14,14 @@ from epo_lightning.experiment.settings import ReportSettings, Settings, read
 from epo_lightning.experiment.sweep import Sweep
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, build_tables, collect, write_report
+from epo_lightning.report.made import distinct
 from epo_lightning.report.runs import scored
+from epo_lightning.report.tables import Row
 from epo_lightning.report.write import is_timed
 from epo_lightning.run_folder import RunFolder
 
 SCENES, GAMES = 4, 512
 """How many scenes are drawn, and over how many the distribution of learned weights is taken."""
-
-ORDER = ("constant_velocity", "marginal", "scene_consistent", "epo")
 
 
 def report(settings: ReportSettings) -> Path:
@@ -35,10 +37,9 @@ def report(settings: ReportSettings) -> Path:
     sweep = Sweep.find(settings.sweep, (), settings.runs) if settings.sweep else None
     subject = of_sweep(sweep) if sweep else Report.of_folder(settings.runs)
     out = Path(settings.out or (sweep.folder / "report" if sweep else "report")).expanduser()
-    build_tables(subject.evaluated)  # whatever cannot be reported is said before anything is drawn
-    evaluated = [RunFolder(path) for path in dict.fromkeys(run.path for run in subject.evaluated)]
-    drawn = draw(evaluated, out / "figures") if evaluated else []
-    write_report(subject, out, figures=drawn, preface=preface(subject.runs))
+    rows = distinct(build_tables(subject.evaluated))  # whatever cannot be reported is said before anything is drawn
+    drawn, notes = draw(rows, out / "figures")
+    write_report(subject, out, drawn, preface(subject.runs), notes)
     return out
 
 
@@ -88,39 +89,46 @@ def preface(runs: Iterable[RunFolder]) -> str:
     )
 
 
-def draw(runs: list[RunFolder], folder: Path) -> list[Path]:
-    """The joint predictions of all rows over the same scenes, and the weights of the games they inferred.
+def draw(rows: Iterable[Row], folder: Path) -> tuple[list[Path], list[str]]:
+    """The joint predictions of rows over the same scenes, and the weights of the games they inferred.
 
-    Every row is drawn by its first run; rows that were trained on other data than the first row are left out.
+    Every row is drawn by its first run, and of rows with the same title the best is. Rows that were trained on other data
+    than the first one are not drawn.
+
+    Returns:
+        the pictures, and notes on what could not be drawn.
     """
     from epo_lightning.report.figures import joint_predictions
     from epo_lightning.report.scenes import highway_comparison
     from epo_lightning.report.style import AGENTS
     from epo_lightning.report.weights import learned_weights
 
-    rows: dict[str, RunFolder] = {}
-    for run in runs:
-        record = run.record
-        same_data = not rows or record["data_digest"] == next(iter(rows.values())).record["data_digest"]
-        if same_data:
-            rows.setdefault(record["title"], run)
-    rows = dict(sorted(rows.items(), key=lambda row: _rank(row[1])))
-    of_rows = {title: read(Settings, run.config()) for title, run in rows.items()}
+    runs: dict[str, tuple[RunFolder, Settings]] = {}
+    forecasters: dict[str, Any] = {}
+    notes = []
+    for row in _best_of_titles(rows):
+        run = RunFolder(row.runs[0].path)
+        try:
+            settings = read(Settings, run.config())
+            forecasters[row.name] = open_checkpoint(settings, run.checkpoint())
+            runs[row.name] = run, settings
+        except ConfigError as error:
+            notes.append(f"{row.name} is not drawn: {error}")
+    if not runs:
+        return [], notes
     try:
-        first = next(iter(rows))
-        forecasters = {title: open_checkpoint(of_rows[title], run.checkpoint()) for title, run in rows.items()}
-        data, shape = open_data(rows[first], of_rows[first]), forecasters[first].configuration.get("shape", "disc")
+        first = next(iter(runs))
+        data, shape = open_data(*runs[first]), forecasters[first].configuration.get("shape", "disc")
         # Records with two futures are found among all scenes only.
         scenes, _ = choose(data, "test", None if data.subsets else GAMES)
     except ConfigError as error:
-        print(f"no figures: {error}")
-        return []
+        return [], [*notes, f"No scenes are drawn: {error}"]
     folder.mkdir(parents=True, exist_ok=True)
     drawn: list[Path] = []
     if is_traffic(scenes, shape):
-        for number, row in enumerate(eventful(scenes, SCENES), 1):
-            forecasts = {title: forecast_of(forecaster, scenes[row]) for title, forecaster in forecasters.items()}
-            drawn.append(highway_comparison(scenes[row], forecasts, folder / f"scene_{number}.png"))
+        for number, index in enumerate(eventful(scenes, SCENES), 1):
+            forecasts = {title: forecast_of(forecaster, scenes[index]) for title, forecaster in forecasters.items()}
+            drawn.append(highway_comparison(scenes[index], forecasts, folder / f"scene_{number}.png"))
     else:
         shown, others = pairs(scenes, SCENES)
         other = None if others is None or scenes.future is None else scenes.future[others]
@@ -131,10 +139,20 @@ def draw(runs: list[RunFolder], folder: Path) -> list[Path]:
     if games:
         names = () if is_traffic(scenes, shape) else AGENTS
         drawn.append(learned_weights(games, folder / "learned_weights.png", names))
-    return drawn
+    return drawn, notes
 
 
-def _rank(run: RunFolder) -> tuple[bool, int, str]:
-    record = run.record
-    name = record["forecaster"]
-    return record["goal"] != "energy", ORDER.index(name) if name in ORDER else len(ORDER), record["title"]
+def _best_of_titles(rows: Iterable[Row]) -> list[Row]:
+    """Rows that saw the data of the first one; of those with the same title, which differ in settings, the best."""
+    best: dict[str, Row] = {}
+    for row in rows:
+        first = next(iter(best.values()), row)
+        other = best.get(row.title, row)
+        if row.runs[0].trained_digest == first.runs[0].trained_digest and _score(row) <= _score(other):
+            best[row.title] = row
+    return list(best.values())
+
+
+def _score(row: Row) -> float:
+    cell = row.cells.get("minSADE")
+    return math.inf if cell is None or math.isnan(cell.mean) else cell.mean

@@ -159,7 +159,7 @@ def draw_learning(curves: Sequence[Curve], size: tuple[float, float] = SIZE, leg
 
 def look(i: int) -> tuple[str, str | tuple[int, tuple[float, float]]]:
     """Colour and dashes of the i-th row."""
-    return VEHICLES[i % len(VEHICLES)], DASHES[i // len(VEHICLES) % len(DASHES)]  # type: ignore[return-value]
+    return VEHICLES[i % len(VEHICLES)], DASHES[i // len(VEHICLES) % len(DASHES)]
 
 
 def steps_curves(rows: Iterable[Row]) -> list[StepsCurve]:
@@ -226,7 +226,7 @@ def draw_steps(curve: StepsCurve, size: tuple[float, float] = SIZE, legend: bool
                     gid=f"row{2 + which}-line",
                 )
         axes.set_xscale("log", base=2)
-        ticks = sorted({int(x) for line in axes.lines for x in line.get_xdata()})  # type: ignore[union-attr, call-overload]
+        ticks = sorted({*curve.optimised.x, *(STEPS if curve.paper else ())})
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_xlabel("optimisation steps S")

@@ -62,7 +62,7 @@ class Made:
 
 def distinct(tables: Iterable[Table]) -> list[Row]:
     """The rows of all tables, each once: tables of one data set and split show the same rows."""
-    rows = {}
+    rows: dict[tuple[object, ...], Row] = {}
     for row in (row for table in tables for row in table.rows):
         rows.setdefault((row.runs[0].split, *(run.path for run in row.runs)), row)
     return list(rows.values())

@@ -86,7 +86,7 @@
     close.setAttribute("aria-label", "Close");
     close.addEventListener("click", () => { const from = shown; hide(); from.focus(); });
     const parts = [title, close, element("p", cell.what, "what"), list([
-      ["mean", cell.mean], ["standard deviation", cell.std ?? "- (one seed)"], ["n", String(cell.n)],
+      ["mean", cell.mean], ["std", cell.std ?? "- (one seed)"], ["n", String(cell.n)],
       ["paper", cell.paper], ["ours - paper", cell.difference],
     ])];
     row.runs.forEach((run, i) => parts.push(element("h5", `Seed ${run.seed}: ${cell.values[i]}`), list([

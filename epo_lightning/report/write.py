@@ -86,6 +86,7 @@ def write_report(
     out: str | Path,
     figures: Sequence[str | Path] = (),
     preface: str = "",
+    notes: Sequence[str] = (),
     console: Console | None = None,
 ) -> str:
     """Print the tables; write ``results.md``, ``.csv`` and ``.tex``, ``index.html`` and the figures of many runs.
@@ -97,6 +98,7 @@ def write_report(
         out: folder of the report.
         figures: pictures that were drawn already.
         preface: Markdown that stands before the tables, for what a reader has to know first.
+        notes: on what could not be drawn.
         console: where to print; the terminal by default.
 
     Returns:
@@ -111,12 +113,12 @@ def write_report(
 
     out = Path(out).expanduser()
     tables = build_tables(report.evaluated)
-    timings, notes = read_timings(report.runs)
+    timings, damaged = read_timings(report.runs)
     comparisons = build_comparisons(tables)
     compared = [comparison_sheet(entry) for entry in comparisons]
     best, hint = _best(report.evaluated)
     settings = [settings_sheet(best)] if best else []
-    notes += [hint] if hint else []
+    notes = [*notes, *damaged, *([hint] if hint else [])]
     made, charts = how_made(tables, timings), charts_of(tables, timings)
     has_paper = any(cell.paper is not None for table in tables for row in table.rows for cell in row.cells.values())
     legend = LEGEND if has_paper else LEGEND.replace(PAPER_IN_LEGEND, "")
@@ -166,8 +168,10 @@ def write_report(
     for name, text in files.items():
         write_text(out / name, text)
     console = console or Console()
-    for table in (*tables, *shown):
-        console.print(to_rich(table))
+    for note in notes:
+        console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    for rich in (*map(to_rich, tables), *map(to_rich, shown)):
+        console.print(rich)
     return markdown
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
@@ -11,7 +12,9 @@ import pytest
 import torch
 from matplotlib.image import imread
 
+from epo_lightning.report import weights
 from epo_lightning.report.figures import joint_predictions
+from epo_lightning.report.style import save
 from epo_lightning.report.weights import learned_weights
 from epo_lightning.scene import GameParameters, JointForecast, Scene
 
@@ -94,6 +97,26 @@ def test_weights_of_one_and_of_several_forecasters(tmp_path: Path) -> None:
     assert pixels(several).shape[0] > 1.5 * pixels(one).shape[0]
     zero = learned_weights(dataclasses.replace(plain, parameters=game(scale=0.0)), tmp_path / "zero.png")
     assert not np.array_equal(pixels(zero), pixels(one))
+
+
+@pytest.mark.parametrize("spread", [0.01, 0.1, 0.4, 3.0])
+def test_numbers_below_narrow_weights_do_not_overlap(
+    tmp_path: Path, spread: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = []
+    monkeypatch.setattr(weights, "save", lambda figure, path: figures.append(figure) or save(figure, path))
+    random = torch.Generator().manual_seed(0)
+    pair = {"proximity": 20 * (1 + spread * torch.rand(50, MODES, 1, generator=random))}
+    own = game(50).own_weights
+    narrow = GameParameters(own, pair, torch.zeros(50, MODES, AGENTS, FUTURE, 2))
+    learned_weights(dataclasses.replace(forecast(scenes(50)), parameters=narrow), tmp_path / "narrow.png")
+    for axes in figures[0].axes:
+        labels = [*axes.get_xticklabels(), *axes.get_xticklabels(minor=True)]
+        low, high = axes.get_window_extent().x0 - 1, axes.get_window_extent().x1 + 1
+        boxes = [label.get_window_extent() for label in labels if label.get_text()]
+        boxes = sorted((box for box in boxes if low <= (box.x0 + box.x1) / 2 <= high), key=lambda box: box.x0)
+        assert boxes
+        assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
 
 
 def test_what_cannot_be_drawn_is_said(tmp_path: Path) -> None:

@@ -1,0 +1,99 @@
+"""``epo report`` of a sweep: its own runs, by what it measures, and the states of those that are left out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from report.page_runs import timed
+from report.run_folders import make_run, scores
+
+from epo_lightning.experiment.report import of_sweep, report
+from epo_lightning.experiment.settings import ReportSettings
+from epo_lightning.experiment.sweep import Sweep
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder, write_json, write_text
+
+
+def begin(runs: Path, name: str, folders: dict[str, str | None], score: str = "test") -> Sweep:
+    """The record of a sweep over these folders; of a score of its own where one is given."""
+    jobs = [
+        {
+            "overrides": [f"seed={seed}"],
+            "folder": folder,
+            "identity": f"{seed:016x}",
+            "title": "V-LSTM",
+            "seed": seed,
+            "score": own or score,
+        }
+        for seed, (folder, own) in enumerate(folders.items())
+    ]
+    folder = runs / "sweeps" / name
+    write_json(folder / "sweep.json", {"name": name, "command": f"epo sweep {name}", "overrides": [], "jobs": jobs})
+    return Sweep(folder)
+
+
+def finish(run: RunFolder) -> RunFolder:
+    run.update(status="finished")
+    return run
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+def test_a_sweep_reports_its_runs_and_the_states_of_the_others(runs: Path) -> None:
+    finish(make_run(runs / "a", "V-LSTM", "marginal", scores(0.3), seed=0))
+    finish(make_run(runs / "b", "V-LSTM", "marginal", scores(0.5), seed=1))
+    finish(make_run(runs / "elsewhere", "Not of the sweep", "marginal", scores(0.1)))
+    make_run(runs / "c", "V-LSTM", "marginal", None, seed=2)
+    sweep = begin(runs, "rpi_main", dict.fromkeys(("a", "b", "c", "d", "e")))
+    write_text(sweep.folder / "failures" / "e.txt", "ValueError: it broke\n\ntraceback\n")
+    subject = of_sweep(sweep)
+    assert (subject.title, subject.command) == ("rpi_main", "epo report rpi_main")
+    assert [run.path.name for run in subject.evaluated] == ["a", "b"]
+    assert subject.left_out == (
+        ("runs/c", "interrupted"),
+        ("runs/d", "waiting"),
+        ("runs/e", "failed: ValueError: it broke"),
+    )
+    out = report(ReportSettings(sweep="rpi_main"))
+    assert out.resolve() == sweep.folder / "report"
+    written = (out / "results.md").read_text()
+    assert "0.400 ± 0.141" in written
+    assert "Not of the sweep" not in written
+    assert "- `runs/e`: failed: ValueError: it broke" in written
+    assert "3 runs left out" in (out / "index.html").read_text()
+
+
+def test_scores_on_another_split_belong_to_another_report(runs: Path) -> None:
+    for split in ("test", "val"):
+        finish(make_run(runs / "a", "V-LSTM", "marginal", scores(0.3), split=split))
+    finish(make_run(runs / "b", "V-LSTM", "marginal", scores(0.3), seed=1, split="test"))
+    subject = of_sweep(begin(runs, "grid", {"a": None, "b": None}, score="val"))
+    assert [(run.path.name, run.split) for run in subject.evaluated] == [("a", "val")]
+    assert [folder for folder, _ in subject.left_out] == ["runs/b"]
+
+
+def test_a_sweep_that_measures_time(runs: Path) -> None:
+    finish(timed(runs, 2, 1, 4, 0.001))
+    finish(timed(runs, 4, 1, 4, 0.002))
+    begin(runs, "runtime", {"N2-S1-M4": None, "N4-S1-M4": None}, score="time")
+    out = report(ReportSettings(sweep="runtime", out="out"))
+    assert out == Path("out")
+    assert (out / "figures" / "runtime.png").is_file()
+    assert not (out / "results.csv").exists()
+
+
+def test_what_cannot_be_reported_is_said(runs: Path) -> None:
+    make_run(runs / "a", "V-LSTM", "marginal", None)
+    begin(runs, "rpi_main", {"a": None})
+    with pytest.raises(ConfigError, match=r"none of the 1 runs of the sweep rpi_main is done: see `epo sweep status"):
+        report(ReportSettings(sweep="rpi_main"))
+    with pytest.raises(ConfigError, match="rpi_main"):
+        report(ReportSettings(sweep="rpi_mian"))
+    assert json.loads((runs / "sweeps/rpi_main/sweep.json").read_text())["name"] == "rpi_main"
+    assert not (runs / "sweeps" / "rpi_main" / "report").exists()
