@@ -1,5 +1,6 @@
 # make run     from a bare machine to the paper's table and figures, at a reduced budget (a quarter of an hour on 2 cores)
 # make test    the tests          make test-slow   those that take minutes          make lint   style and types
+# make smoke   every experiment for a few steps, on drawn scenes (a minute)
 # make wheel   a package for this platform, with the compiled layer, in dist/
 # make clean   remove what these made, but for the data in cache/
 #
@@ -13,7 +14,7 @@ BIN := $(VENV)/bin
 EPO := $(BIN)/epo
 STAMP := $(VENV)/.installed
 
-.PHONY: run install test test-slow lint wheel clean
+.PHONY: run install test test-slow smoke lint wheel clean
 
 install: $(STAMP)
 
@@ -43,6 +44,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
+
+smoke: $(STAMP)
+	$(BIN)/python -m pytest tests/experiment/test_smoke.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
