@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from epo_lightning.report import Report, build_tables, collect, write_report
 from epo_lightning.report.made import distinct
 from epo_lightning.report.runs import scored
 from epo_lightning.report.tables import Row
-from epo_lightning.report.write import is_timed
+from epo_lightning.report.write import is_timed, why_left_out
 from epo_lightning.run_folder import RunFolder
 
 SCENES, GAMES = 4, 512
@@ -53,7 +54,8 @@ def of_sweep(sweep: Sweep) -> Report:
     done = [job for job in jobs if scored(job.run) or is_timed(job.run)]
     if not done:
         raise ConfigError(
-            f"none of the {len(jobs)} runs of the sweep {sweep.label} is done: see `epo sweep status {sweep.label}`"
+            f"none of the {len(jobs)} runs of the sweep {sweep.label} is evaluated: `epo sweep status {sweep.label}` says "
+            f"how far they are, epo evaluate runs={os.path.relpath(sweep.root)} evaluates those that are finished"
         )
     splits = {job.run.path: job.score for job in jobs}
     with_scores = [job.run for job in done if scored(job.run)]
@@ -67,10 +69,18 @@ def of_sweep(sweep: Sweep) -> Report:
     for job in jobs:
         if job.run.path not in measured:
             state, error = sweep.state(job), sweep.error(job)
-            left_out.append((str(job.run.path), f"{state}: {error}" if state == "failed" and error else state))
+            why = (
+                why_left_out(job.run)
+                if state == "done"
+                else f"{state}: {error}"
+                if state == "failed" and error
+                else state
+            )
+            left_out.append((str(job.run.path), why))
+    runs = os.path.relpath(sweep.root)
     return Report(
         title=sweep.label,
-        command=f"epo report {sweep.label}",
+        command=f"epo report {sweep.label}" + (f" runs={runs}" if runs != "runs" else ""),
         runs=tuple(job.run for job in jobs if job.run.path in measured),
         evaluated=tuple(evaluated),
         left_out=tuple(left_out),
