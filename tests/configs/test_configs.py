@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 from experiment import tiny
+from hydra.types import RunMode
 from experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
 
 from epo_lightning.data.datamodule import SceneDataModule
@@ -91,9 +92,21 @@ def test_backbones_and_forecasters_can_be_built_for_highways(backbone: str, fore
 @pytest.mark.parametrize("sweep", names(tree() / "sweeps"))
 def test_sweeps_list_their_runs(sweep: str) -> None:
     listed = jobs("train", [f"sweeps={sweep}"])
-    assert len(listed) > 1
-    for job in listed:
-        read(Settings, compose("train", job))
+    for job in listed or [[f"sweeps={sweep}"]]:
+        settings = read(Settings, compose("train", job))
+        assert settings.score is not None
+        assert settings.score != "test" or not sweep.startswith("grid")
+    # A search thinks of its runs as it goes.
+    assert len(listed) > 1 or sweep.endswith("_search")
+
+
+def test_searches_learn_from_scores_and_keep_what_they_learned() -> None:
+    with hydra() as instance:
+        config = instance.compose_config("train", ["sweeps=rpi_search"], run_mode=RunMode.MULTIRUN)
+        sweeper = config.hydra.sweeper
+        assert sweeper["_target_"].endswith("OptunaSweeper")
+        assert sweeper.storage == f"sqlite:///{config.hydra.sweep.dir}/study.db"
+        read(Settings, compose("train", [f"experiment={sweeper.params.experiment}"]))
 
 
 def test_a_budget_in_the_command_line_wins_over_the_experiment() -> None:
