@@ -186,18 +186,12 @@ def _best(runs: Sequence[EvaluatedRun]) -> tuple[list[BestSetting], str]:
 
 def _how_made(rows: Sequence[Made], report: Report) -> str:
     """What somebody needs to judge the tables, and to make them again."""
-    lines = [
-        "### How this was made",
-        "",
-        "| method | of | budget | n | seeds | parameters | commit | data digest |",
-        "|:--|:--|:--|--:|:--|--:|:--|:--|",
-        *(
-            f"| {row.name} | {row.what} | {row.budget} | {len(row.runs)} | {row.seeds} | {row.parameters} | "
-            f"{row.commits} | {row.digests} |"
-            for row in rows
-        ),
-        "",
-    ]
+    header = ("method", "of", "budget", "seeds", "commit", "data digest", "parameters", "n")
+    entries = tuple(
+        (row.name, row.what, row.budget, row.seeds, row.commits, row.digests, row.parameters, str(len(row.runs)))
+        for row in rows
+    )
+    lines = [to_markdown(Sheet("How this was made", header, entries, left=6))]
     commands = {run.folder: f"- `{run.folder}`: `{run.command}`" for row in rows for run in row.runs}
     lines += [*commands.values(), "", f"Written by `{report.command}`."]
     if report.left_out:

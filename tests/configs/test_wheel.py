@@ -47,4 +47,5 @@ def test_an_installed_wheel_works_from_any_folder(tmp_path: Path) -> None:
     assert "title: V-LSTM + EPO" in epo("config", "experiment=rpi/v_lstm_epo")
     assert "is sound" in epo("config", "check", "experiment=rpi/v_lstm_epo_goal", "budget=reduced")
     assert "rpi_main" in epo("train", "--help")
+    assert {"page.html.j2", "page.css", "page.js"} <= {path.name for path in (site / "epo_lightning/report").iterdir()}
     assert not list(elsewhere.iterdir())

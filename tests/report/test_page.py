@@ -230,9 +230,10 @@ def test_without_scripts_and_on_paper_every_section_is_there(browser: Any, page_
     page.goto(page_file.as_uri())
     assert all(section.is_visible() for section in page.locator("main > section").all())
     context.close()
-    page = browser.new_page()
+    page = browser.new_page(viewport={"width": 718, "height": 1000})  # A4 with margins of a centimetre
     page.goto(page_file.as_uri())
     page.emulate_media(media="print")
+    assert page.evaluate("document.documentElement.scrollWidth") == 718
     assert all(section.is_visible() for section in page.locator("main > section").all())
     assert page.locator("nav").is_hidden()
     page.close()

@@ -51,7 +51,7 @@ def test_markdown_by_hand(tmp_path: Path) -> None:
     )
     assert "<u>0.100</u> (0.04, +0.060)" in markdown
     assert lines.index("A reduced budget.") < lines.index("### rpi, test split")
-    assert "| V-LSTM + EPO | rpi, test split | reduced | 2 | 0, 1 | 1234 | 0123456789 | abc |" in lines
+    assert "| V-LSTM + EPO | rpi, test split | reduced | 0, 1 | 0123456789 | abc | 1234 | 2 |" in lines
     assert f"- `{tmp_path}/runs/e1`: `epo train experiment=None seed=1`" in lines
     assert f"Written by `epo report runs={tmp_path}/runs`." in lines
 
@@ -145,7 +145,7 @@ def test_runs_that_are_left_out_and_changed_code_are_said(tmp_path: Path) -> Non
         f"- `{late.path}`: not evaluated yet: epo evaluate run={late.path}"
         in report(tmp_path / "runs", tmp_path / "out")[0]
     )
-    assert "| V-LSTM | rpi, test split | reduced | 1 | 0 | 1234 | 0123456789+ | abc |" in markdown
+    assert "| V-LSTM | rpi, test split | reduced | 0 | 0123456789+ | abc | 1234 | 1 |" in markdown
 
 
 def test_nothing_is_overwritten_by_a_report_that_fails(tmp_path: Path) -> None:
