@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 from experiment import tiny
-from hydra.types import RunMode
 from experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
+from hydra.types import RunMode
 
 from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment import assembly
