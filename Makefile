@@ -57,4 +57,4 @@ wheel: $(STAMP)
 	$(BIN)/pip wheel -q --no-deps -w dist .
 
 clean:
-	rm -rf epo_lightning/solvers/kernel/epo_kernel.* runs/reduced figures results.md results.csv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf epo_lightning/solvers/kernel/epo_kernel.* runs/reduced figures results.md results.csv results.tex comparisons.csv index.html build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
