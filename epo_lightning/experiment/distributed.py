@@ -243,7 +243,7 @@ class _Processes(_Launcher):
 
     def kill(self, signum: Any) -> None:
         """Lightning's handler of SIGTERM asks for it. It would then broadcast amid whatever is under way, and never end."""
-        raise SIGTERMException
+        raise SIGTERMException(128 + int(signum))
 
     def meet(self) -> dist.TCPStore:
         """The store, as soon as everybody is there.

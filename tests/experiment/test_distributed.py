@@ -153,7 +153,7 @@ def test_the_jobs_of_a_sweep_train_in_workers(epo: Epo) -> None:
     sweep(epo, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
 
 
-LONG = ("train", "experiment=rpi/v_lstm_sc", *QUIET, *RPI, DOUBLE, "trainer.max_epochs=40")
+LONG = ("train", "experiment=rpi/v_lstm_sc", *QUIET, *RPI, DOUBLE, "optimizer.lr=5e-5", "trainer.max_epochs=40")
 
 
 def test_a_run_on_one_device_goes_on_on_two(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,8 +210,8 @@ def test_the_leader_says_what_a_follower_stumbled_over() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_followers_end_with_the_leader_and_the_run_goes_on(epo: Epo, how: signal.Signals) -> None:
-    assert epo(*LONG, "run_dir=whole", "trainer.max_epochs=30") == 0
-    words = [*LONG, "run_dir=parts", TWO, "trainer.max_epochs=30"]
+    assert epo(*LONG, "run_dir=whole", "trainer.max_epochs=12") == 0
+    words = [*LONG, "run_dir=parts", TWO, "trainer.max_epochs=12"]
     leader = subprocess.Popen(
         [sys.executable, "-m", "epo_lightning.cli", *words], env={**os.environ, "PYTHONPATH": str(ROOT)}
     )
