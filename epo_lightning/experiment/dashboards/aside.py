@@ -7,9 +7,11 @@ rows into a queue.
 
 from __future__ import annotations
 
+import math
 import queue
 import sys
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -83,16 +85,19 @@ class Aside(Logger):
             self._switch_off(" ".join(f"{type(error).__name__}: {error}".split())[:300])
 
     def _waiting(self) -> tuple[list[Row], Ending | None]:
-        """All rows that have come up, at least one, or the ending."""
+        """The next row and all that come up soon after it, or the ending."""
         rows: list[Row] = []
+        until = math.inf
         while True:
             try:
-                item = self._queue.get(block=not rows)
+                left = until - time.monotonic()
+                item = self._queue.get(timeout=None if left == math.inf else max(left, 0.0))
             except queue.Empty:
                 return rows, None
             if isinstance(item, Ending):
                 return rows, item
             rows.append(item)
+            until = min(until, time.monotonic() + self.dashboard.every)
 
     def _switch_off(self, why: str) -> None:
         if self.off:

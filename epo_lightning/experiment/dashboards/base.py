@@ -59,6 +59,8 @@ class Dashboard(ABC):
     """One dashboard of one run. Its methods may raise and may be slow: they are called aside from the training."""
 
     label: ClassVar[str]
+    every: ClassVar[float] = 0.0
+    """Seconds of which the rows are told together, where telling is dear."""
 
     def __init__(self, facts: Facts) -> None:
         self.facts = facts

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import re
@@ -17,6 +16,8 @@ from epo_lightning.experiment.settings import MLflowSettings
 from epo_lightning.registry import ConfigError
 
 SQLITE = "sqlite:///"
+KIND = {"mlflow.experimentKind": "custom_model_development"}
+"""Without it, MLflow's page guesses, and may show runs as it shows the traces of a language model."""
 
 
 def check() -> None:
@@ -33,6 +34,7 @@ class MLflow(Dashboard):
     """See the module. A run is found again by its tag ``run``; rows that are there are not written twice."""
 
     label = "MLflow"
+    every = 5.0
 
     def __init__(self, facts: Facts, settings: MLflowSettings, runs: Path) -> None:
         super().__init__(facts)
@@ -41,6 +43,7 @@ class MLflow(Dashboard):
         self._uri = settings.uri or os.environ.get("MLFLOW_TRACKING_URI") or default
         self._known: dict[str, tuple[int, float]] = {}  # last step and value of each metric
         self._last = 0
+        self._ended: int | None = None  # when an earlier process ended the run, if it told all
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
@@ -57,8 +60,7 @@ class MLflow(Dashboard):
 
     def open(self) -> None:
         os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-        for chatty in ("mlflow", "alembic"):
-            logging.getLogger(chatty).setLevel(logging.WARNING)
+        os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
         from mlflow import MlflowClient
 
         with self._alone():
@@ -66,10 +68,11 @@ class MLflow(Dashboard):
             place = None if not self._uri.startswith(SQLITE) else self._artifacts()
             name = self.facts.group or self._settings.experiment
             experiment = self._client.get_experiment_by_name(name)
-            key = experiment.experiment_id if experiment else self._client.create_experiment(name, place)
+            key = experiment.experiment_id if experiment else self._client.create_experiment(name, place, KIND)
             found = self._client.search_runs([key], f"tags.run = '{self.facts.id}'", max_results=1)
             if found:
                 self._run = found[0].info.run_id
+                self._ended = found[0].info.end_time
                 self._client.update_run(self._run, status="RUNNING")
                 self._known = {name: self._latest(name) for name in found[0].data.metrics}
             else:
@@ -95,24 +98,30 @@ class MLflow(Dashboard):
         self._last = max([self._last, *(step for step, _ in rows)])
         self._write((step, name, value) for step, metrics in rows for name, value in metrics.items())
 
-    def _write(self, points: Iterable[tuple[int, str, float]]) -> None:
-        """Add the points that come after what is known of their metric."""
+    def _write(self, points: Iterable[tuple[int, str, float]], final: bool = False) -> None:
+        """Add the points that come after what is known of their metric; of final ones those that are not the same."""
         from mlflow.entities import Metric
 
         now = int(time.time() * 1000)
-        named = [(step, re.sub(r"[^\w/. -]", "_", name), value) for step, name, value in points]
-        fresh = [Metric(name, v, now, step) for step, name, v in named if step > self._known.get(name, (-1, 0.0))[0]]
+        fresh = []
+        for step, name, value in points:
+            name = re.sub(r"[^\w/. -]", "_", name)
+            last, there = self._known.get(name, (-1, math.nan))
+            if step > last or (final and value != there):
+                fresh.append(Metric(name, value, now, step))
         if fresh:
+            self._ended = self._ended if final else None
             with self._alone():
                 for first in range(0, len(fresh), 1000):  # no more in one call
                     self._client.log_batch(self._run, metrics=fresh[first : first + 1000])
 
     def close(self, ending: Ending) -> None:
-        self._write((self._last, name, value) for name, value in ending.summary.items() if not math.isnan(value))
+        summary = ((self._last, name, value) for name, value in ending.summary.items() if not math.isnan(value))
+        self._write(summary, final=True)
         with self._alone():
             for path in ending.pictures[: self._settings.pictures]:
                 self._client.log_artifact(self._run, str(path), "pictures")
             if self._settings.artifacts and not ending.failed:
                 for name in ARTIFACTS:
                     self._client.log_artifact(self._run, str(self.facts.folder / name))
-            self._client.set_terminated(self._run, "FAILED" if ending.failed else "FINISHED")
+            self._client.set_terminated(self._run, "FAILED" if ending.failed else "FINISHED", self._ended)
