@@ -81,6 +81,7 @@ def test_on_a_ray_cluster(sequential: Path) -> None:
     check(sequential, "ray", "hydra/launcher=ray_cluster")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="the extra `local` is not installed"
 )
