@@ -83,12 +83,16 @@ def see_mlflow(runs: Path, names: list[str], picture: Path, experiment: str = "e
 
     database = f"sqlite:///{runs.resolve() / 'mlflow.db'}"
     key = MlflowClient(database).get_experiment_by_name(experiment).experiment_id
-    with serving("mlflow", "server", f"--backend-store-uri={database}", "--workers=1") as address, browsing() as page:
+    with (
+        serving("mlflow", "server", f"--backend-store-uri={database}", "--workers=1") as address,
+        browsing(1760) as page,
+    ):
         page.goto(f"{address}/#/experiments/{key}/runs?compareRunsMode=CHART")
         for name in names:
             page.get_by_text(name, exact=True).first.wait_for(state="visible")
+        page.get_by_placeholder("Search metric charts").fill("^val/min")
         page.wait_for_timeout(4000)  # the charts come one after the other
-        page.screenshot(path=picture)
+        page.screenshot(path=picture, clip={"x": 0, "y": 0, "width": 1305, "height": 620})  # its assistant is beyond
 
 
 def see_tensorboard(runs: Path, names: list[str], picture: Path) -> None:
