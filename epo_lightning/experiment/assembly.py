@@ -122,7 +122,7 @@ def quiet() -> None:
         warnings.filterwarnings("ignore", message=text)
 
 
-class _Double(DoublePrecision):
+class Double(DoublePrecision):
     """Double precision of scenes, which are frozen data classes: Lightning's own refuses these."""
 
     def convert_input(self, data: Any) -> Any:
@@ -154,7 +154,7 @@ def build_trainer(
             plugins=[
                 WholeCheckpoints(),
                 *([LightningEnvironment()] if strategy is None else []),
-                *([_Double()] if double else []),
+                *([Double()] if double else []),
             ],
             precision=None if double else settings.precision,  # type: ignore[arg-type]
             max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,

@@ -50,10 +50,12 @@ def _score(run: RunFolder, settings: EvaluateSettings) -> dict[str, float]:
     loader = split_of(data, settings.split)
     seed_everything(of_run.seed, workers=True, verbose=False)
     torch.set_num_threads(of_run.trainer.threads)
+    double = of_run.trainer.precision == "64-true"
     trainer = Trainer(
         accelerator=of_run.trainer.accelerator,
         devices=gpus.devices(of_run.trainer) if of_run.trainer.devices == 1 else 1,
-        precision=of_run.trainer.precision,  # type: ignore[arg-type]
+        precision=None if double else of_run.trainer.precision,  # type: ignore[arg-type]
+        plugins=[assembly.Double()] if double else None,
         deterministic=of_run.trainer.deterministic,
         inference_mode=False,  # the layer differentiates its energy also when it only forecasts
         logger=False,

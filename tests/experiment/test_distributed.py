@@ -116,9 +116,12 @@ def test_two_processes_give_the_numbers_of_one(epo: Epo, row: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["32-true", "64-true"])
 @pytest.mark.parametrize(
-    "row", ["rpi/v_lstm_sc", "rpi/v_lstm_epo", "exid/v_lstm", "exid/v_lstm_sc", "exid/vibes_epo", "exid/hivt_m_epo"]
+    ("row", "precision"),
+    [
+        *((row, "32-true") for row in ("rpi/v_lstm_sc", "rpi/v_lstm_epo", "exid/v_lstm_sc", "exid/hivt_m_epo")),
+        *((row, "64-true") for row in ("rpi/v_lstm_epo", "exid/v_lstm", "exid/vibes_epo", "exid/hivt_m_epo")),
+    ],
 )
 def test_two_processes_give_the_scores_of_one(epo: Epo, row: str, precision: str) -> None:
     """In single precision at the paper's learning rate: a greater one makes much of a rounding error, in one process too."""
