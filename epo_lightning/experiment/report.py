@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from epo_lightning.experiment.evaluate import open_checkpoint, open_data
 from epo_lightning.experiment.predict import choose, eventful, forecast_of, is_traffic, pairs, spread
 from epo_lightning.experiment.settings import ReportSettings, Settings, read
 from epo_lightning.experiment.sweep import Sweep
+from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, build_tables, collect, write_report
 from epo_lightning.report.made import distinct
@@ -89,14 +91,22 @@ def of_sweep(sweep: Sweep) -> Report:
 
 def preface(runs: Iterable[RunFolder]) -> str:
     """What a reader has to know before the numbers: that the budget was not the paper's, and how to use that."""
+    runs = list(runs)
     budgets = sorted({run.record.get("budget", "paper") for run in runs} - {"paper"})
-    if not budgets:
+    words = [word for run in runs for word in shlex.split(run.record.get("command", ""))]
+    changed = sorted({word for word in words if word.lstrip("+").startswith(("trainer.", "data.")) and _matters(word)})
+    if not budgets and not changed:
         return ""
+    changes = f" Changed by hand: `{' '.join(changed)}`." if changed else ""
     return (
-        f"**Budget: {', '.join(budgets)}.** These runs saw less data or fewer steps than the paper's, so the numbers show "
-        "that everything works, not which row is best, and do not reproduce the table. The paper's settings are those of "
-        "`epo train` without `budget=`."
+        f"**Budget: {', '.join(budgets or ['paper'])}.**{changes} These runs saw other data or another number of steps than "
+        "the paper's, so the numbers show that everything works, not which row is best, and do not reproduce the table. The "
+        "paper's settings are those of `epo train` without `budget=`."
     )
+
+
+def _matters(word: str) -> bool:
+    return word.lstrip("+").partition("=")[0] not in ELSEWHERE
 
 
 def draw(rows: Iterable[Row], folder: Path) -> tuple[list[Path], list[str]]:

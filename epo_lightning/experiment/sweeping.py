@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from epo_lightning.experiment import assembly, compose
@@ -42,7 +43,7 @@ def run(
     # Absolute, because a worker on another machine may start in any folder.
     words += [f"sweep={sweep.folder}", f"runs={sweep.root}", f"hydra.sweep.dir={sweep.folder}", "existing=continue"]
     words += ["hydra/hydra_logging=none"]  # the news say it better
-    listed = {}
+    listed: dict[Path, Job] = {}
     for words_of_job in compose.jobs("train", words, extra):
         config = compose.compose("train", words_of_job, extra)
         job = Job.of(config, words_of_job)

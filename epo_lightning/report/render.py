@@ -87,7 +87,10 @@ def own_text(cell: Cell, column: Column) -> str:
 def paper_text(row: Row, column: Column) -> str:
     """The paper's value with the digits that it is printed with, or nothing."""
     cell = row.cells.get(column.metric)
-    return "" if cell is None or cell.paper is None else number(cell.paper, column.digits - 1)
+    if cell is None or cell.paper is None:
+        return ""
+    printed = len(f"{cell.paper!r}".partition(".")[2])
+    return number(cell.paper, max(printed, column.digits - 1))
 
 
 def difference_text(row: Row, column: Column) -> str:
