@@ -89,13 +89,14 @@ class MLP(nn.Module):
         super().__init__()
         sizes = [inputs, *[width] * (layers - 1)]
         normalisation = {"batch": _MaskedBatchNorm, "layer": nn.LayerNorm}[norm]
-        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        hidden = [nn.Linear(a, b) for a, b in pairwise(sizes)]
+        self.hidden = nn.ModuleList(hidden)
         self.norms = nn.ModuleList(normalisation(size) for size in sizes[1:])
         self.output = nn.Linear(sizes[-1], outputs, bias=bias)
         if norm == "batch":
             # Batch normalisation takes away what a bias adds: the bias's gradient is zero but for rounding errors. Adam
             # would make steps of full length of these, and the running means, which lag behind, would let them be seen.
-            for linear in self.hidden:
+            for linear in hidden:
                 linear.bias.register_hook(torch.zeros_like)
 
     def forward(
