@@ -49,8 +49,8 @@ class TrainerSettings:
             raise ConfigError(f"trainer.validate_steps must be 1 or more, or null, not {self.validate_steps}")
         if self.overfit_batches < 0 or (self.overfit_batches and self.devices > 1):
             raise ConfigError(
-                f"trainer.overfit_batches={self.overfit_batches} on {self.devices} device(s): it takes 0 for all batches, or "
-                "1 or more of them on one device"
+                f"trainer.overfit_batches={self.overfit_batches} on {self.devices} device(s): it takes 0 for all batches, "
+                "or 1 or more of them on one device"
             )
         for name in ("limit_train_batches", "limit_val_batches"):
             value = getattr(self, name)
