@@ -7,6 +7,7 @@ import math
 import platform
 import shlex
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from typing import Any
 import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from epo_lightning.experiment import assembly, callbacks, distributed, gpus, logs
 from epo_lightning.experiment.compose import PACKAGE
@@ -136,6 +138,8 @@ def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path 
     """Train from the beginning, or from the checkpoint ``last``; an error is also left in run.json."""
     try:
         _train(settings, config, run, last)
+    except SIGTERMException:  # it would say that all is well
+        raise SystemExit(128 + signal.SIGTERM) from None
     except Exception as error:
         with contextlib.suppress(OSError, ConfigError):  # the disk may be what failed
             run.update(status=FAILED, error=f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
@@ -159,7 +163,9 @@ def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Pat
         trainer = assembly.build_trainer(settings.trainer, run, watchers, loggers, bar, strategy)
         run.update(parameters=assembly.parameters(model))
         if learns:
-            trainer.fit(model, assembly.as_data(data, settings.trainer.overfit_batches), ckpt_path=last, weights_only=True)
+            trainer.fit(
+                model, assembly.as_data(data, settings.trainer.overfit_batches), ckpt_path=last, weights_only=True
+            )
         else:
             _keep_unlearned(trainer, model, data, run)
         if trainer.interrupted:
