@@ -8,7 +8,7 @@
                                `identity` is what makes it this run and no other, `row` the same without its seed
         checkpoints/best.ckpt  the epoch with the smallest validation minSADE
         checkpoints/last.ckpt  the last finished epoch, with everything that continuing needs
-        logs/metrics.csv       what was logged while training; TensorBoard's and W&B's files lie beside it
+        logs/                  metrics.csv: what was logged while training; TensorBoard's and W&B's files lie beside it
         metrics.json           scores on the test split, written by ``evaluate`` ({"split", "data", "checkpoint", "metrics"})
         metrics-val.json       the same on the validation split, if asked for
         runtime.json           how long one joint forecast takes, if asked for

@@ -161,6 +161,12 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
         return [[str(text) for text in job] for batch in batches for job in batch]
 
 
+def trials(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> int | None:
+    """How many runs a searching sweeper is asked for; None where it does not say."""
+    with hydra(extra) as instance:
+        return _composed(instance, name, overrides, multirun=True).hydra.sweeper.get("n_trials")
+
+
 def launch(
     name: str,
     overrides: Sequence[str],

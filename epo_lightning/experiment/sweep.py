@@ -194,8 +194,8 @@ class Sweep:
         self, name: str, command: str, overrides: Sequence[str], jobs: Sequence[Job], stop_on_failure: bool
     ) -> None:
         """Write down what is about to run; failures of earlier attempts are forgotten."""
-        for job in jobs:
-            self._failure(job).unlink(missing_ok=True)
+        for failure in (self.folder / "failures").glob("*.txt"):
+            failure.unlink()
         content = {
             "name": name,
             "label": self.label,

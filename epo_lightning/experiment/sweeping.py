@@ -64,13 +64,25 @@ def run(
         with news(sweep):
             if missing:
                 compose.launch("train", words, missing, task, extra)
-            elif not jobs:  # a sweeper that chooses as it goes
-                compose.multirun("train", words, task, extra)
+            elif not jobs:
+                _search(sweep, words, task, extra)
         counts = status(sweep)
     done = counts["done"] == counts.total()
     if done:
         print(f"next: epo report {sweep.label}" + (f" runs={runs}" if runs != "runs" else ""))
     return done
+
+
+def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]) -> None:
+    """Go on with a sweep whose sweeper chooses as it goes: finish what it has thought of, then let it think further."""
+    found = sweep.jobs
+    if unfinished := [list(job.overrides) for job in found if sweep.state(job) != "done"]:
+        compose.launch("train", words, unfinished, task, extra)
+    trials = compose.trials("train", words, extra)
+    if trials is None:
+        compose.multirun("train", words, task, extra)
+    elif trials > len(found):
+        compose.multirun("train", [*words, f"hydra.sweeper.n_trials={trials - len(found)}"], task, extra)
 
 
 def show(name: str, overrides: Sequence[str]) -> None:

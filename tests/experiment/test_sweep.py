@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -179,6 +180,27 @@ def test_globs_find_experiments_in_folders() -> None:
     listed = jobs("train", ["experiment=glob('rpi/*')", "seed=1,2,3"])
     assert ["experiment=rpi/v_lstm_epo", "seed=2"] in listed
     assert len(listed) == 3 * len(list((SRC / "conf" / "experiment" / "rpi").glob("*.yaml")))
+
+
+@pytest.mark.skipif(
+    find_spec("hydra_plugins.hydra_optuna_sweeper") is None, reason="the extra `search` is not installed"
+)
+def test_a_search_goes_on_where_it_was(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("sweep", "rpi_search", *TINY, "hydra.sweeper.sampler.n_startup_trials=1")
+    assert epo(*words, "hydra.sweeper.n_trials=2") == 0
+    sweep = the_sweep()
+    before = {str(job.run.path) for job in sweep.jobs}
+    assert len(before) == 2
+    interrupted = sweep.jobs[0].run
+    interrupted.update(status="training")
+    assert epo(*words, "hydra.sweeper.n_trials=3") == 0
+    assert interrupted.finished
+    assert len(sweep.jobs) == 3
+    assert before < {str(job.run.path) for job in sweep.jobs}
+    capsys.readouterr()
+    assert epo(*words, "hydra.sweeper.n_trials=3") == 0
+    assert "3 runs: 3 done" in capsys.readouterr().out
+    assert len(sweep.jobs) == 3
 
 
 @pytest.mark.slow
