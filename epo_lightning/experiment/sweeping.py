@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -10,6 +11,7 @@ from typing import Any
 
 from epo_lightning.experiment import assembly, compose
 from epo_lightning.experiment import train as training
+from epo_lightning.experiment.settings import Settings, read
 from epo_lightning.experiment.sweep import Job, Sweep
 from epo_lightning.experiment.watch import news, status, summary
 from epo_lightning.registry import ConfigError
@@ -43,19 +45,8 @@ def run(
     # Absolute, because a worker on another machine may start in any folder.
     words += [f"sweep={sweep.folder}", f"runs={sweep.root}", f"hydra.sweep.dir={sweep.folder}", "existing=continue"]
     words += ["hydra/hydra_logging=none"]  # the news say it better
-    listed: dict[Path, Job] = {}
-    for words_of_job in compose.jobs("train", words, extra):
-        config = compose.compose("train", words_of_job, extra)
-        job = Job.of(config, words_of_job)
-        if job.run.record_file.is_file():
-            training.refuse_other(job.run, config)
-        elif job.run.exists:
-            raise ConfigError(
-                f"{job.run.path} exists and is not a run folder: move it away, or choose another runs=<folder>"
-            )
-        listed.setdefault(job.run.path, job)
+    jobs = _listed(sweep, words, extra)
     with sweep.lock():
-        jobs = list(listed.values())
         states = [sweep.state(job) for job in jobs]
         sweep.begin(name, shlex.join(["epo", "sweep", name, *overrides]), overrides, jobs, stop_on_failure)
         if jobs:
@@ -71,6 +62,31 @@ def run(
     if done:
         print(f"next: epo report {sweep.label}" + (f" runs={runs}" if runs != "runs" else ""))
     return done
+
+
+def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Job]:
+    """All runs of a sweep that says them beforehand, each once, with everything looked at that could stop one at its start.
+
+    Raises:
+        ConfigError: a mistake in a configuration, a folder that holds something else, or data that is missing.
+    """
+    jobs: dict[Path, Job] = {}
+    ready: set[str] = set()
+    for overrides in compose.jobs("train", words, extra):
+        config = compose.compose("train", overrides, extra)
+        job = Job.of(config, overrides)
+        if job.run.record_file.is_file():
+            training.refuse_other(job.run, config)
+        elif job.run.exists:
+            raise ConfigError(
+                f"{job.run.path} exists and is not a run folder: move it away, or choose another runs=<folder>"
+            )
+        data = json.dumps(config["data"], sort_keys=True)
+        if data not in ready and sweep.state(job) != "done":
+            training.ready(read(Settings, config))
+            ready.add(data)
+        jobs.setdefault(job.run.path, job)
+    return list(jobs.values())
 
 
 def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]) -> None:

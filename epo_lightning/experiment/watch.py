@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from epo_lightning.experiment.sweep import Job, State, Sweep
+from epo_lightning.run_folder import read_json
 
 STYLES: dict[State, str] = {
     "running": "cyan",
@@ -85,7 +86,9 @@ def how_far(job: Job) -> str:
 
 
 def result(job: Job) -> str:
-    """The best validation score of a finished run, and how long it took."""
+    """What a finished run has come to: its best validation score and how long it took, or how long a forecast takes."""
+    if job.score == "time":
+        return f"{1000 * read_json(job.run.metrics_file('time'))['seconds']['median']:.1f} ms per forecast"
     record = job.run.record
     best = next(((key, value) for key, value in record.get("best", {}).items() if value is not None), None)
     score = f"{best[0]} {best[1]:.4f}, " if best else ""

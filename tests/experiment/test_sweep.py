@@ -147,6 +147,7 @@ def test_mistakes_in_sweeps_are_refused(refused: Callable[..., str]) -> None:
     assert "'seed'" in refused("sweep", "rpi_main", "sede=1")
     assert "none has begun" in refused("sweep", "status", "rpi_main")
     assert "run_dir" in refused("sweep", "rpi_main", "run_dir=x")
+    assert "epo generate" in refused("sweep", "rpi_main", "data.root=nowhere"), "said once, before any run begins"
     assert "belongs to epo sweep" in refused("train", "--stop-on-failure")
 
 
