@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
+from epo_lightning.report.render import Sheet
 from epo_lightning.run_folder import RunFolder, read_json
 
 
@@ -99,6 +101,20 @@ def over_modes(timings: Sequence[Timing]) -> tuple[tuple[int, int | None], dict[
     n, s = max(sizes, key=lambda key: (sizes[key], key[0], key[1] or 0))
     found = _means({t: t.modes for t in timings if (t.agents, t.steps) == (n, s)})
     return (n, s), dict(sorted(found.items()))
+
+
+def timing_sheet(where: str, timings: Sequence[Timing]) -> Sheet:
+    """What was measured at one place, by sizes, with the paper's values where it has them."""
+    lines = []
+    for t in sorted(timings, key=lambda t: (t.agents, t.steps or 0, t.modes)):
+        paper = RUNTIME.get((t.agents, t.steps or 0)) if t.modes == 4 else None
+        if paper is None and (t.agents, t.steps) == (4, 2):
+            paper = RUNTIME_MODES.get(t.modes)
+        sizes = (str(t.agents), "-" if t.steps is None else str(t.steps), str(t.modes))
+        times = (time(t.mean), time(t.median), f"{time(t.p10)} to {time(t.p90)}")
+        lines.append((*sizes, *times, str(t.samples), "" if paper is None else time(paper)))
+    header = ("N", "S", "M", "mean", "median", "10 % to 90 %", "forecasts", "paper")
+    return Sheet(f"Time of a forecast: {where}", header, tuple(lines), left=0)
 
 
 def _means(keys: Mapping[Timing, Any]) -> dict[Any, float]:

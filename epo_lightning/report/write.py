@@ -27,7 +27,7 @@ from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, scored
 from epo_lightning.report.selection import BestSetting, best_settings
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import build_tables
-from epo_lightning.report.timings import read_timings
+from epo_lightning.report.timings import places, read_timings, timing_sheet
 from epo_lightning.run_folder import RunFolder, write_text
 
 PAPER_IN_LEGEND = "; in brackets the paper's value and ours minus the paper's"
@@ -123,7 +123,8 @@ def write_report(
     has_paper = any(cell.paper is not None for table in tables for row in table.rows for cell in row.cells.values())
     legend = LEGEND if has_paper else LEGEND.replace(PAPER_IN_LEGEND, "")
 
-    shown: list[Sheet] = [*settings, *compared]
+    timed = [timing_sheet(where, same) for where, same in places(timings).items()]
+    shown: list[Sheet] = [*settings, *compared, *timed]
     links = [f"figures/{chart.name}.png" for chart in charts] + [os.path.relpath(figure, out) for figure in figures]
     markdown = "\n".join(
         part

@@ -19,7 +19,7 @@ from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.runtime import draw_modes, heat_map
 from epo_lightning.report.style import svg
 from epo_lightning.report.tables import build_tables
-from epo_lightning.report.timings import grid, over_modes, places, read_timings, time
+from epo_lightning.report.timings import grid, over_modes, places, read_timings, time, timing_sheet
 
 from .page_runs import over_runtime, over_steps, rows_with_seeds, timed, write_log
 from .run_folders import make_run, scores
@@ -120,6 +120,18 @@ def test_the_heat_map_shows_every_timing_and_the_papers(tmp_path: Path) -> None:
     assert by_id["keep-12-8"] == time(seconds[12, 8])
     assert by_id["keep-12-8-paper"] == f"paper {time(RUNTIME[12, 8])}" == "paper 320 ms"
     assert "keep-4-None-paper" not in by_id
+
+
+def test_timings_are_a_table_as_well(tmp_path: Path) -> None:
+    timed(tmp_path, 12, 8, 4, 0.0076)
+    timed(tmp_path, 4, 2, 1, 0.003)
+    timed(tmp_path, 4, None, 1, 0.0009)
+    sheet = timing_sheet("here", read_timings(find_runs(tmp_path))[0])
+    assert [(*line[:4], line[-1]) for line in sheet.lines] == [
+        ("4", "-", "1", "900 µs", ""),
+        ("4", "2", "1", "3.0 ms", "170 ms"),
+        ("12", "8", "4", "7.6 ms", "320 ms"),
+    ]
 
 
 def test_runtime_over_modes(tmp_path: Path) -> None:
