@@ -15,6 +15,7 @@ from epo_lightning.experiment.settings import Settings, read
 from epo_lightning.experiment.sweep import Job, Sweep
 from epo_lightning.experiment.watch import news, status, summary
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.labels import value_text, word
 
 
 def run(
@@ -36,14 +37,15 @@ def run(
         ConfigError: a mistake in the configuration of any run, before the first one begins; or the sweep runs already.
     """
     assembly.quiet()
-    for word in overrides:
-        if word.split("=")[0] in ("run_dir", "resume", "sweep", "sweeps"):
-            raise ConfigError(f"{word} makes no sense in a sweep, whose runs have folders of their own: leave it out")
-    runs = _value_of("runs", overrides) or "runs"
+    for given in overrides:
+        if given.split("=")[0] in ("run_dir", "resume", "sweep", "sweeps"):
+            raise ConfigError(f"{given} makes no sense in a sweep, whose runs have folders of their own: leave it out")
+    runs = _runs(overrides)
     sweep = Sweep.of(name, overrides, runs)
     words = [f"sweeps={name}", *overrides]
     # Absolute, because a worker on another machine may start in any folder.
-    words += [f"sweep={sweep.folder}", f"runs={sweep.root}", f"hydra.sweep.dir={sweep.folder}", "existing=continue"]
+    places = {"sweep": sweep.folder, "runs": sweep.root, "hydra.sweep.dir": sweep.folder}
+    words += [f"{key}={value_text(str(place))}" for key, place in places.items()] + ["existing=continue"]
     words += ["hydra/hydra_logging=none"]  # the news say it better
     jobs = _listed(sweep, words, extra)
     with sweep.lock():
@@ -60,7 +62,7 @@ def run(
         counts = status(sweep)
     done = counts["done"] == counts.total()
     if done:
-        print(f"next: epo report {sweep.label}" + (f" runs={runs}" if runs != "runs" else ""))
+        print(f"next: epo report {sweep.label}" + (f" {word('runs', runs)}" if runs != "runs" else ""))
     return done
 
 
@@ -107,8 +109,9 @@ def show(name: str, overrides: Sequence[str]) -> None:
     Raises:
         ConfigError: there is none of that name and overrides.
     """
-    status(Sweep.find(name, overrides, _value_of("runs", overrides) or "runs"))
+    status(Sweep.find(name, overrides, _runs(overrides)))
 
 
-def _value_of(key: str, overrides: Sequence[str]) -> str | None:
-    return next((word.partition("=")[2] for word in reversed(overrides) if word.startswith(f"{key}=")), None)
+def _runs(overrides: Sequence[str]) -> str:
+    """The folder that runs are written below, as Hydra reads it."""
+    return str(compose.compose("train", [given for given in overrides if given.startswith("runs=")])["runs"])

@@ -61,7 +61,8 @@ def summary(counts: Counter[State]) -> str:
     parts = [
         f"{counts[state]} {state}" for state in ("done", "running", "interrupted", "failed", "waiting") if counts[state]
     ]
-    return f"{counts.total()} runs: {', '.join(parts) or 'none'}"
+    total = counts.total()
+    return f"{total} run{'' if total == 1 else 's'}: {', '.join(parts) or 'none'}"
 
 
 def _details(sweep: Sweep, job: Job, state: State) -> str:
