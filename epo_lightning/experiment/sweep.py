@@ -135,7 +135,7 @@ class Sweep:
     def _entry(self, job: Job) -> dict[str, Any]:
         return {
             "overrides": list(job.overrides),
-            "folder": os.path.relpath(job.run.path.absolute(), self.root),
+            "folder": self._place(job.run),
             "identity": job.identity,
             "title": job.title,
             "seed": job.seed,
@@ -149,21 +149,156 @@ class Sweep:
             if job.score is None or job.run.metrics_file(job.score).is_file():
                 return "done"
             state = "running" if job.run.locked else "interrupted"
-        return "failed" if state in ("waiting", "interrupted") and self._failure(job).is_file() else state
+        return "failed" if state in ("waiting", "interrupted") and self._failure(job.run).is_file() else state
 
     def error(self, job: Job) -> str:
         """Why a run failed, in one line; empty if it did not."""
         try:
-            lines = self._failure(job).read_text(encoding="utf-8").strip().splitlines()
+            lines = self._failure(job.run).read_text(encoding="utf-8").strip().splitlines()
         except OSError:
             return str(job.run.record.get("error") or "") if job.run.record_file.is_file() else ""
         return lines[0] if lines else ""
 
-    def _failure(self, job: Job) -> Path:
-        return self.folder / "failures" / f"{self._key(job)}.txt"
+    def _failure(self, run: RunFolder) -> Path:
+        return self.folder / "failures" / f"{self._place(run).replace(os.sep, '__')}.txt"
 
-    def _key(self, job: Job) -> str:
-        return self._entry(job)["folder"].replace(os.sep, "__")
+    def _place(self, run: RunFolder) -> str:
+        """A run's folder, relative to the folder of all runs, which may be moved."""
+        return os.path.relpath(run.path.absolute(), self.root)
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep a second start of the same sweep away.
+
+        Raises:
+            ConfigError: it runs already.
+        """
+        from filelock import FileLock, Timeout
+
+        self.folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.folder / LOCK)
+        try:
+            lock.acquire(timeout=0.5, poll_interval=0.1)
+        except Timeout:
+            record = self.record if (self.folder / "sweep.json").is_file() else {}
+            who = f" (process {record['process']} on {record['host']})" if "process" in record else ""
+            raise ConfigError(
+                f"the sweep {self.label} runs already{who}: see `epo sweep status {self.label}`, or give this one "
+                "another place with runs=<folder>"
+            ) from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def begin(
+        self, name: str, command: str, overrides: Sequence[str], jobs: Sequence[Job], stop_on_failure: bool
+    ) -> None:
+        """Write down what is about to run; failures of earlier attempts are forgotten."""
+        for failure in (self.folder / "failures").glob("*.txt"):
+            failure.unlink()
+        content = {
+            "name": name,
+            "label": self.label,
+            "command": command,
+            "overrides": list(overrides),
+            "directory": str(Path.cwd()),
+            "cache": os.environ.get("EPO_CACHE"),
+            "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "process": os.getpid(),
+            "host": socket.gethostname(),
+            "stop_on_failure": stop_on_failure,
+            "jobs": [self._entry(job) for job in jobs],
+        }
+        write_json(self.folder / "sweep.json", content)
+
+    def work(self, config: Mapping[str, Any], overrides: Sequence[str]) -> float | None:
+        """Train and score one of the runs, in whatever process a launcher chose.
+
+        Returns:
+            the best validation score; None for a run that was left alone because another one failed.
+
+        Raises:
+            RunFailed: the run failed; the sweep's folder holds the traceback.
+        """
+        record = self.record
+        # A worker on another machine may have started anywhere, and knows nothing of our environment.
+        with contextlib.suppress(OSError):
+            os.chdir(record["directory"])
+        if record["cache"]:
+            os.environ.setdefault("EPO_CACHE", record["cache"])
+        if record["stop_on_failure"] and any((self.folder / "failures").glob("*.txt")):
+            return None
+        settings = read(Settings, config)
+        run = training.folder_for(settings)
+        try:
+            if not record["jobs"]:
+                name = self._failure(run).with_suffix(".json").name
+                write_json(self.folder / "found" / name, self._entry(Job.of(config, overrides)))
+            training.train(dict(config), overrides)
+        except Exception as error:
+            message = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            write_text(self._failure(run), f"{message}\n\n{traceback.format_exc()}")
+            raise RunFailed(f"{settings.title}, seed {settings.seed}: {message}") from None
+        return next(iter(run.record.get("best", {}).values()), None)
+
+
+def label(self) -> str:
+        return self.folder.name
+
+    @property
+    def root(self) -> Path:
+        """The folder that all runs lie below."""
+        return self.folder.parents[1]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The contents of sweep.json."""
+        return read_json(self.folder / "sweep.json")
+
+    @property
+    def jobs(self) -> list[Job]:
+        """All of its runs; of a sweep that searches, those that it has thought of so far."""
+        found = [read_json(path) for path in sorted((self.folder / "found").glob("*.json"))]
+        return [self._job(entry) for entry in [*self.record.get("jobs", []), *found]]
+
+    def _job(self, entry: Mapping[str, Any]) -> Job:
+        run = RunFolder(Path(os.path.relpath(self.root / entry["folder"])))
+        return Job(tuple(entry["overrides"]), run, entry["identity"], entry["title"], entry["seed"], entry["score"])
+
+    def _entry(self, job: Job) -> dict[str, Any]:
+        return {
+            "overrides": list(job.overrides),
+            "folder": self._place(job.run),
+            "identity": job.identity,
+            "title": job.title,
+            "seed": job.seed,
+            "score": job.score,
+        }
+
+    def state(self, job: Job) -> State:
+        """What has become of a run, its scores included."""
+        state = job.run.state
+        if state == "finished":
+            if job.score is None or job.run.metrics_file(job.score).is_file():
+                return "done"
+            state = "running" if job.run.locked else "interrupted"
+        return "failed" if state in ("waiting", "interrupted") and self._failure(job.run).is_file() else state
+
+    def error(self, job: Job) -> str:
+        """Why a run failed, in one line; empty if it did not."""
+        try:
+            lines = self._failure(job.run).read_text(encoding="utf-8").strip().splitlines()
+        except OSError:
+            return str(job.run.record.get("error") or "") if job.run.record_file.is_file() else ""
+        return lines[0] if lines else ""
+
+    def _failure(self, run: RunFolder) -> Path:
+        return self.folder / "failures" / f"{self._place(run).replace(os.sep, '__')}.txt"
+
+    def _place(self, run: RunFolder) -> str:
+        """A run's folder, relative to the folder of all runs, which may be moved."""
+        return os.path.relpath(run.path.absolute(), self.root)
 
     @contextmanager
     def lock(self) -> Iterator[None]:
