@@ -43,6 +43,14 @@ Options
   -h, --help
 """
 
+SWEEP_USAGE = """\
+epo sweep <name> [key=value ...]         train and score all runs of a sweep, or what is missing of them
+epo sweep status [<name or label>]       what has become of them
+epo sweep                                list the sweeps
+
+  --stop-on-failure   begin no further run when one has failed
+"""
+
 VERBS = {
     "generate": "make a data set and print its report",
     "train": "train a forecaster into a run folder",
@@ -122,7 +130,10 @@ def main(words: Sequence[str] | None = None) -> None:
         print(f"epo: {error.strerror or error}{where}", file=sys.stderr)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
-        print("epo: interrupted; an unfinished run continues with `epo train resume=<run folder>`", file=sys.stderr)
+        again = (
+            "the same command goes on" if "sweep" in words[:1] else "a run goes on with `epo train resume=<run folder>`"
+        )
+        print(f"epo: interrupted; {again}", file=sys.stderr)
         raise SystemExit(130) from None
 
 
@@ -153,6 +164,10 @@ def _help(arguments: Arguments) -> None:
 
     from epo_lightning.experiment.compose import hydra, options_of, tree
 
+    if arguments.verb == "sweep":
+        print(SWEEP_USAGE)
+        _sweep(Arguments("sweep", extra=arguments.extra))
+        return
     print(f"epo {arguments.verb} [-m] [key=value ...]: {VERBS[arguments.verb]}\n")
     if arguments.verb == "config":
         print(
@@ -265,25 +280,26 @@ def _multirun(arguments: Arguments) -> None:
 
 
 def _sweep(arguments: Arguments) -> None:
-    """``epo sweep <name> [overrides]`` and ``epo sweep status <name> [overrides]``."""
-    words = list(arguments.overrides)
-    looking = bool(words) and words[0] == "status"
-    words = words[1:] if looking else words
-    from epo_lightning.experiment.compose import hydra, options_of
-
-    with hydra(arguments.extra) as instance:
-        known = options_of(instance, "sweeps")
-    if not words or "=" in words[0]:
-        raise ConfigError(f"which sweep? `epo sweep {'status ' if looking else ''}<name>`; known: {', '.join(known)}")
-    name, *overrides = words
+    """See ``SWEEP_USAGE``."""
     from epo_lightning.experiment import sweeping
 
+    words = list(arguments.overrides)
+    looking = words[:1] == ["status"]
+    words = words[1:] if looking else words
+    name = words.pop(0) if words and "=" not in words[0] else None
     if looking:
-        sweeping.show(name, overrides)
+        sweeping.show(name, words)
+        return
+    known = sweeping.known(arguments.extra)
+    if name is None:
+        if words:
+            raise ConfigError(f"which sweep? `epo sweep <name> {' '.join(words)}`; known: {', '.join(known)}")
+        for option, says in known.items():
+            print(f"  {option:<22}{says}")
         return
     if name not in known:
         raise ConfigError(f"unknown sweep {name!r}: {nearest(name, known)}")
-    if not sweeping.run(name, overrides, arguments.extra, job_of_sweep, arguments.stop_on_failure):
+    if not sweeping.run(name, words, arguments.extra, job_of_sweep, arguments.stop_on_failure):
         raise SystemExit(1)
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import signal
+import threading
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -13,6 +16,7 @@ from lightning.pytorch import Callback, LightningDataModule, LightningModule, Tr
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins import DoublePrecision
 from lightning.pytorch.strategies import Strategy
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from epo_lightning.data.datamodule import check_share
 from epo_lightning.experiment import debugging, gpus, logs
@@ -174,6 +178,22 @@ def build_trainer(
         )
     except (ValueError, RuntimeError) as error:  # Lightning's MisconfigurationException among them
         raise ConfigError(f"trainer: {' '.join(str(error).split())}") from error
+
+
+@contextmanager
+def signals() -> Iterator[None]:
+    """Around Lightning's trainer, which answers Ctrl-C with a silent exit, and SIGTERM with one that says all is well."""
+    main = threading.current_thread() is threading.main_thread()
+    handler = signal.getsignal(signal.SIGINT) if main else None
+    try:
+        yield
+    except SIGTERMException:
+        raise SystemExit(128 + signal.SIGTERM) from None
+    except SystemExit:
+        raise KeyboardInterrupt from None
+    finally:
+        if main:
+            signal.signal(signal.SIGINT, handler)
 
 
 def as_data(data: Any, overfit_batches: int = 0) -> LightningDataModule:

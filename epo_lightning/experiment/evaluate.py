@@ -63,7 +63,8 @@ def _score(run: RunFolder, settings: EvaluateSettings) -> dict[str, float]:
         enable_progress_bar=False,
         enable_model_summary=False,
     )
-    (scores,) = trainer.test(forecaster, dataloaders=loader, verbose=False)
+    with assembly.signals():
+        (scores,) = trainer.test(forecaster, dataloaders=loader, verbose=False)
     metrics = {name.removeprefix("test/"): float(value) for name, value in scores.items()}
     write_json(
         run.metrics_file(settings.split),

@@ -158,6 +158,7 @@ class Settings:
     callbacks: CallbackSettings
     logger: LoggerSettings
     budget: BudgetSettings
+    task: str = ""
     title: str = "untitled"
     goal: Literal["energy", "all"] = "energy"
     seed: int = 0

@@ -29,9 +29,10 @@ from typing import Any, Literal
 
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
+from epo_lightning.experiment.orphans import working_for
 from epo_lightning.experiment.settings import Settings, read
 from epo_lightning.identity import identity
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_json, write_text
 
 State = Literal["waiting", "running", "interrupted", "failed", "done"]
@@ -98,15 +99,25 @@ class Sweep:
             ConfigError: there is none; the message names those that there are.
         """
         home = Path(runs).expanduser().absolute() / "sweeps"
-        known = {path.parent.name: cls(path.parent) for path in sorted(home.glob("*/sweep.json"))}
+        known = {sweep.label: sweep for sweep in cls.begun(runs)}
         exact = label(name, overrides)
         if exact in known and (exact != name or not any(found.startswith(f"{name}-") for found in known)):
             return known[exact]
         alike = [sweep for sweep in known.values() if sweep.record.get("name") == name or sweep.folder.name == name]
         if not alike or exact != name:
-            hint = nearest(exact, known) if known else f"none has begun; `epo sweep {name}` begins it"
-            raise ConfigError(f"no sweep {exact} below {home}: {hint}")
-        return max(alike, key=lambda sweep: sweep.record.get("began", ""))
+            what = f"{name} with these overrides" if exact != name else name
+            begun = "; ".join(f"{key} ({sweep.record.get('command')})" for key, sweep in known.items())
+            raise ConfigError(
+                f"no sweep {what} has begun below {home}: " + (f"known: {begun}" if begun else "none has")
+            )
+        return alike[0]
+
+    @classmethod
+    def begun(cls, runs: str | Path) -> list[Sweep]:
+        """All sweeps that have begun, the latest first."""
+        home = Path(runs).expanduser().absolute() / "sweeps"
+        found = [cls(path.parent) for path in home.glob("*/sweep.json")]
+        return sorted(found, key=lambda sweep: sweep.record.get("began", ""), reverse=True)
 
     @property
     def label(self) -> str:
@@ -235,9 +246,11 @@ class Sweep:
             if not record["jobs"]:
                 name = self._failure(run).with_suffix(".json").name
                 write_json(self.folder / "found" / name, self._entry(Job.of(config, overrides)))
-            training.train(dict(config), overrides)
+            with working_for(record["process"]):
+                training.train(dict(config), overrides)
         except Exception as error:
             message = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            message = message.replace(f"{self.root}{os.sep}", f"{os.path.relpath(self.root)}{os.sep}")
             write_text(self._failure(run), f"{message}\n\n{traceback.format_exc()}")
             raise RunFailed(f"{settings.title}, seed {settings.seed}: {message}") from None
         return next(iter(run.record.get("best", {}).values()), None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -60,6 +61,8 @@ def run(
             elif not jobs:
                 _search(sweep, words, task, extra)
         counts = status(sweep)
+    if counts["failed"]:
+        print(f"tracebacks: {os.path.relpath(sweep.folder / 'failures')}")
     done = counts["done"] == counts.total()
     if done:
         print(f"next: epo report {sweep.label}" + (f" {word('runs', runs)}" if runs != "runs" else ""))
@@ -103,13 +106,31 @@ def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra:
         compose.multirun("train", [*words, f"hydra.sweeper.n_trials={trials - len(found)}"], task, extra)
 
 
-def show(name: str, overrides: Sequence[str]) -> None:
-    """Print the state of every run of a sweep that has begun.
+def known(extra: Sequence[str] = ()) -> dict[str, str]:
+    """The names of all sweeps, and what the first line of each file says."""
+    says = {}
+    with compose.hydra(extra) as instance:
+        for option in compose.options_of(instance, "sweeps"):
+            files = (Path(folder) / "sweeps" / f"{option}.yaml" for folder in (*extra, compose.tree()))
+            lines = next((file.read_text(encoding="utf-8").splitlines() for file in files if file.is_file()), [])
+            comments = [line.lstrip("# ") for line in lines if line.startswith("#") and "@package" not in line]
+            says[option] = comments[0].partition(":  ")[0].rstrip(":") if comments else ""
+    return says
+
+
+def show(name: str | None, overrides: Sequence[str]) -> None:
+    """Print the state of every run of a sweep that has begun; without a name, how far each sweep is.
 
     Raises:
         ConfigError: there is none of that name and overrides.
     """
-    status(Sweep.find(name, overrides, _runs(overrides)))
+    runs = _runs(overrides)
+    if name is not None:
+        status(Sweep.find(name, overrides, runs))
+        return
+    for sweep in Sweep.begun(runs):
+        counts = Counter(sweep.state(job) for job in sweep.jobs)
+        print(f"{sweep.label}: {summary(counts)}\n    {sweep.record['command']}")
 
 
 def _runs(overrides: Sequence[str]) -> str:

@@ -7,7 +7,6 @@ import math
 import platform
 import shlex
 import shutil
-import signal
 import subprocess
 import time
 from collections.abc import Sequence
@@ -18,7 +17,6 @@ from typing import Any
 import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
-from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from epo_lightning.experiment import assembly, callbacks, distributed, gpus, logs
 from epo_lightning.experiment.compose import PACKAGE
@@ -31,6 +29,10 @@ from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
 NOT_IN_COMMAND = ("sweep=", "existing=", "runs=", "run_dir=", "resume=")
 """Words of a command line that say nothing of what was trained."""
 PACKAGES = ("epo_lightning", "torch", "lightning", "hydra-core", "omegaconf", "torchmetrics", "numpy", "numba")
+
+
+class Diverged(ConfigError):
+    """A training that came to nothing."""
 
 
 def folder_for(settings: Settings) -> RunFolder:
@@ -137,9 +139,8 @@ def _score(settings: Settings, run: RunFolder) -> None:
 def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None = None) -> None:
     """Train from the beginning, or from the checkpoint ``last``; an error is also left in run.json."""
     try:
-        _train(settings, config, run, last)
-    except SIGTERMException:  # it would say that all is well
-        raise SystemExit(128 + signal.SIGTERM) from None
+        with assembly.signals():
+            _train(settings, config, run, last)
     except Exception as error:
         with contextlib.suppress(OSError, ConfigError):  # the disk may be what failed
             run.update(status=FAILED, error=f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
@@ -156,7 +157,7 @@ def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Pat
     model = assembly.build_model(settings, data)
     step = _steps_in(last, model) if last else 0
     with logs.open_logs(settings, config, run, step) as loggers:
-        watchers = callbacks.watchers(settings.callbacks, run, settings.title)
+        watchers = callbacks.watchers(settings.callbacks, run, f"{settings.title}, seed {settings.seed}")
         bar = any(isinstance(watcher, callbacks.TQDMProgressBar) for watcher in watchers)
         learns = assembly.parameters(model) > 0 and settings.trainer.max_steps != 0
         strategy = distributed.strategy(settings.trainer.devices, run, config, last) if learns else None
@@ -168,8 +169,6 @@ def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Pat
             )
         else:
             _keep_unlearned(trainer, model, data, run)
-        if trainer.interrupted:
-            raise KeyboardInterrupt
         score = _best_score(run, trainer, settings.callbacks.monitor)
     run.update(
         status=FINISHED,
@@ -192,13 +191,13 @@ def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:
     """The smallest validation score.
 
     Raises:
-        ConfigError: there is no finite one.
+        Diverged: there is no finite one.
     """
     best = [w.best_model_score for w in trainer.checkpoint_callbacks if isinstance(w, ModelCheckpoint) and w.monitor]
     score = next((float(value) for value in best if value is not None), None)
     score = float(trainer.callback_metrics.get(monitor, math.nan)) if score is None else score
     if not math.isfinite(score):
-        raise ConfigError(
+        raise Diverged(
             f"{run.path}: {trainer.global_step} steps without a single finite validation score; look at "
             f"{run.logs / 'metrics.csv'}, and try a smaller optimizer.lr, or optimizer.clip=1"
         )

@@ -143,12 +143,25 @@ def test_damaged_runs_are_named_before_anything_runs(epo: Epo, refused: Callable
 
 def test_mistakes_in_sweeps_are_refused(refused: Callable[..., str]) -> None:
     assert "'rpi_main'" in refused("sweep", "rpi_mian")
-    assert "rpi_main" in refused("sweep")
+    assert "rpi_main" in refused("sweep", "seed=1")
     assert "'seed'" in refused("sweep", "rpi_main", "sede=1")
-    assert "none has begun" in refused("sweep", "status", "rpi_main")
+    assert "none has" in refused("sweep", "status", "rpi_main")
     assert "run_dir" in refused("sweep", "rpi_main", "run_dir=x")
     assert "epo generate" in refused("sweep", "rpi_main", "data.root=nowhere"), "said once, before any run begins"
     assert "belongs to epo sweep" in refused("train", "--stop-on-failure")
+
+
+def test_sweeps_are_listed(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo("sweep") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(list((SRC / "sweeps").glob("*.yaml")))
+    assert next(line for line in lines if " rpi_main " in line).endswith("every row with three seeds")
+    assert epo("sweep", "--help") == 0
+    assert "--stop-on-failure" in capsys.readouterr().out
+    assert epo("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/const_vel") == 0
+    capsys.readouterr()
+    assert epo("sweep", "status") == 0
+    assert "1 run: 1 done" in capsys.readouterr().out
 
 
 def test_the_latest_sweep_of_a_name_is_found(tmp_path: Path) -> None:
@@ -156,9 +169,9 @@ def test_the_latest_sweep_of_a_name_is_found(tmp_path: Path) -> None:
         write_json(tmp_path / "sweeps" / name / "sweep.json", {"name": name.partition("-")[0], "began": began})
     assert Sweep.find("rpi_main", [], tmp_path).label == "rpi_main-bbbbbb"
     assert Sweep.find("rpi_main-aaaaaa", [], tmp_path).label == "rpi_main-aaaaaa"
-    with pytest.raises(ConfigError, match="rpi_main-bbbbbb"):
+    with pytest.raises(ConfigError, match=r"rpi_main with these overrides.*rpi_main-bbbbbb"):
         Sweep.find("rpi_main", ["budget=short"], tmp_path)
-    with pytest.raises(ConfigError, match="no sweep rpi_mai "):
+    with pytest.raises(ConfigError, match="no sweep rpi_mai has begun"):
         Sweep.find("rpi_mai", [], tmp_path)
 
 
@@ -202,6 +215,29 @@ def test_a_search_goes_on_where_it_was(epo: Epo, capsys: pytest.CaptureFixture[s
     assert epo(*words, "hydra.sweeper.n_trials=3") == 0
     assert "3 runs: 3 done" in capsys.readouterr().out
     assert len(sweep.jobs) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", [(), ("hydra/launcher=local", "hydra.launcher.n_jobs=2")])
+@pytest.mark.parametrize(("how", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_a_stopped_sweep_says_so_and_leaves_nobody_behind(
+    tmp_path: Path, launcher: tuple[str, ...], how: signal.Signals, status: int
+) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(SRC)}
+    words = ["data=drawn", "budget=smoke", "trainer.max_epochs=2000", "trainer.limit_train_batches=1", "seed=0,1"]
+    words += ["experiment=rpi/v_lstm_sc", "callbacks.progress=none", *launcher]
+    program = [sys.executable, "-m", "epo_lightning.cli", "sweep", "rpi_main", *words]
+    process = subprocess.Popen(program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("runs/rpi/*/*/checkpoints/last.ckpt")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(how)
+    _, said = process.communicate(timeout=60)  # not before everybody who holds the pipe has ended
+    if not (launcher and how == signal.SIGTERM):  # joblib's parent has no handler of SIGTERM
+        assert process.returncode == status
+    if how == signal.SIGINT:
+        assert "epo: interrupted; the same command goes on" in said
+    assert "Traceback" not in said
 
 
 @pytest.mark.slow
