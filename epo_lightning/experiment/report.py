@@ -86,6 +86,7 @@ def of_sweep(sweep: Sweep) -> Report:
         runs=tuple(job.run for job in jobs if job.run.path in measured),
         evaluated=tuple(evaluated),
         left_out=tuple(left_out),
+        sweep=str(sweep.record.get("command", "")),
     )
 
 

@@ -87,7 +87,7 @@ def _learning(tables: Sequence[Table]) -> Iterable[Chart]:
                 caption="minSADE on the validation split while training: mean over seeds, with a band from the best "
                 "to the worst seed. A line ends where the first of its seeds stopped.",
                 draw=lambda size, legend, curves=curves: draw_learning(curves, size, legend),  # type: ignore[misc]
-                wide=(7.4, 3.9),
+                wide=(8.8, 4.3),
                 narrow=(4.0, 3.5),
                 legend=tuple(Key(curve.name, look(i)[0], look(i)[1] != "-") for i, curve in enumerate(curves)),
                 header=("row", "seeds", "last step", "minSADE there", "smallest mean", "at step"),
@@ -120,7 +120,7 @@ def _steps(tables: Sequence[Table]) -> Iterable[Chart]:
             "(initial): mean over seeds, with a band from the best to the worst."
             + (" Dashed: the paper's figure, on its RPI validation split." if curve.paper else ""),
             draw=lambda size, legend, curve=curve: draw_steps(curve, size, legend),  # type: ignore[misc]
-            wide=(7.4, 3.7),
+            wide=(8.8, 4.1),
             narrow=(4.0, 3.3),
             legend=tuple(Key(*entry) for entry in steps_names(curve)),
             header=("S", "seeds", "optimised [m]", "initial [m]"),
@@ -154,7 +154,7 @@ def _runtimes(timings: Sequence[Timing]) -> Iterable[Chart]:
                 caption=f"Mean time of one joint forecast with M = {modes} modes. Below it the paper's, with M = 4, "
                 "on its own machine.",
                 draw=lambda size, _, seconds=seconds: heat_map(seconds, RUNTIME, size),  # type: ignore[misc]
-                wide=(7.0, 4.4),
+                wide=(8.8, 4.8),
                 narrow=(4.0, 4.4),
                 legend=(),
                 header=header,
@@ -171,7 +171,7 @@ def _runtimes(timings: Sequence[Timing]) -> Iterable[Chart]:
                 + (f" and S = {steps} steps." if steps is not None else ".")
                 + (" The paper's own two panels differ where they meet (N = 4, S = 2, M = 4)." if paper else ""),
                 draw=lambda size, legend, values=by_modes, paper=paper: draw_modes(values, paper, size, legend),  # type: ignore[misc]
-                wide=(7.0, 2.9),
+                wide=(8.8, 3.3),
                 narrow=(4.0, 2.9),
                 legend=(Key("here", "#0072B2"), *([Key("paper", "#8A8A8A", True)] if paper else [])),
                 header=header,

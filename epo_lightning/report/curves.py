@@ -14,7 +14,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 
 from epo_lightning.identity import essence
 from epo_lightning.registry import ConfigError
@@ -103,7 +103,7 @@ def learning_curves(rows: Iterable[Row], metric: str = METRIC) -> tuple[list[Cur
 
 
 def read_log(file: Path, metric: str) -> dict[int, float]:
-    """The values of one column by training step; of a step that was logged twice, the later one.
+    """The values of one column by how many training steps were done; of a step that was logged twice, the later one.
 
     Raises:
         ConfigError: the file is missing, or holds no whole line with this column.
@@ -120,7 +120,7 @@ def read_log(file: Path, metric: str) -> dict[int, float]:
         except (KeyError, ValueError, TypeError):
             continue
         if math.isfinite(value):
-            values[step] = value
+            values[step + 1] = value  # the log counts from zero: step 3 is the fourth
     if not values:
         raise ConfigError(f"{file} holds no {metric} of any step")
     return values
@@ -148,6 +148,7 @@ def draw_learning(curves: Sequence[Curve], size: tuple[float, float] = SIZE, leg
         everything = [value for curve in curves for value in (*curve.low, *curve.high)]
         if min(everything) > 0 and max(everything) > 5 * min(everything):
             _logarithmic(axes)
+        axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
         axes.set_xlabel("training steps")
         axes.set_ylabel("minSADE, validation [m]")
         axes.margins(x=0.02)

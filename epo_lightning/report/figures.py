@@ -13,6 +13,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 from torch import Tensor
 
@@ -148,8 +149,10 @@ def _name(axes: Axes, name: str, where: np.ndarray, centre: np.ndarray) -> None:
         textcoords="offset points",
         ha=sideways,
         va="bottom" if above else "top",
-        color="#555555",
+        color="#333333",
         fontsize=8,
+        zorder=8,  # above all lines, and apart from them
+        path_effects=[withStroke(linewidth=2.5, foreground="white")],
     )
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from epo_lightning.identity import differences, essence
 
-MOST, LONGEST = 4, 24
-"""How many settings a label names, and how long the text of one value may be, before it becomes unreadable."""
+MOST, LONGEST, DIGITS = 4, 24, 3
+"""How many settings a label names, how long the text of one value may be, and with how many digits it is printed."""
 
 PLAIN, OTHER = re.compile(r"[\w./-]+"), re.compile(r"[-\d._e]+|true|false|null|nan|inf", re.IGNORECASE)
 """Text that needs no quotes, and text that would be read as something else without them."""
@@ -48,9 +48,13 @@ def labels(
         rows: their identities, named where settings would be too many or do not tell rows apart.
     """
     keys = short_keys(list(settings[0]), config)
-    names = [
-        ", ".join([title, *(f"{keys[key]}={_shown(value)}" for key, value in entry.items())]) for entry in settings
-    ]
+
+    def named(shown: Callable[[Any], str]) -> list[str]:
+        return [", ".join([title, *(f"{keys[key]}={shown(value)}" for key, value in own.items())]) for own in settings]
+
+    names = named(lambda value: _shown(_rounded(value)))
+    if len({*names}) < len(names):
+        names = named(_shown)
     if len(keys) > MOST:
         names = [title] * len(settings)
     return [name if names.count(name) == 1 else f"{name}, row {row[:8]}" for name, row in zip(names, rows, strict=True)]
@@ -81,6 +85,11 @@ def natural(settings: Mapping[str, Any]) -> tuple[tuple[int, float, str], ...]:
         (0, float(value), "") if isinstance(value, int | float) else (1, 0.0, value_text(value))
         for _, value in sorted(settings.items())
     )
+
+
+def _rounded(value: Any) -> Any:
+    """What a search drew has more digits than anybody reads."""
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
 def _shown(value: Any) -> str:

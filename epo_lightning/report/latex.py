@@ -9,7 +9,15 @@ import re
 import unicodedata
 from collections.abc import Sequence
 
-from epo_lightning.report.render import Sheet, comparison_sheet, difference_text, number, paper_text, with_ends
+from epo_lightning.report.render import (
+    Sheet,
+    comparison_sheet,
+    difference_text,
+    legend,
+    number,
+    paper_text,
+    with_ends,
+)
 from epo_lightning.report.statistics import Comparisons
 from epo_lightning.report.tables import Column, Row, Table
 
@@ -21,11 +29,6 @@ SPECIAL = {
     **{"\N{MULTIPLICATION SIGN}": r"$\times$", "\N{MINUS SIGN}": "$-$", "\N{EN DASH}": "--"},
 }
 
-CAPTION = (
-    "Displacements in m, minimum over the modes; lower is better. Mean $\\pm$ sample standard deviation over $n$ seeds; "
-    "below, the paper's value and ours minus the paper's. \\textbf{Bold} is the best and \\underline{underlined} the "
-    "second best of the rows with the same backbone that know equally much."
-)
 COMPARISON_CAPTION = (
     "First row minus second row, paired by seed: negative is better for the first; $n$ pairs; two-sided paired t-test, "
     "not corrected for the number of comparisons. With three seeds it has little power."
@@ -43,11 +46,12 @@ def _letter(letter: str) -> str:
     return letter if known or letter in "ßæøÆØ" else f"{{[}}U+{ord(letter):04X}{{]}}"
 
 
-def to_latex(table: Table, label: str | None = None) -> str:
+def to_latex(table: Table, label: str | None = None, caveat: str = "") -> str:
     """The main kind of table: rows x metrics, rules between the groups.
 
     Args:
         label: what ``\\ref`` calls it; made of the title if not given.
+        caveat: text without markup that has to be known before the numbers are used.
     """
     lines = []
     for row, last in with_ends(table.rows):
@@ -59,19 +63,31 @@ def to_latex(table: Table, label: str | None = None) -> str:
         if last and row is not table.rows[-1]:
             lines.append(r"\midrule")
     header = ["Method", "$n$", *(latex_text(column.label) for column in table.columns)]
-    caption = f"{latex_text(table.title)}. {CAPTION}"
-    return _float(
-        behind(table.rows), header, "lr" + "r" * len(table.columns), lines, caption, label or slug(table.title)
-    )
+    columns = "lr" + "r" * len(table.columns)
+    caption = _caption(table.title, caveat, _legend(table))
+    return _float(behind(table.rows), header, columns, lines, caption, label or slug(table.title))
 
 
-def sheet_to_latex(sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", label: str | None = None) -> str:
+def _caption(title: str, caveat: str, legend: str) -> str:
+    warning = rf"\textbf{{{latex_text(caveat)}}}" if caveat else ""
+    return " ".join(part for part in (f"{latex_text(title)}.", warning, legend) if part)
+
+
+def _legend(table: Table) -> str:
+    """What a reader has to know of a table's numbers, as :func:`~epo_lightning.report.render.legend` says it."""
+    text = legend([table], "below", r"\textbf{Bold}", r"\underline{underlined}")
+    return text.replace("±", r"$\pm$").replace("n seeds", "$n$ seeds")
+
+
+def sheet_to_latex(
+    sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", label: str | None = None, caveat: str = ""
+) -> str:
     """A table of plain text.
 
     Args:
         rows: those that are behind its numbers, named in the comments.
         caption: LaTeX that follows the title.
-        label: what ``\\ref`` calls it; made of the title if not given.
+        label, caveat: as in :func:`to_latex`.
     """
     lines = []
     for index, line in enumerate(sheet.lines):
@@ -80,15 +96,15 @@ def sheet_to_latex(sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", la
         if index in sheet.ends and index + 1 < len(sheet.lines):
             lines.append(r"\midrule")
     columns = "l" * sheet.left + "r" * (len(sheet.header) - sheet.left)
-    caption = f"{latex_text(sheet.title)}. {caption}".strip()
+    caption = _caption(sheet.title, caveat, caption)
     header = [latex_text(text) for text in sheet.header]
     return _float(behind(rows), header, columns, lines, caption, label or slug(sheet.title))
 
 
-def comparisons_to_latex(comparisons: Comparisons, label: str | None = None) -> str:
-    """The paired comparisons of a table."""
+def comparisons_to_latex(comparisons: Comparisons, label: str | None = None, caveat: str = "") -> str:
+    """The paired comparisons of a table; label and caveat as in :func:`to_latex`."""
     rows = {row.identity: row for pair in comparisons.pairs for row in (pair.one, pair.other)}
-    return sheet_to_latex(comparison_sheet(comparisons), list(rows.values()), COMPARISON_CAPTION, label)
+    return sheet_to_latex(comparison_sheet(comparisons), list(rows.values()), COMPARISON_CAPTION, label, caveat)
 
 
 def behind(rows: Sequence[Row]) -> list[str]:
@@ -97,7 +113,7 @@ def behind(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         seeds = " ".join(map(str, row.seeds))
         lines.append(
-            f"{row.name}: n = {len(row.runs)} (seeds {seeds}), budget {row.runs[0].budget}, data {row.data_digest}, "
+            f"{row.name}: n = {len(row.runs)} (seeds {seeds}), budget {row.budget}, data {row.data_digest}, "
             f"commit {' '.join(row.commits)}, row {row.identity}"
         )
         lines += [f"  {command}" for command in row.commands]

@@ -76,12 +76,11 @@ def how_made(tables: Sequence[Table], timings: Sequence[Timing] = ()) -> list[Ma
 
 
 def _of_row(row: Row) -> Made:
-    first = row.runs[0]
     runs = tuple(
         _run(RunFolder(run.path), run.seed, run.command, run.git_commit, run.data_digest, run.parameters)
         for run in row.runs
     )
-    return Made(row.name, f"{first.data}, {first.split} split", first.budget if first.learned else "-", runs)
+    return Made(row.name, f"{row.runs[0].data}, {row.runs[0].split} split", row.budget, runs)
 
 
 def _timed(timings: Iterable[Timing]) -> list[Made]:

@@ -36,6 +36,7 @@ class Content:
         made: how every row was made.
         left_out: run folders that were left out, and why.
         notes: on what could not be shown.
+        sweep: the command that began the sweep, if the page is of one.
     """
 
     title: str
@@ -51,6 +52,7 @@ class Content:
     made: Sequence[Made]
     left_out: Sequence[tuple[str, str]]
     notes: Sequence[str] = ()
+    sweep: str = ""
 
 
 def page(content: Content) -> str:

@@ -20,14 +20,6 @@ from epo_lightning.report.selection import BestSetting
 from epo_lightning.report.statistics import Comparisons, Difference
 from epo_lightning.report.tables import Cell, Column, Row, Table, distinct
 
-LEGEND = (
-    "Displacements in m, minimum over the modes; overlap rates (OR) of the most likely joint mode; lower is better. "
-    "Mean ± sample standard deviation over n seeds; in brackets the paper's value and ours minus the paper's. **Bold** is "
-    "the best and <u>underlined</u> the second best of the rows with the same backbone that know equally much. OR (JFP) "
-    "is the share of scenes with an overlap, as the paper defines its OR; OR (authors) counts overlapping pairs divided "
-    "by agents, as the authors' code does."
-)
-
 COMPARISON_LEGEND = (
     "Differences of the scores of two rows, paired by seed: the first row minus the second, so that negative is better for "
     "the first; n is the number of pairs. The interval covers the mean difference with 95 % confidence; p is that of the "
@@ -97,6 +89,41 @@ def difference_text(row: Row, column: Column) -> str:
     """Ours minus the paper's, or nothing."""
     cell = row.cells.get(column.metric)
     return "" if cell is None or cell.difference is None else signed(cell.difference, column.digits)
+
+
+def legend(
+    tables: Sequence[Table], where: str = "in brackets", bold: str = "**Bold**", second: str = "<u>underlined</u>"
+) -> str:
+    """How to read the numbers of tables: of what is in them, and of nothing else.
+
+    Args:
+        where: the paper's values stand.
+        bold, second: these words, marked up as the best and the second best are.
+    """
+    cells = [
+        row.cells[c.metric] for table in tables for row in table.rows for c in table.columns if c.metric in row.cells
+    ]
+    overlaps = any("overlap" in column.metric for table in tables for column in table.columns)
+    rates = "; overlap rates (OR) of the most likely joint mode" if overlaps else ""
+    mean = "Mean ± sample standard deviation over n seeds" if any(cell.deviation is not None for cell in cells) else ""
+    paper = (
+        f"{where} the paper's value and ours minus the paper's" if any(cell.paper is not None for cell in cells) else ""
+    )
+    numbers = "; ".join(part for part in (mean, paper) if part)
+    ranked = (
+        f"{bold} is the best and {second} the second best of the rows with the same backbone that know equally much."
+    )
+    rules = (
+        "OR (JFP) is the share of scenes with an overlap, as the paper defines its OR; OR (authors) counts overlapping "
+        "pairs divided by agents, as the authors' code does."
+    )
+    parts = (
+        f"Displacements in m, minimum over the modes{rates}; lower is better.",
+        f"{numbers[0].upper()}{numbers[1:]}." if numbers else "",
+        ranked if any(cell.rank for cell in cells) else "",
+        rules if overlaps else "",
+    )
+    return " ".join(part for part in parts if part)
 
 
 def comparison_sheet(comparisons: Comparisons) -> Sheet:
@@ -220,7 +247,7 @@ def to_csv(tables: Iterable[Table]) -> str:
     for row in distinct(tables):
         run = row.runs[0]
         seeds = " ".join(map(str, row.seeds))
-        same = (run.data, run.split, row.name, run.backbone, run.forecaster, run.goal, run.budget, seeds)
+        same = (run.data, run.split, row.name, run.backbone, run.forecaster, run.goal, row.budget, seeds)
         behind = (row.identity, row.data_digest, " ".join(row.commits), "; ".join(row.commands))
         for metric, cell in row.cells.items():
             values = (cell.mean, cell.deviation, cell.paper, cell.difference)

@@ -12,6 +12,9 @@ from epo_lightning.report.labels import natural, word
 from epo_lightning.report.runs import EvaluatedRun
 from epo_lightning.report.tables import Row, plain_rows, require_comparable
 
+SEARCHED = ("optimizer", "backbone", "forecaster")
+"""Sections with settings that are searched for the best; others are varied to see what they bring."""
+
 
 @dataclass(frozen=True)
 class BestSetting:
@@ -43,7 +46,8 @@ class BestSetting:
 def best_settings(runs: Iterable[EvaluatedRun], split: str = "val", metric: str = "minSADE") -> list[BestSetting]:
     """Of every experiment with several settings, the one with the lowest mean over seeds.
 
-    A setting with fewer seeds than another is no candidate: a mean over one lucky seed must not win.
+    A sweep over the optimisation steps, or over the number of modes, is no search. A setting with fewer seeds than
+    another is no candidate: a mean over one lucky seed must not win.
 
     Args:
         runs: of a search; scores on other splits are not looked at.
@@ -65,7 +69,11 @@ def best_settings(runs: Iterable[EvaluatedRun], split: str = "val", metric: str 
     if not experiments:
         raise ConfigError("no run was scored on the validation split: epo evaluate runs=<folder> split=val does it")
     searched = [(members, plain_rows(members)) for _, members in sorted(experiments.items())]
-    return [_best(members, rows, metric) for members, rows in searched if len(rows) > 1]
+    return [_best(members, rows, metric) for members, rows in searched if any(map(_is_searched, rows[0].settings))]
+
+
+def _is_searched(key: str) -> bool:
+    return key.split(".")[0] in SEARCHED and key != "forecaster.modes"
 
 
 def _best(runs: list[EvaluatedRun], rows: list[Row], metric: str) -> BestSetting:

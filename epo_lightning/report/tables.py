@@ -16,11 +16,12 @@ from typing import Any
 from epo_lightning.identity import differences
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import labels, natural, value_text, varying
-from epo_lightning.report.paper import paper_values
+from epo_lightning.report.paper import PAPER, paper_values
 from epo_lightning.report.runs import EvaluatedRun
 
+BACKBONES = tuple(dict.fromkeys(backbone for _, backbone, _ in PAPER))
 FORECASTERS = ("marginal", "scene_consistent", "epo")
-"""The order of rows within a group."""
+"""The paper's order of groups, and of rows within a group; what it does not have follows in the order of the runs."""
 
 CONDITIONS = ("data", "trainer", "callbacks")
 """Sections of the configuration that the learned rows of one table share; the others are what a table compares."""
@@ -44,7 +45,8 @@ class Cell:
     """One number of a table.
 
     Attributes:
-        mean, deviation: over seeds; the sample standard deviation is None for a single seed.
+        mean, deviation: over seeds; the sample standard deviation is None for a single seed, and where nothing was
+            learned and so nothing can vary.
         rank: 1 for the best of the group, 2 for the second, None for others and where there is nothing to rank.
         paper: the value in the paper.
         n: number of seeds.
@@ -88,6 +90,11 @@ class Row:
     @property
     def forecaster(self) -> str:
         return self.runs[0].forecaster
+
+    @property
+    def budget(self) -> str:
+        """With which its runs were trained; "none" where nothing is."""
+        return self.runs[0].budget if self.runs[0].learned else "none"
 
     @property
     def identity(self) -> str:
@@ -191,13 +198,24 @@ def _shown(title: str, columns: tuple[Column, ...], rows: Sequence[Row]) -> list
 
 
 def build_rows(runs: Sequence[EvaluatedRun]) -> tuple[Row, ...]:
-    """Runs of one table -> its rows in the paper's order, with ranks.
+    """Runs of one table -> its rows in the paper's order, with ranks; other rows in the order of the runs.
 
     Raises:
         ConfigError: as :func:`build_tables`.
     """
     require_comparable(runs)
-    return _with_ranks(sorted(plain_rows(runs), key=_order))
+    rows = plain_rows(runs)
+    backbones = list(dict.fromkeys([*BACKBONES, *(row.group[0] for row in rows)]))
+    titles = list(dict.fromkeys(row.title for row in rows))
+
+    def order(row: Row) -> tuple[object, ...]:
+        """The paper's goal first, baselines without a backbone last; rows of one title by their settings."""
+        backbone, goal = row.group
+        rank = FORECASTERS.index(row.forecaster) if row.forecaster in FORECASTERS else len(FORECASTERS)
+        place = backbones.index(backbone)
+        return backbone == "", place, goal != "energy", goal, rank, titles.index(row.title), natural(row.settings)
+
+    return _with_ranks(sorted(rows, key=order))
 
 
 def plain_rows(runs: Iterable[EvaluatedRun]) -> list[Row]:
@@ -226,13 +244,6 @@ def plain_rows(runs: Iterable[EvaluatedRun]) -> list[Row]:
 def group_of(run: EvaluatedRun) -> tuple[str, str]:
     """Backbone and goal; what learns nothing has neither."""
     return (run.backbone, run.goal) if run.learned else ("", "")
-
-
-def _order(row: Row) -> tuple[object, ...]:
-    """Groups by backbone, the paper's goal first, baselines without a backbone last; in a group as the paper does."""
-    backbone, goal = row.group
-    rank = FORECASTERS.index(row.forecaster) if row.forecaster in FORECASTERS else len(FORECASTERS)
-    return backbone == "", backbone, goal != "energy", goal, rank, row.title, natural(row.settings), row.name
 
 
 def require_comparable(runs: Sequence[EvaluatedRun]) -> None:
@@ -301,7 +312,9 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
     cells = {}
     for metric in first.metrics:
         values = [run.metrics[metric] for run in runs]
-        deviation = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
+        constant = not first.learned and len({*values}) == 1
+        sampled = len(values) > 1 and all(map(math.isfinite, values)) and not constant
+        deviation = statistics.stdev(values) if sampled else None
         cells[metric] = Cell(statistics.fmean(values), deviation, None, paper.get(metric), len(values))
     return Row(first.name, group_of(first), tuple(runs), cells)
 

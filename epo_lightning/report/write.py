@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,10 @@ from epo_lightning.report.latex import comparisons_to_latex, sheet_to_latex, to_
 from epo_lightning.report.made import Made, how_made
 from epo_lightning.report.render import (
     COMPARISON_LEGEND,
-    LEGEND,
     Sheet,
     comparison_sheet,
     comparisons_to_csv,
+    legend,
     settings_sheet,
     to_csv,
     to_markdown,
@@ -26,11 +27,9 @@ from epo_lightning.report.render import (
 from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, scored
 from epo_lightning.report.selection import BestSetting, best_settings
 from epo_lightning.report.statistics import build_comparisons
-from epo_lightning.report.tables import build_tables
+from epo_lightning.report.tables import Table, build_tables
 from epo_lightning.report.timings import places, read_timings, timing_sheet
 from epo_lightning.run_folder import RunFolder, write_text
-
-PAPER_IN_LEGEND = "; in brackets the paper's value and ours minus the paper's"
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,7 @@ class Report:
         runs: all run folders that have scores or were timed.
         evaluated: what was scored in them.
         left_out: the other run folders, and why they are left out.
+        sweep: the command that began the sweep, if the report is of one.
     """
 
     title: str
@@ -50,6 +50,7 @@ class Report:
     runs: tuple[RunFolder, ...]
     evaluated: tuple[EvaluatedRun, ...]
     left_out: tuple[tuple[str, str], ...] = ()
+    sweep: str = ""
 
     @classmethod
     def of_folder(cls, folder: str | Path) -> Report:
@@ -120,9 +121,6 @@ def write_report(
     settings = [settings_sheet(best)] if best else []
     notes = [*notes, *damaged, *([hint] if hint else [])]
     made, charts = how_made(tables, timings), charts_of(tables, timings)
-    has_paper = any(cell.paper is not None for table in tables for row in table.rows for cell in row.cells.values())
-    legend = LEGEND if has_paper else LEGEND.replace(PAPER_IN_LEGEND, "")
-
     timed = [timing_sheet(where, same) for where, same in places(timings).items()]
     shown: list[Sheet] = [*settings, *compared, *timed]
     links = [f"figures/{chart.name}.png" for chart in charts] + [os.path.relpath(figure, out) for figure in figures]
@@ -130,10 +128,11 @@ def write_report(
         part
         for part in (
             f"# Results: {report.title}\n",
+            f"`{report.sweep}`\n" if report.sweep else "",
             preface.strip() + "\n" if preface.strip() else "",
             *(note + "\n" for note in notes),
             *(to_markdown(table) for table in tables),
-            legend + "\n" if tables else "",
+            legend(tables) + "\n" if tables else "",
             *(to_markdown(sheet) for sheet in shown),
             COMPARISON_LEGEND + "\n" if compared else "",
             _how_made(made, report),
@@ -145,7 +144,7 @@ def write_report(
         title=report.title,
         command=report.command,
         preface=preface,
-        legend=legend.replace("in brackets", "below"),
+        legend=legend(tables, "below"),
         comparison_legend=COMPARISON_LEGEND,
         tables=tables,
         comparisons=compared,
@@ -155,11 +154,15 @@ def write_report(
         made=made,
         left_out=report.left_out,
         notes=notes,
+        sweep=report.sweep,
     )
     files = {"results.md": markdown, "index.html": page(content)}
     if tables:
         files["results.csv"] = to_csv(tables)
-        latex = [*map(to_latex, tables), *map(comparisons_to_latex, comparisons), *map(sheet_to_latex, settings)]
+        caveat = _caveat(tables) if preface.strip() else ""
+        latex = [to_latex(table, caveat=caveat) for table in tables]
+        latex += [comparisons_to_latex(entry, caveat=caveat) for entry in comparisons]
+        latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in settings]
         files["results.tex"] = "\n".join(latex)
     if comparisons:
         files["comparisons.csv"] = comparisons_to_csv(comparisons)
@@ -173,7 +176,25 @@ def write_report(
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
     for rich in (*map(to_rich, tables), *map(to_rich, shown)):
         console.print(rich)
+    if report.left_out:
+        console.print(_summary(report.left_out), style="yellow", markup=False, highlight=False, soft_wrap=True)
     return markdown
+
+
+def _caveat(tables: Sequence[Table]) -> str:
+    """The preface in a sentence, for captions: tables of a paper are copied without what stands around them."""
+    budgets = sorted({run.budget for table in tables for row in table.rows for run in row.runs if run.learned})
+    return (
+        f"Budget: {', '.join(budgets) or 'none'}, other data or steps than the paper's: does not reproduce its table."
+    )
+
+
+def _summary(left_out: Sequence[tuple[str, str]]) -> str:
+    """``3 runs left out: 1 waiting, 2 failed``: the reasons are long, and stand in the files."""
+    states = Counter(why.partition(":")[0] for _, why in left_out)
+    named = ", ".join(f"{count} {state}" for state, count in states.items())
+    runs = "run" if len(left_out) == 1 else "runs"
+    return f"{len(left_out)} {runs} left out: {named} (see How this was made in results.md)"
 
 
 def _best(runs: Sequence[EvaluatedRun]) -> tuple[list[BestSetting], str]:

@@ -66,7 +66,10 @@ def test_a_sweep_reports_its_runs_and_the_states_of_the_others(runs: Path) -> No
     assert "0.400 ± 0.141" in written
     assert "Not of the sweep" not in written
     assert "- `runs/e`: failed: ValueError: it broke" in written
-    assert "3 runs left out" in (out / "index.html").read_text()
+    page = (out / "index.html").read_text()
+    assert "3 runs left out" in page
+    assert "<code>epo sweep rpi_main</code>" in page
+    assert "`epo sweep rpi_main`" in written
 
 
 def test_scores_on_another_split_belong_to_another_report(runs: Path) -> None:

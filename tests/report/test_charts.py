@@ -40,13 +40,21 @@ def test_learning_curves_are_means_over_seeds_with_the_range_as_band(tmp_path: P
         write_log(make_run(tmp_path / str(seed), "V-LSTM", "marginal", scores(0.3), seed=seed), values)
     curves, notes = learning_curves(distinct(build_tables(collect(tmp_path))))
     assert notes == []
-    assert curves == [Curve("V-LSTM", (99, 199), (1.5, 0.7), (1.0, 0.5), (2.0, 0.9), 2)]
+    assert curves == [Curve("V-LSTM", (100, 200), (1.5, 0.7), (1.0, 0.5), (2.0, 0.9), 2)]
     figure = draw_learning(curves)
-    assert lines(figure) == {"row0-line": [(99, 1.5), (199, 0.7)]}
+    assert lines(figure) == {"row0-line": [(100, 1.5), (200, 0.7)]}
     band = figure.axes[0].collections[0]
     assert band.get_gid() == "row0-band"
     corners = {tuple(corner) for corner in band.get_paths()[0].vertices.tolist()}
-    assert corners == {(99, 1.0), (99, 2.0), (199, 0.5), (199, 0.9)}
+    assert corners == {(100, 1.0), (100, 2.0), (200, 0.5), (200, 0.9)}
+
+
+def test_training_steps_are_whole_numbers() -> None:
+    figure = draw_learning([Curve("V-LSTM", (2, 3, 4), (0.3, 0.2, 0.1), (0.3, 0.2, 0.1), (0.3, 0.2, 0.1), 1)])
+    figure.canvas.draw()
+    labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
+    assert {"2", "3", "4"} <= {*labels}
+    assert all(label.lstrip("\N{MINUS SIGN}").isdigit() for label in labels)
 
 
 def test_a_row_without_a_sound_log_is_left_out_with_a_note(tmp_path: Path) -> None:
@@ -70,7 +78,7 @@ def test_a_row_without_a_sound_log_is_left_out_with_a_note(tmp_path: Path) -> No
 def test_the_half_of_a_line_is_no_value_and_a_repeated_step_counts_once(tmp_path: Path) -> None:
     file = tmp_path / "metrics.csv"
     file.write_text("epoch,step,val/minSADE\n0,99,0.5\n1,199,0.4\n1,199,0.3\n2,x9,0.2\n2,299,0.2")
-    assert read_log(file, "val/minSADE") == {99: 0.5, 199: 0.3}
+    assert read_log(file, "val/minSADE") == {100: 0.5, 200: 0.3}
     with pytest.raises(ConfigError, match=r"metrics\.csv holds no val/minFDE"):
         read_log(file, "val/minFDE")
 
@@ -178,7 +186,7 @@ def test_charts_come_with_legends_and_numbers(tmp_path: Path) -> None:
     charts = {chart.name: chart for chart in charts_of(tables, timings)}
     assert list(charts) == ["learning_curves", "steps", "runtime", "runtime_modes"]
     assert [key.label for key in charts["learning_curves"].legend] == ["V-LSTM", "V-LSTM + SC", "V-LSTM + EPO"]
-    assert charts["learning_curves"].numbers[2] == ("V-LSTM + EPO", "3", "999", "0.0640", "0.0640", "999")
+    assert charts["learning_curves"].numbers[2] == ("V-LSTM + EPO", "3", "1000", "0.0640", "0.0640", "1000")
     assert charts["steps"].numbers[0] == ("1", "2", "0.0610", "0.0700")
     assert len(charts["runtime"].numbers) == 24
     for chart in charts.values():

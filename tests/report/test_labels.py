@@ -69,6 +69,14 @@ def test_labels_by_hand() -> None:
     assert labels("V", [{}], CONFIG, ["aaaa"]) == ["V"]
 
 
+def test_labels_round_numbers_unless_that_makes_them_equal() -> None:
+    def of(*rates: float) -> list[str]:
+        return labels("V", [{"solver.rate": rate, "solver.steps": 1234} for rate in rates], CONFIG, ["a", "b"])
+
+    assert of(0.00034538226139400343, 0.0005) == ["V, rate=0.000345, steps=1234", "V, rate=0.0005, steps=1234"]
+    assert of(0.0003453, 0.0003454) == ["V, rate=0.0003453, steps=1234", "V, rate=0.0003454, steps=1234"]
+
+
 def test_rows_that_settings_do_not_name_are_named_by_their_identity() -> None:
     rows = ["0123456789abcdef", "fedcba9876543210"]
     many = [{f"solver.k{number}": number + row for number in range(5)} for row in range(2)]

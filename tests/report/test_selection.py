@@ -104,7 +104,15 @@ def test_experiments_without_a_choice_are_left_out(tmp_path: Path) -> None:
 
 
 def test_words_without_an_experiment_name_the_parts(tmp_path: Path) -> None:
-    for number, steps in enumerate((2, 4)):
-        make_run(tmp_path / str(steps), "own", "epo", scores(number), split="val", settings={"solver.steps": steps})
+    for number, lr in enumerate((0.1, 0.2)):
+        settings = {"solver.steps": 2 + number, "optimizer.lr": lr}
+        make_run(tmp_path / str(lr), "own", "epo", scores(number), split="val", settings=settings)
     (found,) = best(tmp_path)
-    assert found.words == "data=rpi backbone=v_lstm forecaster=epo solver.steps=2"
+    assert found.words == "data=rpi backbone=v_lstm forecaster=epo optimizer.lr=0.1 solver.steps=2"
+
+
+@pytest.mark.parametrize("key", ["solver.steps", "forecaster.modes"])
+def test_what_is_varied_to_see_its_effect_is_not_chosen(tmp_path: Path, key: str) -> None:
+    for value in (1, 2):
+        make_run(tmp_path / str(value), "own", "epo", scores(value), split="val", settings={key: value})
+    assert best(tmp_path) == []

@@ -46,6 +46,28 @@ def test_mean_deviation_and_order_by_hand(tmp_path: Path) -> None:
     assert rows["V-LSTM"].cells["minSADE"].deviation is None
 
 
+def test_rows_that_the_paper_does_not_have_follow_in_the_order_of_the_runs(tmp_path: Path) -> None:
+    rows = [
+        *(("Zeta", "epo", "own_net"), ("V-LSTM + EPO", "epo", "v_lstm"), ("Mine", "epo", "v_lstm")),
+        *(("Later", "marginal", "v_lstm"), ("HiVT", "marginal", "hivt_m"), ("VIBES", "marginal", "vibes")),
+        ("Alpha", "marginal", "another_net"),
+    ]
+    runs = [make_run(tmp_path / title, title, name, scores(0.1), backbone=net) for title, name, net in rows]
+    (table,) = build_tables(collect(runs))
+    assert [row.name for row in table.rows] == ["Later", "V-LSTM + EPO", "Mine", "VIBES", "HiVT", "Zeta", "Alpha"]
+
+
+def test_what_learns_nothing_has_no_deviation_where_its_runs_agree(tmp_path: Path) -> None:
+    for seed in range(3):
+        make_run(tmp_path / f"cv{seed}", "Constant velocity", "constant_velocity", scores(0.5, 0.1 * seed), seed=seed)
+        make_run(tmp_path / f"m{seed}", "V-LSTM", "marginal", scores(0.5), seed=seed)
+    rows = rows_of(tmp_path)
+    assert rows["Constant velocity"].cells["minSADE"] == Cell(0.5, None, None, None, 3)
+    assert rows["Constant velocity"].cells["overlap_jfp"].deviation == pytest.approx(0.1)
+    assert rows["V-LSTM"].cells["minSADE"].deviation == 0
+    assert (rows["Constant velocity"].budget, rows["V-LSTM"].budget) == ("none", "reduced")
+
+
 def test_best_and_second_of_the_group_and_the_papers_values(tmp_path: Path) -> None:
     paper_table(tmp_path)
     rows = rows_of(tmp_path)

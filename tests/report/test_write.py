@@ -6,7 +6,9 @@ import csv
 import io
 import math
 import resource
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -14,7 +16,6 @@ from rich.console import Console
 
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, write_report
-from epo_lightning.report.write import PAPER_IN_LEGEND
 from epo_lightning.run_folder import write_json
 
 from .page_runs import over_runtime, over_steps, rows_with_seeds
@@ -98,11 +99,41 @@ def test_figures_are_linked_from_the_report(tmp_path: Path) -> None:
     assert "![joint](figures/joint.png)" in markdown
 
 
-def test_the_legend_speaks_of_the_paper_where_it_has_values(tmp_path: Path) -> None:
+def test_the_legend_and_captions_speak_of_what_is_there(tmp_path: Path) -> None:
     three_rows(tmp_path / "ours")
     make_run(tmp_path / "other" / "m", "V-LSTM", "marginal", scores(0.3), data="highway_sim")
-    assert PAPER_IN_LEGEND in report(tmp_path / "ours", tmp_path / "out")[0]
-    assert "the paper's value" not in report(tmp_path / "other", tmp_path / "out")[0]
+    whole = report(tmp_path / "ours", tmp_path / "out")[0], (tmp_path / "out" / "results.tex").read_text()
+    short = report(tmp_path / "other", tmp_path / "out")[0], (tmp_path / "out" / "results.tex").read_text()
+    for text, other in zip(whole, short, strict=True):
+        for words in ("the paper's value and ours minus the paper's", "ample standard deviation", "the second best"):
+            assert words in text
+            assert words not in other
+        assert "OR (authors) counts overlapping pairs" in other
+    assert "seeds; in brackets, the paper's" in whole[0]
+    assert "$n$ seeds; below, the paper's" in whole[1]
+
+
+def test_captions_carry_the_caveat_of_the_preface(tmp_path: Path) -> None:
+    rows_with_seeds(tmp_path / "runs")
+    for preface, count in (("**Budget: reduced.**", 3), ("", 0)):
+        report(tmp_path / "runs", tmp_path / "out", preface=preface)
+        captions = [
+            line for line in (tmp_path / "out/results.tex").read_text().splitlines() if line.startswith("\\caption")
+        ]
+        assert len(captions) == 3
+        assert sum("\\textbf{Budget: reduced, " in line and "does not reproduce" in line for line in captions) == count
+
+
+def test_the_terminal_ends_with_what_is_left_out(tmp_path: Path) -> None:
+    three_rows(tmp_path / "runs")
+    assert "left out" not in report(tmp_path / "runs", tmp_path / "out")[1]
+    whole = Report.of_folder(tmp_path / "runs")
+    left_out = (("a", "failed: ValueError: it: broke"), ("b", "failed"), ("c", "not evaluated yet: epo evaluate run=c"))
+    for count, words in ((3, "3 runs left out: 2 failed, 1 not evaluated yet"), (1, "1 run left out: 1 failed")):
+        console = Console(file=io.StringIO(), width=80)
+        write_report(replace(whole, left_out=left_out[:count]), tmp_path / "out", console=console)
+        printed = console.file.getvalue().rstrip()  # type: ignore[attr-defined]
+        assert printed.splitlines()[-1] == f"{words} (see How this was made in results.md)"
 
 
 def test_latex_and_comparisons_lie_beside(tmp_path: Path) -> None:
@@ -115,13 +146,21 @@ def test_latex_and_comparisons_lie_beside(tmp_path: Path) -> None:
 
 
 def test_a_search_ends_in_its_best_setting_or_says_why_not(tmp_path: Path) -> None:
-    over_steps(tmp_path / "runs")
-    assert "solver.steps=8 | 0.040" in report(tmp_path / "runs", tmp_path / "out")[0]
-    for run in (tmp_path / "runs").glob("S*-s1"):
-        metrics = scores(math.nan) | {"initial/minSADE": 0.1, "initial/minSFDE": 0.1}
+    for lr, value in ((0.001, 0.05), (0.0003, 0.04)):
+        for seed in range(2):
+            options: dict[str, Any] = {"seed": seed, "split": "val", "settings": {"optimizer.lr": lr}}
+            make_run(tmp_path / "runs" / f"{lr}-s{seed}", "V-LSTM + EPO", "epo", scores(value), **options)
+    assert "optimizer.lr=0.0003 | 0.040" in report(tmp_path / "runs", tmp_path / "out")[0]
+    for run in (tmp_path / "runs").glob("*-s1"):
+        metrics = scores(math.nan)
         write_json(run / "metrics-val.json", {"data_digest": "abc", "split": "val", "metrics": metrics})
     markdown, _ = report(tmp_path / "runs", tmp_path / "out")
     assert "No setting was chosen: no setting of 'V-LSTM + EPO' has finite scores" in markdown
+
+
+def test_an_s_curve_is_no_search(tmp_path: Path) -> None:
+    over_steps(tmp_path / "runs")
+    assert "Best settings" not in report(tmp_path / "runs", tmp_path / "out")[0]
 
 
 def test_runs_that_were_only_timed_are_a_report(tmp_path: Path) -> None:
