@@ -31,15 +31,24 @@ ELSEWHERE = (
 """Keys of those sections that say where the data lies, or on what and how visibly it is computed."""
 
 
+SHARES = ("trainer.limit_train_batches", "trainer.limit_val_batches")
+"""Keys of which a whole number says something else than the same number with a point: one batch, or all of them."""
+
+
 def essence(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a resolved configuration that decides on the result, as plain JSON values."""
-    kept: dict[str, Any] = {}
-    for section in SECTIONS:
-        value = config.get(section)
-        if isinstance(value, Mapping):
-            value = {key: entry for key, entry in value.items() if f"{section}.{key}" not in ELSEWHERE}
-        kept[section] = value
-    return json.loads(json.dumps(kept, sort_keys=True))
+    """The part of a resolved configuration that decides on the result, as plain JSON values, each number in one way."""
+    return {section: _plain(config.get(section), section) for section in SECTIONS}
+
+
+def _plain(value: Any, where: str) -> Any:
+    if isinstance(value, Mapping):
+        entries = {str(key): (f"{where}.{key}", entry) for key, entry in value.items()}
+        return {key: _plain(entry, place) for key, (place, entry) in entries.items() if place not in ELSEWHERE}
+    if isinstance(value, list | tuple):
+        return [_plain(entry, where) for entry in value]
+    if isinstance(value, float) and where in SHARES:
+        return f"{value!r} of all"
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def identity(config: Mapping[str, Any], data_digest: str) -> str:
@@ -55,7 +64,13 @@ def row_identity(config: Mapping[str, Any], data_digest: str) -> str:
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """Key, value and other value of everything in which the essences of two configurations differ."""
     left, right = dict(_leaves(essence(one))), dict(_leaves(essence(other)))
-    return [(key, left.get(key), right.get(key)) for key in sorted({*left, *right}) if left.get(key) != right.get(key)]
+    pairs = [(key, left.get(key), right.get(key)) for key in sorted({*left, *right})]
+    return [(key, a, b) for key, a, b in pairs if canonical(a) != canonical(b)]
+
+
+def canonical(content: Any) -> str:
+    """Equal for equal values of equal types; Python takes 1 and true for the same."""
+    return json.dumps(content, sort_keys=True)
 
 
 def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -67,4 +82,4 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _hash(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(canonical(content).encode()).hexdigest()[:16]

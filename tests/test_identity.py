@@ -57,6 +57,16 @@ def test_names_places_and_machines_are_not(key: str, value: Any) -> None:
     assert differences(CONFIG, other) == []
 
 
+def test_a_number_is_the_same_however_it_is_written_and_one_batch_is_not_all_of_them() -> None:
+    for key, one, other in (("optimizer.clip", 1, 1.0), ("solver.damping", 10, 10.0), ("forecaster.own_start", 1, 1.0)):
+        assert identity(changed(key, one), "d") == identity(changed(key, other), "d")
+        assert differences(changed(key, one), changed(key, other)) == []
+    for key in ("trainer.limit_train_batches", "trainer.limit_val_batches"):
+        assert identity(changed(key, 1), "d") != identity(changed(key, 1.0), "d")
+        assert [found for found, _, _ in differences(changed(key, 1), changed(key, 1.0))] == [key]
+    assert differences(changed("solver.adaptive", True), changed("solver.adaptive", 1))
+
+
 def test_rows_are_runs_without_their_seed() -> None:
     other = changed("seed", 5)
     assert identity(other, "d") != identity(CONFIG, "d")

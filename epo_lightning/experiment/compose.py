@@ -7,7 +7,6 @@ composed here and checked before anything else happens, so that a misspelt word 
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from epo_lightning.identity import essence
+from epo_lightning.identity import canonical, essence
 from epo_lightning.registry import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -102,10 +101,10 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     if choices.get("experiment"):
         values["experiment"] = choices["experiment"]
     if "trainer" in values:
-        own = essence({**values, "seed": None})
+        own = canonical(essence({**values, "seed": None}))
         words = tuple(f"{group}={choices[group]}" for group in ("experiment", "budget") if choices.get(group))
         same = own == _as_written(words, _search_path())
-        values["variant"] = "" if same else hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:6]
+        values["variant"] = "" if same else hashlib.sha256(own.encode()).hexdigest()[:6]
     return values
 
 
@@ -116,7 +115,7 @@ def _search_path() -> tuple[str, ...]:
 
 
 @cache
-def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> dict[str, Any] | None:
+def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> str | None:
     """The essence of an experiment at its budget, without a seed; None where it cannot stand alone."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.types import RunMode
@@ -124,7 +123,7 @@ def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> dict[st
     loader = GlobalHydra.instance().config_loader()
     try:
         config = loader.load_configuration("train", list(words), run_mode=RunMode.RUN)
-        return essence({**_plain_values(config), "seed": None})
+        return canonical(essence({**_plain_values(config), "seed": None}))
     except Exception:  # it needs a value that only the run at hand brings
         return None
 

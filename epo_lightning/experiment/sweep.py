@@ -37,7 +37,9 @@ from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_json, wri
 
 State = Literal["waiting", "running", "interrupted", "failed", "done"]
 BESIDE = (
-    *("hydra", "logger", "existing", "runs", "sweep", "sweeps"),
+    *("logger", "existing", "runs", "sweep", "sweeps"),
+    *("hydra/launcher", "hydra.launcher", "hydra/hydra_logging", "hydra.sweep", "hydra.job", "hydra.verbose"),
+    *("hydra.sweeper.n_trials", "hydra.sweeper.n_jobs"),
     *("callbacks.progress", "callbacks.refresh"),
     *("trainer.accelerator", "trainer.devices", "trainer.share", "trainer.threads"),
 )
@@ -154,8 +156,11 @@ class Sweep:
         }
 
     def state(self, job: Job) -> State:
-        """What has become of a run, its scores included."""
-        state = job.run.state
+        """What has become of a run, its scores included; a damaged folder has failed."""
+        try:
+            state = job.run.state
+        except ConfigError:
+            return "failed"
         if state == "finished":
             if job.score is None or job.run.metrics_file(job.score).is_file():
                 return "done"
@@ -165,10 +170,11 @@ class Sweep:
     def error(self, job: Job) -> str:
         """Why a run failed, in one line; empty if it did not."""
         try:
-            lines = self._failure(job.run).read_text(encoding="utf-8").strip().splitlines()
-        except OSError:
+            if self._failure(job.run).is_file():
+                return self._failure(job.run).read_text(encoding="utf-8").partition("\n")[0]
             return str(job.run.record.get("error") or "") if job.run.record_file.is_file() else ""
-        return lines[0] if lines else ""
+        except ConfigError as error:
+            return str(error)
 
     def _failure(self, run: RunFolder) -> Path:
         return self.folder / "failures" / f"{self._place(run).replace(os.sep, '__')}.txt"
@@ -223,6 +229,10 @@ class Sweep:
         }
         write_json(self.folder / "sweep.json", content)
 
+    def lost(self, job: Job) -> None:
+        """Note that a run's process has died without a word."""
+        write_text(self._failure(job.run), "its process died, again and again (out of memory?)\n")
+
     def work(self, config: Mapping[str, Any], overrides: Sequence[str]) -> float | None:
         """Train and score one of the runs, in whatever process a launcher chose.
 
@@ -260,6 +270,8 @@ def label(name: str, overrides: Sequence[str]) -> str:
     """``name``, and six digits of a hash of the overrides that decide on results, where there are any."""
     keys = {word: word.lstrip("+~").split("=")[0].split("@")[0] for word in overrides}
     special = sorted(
-        word for word, key in keys.items() if key.split(".")[0].split("/")[0] not in BESIDE and key not in BESIDE
+        word
+        for word, key in keys.items()
+        if not any(key == beside or key.startswith((f"{beside}.", f"{beside}/")) for beside in BESIDE)
     )
     return name + ("-" + hashlib.sha256("\n".join(special).encode()).hexdigest()[:6] if special else "")

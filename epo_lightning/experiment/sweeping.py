@@ -12,11 +12,15 @@ from typing import Any
 
 from epo_lightning.experiment import assembly, compose
 from epo_lightning.experiment import train as training
-from epo_lightning.experiment.settings import Settings, read
+from epo_lightning.experiment.settings import Settings, TrainerSettings, read
 from epo_lightning.experiment.sweep import Job, Sweep
 from epo_lightning.experiment.watch import news, status, summary
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import value_text, word
+from epo_lightning.run_folder import RunFolder, read_json
+
+ATTEMPTS = 3
+"""How often a launcher may break down in a sweep."""
 
 
 def run(
@@ -54,11 +58,11 @@ def run(
         sweep.begin(name, shlex.join(["epo", "sweep", name, *overrides]), overrides, jobs, stop_on_failure)
         if jobs:
             print(f"{sweep.label}: {summary(Counter(states))}", flush=True)
-        missing = [list(job.overrides) for job, state in zip(jobs, states, strict=True) if state != "done"]
         with news(sweep):
-            if missing:
-                compose.launch("train", words, missing, task, extra)
-            elif not jobs:
+            if jobs:
+                missing = [job for job, state in zip(jobs, states, strict=True) if state != "done"]
+                _launch(sweep, missing, words, task, extra)
+            else:
                 _search(sweep, words, task, extra)
         counts = status(sweep)
     if counts["failed"]:
@@ -86,6 +90,8 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Jo
             raise ConfigError(
                 f"{job.run.path} exists and is not a run folder: move it away, or choose another runs=<folder>"
             )
+        if job.score == "time":
+            _set_aside(job.run, read(Settings, config).trainer)
         data = json.dumps(config["data"], sort_keys=True)
         if data not in ready and sweep.state(job) != "done":
             training.ready(read(Settings, config))
@@ -94,11 +100,48 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Jo
     return list(jobs.values())
 
 
+def _set_aside(run: RunFolder, settings: TrainerSettings) -> None:
+    """Keep a time that was measured on something else under another name, so that it is measured anew."""
+    file = run.metrics_file("time")
+    if not file.is_file():
+        return
+    found = read_json(file)
+    on_gpu = found["device"] != "cpu"
+    if found["threads"] != settings.threads or (
+        settings.accelerator != "auto" and on_gpu == (settings.accelerator == "cpu")
+    ):
+        kind = "gpu" if on_gpu else "cpu"
+        file.rename(file.with_name(f"runtime-{kind}-{found['threads']}.json"))
+
+
+def _launch(
+    sweep: Sweep, jobs: Sequence[Job], words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]
+) -> None:
+    """Have jobs done. A launcher that breaks down, because a worker was killed, say, is started again for what it left."""
+    left = list(jobs)
+    for _ in range(ATTEMPTS):
+        if not left:
+            return
+        try:
+            compose.launch("train", words, [list(job.overrides) for job in left], task, extra)
+            return
+        except ConfigError:
+            raise
+        except Exception as error:
+            left = [job for job in left if sweep.state(job) not in ("done", "failed")]
+            said = " ".join(str(error).split())
+            print(
+                f"the launcher broke down ({type(error).__name__}: {said[:200]}): {len(left)} runs are left", flush=True
+            )
+    for job in left:
+        if sweep.state(job) == "interrupted":
+            sweep.lost(job)
+
+
 def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]) -> None:
     """Go on with a sweep whose sweeper chooses as it goes: finish what it has thought of, then let it think further."""
     found = sweep.jobs
-    if unfinished := [list(job.overrides) for job in found if sweep.state(job) != "done"]:
-        compose.launch("train", words, unfinished, task, extra)
+    _launch(sweep, [job for job in found if sweep.state(job) != "done"], words, task, extra)
     trials = compose.trials("train", words, extra)
     if trials is None:
         compose.multirun("train", words, task, extra)

@@ -125,6 +125,33 @@ def test_what_was_killed_before_it_had_begun_begins_again(epo: Epo) -> None:
     assert the_sweep().state(job) == "done"
 
 
+def test_one_damaged_run_does_not_hide_the_others(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/v_lstm,rpi/const_vel") == 0
+    the_sweep().jobs[0].run.record_file.write_text("{")
+    capsys.readouterr()
+    assert epo("sweep", "status", "rpi_main") == 0
+    out = capsys.readouterr().out
+    assert "1 done, 1 failed" in out
+    assert "is not JSON" in " ".join(out.split())
+
+
+@pytest.mark.parametrize("place", ["a,b", "x(1)", "it's", "über", "a=b", "[z]", "{k}", "#5", "~t", 'q"q', "s p", "a:b"])
+def test_folders_may_be_called_anything(epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
+    (tmp_path / place).mkdir()
+    monkeypatch.chdir(tmp_path / place)
+    assert epo("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/const_vel") == 0
+    assert list((tmp_path / place).glob("runs/rpi/const_vel/*/run.json"))
+
+
+def test_times_on_other_threads_are_other_times(epo: Epo) -> None:
+    words = ("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/v_lstm", "score=time")
+    for threads in (1, 2):
+        assert epo(*words, f"trainer.threads={threads}") == 0
+        (job,) = the_sweep().jobs
+        assert json.loads(job.run.metrics_file("time").read_text())["threads"] == threads
+    assert json.loads((job.run.path / "runtime-cpu-1.json").read_text())["threads"] == 1, "nothing is lost"
+
+
 def test_damaged_runs_are_named_before_anything_runs(epo: Epo, refused: Callable[..., str]) -> None:
     words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm")
     assert epo(*words) == 0
@@ -177,6 +204,8 @@ def test_the_latest_sweep_of_a_name_is_found(tmp_path: Path) -> None:
 
 def test_labels_say_what_is_run_and_not_where() -> None:
     assert label("steps", []) == label("steps", ["logger=[wandb]", "hydra/launcher=local", "runs=x"]) == "steps"
+    assert label("steps", ["hydra.sweeper.params.seed=7"]) != "steps"
+    assert label("steps", ["hydra.sweeper.n_trials=7", "hydra.launcher.n_jobs=2"]) == "steps"
     assert label("steps", ["seed=1"]) == label("steps", ["seed=1", "trainer.threads=2"]) != "steps"
     assert label("steps", ["a=1", "b=2"]) == label("steps", ["b=2", "a=1"])
 
@@ -188,6 +217,8 @@ def test_run_folders_are_named_by_what_they_mean() -> None:
     assert variant() == variant("solver.steps=2") == variant("seed=7") == variant("budget=short") == ""
     assert variant("solver.steps=3") == variant("solver.steps=3", "seed=4", "logger=[tensorboard]") != ""
     assert variant("solver.steps=3") != variant("solver.steps=4")
+    assert variant("trainer.limit_train_batches=1") != variant("trainer.limit_train_batches=1.0") == ""
+    assert variant("optimizer.clip=1") == variant("optimizer.clip=1.0") != ""
 
 
 def test_globs_find_experiments_in_folders() -> None:
