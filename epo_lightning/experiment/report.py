@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from epo_lightning.experiment.settings import ReportSettings, Settings, read
 from epo_lightning.experiment.sweep import Sweep
 from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
-from epo_lightning.report import Report, build_tables, collect, write_report
+from epo_lightning.report import EvaluatedRun, Report, build_tables, collect, write_report
 from epo_lightning.report.made import distinct
 from epo_lightning.report.runs import scored
 from epo_lightning.report.tables import Row
@@ -42,7 +42,7 @@ def report(settings: ReportSettings) -> Path:
     out = Path(settings.out or (sweep.folder / "report" if sweep else "report")).expanduser()
     rows = distinct(build_tables(subject.evaluated))  # whatever cannot be reported is said before anything is drawn
     drawn, notes = draw(rows, out / "figures")
-    write_report(subject, out, drawn, preface(subject.runs), notes)
+    write_report(subject, out, drawn, preface(subject.evaluated), notes)
     return out
 
 
@@ -90,11 +90,10 @@ def of_sweep(sweep: Sweep) -> Report:
     )
 
 
-def preface(runs: Iterable[RunFolder]) -> str:
-    """What a reader has to know before the numbers: that the budget was not the paper's, and how to use that."""
-    runs = list(runs)
-    budgets = sorted({run.record.get("budget", "paper") for run in runs} - {"paper"})
-    words = [word for run in runs for word in shlex.split(run.record.get("command", ""))]
+def preface(runs: Sequence[EvaluatedRun]) -> str:
+    """What a reader has to know before the scores of runs: that the budget was not the paper's, and how to use that."""
+    budgets = sorted({run.budget for run in runs} - {"paper"})
+    words = [word for run in runs for word in shlex.split(run.command)]
     changed = sorted({word for word in words if word.lstrip("+").startswith(("trainer.", "data.")) and _matters(word)})
     if not budgets and not changed:
         return ""

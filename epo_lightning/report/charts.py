@@ -130,10 +130,10 @@ def _steps(tables: Sequence[Table]) -> Iterable[Chart]:
 
 def _of_steps(curve: StepsCurve) -> Iterable[tuple[str, ...]]:
     initial = {} if curve.initial is None else dict(zip(curve.initial.x, curve.initial.mean, strict=True))
-    for steps, mean in zip(curve.optimised.x, curve.optimised.mean, strict=True):
+    for steps, mean, seeds in zip(curve.optimised.x, curve.optimised.mean, curve.seeds, strict=True):
         yield (
             str(steps),
-            str(curve.optimised.seeds),
+            str(seeds),
             f"{mean:.4f}",
             f"{initial[steps]:.4f}" if steps in initial else "-",
         )

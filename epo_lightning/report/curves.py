@@ -70,6 +70,7 @@ class StepsCurve:
         name: of the row with the fewest steps, which stands for all.
         split: on which data, and which part of it.
         optimised, initial: minSADE over S of what the game's solution and of what the network alone predicts.
+        seeds: how many there are at every S; a sweep that is not done has fewer at some.
         paper: the paper's curves belong beside it.
     """
 
@@ -77,6 +78,7 @@ class StepsCurve:
     split: str
     optimised: Curve
     initial: Curve | None
+    seeds: tuple[int, ...]
     paper: bool = False
 
 
@@ -193,6 +195,7 @@ def steps_curves(rows: Iterable[Row]) -> list[StepsCurve]:
                 split=f"{first.runs[0].data}, {first.runs[0].split} split",
                 optimised=Curve.over_seeds(first.name, solved),
                 initial=Curve.over_seeds(first.name, initial) if initial else None,
+                seeds=tuple(len(group) for group in runs.values()),
                 paper=(first.runs[0].data, first.runs[0].backbone) == ("rpi", "v_lstm"),
             )
         )

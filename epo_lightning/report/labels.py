@@ -13,7 +13,7 @@ from epo_lightning.identity import differences, essence
 MOST, LONGEST, DIGITS = 4, 24, 3
 """How many settings a label names, how long the text of one value may be, and with how many digits it is printed."""
 
-PLAIN, OTHER = re.compile(r"[\w./-]+"), re.compile(r"[-\d._e]+|true|false|null|nan|inf", re.IGNORECASE)
+PLAIN, OTHER = re.compile(r"[\w./-]+", re.ASCII), re.compile(r"[-\d._e]+|true|false|null|nan|inf", re.IGNORECASE)
 """Text that needs no quotes, and text that would be read as something else without them."""
 
 

@@ -107,7 +107,9 @@ def legend(
     rates = "; overlap rates (OR) of the most likely joint mode" if overlaps else ""
     mean = "Mean ± sample standard deviation over n seeds" if any(cell.deviation is not None for cell in cells) else ""
     paper = (
-        f"{where} the paper's value and ours minus the paper's" if any(cell.paper is not None for cell in cells) else ""
+        f"{where}, the paper's value and ours minus the paper's"
+        if any(cell.paper is not None for cell in cells)
+        else ""
     )
     numbers = "; ".join(part for part in (mean, paper) if part)
     ranked = (

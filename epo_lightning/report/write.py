@@ -183,10 +183,9 @@ def write_report(
 
 def _caveat(tables: Sequence[Table]) -> str:
     """The preface in a sentence, for captions: tables of a paper are copied without what stands around them."""
-    budgets = sorted({run.budget for table in tables for row in table.rows for run in row.runs if run.learned})
-    return (
-        f"Budget: {', '.join(budgets) or 'none'}, other data or steps than the paper's: does not reproduce its table."
-    )
+    budgets = sorted({run.budget for table in tables for row in table.rows for run in row.runs} - {"paper"})
+    names = ", ".join(budgets or ["paper"])
+    return f"Budget: {names}, other data or steps than the paper's: does not reproduce its table."
 
 
 def _summary(left_out: Sequence[tuple[str, str]]) -> str:

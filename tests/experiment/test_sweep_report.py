@@ -65,6 +65,8 @@ def test_a_sweep_reports_its_runs_and_the_states_of_the_others(runs: Path) -> No
     written = (out / "results.md").read_text()
     assert "0.400 ± 0.141" in written
     assert "Not of the sweep" not in written
+    assert "**Budget: reduced.**" in written
+    assert r"\textbf{Budget: reduced, " in (out / "results.tex").read_text()
     assert "- `runs/e`: failed: ValueError: it broke" in written
     page = (out / "index.html").read_text()
     assert "3 runs left out" in page
@@ -89,6 +91,7 @@ def test_a_sweep_that_measures_time(runs: Path) -> None:
     assert out == Path("out")
     assert (out / "figures" / "runtime.png").is_file()
     assert not (out / "results.csv").exists()
+    assert "Budget:" not in (out / "results.md").read_text()  # a time does not depend on it
 
 
 def test_what_cannot_be_reported_is_said(runs: Path) -> None:

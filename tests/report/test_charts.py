@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -85,10 +86,13 @@ def test_the_half_of_a_line_is_no_value_and_a_repeated_step_counts_once(tmp_path
 
 def test_the_s_curve_joins_rows_that_differ_in_steps_alone(tmp_path: Path) -> None:
     over_steps(tmp_path / "steps")
+    shutil.rmtree(tmp_path / "steps" / "S8-s1")  # not done yet
     (curve,) = steps_curves(distinct(build_tables(collect(tmp_path))))
     assert (curve.name, curve.split, curve.paper) == ("V-LSTM + EPO", "rpi, val split", True)
     assert curve.optimised.x == (1, 2, 4, 8)
-    assert curve.optimised.mean == pytest.approx((0.061, 0.051, 0.041, 0.04))
+    assert curve.optimised.mean == pytest.approx((0.061, 0.051, 0.041, 0.039))
+    (chart,) = (chart for chart in charts_of(build_tables(collect(tmp_path)), []) if chart.section == "S curve")
+    assert [line[:2] for line in chart.numbers] == [("1", "2"), ("2", "2"), ("4", "2"), ("8", "1")]
     assert curve.initial is not None
     assert curve.initial.mean == pytest.approx((0.07, 0.08, 0.09, 0.1))
     drawn = lines(draw_steps(curve))

@@ -32,6 +32,8 @@ def write_page(folder: Path) -> Path:
         make(runs / make.__name__)
     make_run(runs / "odd", "<b>Odd</b> & \"co\" </script><script>alert('x')</script>", "marginal", scores(0.07))
     make_run(runs / "late", "Late", "epo", None, settings={"optimizer.lr": 0.5})
+    for lr in (0.001, 0.0003):
+        make_run(runs / f"lr{lr}", "Searched", "marginal", scores(lr), split="val", settings={"optimizer.lr": lr})
     pictures = [out / "figures" / name for name in ("scene_1.png", "learned_weights.png")]
     for picture in pictures:
         picture.parent.mkdir(parents=True, exist_ok=True)
