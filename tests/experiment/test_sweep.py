@@ -144,7 +144,7 @@ def test_folders_may_be_called_anything(epo: Epo, tmp_path: Path, monkeypatch: p
 
 
 def test_times_on_other_threads_are_other_times(epo: Epo) -> None:
-    words = ("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/v_lstm", "score=time")
+    words = ("sweep", "rpi_main", "data=drawn", "budget=untrained", "seed=0", "experiment=rpi/v_lstm", "score=time")
     for threads in (1, 2):
         assert epo(*words, f"trainer.threads={threads}") == 0
         (job,) = the_sweep().jobs
