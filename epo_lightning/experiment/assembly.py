@@ -115,7 +115,6 @@ def quiet() -> None:
         ".*does not have many workers.*",
         ".*Checkpoint directory .* exists and is not empty.*",
         ".*Experiment logs directory .* exists and is not empty.*",
-        ".*dirpath has changed.*",
         ".*LeafSpec.*",
         ".*configure_optimizers.*returned .None.*",
         ".*Found .* module.s. in eval mode.*",

@@ -1,4 +1,4 @@
-"""What watches a training run: random states and progress."""
+"""What watches a training run: its best and last epoch, when to stop, random states and progress."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import random
 import socket
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch import callbacks as of_lightning
+from lightning.pytorch.callbacks import TQDMProgressBar
 
 from epo_lightning.experiment.settings import CallbackSettings
 from epo_lightning.run_folder import RunFolder, write_json
@@ -59,6 +61,31 @@ class RandomStates(Callback):
         numpy.random.set_state((name, keys.numpy().astype("uint32"), position, has_gauss, gauss))  # noqa: NPY002
         version, internal, gauss_next = states["python"]
         random.setstate((version, tuple(internal), gauss_next))
+
+
+# These two keep the names of Lightning's own, because a checkpoint calls their states by them.
+
+
+class ModelCheckpoint(of_lightning.ModelCheckpoint):
+    """Knows its best epoch also in a run folder that was moved, where Lightning's own would begin to look for it again."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        def here(path: str) -> str:
+            return str(Path(str(self.dirpath)) / Path(path).name) if path else path
+
+        moved = {
+            "dirpath": self.dirpath,
+            "best_k_models": {here(path): score for path, score in state_dict["best_k_models"].items()},
+            **{key: here(state_dict[key]) for key in ("best_model_path", "kth_best_model_path", "last_model_path")},
+        }
+        super().load_state_dict({**state_dict, **moved})
+
+
+class EarlyStopping(of_lightning.EarlyStopping):
+    """Stops for good: a run that was killed right after it had stopped does not go on when it is continued."""
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        trainer.should_stop = trainer.should_stop or self.wait_count >= self.patience
 
 
 class EpochLines(Callback):

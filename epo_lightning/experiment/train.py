@@ -16,7 +16,6 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
-from lightning.pytorch.callbacks import ModelCheckpoint
 
 from epo_lightning.experiment import assembly, callbacks, distributed, gpus, logs
 from epo_lightning.experiment.compose import PACKAGE
@@ -172,7 +171,7 @@ def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Pat
         score = _best_score(run, trainer, settings.callbacks.monitor)
     run.update(
         status=FINISHED,
-        epochs=trainer.current_epoch,
+        epochs=trainer.fit_loop.epoch_progress.current.processed,  # current_epoch lags where no step was left to make
         steps=trainer.global_step,
         best={settings.callbacks.monitor: score},
         seconds=round(run.record.get("seconds", 0.0) + time.monotonic() - started, 1),
@@ -193,7 +192,8 @@ def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:
     Raises:
         Diverged: there is no finite one.
     """
-    best = [w.best_model_score for w in trainer.checkpoint_callbacks if isinstance(w, ModelCheckpoint) and w.monitor]
+    watchers = [w for w in trainer.checkpoint_callbacks if isinstance(w, callbacks.ModelCheckpoint) and w.monitor]
+    best = [w.best_model_score for w in watchers]
     score = next((float(value) for value in best if value is not None), None)
     score = float(trainer.callback_metrics.get(monitor, math.nan)) if score is None else score
     if not math.isfinite(score):
