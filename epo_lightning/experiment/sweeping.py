@@ -154,7 +154,7 @@ def known(extra: Sequence[str] = ()) -> dict[str, str]:
     says = {}
     with compose.hydra(extra) as instance:
         for option in compose.options_of(instance, "sweeps"):
-            files = (Path(folder) / "sweeps" / f"{option}.yaml" for folder in (*extra, compose.tree()))
+            files = (folder / "sweeps" / f"{option}.yaml" for folder in [*map(Path, extra), compose.tree()])
             lines = next((file.read_text(encoding="utf-8").splitlines() for file in files if file.is_file()), [])
             comments = [line.lstrip("# ") for line in lines if line.startswith("#") and "@package" not in line]
             says[option] = comments[0].partition(":  ")[0].rstrip(":") if comments else ""
