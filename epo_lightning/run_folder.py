@@ -224,8 +224,10 @@ class RunFolder:
             content = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))
         except OSError as error:
             raise ConfigError(f"cannot read {self.config_file}: {error.strerror}") from error
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{self.config_file} is not YAML: {error}") from error
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise ConfigError(
+                f"{self.config_file} is not YAML ({' '.join(str(error).split())}); was it edited or copied by half?"
+            ) from error
         if not isinstance(content, dict):
             raise ConfigError(f"{self.config_file} holds no configuration")
         return content

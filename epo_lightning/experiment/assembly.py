@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from lightning.fabric.plugins.environments import LightningEnvironment
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins import DoublePrecision
@@ -147,7 +148,7 @@ def build_trainer(
     """
     torch.set_num_threads(settings.threads)
     double = settings.precision == "64-true"
-    try:
+    with naming(settings, run):
         return Trainer(
             default_root_dir=run.path,
             accelerator=settings.accelerator,
@@ -175,24 +176,55 @@ def build_trainer(
             num_sanity_val_steps=0,
             inference_mode=False,  # the layer differentiates its energy also when it only forecasts
         )
-    except (ValueError, RuntimeError) as error:  # Lightning's MisconfigurationException among them
-        raise ConfigError(f"trainer: {' '.join(str(error).split())}") from error
+
+
+@contextmanager
+def naming(settings: TrainerSettings, run: RunFolder) -> Iterator[None]:
+    """Around the making of Lightning's trainer, whose complaints do not say which setting they are about.
+
+    Raises:
+        ConfigError: a device or precision that this machine does not have.
+    """
+    try:
+        yield
+    except (MisconfigurationException, ValueError, RuntimeError) as error:
+        raise ConfigError(
+            f"this machine has no device for trainer.accelerator={settings.accelerator}, trainer.precision="
+            f"{settings.precision} ({' '.join(str(error).split())}): trainer.accelerator=cpu works everywhere; "
+            f"that of a run which has begun stands in {run.config_file}"
+        ) from error
 
 
 @contextmanager
 def signals() -> Iterator[None]:
-    """Around Lightning's trainer, which answers Ctrl-C with a silent exit, and SIGTERM with one that says all is well."""
+    """Around Lightning's trainer, which answers Ctrl-C with a silent exit, and SIGTERM with one that says all is well.
+
+    Lightning looks between two batches whether a SIGTERM has come; here it is heard before the first one and in the last
+    one, too.
+    """
     main = threading.current_thread() is threading.main_thread()
-    handler = signal.getsignal(signal.SIGINT) if main else None
+    told = False
+
+    def end(*_: object) -> None:
+        nonlocal told
+        told = True
+        if signal.getsignal(signal.SIGTERM) is end:  # else Lightning's handler is there, and has called this one
+            raise SIGTERMException(128 + signal.SIGTERM)
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)} if main else {}
     try:
+        if main:
+            signal.signal(signal.SIGTERM, end)
         yield
     except SIGTERMException:
-        raise SystemExit(128 + signal.SIGTERM) from None
+        told = True
     except SystemExit:
         raise KeyboardInterrupt from None
     finally:
-        if main:
-            signal.signal(signal.SIGINT, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+    if told:
+        raise SystemExit(128 + signal.SIGTERM)
 
 
 def as_data(data: Any, overfit_batches: int = 0) -> LightningDataModule:

@@ -6,6 +6,7 @@ the move is a copy, and a kill in the middle of it leaves a run that cannot go o
 
 from __future__ import annotations
 
+import io
 import os
 import tempfile
 from pathlib import Path
@@ -19,12 +20,14 @@ class WholeCheckpoints(TorchCheckpointIO):
     """Writes beside the file that is to be, and renames."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
+        content = io.BytesIO()  # torch hides a full disk behind a complaint of its own
+        torch.save(checkpoint, content)
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
         try:
             with os.fdopen(descriptor, "wb") as file:
-                torch.save(checkpoint, file)
+                file.write(content.getbuffer())
                 file.flush()
                 os.fsync(file.fileno())
             Path(temporary).chmod(0o644)

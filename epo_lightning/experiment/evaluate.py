@@ -10,7 +10,7 @@ from lightning.pytorch import Trainer, seed_everything
 
 import epo_lightning
 from epo_lightning.experiment import assembly, gpus, logs
-from epo_lightning.experiment.settings import EvaluateSettings, Settings, read
+from epo_lightning.experiment.settings import EvaluateSettings, Settings, TrainerSettings, read
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, write_json
 
@@ -23,7 +23,7 @@ def evaluate(config: dict[str, Any]) -> list[tuple[RunFolder, dict[str, float]]]
     """
     assembly.quiet()
     settings = read(EvaluateSettings, config)
-    return [(run, _score(run, settings)) for run in _chosen(settings)]
+    return [(run, score(run, settings)) for run in _chosen(settings)]
 
 
 def _chosen(settings: EvaluateSettings) -> list[RunFolder]:
@@ -40,7 +40,17 @@ def _chosen(settings: EvaluateSettings) -> list[RunFolder]:
     return finished
 
 
-def _score(run: RunFolder, settings: EvaluateSettings) -> dict[str, float]:
+def score(run: RunFolder, settings: EvaluateSettings, machine: TrainerSettings | None = None) -> dict[str, float]:
+    """Score one run and write its metrics file.
+
+    Args:
+        run: a finished run.
+        settings: the split, the checkpoint and the batch size.
+        machine: the accelerator and the threads to compute with; by default those that the run began with.
+
+    Raises:
+        ConfigError: see :func:`evaluate`.
+    """
     if not run.finished:
         raise ConfigError(f"{run.path} is not finished: continue it with `epo train resume={run.path}`")
     of_run = read(Settings, run.config())
@@ -49,20 +59,22 @@ def _score(run: RunFolder, settings: EvaluateSettings) -> dict[str, float]:
     data = open_data(run, of_run, settings.batch_size)
     loader = split_of(data, settings.split)
     seed_everything(of_run.seed, workers=True, verbose=False)
-    torch.set_num_threads(of_run.trainer.threads)
+    machine = machine or of_run.trainer
+    torch.set_num_threads(machine.threads)
     double = of_run.trainer.precision == "64-true"
-    trainer = Trainer(
-        accelerator=of_run.trainer.accelerator,
-        devices=gpus.devices(of_run.trainer) if of_run.trainer.devices == 1 else 1,
-        precision=None if double else of_run.trainer.precision,  # type: ignore[arg-type]
-        plugins=[assembly.Double()] if double else None,
-        deterministic=of_run.trainer.deterministic,
-        inference_mode=False,  # the layer differentiates its energy also when it only forecasts
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
+    with assembly.naming(machine, run):
+        trainer = Trainer(
+            accelerator=machine.accelerator,
+            devices=gpus.devices(machine) if machine.devices == 1 else 1,
+            precision=None if double else of_run.trainer.precision,  # type: ignore[arg-type]
+            plugins=[assembly.Double()] if double else None,
+            deterministic=of_run.trainer.deterministic,
+            inference_mode=False,  # the layer differentiates its energy also when it only forecasts
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
     with assembly.signals():
         (scores,) = trainer.test(forecaster, dataloaders=loader, verbose=False)
     metrics = {name.removeprefix("test/"): float(value) for name, value in scores.items()}

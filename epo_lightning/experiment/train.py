@@ -19,8 +19,8 @@ from lightning.pytorch import LightningModule, Trainer, seed_everything
 
 from epo_lightning.experiment import assembly, callbacks, distributed, gpus, logs
 from epo_lightning.experiment.compose import PACKAGE
-from epo_lightning.experiment.evaluate import evaluate
-from epo_lightning.experiment.settings import Settings, read
+from epo_lightning.experiment.evaluate import score
+from epo_lightning.experiment.settings import EvaluateSettings, Settings, read
 from epo_lightning.identity import differences, identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
@@ -132,7 +132,7 @@ def _score(settings: Settings, run: RunFolder) -> None:
 
         measure(run, settings)
     else:
-        evaluate({"run": str(run.path), "split": settings.score})
+        score(run, EvaluateSettings(run=str(run.path), split=settings.score), settings.trainer)
 
 
 def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None = None) -> None:
@@ -168,12 +168,12 @@ def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Pat
             )
         else:
             _keep_unlearned(trainer, model, data, run)
-        score = _best_score(run, trainer, settings.callbacks.monitor)
+        best = _best_score(run, trainer, settings.callbacks.monitor)
     run.update(
         status=FINISHED,
-        epochs=trainer.fit_loop.epoch_progress.current.processed,  # current_epoch lags where no step was left to make
+        epochs=trainer.fit_loop.epoch_progress.current.ready,  # current_epoch lags where there was no step left to make
         steps=trainer.global_step,
-        best={settings.callbacks.monitor: score},
+        best={settings.callbacks.monitor: best},
         seconds=round(run.record.get("seconds", 0.0) + time.monotonic() - started, 1),
     )
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import shutil
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from experiment.conftest import TINY, Epo
 
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.callbacks import RandomStates
-from epo_lightning.run_folder import RunFolder
+from epo_lightning.forecasters.base import Forecaster
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder, read_json
 
 WORSENING = ("train", "experiment=rpi/v_lstm_sc", *TINY, "optimizer.lr=0.05", "trainer.max_epochs=4", "score=test")
 """A step so large that the validation gets worse: the best epoch is not the last one."""
@@ -78,5 +84,103 @@ def test_a_run_that_had_stopped_early_makes_no_further_step(epo: Epo) -> None:
         patch.setattr(training, "_best_score", fail)
         with pytest.raises(RuntimeError, match="power failure"):
             epo(*words, "run_dir=parts")
+    assert epo("train", "resume=parts") == 0
+    assert same("whole", "parts")
+
+
+@pytest.mark.parametrize(("during", "words"), [("test_step", ()), ("validation_step", ("budget=untrained",))])
+def test_a_run_that_is_terminated_while_it_is_measured_ends(
+    epo: Epo, monkeypatch: pytest.MonkeyPatch, during: str, words: tuple[str, ...]
+) -> None:
+    original = getattr(Forecaster, during)
+
+    def terminate(self: Forecaster, *batch: object) -> object:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return original(self, *batch)
+
+    words = (*WORSENING, *words, "trainer.limit_val_batches=1", "run_dir=parts", "existing=continue")
+    before = signal.getsignal(signal.SIGTERM)
+    with monkeypatch.context() as patch:
+        patch.setattr(Forecaster, during, terminate)
+        assert epo(*words) == 143
+    run = RunFolder(Path("parts"))
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert not run.metrics_file().exists()
+    assert not run.locked
+    assert epo(*words) == 0
+    assert run.metrics_file().exists()
+
+
+def test_a_run_that_is_terminated_outside_of_lightnings_loops_ends_at_once(
+    epo: Epo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = training._best_score
+
+    def terminate(*arguments: object) -> float:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return original(*arguments)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "_best_score", terminate)
+        assert epo(*WORSENING, "run_dir=parts") == 143
+    assert RunFolder(Path("parts")).state == "interrupted"
+
+
+def give_to(run: str, accelerator: str) -> None:
+    """As if the run had begun on another machine."""
+    file = RunFolder(Path(run)).config_file
+    file.write_text(file.read_text().replace("accelerator: cpu", f"accelerator: {accelerator}"))
+    assert RunFolder(Path(run)).config()["trainer"]["accelerator"] == accelerator
+
+
+def test_a_run_that_began_on_a_gpu_is_finished_and_scored_on_a_cpu(epo: Epo) -> None:
+    assert epo(*WORSENING, "run_dir=whole") == 0
+    begin_and_stop(epo, "parts", 3)
+    give_to("parts", "gpu")
+    assert epo(*WORSENING, "run_dir=parts", "existing=continue") == 0
+    assert same("whole", "parts")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_missing_gpu_is_named(epo: Epo, refused: Callable[..., str]) -> None:
+    assert epo(*WORSENING, "run_dir=run") == 0
+    give_to("run", "gpu")
+    RunFolder(Path("run")).metrics_file().unlink()
+    assert "trainer.accelerator=gpu" in refused("evaluate", "run=run")
+
+
+def test_garbage_in_a_run_folder_is_named(tmp_path: Path) -> None:
+    garbage = b"\xff\xfe\x00garbage"
+    (tmp_path / "config.yaml").write_bytes(garbage)
+    (tmp_path / "run.json").write_bytes(garbage)
+    with pytest.raises(ConfigError, match=r"config\.yaml is not YAML"):
+        RunFolder(tmp_path).config()
+    with pytest.raises(ConfigError, match=r"run\.json is not JSON"):
+        read_json(tmp_path / "run.json")
+
+
+@contextmanager
+def files_of_at_most(count: int) -> Iterator[None]:
+    """A disk on which larger files find no place."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (count, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_is_said_to_be_full_and_the_run_goes_on_when_it_is_not(
+    epo: Epo, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert epo(*WORSENING, "run_dir=whole") == 0
+    capsys.readouterr()
+    with files_of_at_most(200_000):
+        assert epo(*WORSENING, "run_dir=parts") == 1
+    assert "epo: File too large" in capsys.readouterr().err
+    run = RunFolder(Path("parts"))
+    assert run.state == "failed"
+    assert "File too large" in run.record["error"]
+    assert not list(run.checkpoints.iterdir())
     assert epo("train", "resume=parts") == 0
     assert same("whole", "parts")
