@@ -1,36 +1,25 @@
-"""Workers whose sweep has died: they finish the run at hand, and end."""
+"""Workers whose sweep has died end as well; what they trained goes on from its last epoch at the next start."""
 
 from __future__ import annotations
 
 import os
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
-
-_busy = threading.Lock()
-
-
-@contextmanager
-def working_for(driver: int) -> Iterator[None]:
-    """Around a run of a sweep: if this process is a child of the ``driver``, it does not outlive it by more than this run.
-
-    Pools of processes (joblib's) otherwise wait for more work for ever, and hold the terminal. Jobs of a cluster are
-    nobody's children and go on.
-    """
-    if os.getppid() == driver:
-        _watch(driver)
-    with _busy:
-        yield
 
 
 @cache
-def _watch(driver: int) -> None:
+def end_with(driver: int) -> None:
+    """If this process is a child of the ``driver``, do not outlive it.
+
+    Pools of processes (joblib's) otherwise work on, wait for more for ever, and hold the terminal. Jobs of a cluster are
+    nobody's children and go on.
+    """
+
     def watch() -> None:
         while os.getppid() == driver:
-            time.sleep(1.0)
-        with _busy:
-            os._exit(1)
+            time.sleep(0.5)
+        os._exit(1)
 
-    threading.Thread(target=watch, name="orphan", daemon=True).start()
+    if os.getppid() == driver:
+        threading.Thread(target=watch, name="orphan", daemon=True).start()

@@ -29,7 +29,7 @@ from typing import Any, Literal
 
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
-from epo_lightning.experiment.orphans import working_for
+from epo_lightning.experiment.orphans import end_with
 from epo_lightning.experiment.settings import Settings, read
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
@@ -250,14 +250,14 @@ class Sweep:
             os.environ.setdefault("EPO_CACHE", record["cache"])
         if record["stop_on_failure"] and any((self.folder / "failures").glob("*.txt")):
             return None
+        end_with(record["process"])
         settings = read(Settings, config)
         run = training.folder_for(settings)
         try:
             if not record["jobs"]:
                 name = self._failure(run).with_suffix(".json").name
                 write_json(self.folder / "found" / name, self._entry(Job.of(config, overrides)))
-            with working_for(record["process"]):
-                training.train(dict(config), overrides)
+            training.train(dict(config), overrides)
         except Exception as error:
             message = f"{type(error).__name__}: {' '.join(str(error).split())}"
             message = message.replace(f"{self.root}{os.sep}", f"{os.path.relpath(self.root)}{os.sep}")
