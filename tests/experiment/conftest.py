@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,9 +18,10 @@ Epo = Callable[..., int]
 
 
 @pytest.fixture
-def epo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Epo:
+def epo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Epo]:
     """Run a command line in an empty folder; returns its exit status."""
     monkeypatch.chdir(tmp_path)
+    handlers = list(logging.getLogger().handlers)
 
     def run(*words: str) -> int:
         try:
@@ -28,7 +30,8 @@ def epo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Epo:
             return int(done.code or 0)
         return 0
 
-    return run
+    yield run
+    logging.getLogger().handlers[:] = handlers  # Hydra's own write to what this test's output was
 
 
 @pytest.fixture
