@@ -97,7 +97,7 @@ class MLP(nn.Module):
             # Batch normalisation takes away what a bias adds: the bias's gradient is zero but for rounding errors. Adam
             # would make steps of full length of these, and the running means, which lag behind, would let them be seen.
             for linear in hidden:
-                linear.bias.register_hook(torch.zeros_like)
+                linear.bias.requires_grad_(False)
 
     def forward(
         self, features: Float[Tensor, "*batch inputs"], mask: Bool[Tensor, "*batch"] | None = None

@@ -135,14 +135,14 @@ def read_run(run: RunFolder) -> list[EvaluatedRun]:
     if not files:
         return []
     _require_records(run)
-    config, record = _sound(run.config_file, run.config, COPY), _sound(run.record_file, lambda: run.record, COPY)
+    config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
     return [_read_split(run, config, record, file) for file in files]
 
 
 def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, Any], file: Path) -> EvaluatedRun:
     split = file.stem.removeprefix("metrics").removeprefix("-") or "test"
     again = f"epo evaluate run={run.path} split={split} writes it again"
-    result = _sound(file, lambda: read_json(file), again)
+    result = _sound(lambda: read_json(file), again)
     metrics = _entry(result, file, again, "metrics")
     if not isinstance(metrics, Mapping) or not all(isinstance(value, int | float) for value in metrics.values()):
         raise ConfigError(f"{file}: metrics must be numbers by name; {again}")
@@ -200,14 +200,12 @@ def _entry(content: Any, file: Path, remedy: str, *keys: str) -> Any:
     return content
 
 
-def _sound(file: Path, read: Callable[[], dict[str, Any]], remedy: str) -> dict[str, Any]:
+def _sound(read: Callable[[], dict[str, Any]], remedy: str) -> dict[str, Any]:
     """What ``read`` reads of a file; if it cannot, its error with what to do about it."""
     try:
         return read()
     except ConfigError as error:
         raise ConfigError(f"{error}; {remedy}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{file} is not text ({error}); {remedy}") from error
 
 
 def _require_records(run: RunFolder) -> None:

@@ -89,7 +89,7 @@ def test_without_a_decoder_of_strategies_solutions_start_at_zero():
     sum(weight * value for weight, value in epo.losses(scene, forecast).values()).backward()
     for name, parameter in epo.named_parameters():
         assert not name.startswith("strategies")
-        assert parameter.grad.abs().sum() > 0, name
+        assert not parameter.requires_grad or parameter.grad.abs().sum() > 0, name
 
 
 @pytest.mark.parametrize("backbone", ["v_lstm", "vibes", "hivt_m"])
@@ -106,7 +106,7 @@ def test_without_a_goal_in_the_energy_no_goal_is_decoded(backbone):
     sum(weight * value for weight, value in terms.values()).backward()
     for name, parameter in epo.named_parameters():
         assert "goal" not in name
-        assert parameter.grad.abs().sum() > 0, name
+        assert not parameter.requires_grad or parameter.grad.abs().sum() > 0, name
 
 
 def test_constant_velocity_keeps_heading_and_speed_on_a_map():
@@ -132,7 +132,7 @@ def test_an_agent_without_a_future_teaches_nothing():
             scene.future_mask[:, 1] = False
             scene.future[~scene.future_mask] = filling
             sum(weight * value for weight, value in learner.losses(scene, learner(scene)).values()).backward()
-            gradients.append([p.grad for p in learner.parameters()])
+            gradients.append([p.grad for p in learner.parameters() if p.requires_grad])
         torch.testing.assert_close(gradients[0], gradients[1], rtol=0, atol=0)
         assert all(gradient.isfinite().all() for gradient in gradients[1])
 

@@ -315,7 +315,7 @@ COPY = r"copy the run folder again"
         ("config.yaml", "a: [", f"config.yaml is not YAML.*{COPY}"),
         ("config.yaml", "title: x", f"config.yaml has no entry seed.*{COPY}"),
         ("config.yaml", "title: x\nseed: one", f"config.yaml: seed must be a whole number, not 'one'.*{COPY}"),
-        ("config.yaml", b"title: \xff", f"config.yaml is not text.*{COPY}"),
+        ("config.yaml", b"title: \xff", f"config.yaml is not YAML.*{COPY}"),
         ("run.json", "{", f"run.json is not JSON.*{COPY}"),
         ("run.json", "{}", f"run.json has no entry data_digest.*{COPY}"),
         ("run.json", '{"data_digest": "abc"}', f"run.json has no entry command.*{COPY}"),
