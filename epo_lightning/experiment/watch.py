@@ -28,7 +28,7 @@ POLL = 2.0
 """Seconds between two looks at the run folders."""
 
 
-def status(sweep: Sweep, console: Console | None = None) -> Counter[State]:
+def status(sweep: Sweep) -> Counter[State]:
     """Print the state of every run; returns how many there are of each."""
     jobs = sweep.jobs
     states = [sweep.state(job) for job in jobs]
@@ -38,7 +38,7 @@ def status(sweep: Sweep, console: Console | None = None) -> Counter[State]:
         table.add_column(column, overflow="fold")
     for job, state in zip(jobs, states, strict=True):
         table.add_row(escape(names[job.run.path]), Text(state, STYLES[state]), escape(_details(sweep, job, state)))
-    console = console or Console()
+    console = Console()
     console.print(sweep.record["command"], style="bold", highlight=False, markup=False)
     console.print(table)
     counts = Counter(states)

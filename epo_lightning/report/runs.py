@@ -98,8 +98,7 @@ def collect(runs: str | Path | Iterable[RunFolder]) -> list[EvaluatedRun]:
     """All evaluated runs, one entry for every split that a run was evaluated on.
 
     Args:
-        runs: run folders, or a folder in and below which they are looked for. Runs without scores are left out,
-            :func:`not_evaluated` names them.
+        runs: run folders, or a folder in and below which they are looked for. Runs without scores are left out.
 
     Raises:
         ConfigError: no folder, no run or no evaluated run (with the command that makes one), or a damaged file.
@@ -114,11 +113,6 @@ def collect(runs: str | Path | Iterable[RunFolder]) -> list[EvaluatedRun]:
         remedy = f"epo evaluate runs={runs}" if isinstance(runs, str | Path) else f"epo evaluate run={begun.path}"
         raise ConfigError(f"none of the {len(known)} runs {where} is evaluated: {remedy} does it")
     return found
-
-
-def not_evaluated(runs: str | Path | Iterable[RunFolder]) -> list[Path]:
-    """Run folders that a report has to leave out, because nothing was scored there yet."""
-    return [run.path for run in _listed(runs) if not scored(run)]
 
 
 def _listed(runs: str | Path | Iterable[RunFolder]) -> list[RunFolder]:
