@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from epo_lightning.experiment.compose import compose
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene
 
 SETTINGS = ("exid", "rpi", "sparse")
@@ -42,7 +42,7 @@ class Game:
     """
 
     setting: str
-    energy: Energy
+    energy: FeatureEnergy
     scene: Scene
     parameters: GameParameters
     steps: int
@@ -74,7 +74,7 @@ def make(setting: str, seed: int = 0, **sizes: int | None) -> Game:
     draw = torch.Generator().manual_seed(seed)
     batch, modes, agents, horizon, steps = (chosen[name] for name in "BMNKS")
     scene = (_walkers if setting == "rpi" else _vehicles)(batch, agents, horizon, setting == "sparse", draw)
-    energy = _rpi_energy() if setting == "rpi" else Energy(own=HIGHWAY)
+    energy = _rpi_energy() if setting == "rpi" else FeatureEnergy(own=HIGHWAY)
     parameters = _parameters(energy, scene, modes, horizon, draw)
     return Game(setting, energy, scene, parameters, steps).to(torch.float32)
 
@@ -86,10 +86,10 @@ def activity(game: Game) -> tuple[float, float]:
     return overlaps.any(-1).float().mean().item(), overlaps.float().mean().item()
 
 
-def _rpi_energy() -> Energy:
+def _rpi_energy() -> FeatureEnergy:
     section = dict(compose("train", ["experiment=rpi/v_lstm_epo"])["energy"])
     del section["name"]
-    return Energy(**section)
+    return FeatureEnergy(**section)
 
 
 def _between(low: float, high: float, *shape: int, draw: torch.Generator) -> Tensor:
@@ -140,7 +140,7 @@ def _walkers(batch: int, agents: int, horizon: int, _: bool, draw: torch.Generat
     return Scene(history=state[:, :, None], dt=dt, size=torch.full((batch, agents, 2), 0.5, dtype=torch.float64))
 
 
-def _parameters(energy: Energy, scene: Scene, modes: int, horizon: int, draw: torch.Generator) -> GameParameters:
+def _parameters(energy: FeatureEnergy, scene: Scene, modes: int, horizon: int, draw: torch.Generator) -> GameParameters:
     """Weights about one, goals near where everybody would be anyway, initial strategies near zero."""
     batch, agents = scene.agent_mask.shape
     speed = scene.current[..., 3]

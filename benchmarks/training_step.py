@@ -22,7 +22,7 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.compose import compose
 from epo_lightning.experiment.settings import Settings, read
 from epo_lightning.forecasters import Forecaster
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import GameParameters, Scene, Solution
 
@@ -66,11 +66,11 @@ class Cut:
     run through the backbone before that of the layer is known.
     """
 
-    def __init__(self, solver: Callable[[Energy, Scene, GameParameters], Solution], clock: Clock) -> None:
+    def __init__(self, solver: Callable[[FeatureEnergy, Scene, GameParameters], Solution], clock: Clock) -> None:
         self.solver, self.clock = solver, clock
         self.features, self.inputs, self.outputs = Edges(), Edges(), Edges()
 
-    def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
+    def __call__(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Solution:
         """Solve, between two cuts."""
         parameters = parameters.map(self.inputs.cut)
         with self.clock.stage("layer, forward"):

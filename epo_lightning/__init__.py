@@ -2,7 +2,7 @@
 
 The layer on plain tensors::
 
-    from epo_lightning import Energy, GameParameters, LevenbergMarquardt, Scene
+    from epo_lightning import FeatureEnergy, GameParameters, LevenbergMarquardt, Scene
 
 A trained forecaster from any folder::
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from epo_lightning.forecasters import load
     from epo_lightning.game.dynamics import Unicycle
     from epo_lightning.game.energy import Energy
+    from epo_lightning.game.feature_energy import FeatureEnergy
     from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
     from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
@@ -26,6 +27,7 @@ _HOMES = {
     "load": "forecasters",
     "Unicycle": "game.dynamics",
     "Energy": "game.energy",
+    "FeatureEnergy": "game.feature_energy",
     "GameParameters": "scene",
     "JointForecast": "scene",
     "Scene": "scene",
@@ -36,6 +38,7 @@ _HOMES = {
 
 __all__ = [
     "Energy",
+    "FeatureEnergy",
     "GameParameters",
     "JointForecast",
     "LevenbergMarquardt",

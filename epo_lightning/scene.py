@@ -233,6 +233,9 @@ class GameParameters(_Batch):
         initial_controls: the strategies from which the solver starts.
         reference: index of the reference line that an agent follows, the one its goal lies on; None for energies without a
             lane feature.
+        context: features z of the agents, for energies that are networks.
+        order: +1 or -1 for every pair i < j, on which side of each other they pass or who goes first, for energies that are
+            convex given the order.
     """
 
     own_weights: Mapping[str, Float[Tensor, "B M N"]]
@@ -240,6 +243,8 @@ class GameParameters(_Batch):
     initial_controls: Float[Tensor, "B M N K 2"]
     goals: Float[Tensor, "B M N 2"] | None = None
     reference: Int[Tensor, "B M N"] | None = None
+    context: Float[Tensor, "B N D"] | None = None
+    order: Float[Tensor, "B M P"] | None = None
 
 
 class Status(IntEnum):

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import torch
 
 from epo_lightning.game import features
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import GameParameters, Scene
@@ -260,7 +260,9 @@ def times(model, change, damping):
     return control + model.dt * node.flip(-1).cumsum(-1).flip(-1)
 
 
-def normal_equations(energy: Energy, scene: Scene, parameters: GameParameters, controls: torch.Tensor, exact=False):
+def normal_equations(
+    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: torch.Tensor, exact=False
+):
     """The model's gradient [B, M, N, K, 2] and matrix [B, M, n, n] in the controls, in the order of ``controls``."""
     model = QuadraticModel(energy, scene, parameters, controls, every_pair=True, exact=exact)
     none, steps, agents = controls.new_zeros(model.samples), model.steps, model.agents

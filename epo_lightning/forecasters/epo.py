@@ -15,7 +15,7 @@ from epo_lightning.decoders.strategies import InitialStrategies
 from epo_lightning.decoders.weights import OwnWeights, PairWeights
 from epo_lightning.forecasters.base import Forecaster, Task, observed_future, weights_of
 from epo_lightning.forecasters.scene_consistent import joint_losses
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, JointForecast, Scene
@@ -53,7 +53,7 @@ class EPO(Forecaster):
         task: Task,
         optimizer: Adam,
         backbone: Backbone,
-        energy: Energy,
+        energy: FeatureEnergy,
         solver: LevenbergMarquardt,
         modes: int,
         loss_weights: Mapping[str, float],

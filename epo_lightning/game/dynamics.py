@@ -11,6 +11,7 @@ with beta = 1 for explicit Euler (the paper), 0 for semi-implicit Euler and 1/2 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -29,6 +30,22 @@ def _direction(heading: Float[Tensor, "..."]) -> Float[Tensor, "... 2"]:
 def _turn_left(vector: Float[Tensor, "... 2"]) -> Float[Tensor, "... 2"]:
     """R(90 degrees) times a vector."""
     return torch.stack((-vector[..., 1], vector[..., 0]), -1)
+
+
+class Dynamics(Protocol):
+    """What turns controls into states; each agent's on its own."""
+
+    def rollout(
+        self, initial: Float[Tensor, "*#batch 4"], controls: Float[Tensor, "*batch K 2"], dt: float
+    ) -> Float[Tensor, "*batch K 4"]:
+        """The states x_1 .. x_K that piecewise constant controls u_0 .. u_{K-1} lead to from x_0."""
+        ...
+
+    def tangent(
+        self, states: Float[Tensor, "*batch K 4"], direction: Float[Tensor, "D *batch K 2"], dt: float
+    ) -> Float[Tensor, "D *batch K 4"]:
+        """How the states that :meth:`rollout` returned change along D directions of the controls."""
+        ...
 
 
 @register("dynamics", "unicycle")

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from epo_lightning.game.energy import Energy, pairs
+from epo_lightning.game.energy import pairs
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene
 
 
@@ -46,7 +47,7 @@ class Edges:
 
     @classmethod
     def near(
-        cls, energy: Energy, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B M N K 4"]
+        cls, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B M N K 4"]
     ) -> Edges:
         """The pairs that may matter: both agents exist, a weight is not zero, and their ways' boxes come within reach."""
         batch, modes, agents = states.shape[:3]

@@ -1,32 +1,31 @@
-"""The energy of a joint strategy: one potential for all agents, a sum of squared, weighted, named residuals."""
+"""What an energy is: a sum of terms of single agents and of pairs, and thereby the potential of a game (Eq. 7).
+
+    E(u; o) = sum_i E_i(u_i; o) + sum_{i<j} E_ij(u_i, u_j; o)
+
+Agent i's own objective is J_i = E_i + sum_j E_ij. Pair terms are symmetric, so dE/du_i = dJ_i/du_i: where no agent can gain
+by changing its strategy alone, the energy cannot fall by changing one agent's strategy, and the other way round (Theorem 1).
+Everything in this family of methods (the paper's Table 1) needs an energy for no more than its terms.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.game.circles import disc, overlap, separation
-from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.features import (
-    OWN_FEATURES,
-    PAIR_FEATURES,
-    WHEELBASE,
-    OwnFeature,
-    PairFeature,
-    Source,
-    Surroundings,
-    signal,
-    signal_change,
-    slope,
-    violation,
-)
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.scene import GameParameters, Scene
+
+GRADIENT, RESIDUALS, FEATURES, CONVEX = "gradient", "residuals", "features", "convex"
+"""What an energy may offer besides values: a gradient by the controls, residuals of which it is half the sum of squares,
+named features whose structure a solver knows, convexity in the controls."""
+
+_TABLE_ENTRIES = 2_000_000
+"""Steps of pairs of candidates that are looked at together: a bound on memory."""
 
 
 def pairs(agents: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
@@ -35,165 +34,73 @@ def pairs(agents: int, device: torch.device | None = None) -> tuple[Tensor, Tens
     return first, second
 
 
-@register("energy", "features")
-@dataclass(frozen=True)
-class Energy:
-    """The potential of Eqs. 10 and 11, E = 1/2 sum_i |w_i c(u_i, g_i)|^2 + 1/2 sum_{i<j} |w_ij d(u_i, u_j)|^2.
-
-    Every named feature is weighted on its own: a residual is w c, so weights enter the energy squared and their sign is of
-    no consequence. Because the pair terms are symmetric, a minimiser of E is an open-loop Nash equilibrium in which agent
-    i minimises its own terms plus the pair terms it takes part in (Theorem 1).
-
-    A pair whose weight is exactly zero is no edge of the game: it costs nothing to solve, and because weights enter squared
-    its weight has no gradient either. Setting weights to zero is thus how a game is told which pairs interact.
-
-    Example::
-
-        energy = Energy(own=["goal", "vel", "acc", "turnr"], pair=["proximity"])
-        energy(scene, parameters, controls)            # [B, M]
-        energy.residuals(scene, parameters, controls)  # {"goal": [B, M, N, 2], ..., "proximity": [B, M, P, K]}
+class Energy(ABC):
+    """The interface of all energies. A subclass says what its terms are; how they add up stands here.
 
     Attributes:
-        own: names out of :data:`~epo_lightning.game.features.OWN_FEATURES`, where one's own are found too
-            (:func:`~epo_lightning.game.features.own_feature`).
-        pair: names out of :data:`~epo_lightning.game.features.PAIR_FEATURES`. Discs have half an agent's length as radius;
-            for the rows of circles see :mod:`~epo_lightning.game.circles`.
-        bounds: lowest and highest value of a signal, for features whose name ends in ``b``: ``{"vel": (-0.05, 2.0)}``.
+        offers: some of :data:`GRADIENT`, :data:`RESIDUALS`, :data:`FEATURES` and :data:`CONVEX`.
+        own, pair: names of the terms of agents and of pairs.
         dynamics: what turns controls into states.
-        pair_stride: pairs are looked at in every step (1), every second step (2), ...: k = stride, 2 stride, ...
     """
 
+    offers: ClassVar[frozenset[str]] = frozenset()
     own: Sequence[str]
-    pair: Sequence[str] = ("proximity",)
-    bounds: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    dynamics: Unicycle = field(default_factory=Unicycle)
-    pair_stride: int = 1
+    pair: Sequence[str]
+    dynamics: Dynamics
 
-    def __post_init__(self) -> None:
-        for kind, names, known in (("own", self.own, OWN_FEATURES), ("pair", self.pair, PAIR_FEATURES)):
-            if isinstance(names, str):
-                raise ConfigError(f"energy.{kind} takes a list of names, not the one name {names!r}")
-            for name in names:
-                if name not in known:
-                    raise ConfigError(f"unknown {kind} feature {name!r}: {nearest(str(name), known)}")
-            if len(set(names)) < len(names):
-                raise ConfigError(f"energy.{kind} names a feature twice: {list(names)}")
-        if not self.own and not self.pair:
-            raise ConfigError("an energy needs at least one feature")
-        for name, feature in self.own_features.items():
-            if feature.bounded and feature.signal not in self.bounds:
-                raise ConfigError(f"feature {name!r} needs energy.bounds.{feature.signal}: [lowest, highest]")
-        if not isinstance(self.pair_stride, int) or self.pair_stride < 1:
-            raise ConfigError(f"energy.pair_stride must be a whole number, 1 or more, not {self.pair_stride}")
-        signals = {feature.signal for feature in OWN_FEATURES.values() if feature.bounded}
-        for name, bound in self.bounds.items():
-            if name not in signals:
-                raise ConfigError(f"unknown signal energy.bounds.{name}: {nearest(name, signals)}")
-            if len(bound) != 2 or not bound[0] < bound[1]:
-                raise ConfigError(f"energy.bounds.{name} must be [lowest, highest], not {list(bound)}")
+    @property
+    def weighted(self) -> tuple[Sequence[str], Sequence[str]]:
+        """Names of the own and pair terms that a decoded weight multiplies."""
+        return self.own, self.pair
 
-    @cached_property
-    def own_features(self) -> dict[str, OwnFeature]:
-        """The own features by name."""
-        return {name: OWN_FEATURES[name] for name in self.own}
-
-    @cached_property
-    def pair_features(self) -> dict[str, PairFeature]:
-        """The pair features by name."""
-        return {name: PAIR_FEATURES[name] for name in self.pair}
-
-    @cached_property
+    @property
     def needs(self) -> set[str]:
-        """What the own features refer to: some of ``goals``, ``reference``, ``reference_speed``, ``size``."""
-        return {feature.needs for feature in self.own_features.values() if feature.needs}
+        """Of ``goals``, ``reference``, ``reference_speed``, ``size``, ``context`` and ``order``, what the terms refer to."""
+        return set()
 
-    @cached_property
-    def needs_goals(self) -> bool:
-        """Whether a feature asks where agents are heading."""
-        return "goals" in self.needs
-
-    @cached_property
-    def needs_reach(self) -> bool:
-        """Whether a pair feature asks for the agents' radii."""
-        return any(feature.source is Source.DISTANCE for feature in self.pair_features.values())
-
-    @cached_property
-    def needs_shape(self) -> bool:
-        """Whether a pair feature asks for the agents' lengths and widths."""
-        return any(feature.needs == "size" for feature in self.pair_features.values())
-
-    def residuals(
-        self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
-    ) -> dict[str, Float[Tensor, "B M _ _"]]:
-        """Weighted residuals w c by feature: [B, M, N, R] for own features and [B, M, P, R] for pairs.
-
-        R is K, K - 1 for jerk and turnacc, 2 for the goal, 2 K for the lane, the number of evaluated steps for pairs, and
-        what the function returns for undeclared features. Absent agents have residuals of zero.
-
-        Raises:
-            ValueError: shapes or names of scene, parameters and controls that do not fit together.
-        """
-        self.validate(scene, parameters, controls)
-        still = controls.new_zeros(0, *controls.shape)
-        return {name: residual for name, residual, _ in self._features(scene, parameters, controls, still)}
-
-    def linearisation(
+    @abstractmethod
+    def own_terms(
         self,
         scene: Scene,
         parameters: GameParameters,
-        controls: Float[Tensor, "B M N K 2"],
-        directions: Float[Tensor, "D B M N K 2"],
-    ) -> tuple[Float[Tensor, "B M R"], Float[Tensor, "D B M R"]]:
-        """All residuals r in one row, and their change J v along D directions v of the controls.
+        states: Float[Tensor, "B C N K 4"],
+        controls: Float[Tensor, "B C N K 2"],
+    ) -> dict[str, Float[Tensor, "B C N"]]:
+        """E_i by name, zero for absent agents. The parameters hold C games, or one for all."""
 
-        Both are differentiable with respect to controls and parameters; hinges keep their side.
+    @abstractmethod
+    def pair_terms(
+        self,
+        scene: Scene,
+        parameters: GameParameters,
+        first: Float[Tensor, "B C P K 4"],
+        second: Float[Tensor, "B C P K 4"],
+    ) -> dict[str, Float[Tensor, "B C P"]]:
+        """E_ij by name for the states of both agents of every pair, zero where one is absent. Symmetric."""
+
+    def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
+        """Refuse tensors that do not fit together, naming the one that does not and the shape it should have.
+
+        Raises:
+            ValueError: as said.
         """
-        _, residuals, changes = zip(*self._features(scene, parameters, controls, directions), strict=True)
-        return torch.cat([r.flatten(2) for r in residuals], -1), torch.cat([c.flatten(3) for c in changes], -1)
-
-    def _features(
-        self, scene: Scene, parameters: GameParameters, controls: Tensor, directions: Tensor
-    ) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Name, weighted residual and its change along every direction of one feature after the other."""
-        controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
-        around = self.surroundings(scene, parameters)
-        states = self.dynamics.rollout(around.initial, controls, scene.dt)
-        moved = self.dynamics.tangent(states, directions, scene.dt)
-        for name, feature in self.own_features.items():
-            if feature.source is Source.TRAJECTORY:
-                assert feature.function is not None
-                value, change = along(feature.function, (states, controls), (moved, directions))
-                present = scene.agent_mask[:, None, :, None]
-                value, change = torch.where(present, value, 0.0), torch.where(present, change, 0.0)
-            else:
-                value, steepness = self.shape(feature, signal(feature, states, controls, around))
-                change = steepness * signal_change(feature, states, controls, moved, directions, around)
-            weight = self.own_weight(scene, parameters, name)[..., None]
-            yield name, weight * value, weight * change
-        if not self.pair:
-            return
-        first, second = pairs(controls.shape[2], controls.device)
-        states, moved = self.at_pair_steps(states), self.at_pair_steps(moved)
-        both, apart = (states[:, :, first], states[:, :, second]), (moved[:, :, :, first], moved[:, :, :, second])
-        distance, normal = separation(both[0][..., :2], both[1][..., :2])
-        closing = (normal * (apart[0] - apart[1])[..., :2]).sum(-1)
-        for name, pair in self.pair_features.items():
-            if pair.source is Source.TRAJECTORY:
-                sizes = [self.size(scene)[:, None, agents, None] for agents in (first, second) if pair.needs]
-                value, change = along(pair.function, both, apart, *sizes)
-            else:
-                value, steepness = self.pair_shape(pair, distance, self.reach(scene)[:, None, :, None])
-                change = steepness * closing
-            exists = self.pair_mask(scene)[:, None, :, None]
-            weight = self.pair_weight(scene, parameters, name)[..., None]
-            yield name, weight * torch.where(exists, value, 0.0), weight * torch.where(exists, change, 0.0)
+        batch, agents = scene.agent_mask.shape
+        if controls.dim() != 5 or controls.shape[0] != batch or controls.shape[2] != agents or controls.shape[4] != 2:
+            expected = f"[{batch}, M, {agents}, K, 2]"
+            raise ValueError(f"controls have shape {list(controls.shape)}; this scene takes {expected}")
 
     def terms(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> dict[str, Float[Tensor, "B M _"]]:
-        """The energy by feature and agent [B, M, N], or by feature and pair [B, M, P]."""
-        residuals = self.residuals(scene, parameters, controls)
-        return {name: 0.5 * residual.square().sum(-1) for name, residual in residuals.items()}
+        """The energy by term and agent [B, M, N], or by term and pair [B, M, P]."""
+        self.validate(scene, parameters, controls)
+        controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
+        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
+        first, second = pairs(controls.shape[2], controls.device)
+        return {
+            **self.own_terms(scene, parameters, states, controls),
+            **self.pair_terms(scene, parameters, states[:, :, first], states[:, :, second]),
+        }
 
     def __call__(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
@@ -201,175 +108,62 @@ class Energy:
         """The energy of every joint strategy."""
         return torch.stack([term.sum(-1) for term in self.terms(scene, parameters, controls).values()]).sum(0)
 
-    def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
-        """Refuse tensors that do not fit together, naming the one that does not and the shape it should have.
-
-        Raises:
-            ValueError: a wrong shape, a missing weight, missing goals, references, reference speeds or sizes.
-        """
-        batch, agents = scene.agent_mask.shape
-        if controls.dim() != 5 or controls.shape[0] != batch or controls.shape[2] != agents or controls.shape[4] != 2:
-            expected = f"[{batch}, M, {agents}, K, 2]"
-            raise ValueError(f"controls have shape {list(controls.shape)}; this scene takes {expected}")
-        modes, steps = controls.shape[1], controls.shape[3]
-        if steps < 2:
-            raise ValueError(f"controls span K = {steps} step(s); an energy needs at least 2")
-        for kind, names, given, count in (
-            ("own_weights", self.own, parameters.own_weights, agents),
-            ("pair_weights", self.pair, parameters.pair_weights, agents * (agents - 1) // 2),
-        ):
-            for name in names:
-                if name not in given:
-                    raise ValueError(f"{kind} lacks the feature {name!r}; it has {sorted(given)}")
-                shape = list(given[name].shape) if isinstance(given[name], Tensor) else given[name]
-                if shape != [batch, modes, count]:
-                    raise ValueError(f"{kind}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}")
-        needed: dict[str, tuple[tuple[str, Tensor | None], ...]] = {
-            "goals": (("parameters.goals", parameters.goals),),
-            "reference": (("scene.references", scene.references), ("parameters.reference", parameters.reference)),
-            "reference_speed": (("scene.reference_speed", scene.reference_speed),),
-            "size": (("scene.size", scene.size),),
-        }
-        for name, feature in self.own_features.items():
-            for what, value in needed[feature.needs] if feature.needs else ():
-                if value is None:
-                    raise ValueError(f"the energy has the feature {name!r}, but {what} is None")
-                takes = {"parameters.goals": [batch, modes, agents, 2], "parameters.reference": [batch, modes, agents]}
-                if list(value.shape) != takes.get(what, list(value.shape)):
-                    raise ValueError(f"{what} has shape {list(value.shape)}; these controls take {takes[what]}")
-        if "reference" in self.needs and parameters.reference.is_floating_point():  # type: ignore[union-attr]
-            raise ValueError("parameters.reference holds indices of lines: it takes whole numbers, not floats")
-        if "reference" in self.needs and controls.device.type == "cpu":  # elsewhere, looking would make the host wait
-            assert scene.references is not None
-            assert parameters.reference is not None
-            lines = scene.references.shape[2]
-            index = torch.where(scene.agent_mask[:, None], parameters.reference, 0)
-            if (scene.agent_mask[:, None] & ((index < 0) | (index >= lines))).any():
-                raise ValueError(
-                    f"parameters.reference chooses among the R = {lines} lines of scene.references by 0 .. R-1"
-                )
-        if (self.needs_reach or self.needs_shape) and scene.size is None:
-            what = "sizes" if self.needs_shape else "radii"
-            raise ValueError(f"pair features take the agents' {what} from scene.size [B, N, 2], which is None")
-
-    def known(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
-        """Whose game is all finite numbers where nothing computed from it would tell otherwise.
-
-        A pair that never touches hides its weight, an agent that no feature places hides where it is, and a reference line
-        hides all its points but the nearest.
-        """
-        present = scene.agent_mask
-        known = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)
-        if self.needs_shape:
-            known = known & self.size(scene).isfinite().flatten(1).all(1)
-        elif self.needs_reach or "size" in self.needs:
-            known = known & self.size(scene)[..., 0].isfinite().all(1)
-        of_modes = known[:, None].expand(-1, parameters.initial_controls.shape[1])
+    def objectives(
+        self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+    ) -> Float[Tensor, "B M N"]:
+        """J_i, what every agent minimises: its own terms and those of the pairs it takes part in."""
+        terms = self.terms(scene, parameters, controls)
+        objective = torch.stack([terms[name] for name in self.own]).sum(0) if self.own else 0.0 * controls[..., 0, 0]
+        first, second = pairs(controls.shape[2], controls.device)
         for name in self.pair:
-            of_modes = of_modes & self.pair_weight(scene, parameters, name).isfinite().all(-1)
-        if "reference" in self.needs:
-            line = self.surroundings(scene, parameters).line
-            assert line is not None
-            of_modes = of_modes & torch.where(present[:, None, :, None, None], line, 0.0).isfinite().flatten(2).all(2)
-        return of_modes
+            objective = objective.index_add(2, first, terms[name]).index_add(2, second, terms[name])
+        return objective
 
-    # What solvers share with the residuals: absent agents are silenced here, once.
+    def tables(
+        self, scene: Scene, parameters: GameParameters, candidates: Float[Tensor, "B C N K 2"]
+    ) -> tuple[Float[Tensor, "B N C"], Float[Tensor, "B P C C"]]:
+        """E_i of C candidate strategies of every agent, and E_ij of all pairs of them: (k, l) is i's k-th and j's l-th.
 
-    def surroundings(self, scene: Scene, parameters: GameParameters) -> Surroundings:
-        """What own features refer to besides the trajectory."""
-        present, needs = scene.agent_mask, self.needs
-        goals = line = reference_speed = wheelbase = None
-        if "goals" in needs:
-            assert parameters.goals is not None
-            goals = torch.where(present[:, None, :, None], parameters.goals, 0.0)
-        if "reference" in needs:
-            assert scene.references is not None
-            followed, on_line = self._followed(scene, parameters)
-            line = torch.where(on_line[..., None, None], scene.references[followed], 0.0)
-        if "reference_speed" in needs:
-            assert scene.reference_speed is not None
-            reference_speed = torch.where(present, scene.reference_speed, 0.0)[:, None]
-        if "size" in needs:
-            wheelbase = WHEELBASE * self.size(scene)[:, None, :, 0]
-        return Surroundings(self.initial(scene), scene.dt, goals, line, reference_speed, wheelbase)
-
-    def _followed(self, scene: Scene, parameters: GameParameters) -> tuple[tuple[Tensor, ...], Bool[Tensor, "B M N"]]:
-        """Where in ``scene.references`` the lines are that agents follow, and which of them exist."""
-        assert scene.reference_mask is not None
-        assert parameters.reference is not None
-        present = scene.agent_mask[:, None]
-        scenes = torch.arange(len(present), device=present.device)[:, None, None]
-        agents = torch.arange(present.shape[2], device=present.device)
-        index = scenes, agents, torch.where(present, parameters.reference, 0).long()
-        return index, scene.reference_mask[index] & present
+        Args:
+            scene: the scene.
+            parameters: one game, M = 1.
+            candidates: controls; agents' candidates of one number do not belong together.
+        """
+        self.validate(scene, parameters, candidates)
+        controls = torch.where(scene.agent_mask[:, None, :, None, None], candidates, 0.0)
+        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
+        unary = sum(self.own_terms(scene, parameters, states, controls).values())
+        first, second = pairs(controls.shape[2], controls.device)
+        batch, count, _, steps, _ = states.shape
+        unary = states.new_zeros(batch, states.shape[2], count) if isinstance(unary, int) else unary.transpose(1, 2)
+        if not self.pair or not len(first):
+            return unary, states.new_zeros(batch, len(first), count, count)
+        one, other = states[:, :, first], states[:, :, second]
+        rows = max(1, _TABLE_ENTRIES // max(1, batch * count * len(first) * steps))
+        parts = []
+        for start in range(0, count, rows):
+            some = one[:, start : start + rows]
+            shape = (batch, some.shape[1], count, *one.shape[2:])
+            left, right = some[:, :, None].expand(shape), other[:, None].expand(shape)
+            terms = self.pair_terms(scene, parameters, left.flatten(1, 2), right.flatten(1, 2))
+            parts.append(torch.stack(list(terms.values())).sum(0).unflatten(1, shape[1:3]))
+        return unary, torch.cat(parts, 1).permute(0, 3, 1, 2)
 
     def initial(self, scene: Scene) -> Float[Tensor, "B 1 N 4"]:
         """The states x_0, zero for absent agents."""
         return torch.where(scene.agent_mask[..., None], scene.current, 0.0)[:, None]
-
-    def own_weight(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B M N"]:
-        """Weights of an own feature, zero for absent agents and where the line to follow does not exist."""
-        active = scene.agent_mask[:, None]
-        if OWN_FEATURES[name].source is Source.POSITION:
-            _, active = self._followed(scene, parameters)
-        return torch.where(active, parameters.own_weights[name], 0.0)
 
     def pair_mask(self, scene: Scene) -> Bool[Tensor, "B P"]:
         """Pairs of which both agents exist."""
         first, second = pairs(scene.agent_mask.shape[1], scene.agent_mask.device)
         return scene.agent_mask[:, first] & scene.agent_mask[:, second]
 
-    def pair_weight(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B M P"]:
-        """Weights of a pair feature, zero for pairs with an absent agent."""
-        return torch.where(self.pair_mask(scene)[:, None], parameters.pair_weights[name], 0.0)
-
     def size(self, scene: Scene) -> Float[Tensor, "B N 2"]:
-        """The agents' lengths and widths, zero for absent agents."""
-        assert scene.size is not None
+        """The agents' lengths and widths, zero for absent agents.
+
+        Raises:
+            ValueError: the scene has no sizes.
+        """
+        if scene.size is None:
+            raise ValueError("this energy takes the agents' sizes from scene.size [B, N, 2], which is None")
         return torch.where(scene.agent_mask[..., None], scene.size, 0.0)
-
-    def extent(self, scene: Scene) -> Float[Tensor, "B N"] | None:
-        """How far from their positions agents can be felt by others; None where a pair feature knows no limit."""
-        extents = [feature.extent for feature in self.pair_features.values()]
-        known = [extent(self.size(scene)) for extent in extents if extent is not None]
-        return torch.stack(known).amax(0) if len(known) == len(extents) else None
-
-    def reach(self, scene: Scene) -> Float[Tensor, "B P"]:
-        """The distance at which the discs of two agents touch."""
-        radius = disc(self.size(scene))
-        first, second = pairs(scene.agent_mask.shape[1], radius.device)
-        return radius[:, first] + radius[:, second]
-
-    def at_pair_steps(self, states: Float[Tensor, "*batch K X"]) -> Float[Tensor, "*batch L X"]:
-        """The steps k = stride, 2 stride, ... at which pairs are looked at."""
-        return states[..., self.pair_stride - 1 :: self.pair_stride, :]
-
-    def shape(self, feature: OwnFeature, value: Float[Tensor, "*shape"]) -> tuple[Tensor, Tensor]:
-        """A declared own feature's value c(z) for its signal z, and the slope dc/dz."""
-        if feature.bounded:
-            lower, upper = self.bounds[feature.signal]
-            return violation(value, lower, upper)
-        if feature.function is not None:
-            return slope(feature.function, value)
-        return value, torch.ones_like(value)
-
-    def pair_shape(self, feature: PairFeature, distance: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """A declared pair feature's value for a distance, and its slope."""
-        if feature.function is overlap:
-            return overlap(distance, reach), -(distance < reach).to(distance.dtype)
-        return slope(feature.function, distance, reach)
-
-
-def along(
-    function: Callable[..., Tensor], at: tuple[Tensor, Tensor], directions: tuple[Tensor, Tensor], *others: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Value of an undeclared feature, and its change along every one of D directions (their first dimension).
-
-    What else the function takes stays as it is.
-    """
-    value = function(*at, *others)
-    if len(directions[0]) == 0:
-        return value, value.new_zeros(0, *value.shape)
-    return value, torch.func.vmap(
-        lambda *moved: torch.func.jvp(lambda *states: function(*states, *others), at, moved)[1]
-    )(*directions)

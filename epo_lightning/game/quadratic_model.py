@@ -26,7 +26,7 @@ from torch import Tensor
 
 from epo_lightning.game.circles import overlap
 from epo_lightning.game.edges import Edges
-from epo_lightning.game.energy import Energy, along
+from epo_lightning.game.feature_energy import FeatureEnergy, along
 from epo_lightning.game.features import (
     OwnFeature,
     PairFeature,
@@ -89,7 +89,7 @@ class QuadraticModel:
     @torch.no_grad()
     def __init__(
         self,
-        energy: Energy,
+        energy: FeatureEnergy,
         scene: Scene,
         parameters: GameParameters,
         controls: Float[Tensor, "B M N K 2"],

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Solution
 from epo_lightning.solvers.kernel.build import load
 
@@ -120,7 +120,7 @@ def _library() -> ctypes.CDLL:
     return library
 
 
-def obstacle(energy: Energy, scene: Scene, parameters: GameParameters) -> str | None:
+def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
     """Why the kernel cannot solve a game; None where it can."""
     controls = parameters.initial_controls
     if controls.device.type != "cpu":
@@ -148,7 +148,7 @@ def say_once(reason: str) -> None:
 
 
 def solve(
-    energy: Energy,
+    energy: FeatureEnergy,
     scene: Scene,
     parameters: GameParameters,
     steps: int,
@@ -194,7 +194,7 @@ class _Call:
 
     def __init__(
         self,
-        energy: Energy,
+        energy: FeatureEnergy,
         scene: Scene,
         parameters: GameParameters,
         steps: int,
@@ -218,7 +218,7 @@ class _Call:
         self._describe(energy, scene, parameters)
         self._reserve(step_size, damping)
 
-    def _describe(self, energy: Energy, scene: Scene, parameters: GameParameters) -> None:
+    def _describe(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> None:
         batch, modes, agents, horizon, _ = self.controls.shape
         like = self.controls.dtype
         kept: list[Tensor] = []
@@ -323,7 +323,7 @@ class _Call:
         return [*own.unbind(0), *([pair] if pair is not None else []), *([goals] if goals is not None else [])]
 
 
-def _has_gaps(energy: Energy, scene: Scene) -> bool:
+def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:
     """Whether there are reference lines that do not exist."""
     return "lane" in energy.own and scene.reference_mask is not None and not scene.reference_mask.all()
 

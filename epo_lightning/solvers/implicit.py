@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import GameParameters, Scene, Status
 from epo_lightning.solvers.structured import Game, factorise, planar
 
 
 def attach(
-    energy: Energy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
+    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
 ) -> tuple[Tensor, Tensor]:
     """The controls of a solution with the gradient that the implicit function theorem gives them, and a status.
 

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers import compiled, implicit, structured
 
-Backend = Callable[[Energy, Scene, GameParameters, int, float, Tensor, bool], Solution]
+Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool], Solution]
 """(energy, scene, parameters, steps, step size, damping [B, M], keep iterates) -> solution."""
 
 _LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e7
@@ -99,7 +99,7 @@ class LevenbergMarquardt:
         """The solver to use outside training."""
         return self if self.test_steps is None else dataclasses.replace(self, steps=self.test_steps)
 
-    def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
+    def __call__(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Solution:
         """Minimise the energy of every scene and mode, starting at ``parameters.initial_controls``.
 
         Raises:
@@ -137,7 +137,7 @@ class LevenbergMarquardt:
         return solution
 
     def _run(
-        self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, damping: Tensor
+        self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, steps: int, damping: Tensor
     ) -> tuple[Solution, Tensor]:
         """Take a number of steps; returns the solution and the damping with which one would go on."""
         solve = _backend(self.backend, energy, scene, parameters)
@@ -155,7 +155,7 @@ class LevenbergMarquardt:
         return solution if self.keep_iterates else dataclasses.replace(solution, iterates=None), damping
 
 
-def _backend(name: str, energy: Energy, scene: Scene, parameters: GameParameters) -> Backend:
+def _backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Backend:
     """What computes the steps of a game."""
     if name == "pytorch":
         return structured.solve

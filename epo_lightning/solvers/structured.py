@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.edges import Group
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import Source
 from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
@@ -42,7 +42,7 @@ _LEAST_RAISED_DAMPING = 1e-3
 
 
 def solve(
-    energy: Energy,
+    energy: FeatureEnergy,
     scene: Scene,
     parameters: GameParameters,
     steps: int,
@@ -97,7 +97,7 @@ def solve(
 class Game:
     """What stays the same from step to step."""
 
-    energy: Energy
+    energy: FeatureEnergy
     scene: Scene
     parameters: GameParameters
     step_size: float
@@ -151,7 +151,7 @@ class Game:
         return by_controls, by
 
     @property
-    def undeclared(self) -> Energy | None:
+    def undeclared(self) -> FeatureEnergy | None:
         """The features that only automatic differentiation knows about."""
         own = [name for name, feature in self.energy.own_features.items() if feature.source is Source.TRAJECTORY]
         pair = [name for name, feature in self.energy.pair_features.items() if feature.source is Source.TRAJECTORY]

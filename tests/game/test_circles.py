@@ -15,7 +15,7 @@ from shapely.affinity import rotate, translate
 
 from epo_lightning.experiment.compose import compose
 from epo_lightning.game.circles import places, row_extent, row_overlap
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import PAIR_FEATURES, Source, pair_feature
 from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.registry import ConfigError
@@ -62,7 +62,7 @@ def pair_of_states(batch, steps=1):
 @pytest.mark.parametrize("stride", [1, 3])
 def test_residuals_equal_a_loop_over_circles(stride):
     scene, parameters = traffic(scenes=6)
-    energy = Energy(OWN, ["circles"], pair_stride=stride)
+    energy = FeatureEnergy(OWN, ["circles"], pair_stride=stride)
     controls = parameters.initial_controls
     found = energy.residuals(scene, parameters, controls)["circles"]
     states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)[..., stride - 1 :: stride, :]
@@ -161,7 +161,7 @@ def test_symmetric_and_unmoved_by_a_common_motion(seed, turn, x, y):
 
 def test_gradients_of_the_energy_equal_finite_differences():
     scene, parameters = traffic(apart=1.5)
-    energy = Energy(["acc"], ["circles"])
+    energy = FeatureEnergy(["acc"], ["circles"])
     assert (energy.residuals(scene, parameters, parameters.initial_controls)["circles"] > 0).any()
     controls = parameters.initial_controls.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda u: energy(scene, parameters, u), controls, atol=1e-6, rtol=1e-6)
@@ -170,7 +170,7 @@ def test_gradients_of_the_energy_equal_finite_differences():
 @pytest.mark.parametrize("stride", [1, 2])
 def test_normal_equations_equal_automatic_differentiation(stride):
     scene, parameters = traffic(agents=3, apart=1.5)
-    energy, controls = Energy(OWN, ["circles"], pair_stride=stride), parameters.initial_controls
+    energy, controls = FeatureEnergy(OWN, ["circles"], pair_stride=stride), parameters.initial_controls
 
     def stacked(u):
         return torch.cat([r.flatten(2) for r in energy.residuals(scene, parameters, u).values()], -1)
@@ -199,7 +199,7 @@ def directional(function, parameters, along, step=1e-6):
 def test_gradients_of_the_layer_equal_finite_differences(mode):
     scene, parameters = traffic(scenes=6, agents=3 if mode == "unrolled" else 2, apart=0.7)
     parameters = dataclasses.replace(parameters, initial_controls=0.2 * parameters.initial_controls)
-    energy = Energy(OWN, ["circles"])
+    energy = FeatureEnergy(OWN, ["circles"])
     few, many = LevenbergMarquardt(3), LevenbergMarquardt(120, 1.0, 1e-2, differentiation="implicit")
     solve = dataclasses.replace(few if mode == "unrolled" else many, backend="pytorch")
     leaves = leaves_of(parameters)
@@ -251,7 +251,7 @@ def test_coincident_vehicles_stay_finite():
     leaves = leaves_of(parameters)
     for mode in ("unrolled", "implicit"):
         solution = LevenbergMarquardt(2, differentiation=mode, backend="pytorch")(
-            Energy(OWN, ["circles"]), scene, leaves
+            FeatureEnergy(OWN, ["circles"]), scene, leaves
         )
         solution.states.sum().backward()
         assert solution.states.isfinite().all()
@@ -272,7 +272,7 @@ def test_pairs_that_only_outer_circles_reach_are_edges():
     )
     found = {}
     for pair in (["circles"], ["proximity"], ["proximity", "circles"]):
-        energy = Energy(["acc", "turnr"], pair)
+        energy = FeatureEnergy(["acc", "turnr"], pair)
         model = QuadraticModel(energy, scene, game, game.initial_controls, every_pair=False)
         found[tuple(pair)] = len(model.edges.pair)
         torch.testing.assert_close(
@@ -292,7 +292,7 @@ def test_the_extent_bounds_where_circles_are_felt(size):
 
 def test_samples_depend_on_neither_batch_nor_padding_to_the_last_bit():
     scene, parameters = traffic(scenes=7, agents=4, dtype=torch.float32)
-    energy = Energy(OWN, ["circles"])
+    energy = FeatureEnergy(OWN, ["circles"])
 
     def result(scene, parameters, chosen=slice(None)):
         leaves = leaves_of(parameters)
@@ -318,7 +318,7 @@ def test_samples_depend_on_neither_batch_nor_padding_to_the_last_bit():
 
 def test_sizes_that_are_missing_or_no_numbers_are_noticed():
     scene, parameters = traffic(scenes=3)
-    energy, solve = Energy(OWN, ["circles"]), LevenbergMarquardt()
+    energy, solve = FeatureEnergy(OWN, ["circles"]), LevenbergMarquardt()
     with pytest.raises(ValueError, match=r"pair features take the agents' sizes from scene\.size"):
         solve(energy, dataclasses.replace(scene, size=None), parameters)
     scene.size[1, 2, 1] = torch.nan
@@ -329,7 +329,7 @@ def test_sizes_that_are_missing_or_no_numbers_are_noticed():
 
 def test_the_compiled_layer_refuses_and_pytorch_takes_its_place():
     scene, parameters = traffic()
-    energy = Energy(OWN, ["circles"])
+    energy = FeatureEnergy(OWN, ["circles"])
     compiled.say_once.cache_clear()
     with pytest.warns(UserWarning, match="does not know the feature 'circles'.*Plain PyTorch does the same"):
         by_default = LevenbergMarquardt()(energy, scene, parameters)
@@ -349,7 +349,10 @@ def test_a_function_of_ones_own_gets_sizes_too(mine):
     scene, parameters = traffic(agents=3, apart=1.0)
     twin = dataclasses.replace(parameters, pair_weights={mine: parameters.pair_weights["circles"]})
     solve = LevenbergMarquardt(backend="pytorch")
-    built_in, own = solve(Energy(OWN, ["circles"]), scene, parameters), solve(Energy(OWN, [mine]), scene, twin)
+    built_in, own = (
+        solve(FeatureEnergy(OWN, ["circles"]), scene, parameters),
+        solve(FeatureEnergy(OWN, [mine]), scene, twin),
+    )
     torch.testing.assert_close(own.controls, built_in.controls, rtol=0, atol=1e-12)
     for needs, source in (("goals", Source.TRAJECTORY), ("size", Source.DISTANCE)):
         with pytest.raises(ConfigError, match=f"not '{needs}' as {source.name}"):
@@ -360,12 +363,12 @@ def test_the_configured_energy():
     config = compose("train", ["experiment=rpi/v_lstm_epo", "energy=exid_circles"])["energy"]
     plain = compose("train", ["experiment=rpi/v_lstm_epo", "energy=exid"])["energy"]
     assert config == {**plain, "pair": ["circles"]}
-    assert Energy(**{key: value for key, value in config.items() if key != "name"}).extent is not None
+    assert FeatureEnergy(**{key: value for key, value in config.items() if key != "name"}).extent is not None
 
 
 def test_energies_with_bounds_and_both_shapes_solve():
     scene, parameters = traffic()
     weights = dict.fromkeys(("circles", "proximity"), parameters.pair_weights["circles"])
     game = dataclasses.replace(parameters, pair_weights=weights)
-    solution = LevenbergMarquardt(30)(Energy([*OWN, "velb"], ["proximity", "circles"], BOUNDS), scene, game)
+    solution = LevenbergMarquardt(30)(FeatureEnergy([*OWN, "velb"], ["proximity", "circles"], BOUNDS), scene, game)
     assert (solution.energy < solution.initial_energy).all()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from epo_lightning.game.circles import overlap, separation
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import (
     OWN_FEATURES,
     PAIR_FEATURES,
@@ -93,7 +93,7 @@ def test_energy_equals_plain_arithmetic(stride):
     scene = random_scene(2, 3, size=2.0, dtype=torch.float64)
     parameters = random_game(scene)
     scene.references[0, :, :, 3:] = scene.references[0, :, :, 2:3]  # a line with fewer points repeats its last one
-    energy = Energy(ALL, bounds=BOUNDS, pair_stride=stride)
+    energy = FeatureEnergy(ALL, bounds=BOUNDS, pair_stride=stride)
     value = energy(scene, parameters, parameters.initial_controls)
     for b in range(2):
         for m in range(2):
@@ -118,7 +118,7 @@ def test_normal_equations_equal_automatic_differentiation(agents, modes, horizon
     torch.manual_seed(seed)
     scene = random_scene(2, agents, history=2, size=size, dtype=torch.float64)
     parameters = random_game(scene, modes, horizon)
-    energy = Energy(sorted(own), bounds=BOUNDS, dynamics=Unicycle(integrator), pair_stride=stride)
+    energy = FeatureEnergy(sorted(own), bounds=BOUNDS, dynamics=Unicycle(integrator), pair_stride=stride)
     controls = parameters.initial_controls
     jacobian = dense_jacobian(energy, scene, parameters, controls)
     residual = stacked(energy, scene, parameters, controls)[..., None]
@@ -137,7 +137,7 @@ def test_normal_equations_equal_automatic_differentiation(agents, modes, horizon
 def test_absent_agents_change_nothing_whatever_they_hold():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, own=ALL)
-    energy = Energy(ALL, bounds=BOUNDS)
+    energy = FeatureEnergy(ALL, bounds=BOUNDS)
     padded, wide = pad(scene, agents=2), widen(parameters)
     alone = energy(scene, parameters, parameters.initial_controls)
     together = energy(padded, wide, wide.initial_controls)
@@ -155,7 +155,7 @@ def test_coincident_agents_have_a_finite_energy_and_a_gradient_of_zero():
 
 
 def test_touching_is_not_active():
-    energy, touching = Energy(["goal"]), torch.tensor([0.5])
+    energy, touching = FeatureEnergy(["goal"]), torch.tensor([0.5])
     depth, slope = energy.pair_shape(PAIR_FEATURES["proximity"], touching, touching)
     assert depth.item() == slope.item() == 0
 
@@ -178,7 +178,7 @@ def test_who_follows_a_line_that_does_not_exist_is_not_drawn_to_it():
     parameters = random_game(scene)
     scene.reference_mask[:] = False
     scene.references[:] = torch.nan
-    residuals = Energy(["lane", "acc"]).residuals(scene, parameters, parameters.initial_controls)
+    residuals = FeatureEnergy(["lane", "acc"]).residuals(scene, parameters, parameters.initial_controls)
     assert (residuals["lane"] == 0).all()
 
 
@@ -238,7 +238,7 @@ def test_a_declared_feature_equals_the_same_function_undeclared(registry, stride
     weights, pair_weights = parameters.own_weights, {"gap": parameters.pair_weights["proximity"]}
     results = []
     for suffix in ("", "_undeclared"):
-        energy = Energy([name + suffix for name in own], ["gap" + suffix], pair_stride=stride)
+        energy = FeatureEnergy([name + suffix for name in own], ["gap" + suffix], pair_stride=stride)
         twin = leaves_of(
             replaced(
                 parameters,
@@ -273,7 +273,7 @@ def test_the_potential_is_each_agents_own_cost_up_to_what_the_agent_cannot_chang
     """The defining property of a potential game: dE/du_i is the gradient of agent i's own terms and its pairs."""
     scene = random_scene(1, 3, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene)
-    energy = Energy(ALL, bounds=BOUNDS)
+    energy = FeatureEnergy(ALL, bounds=BOUNDS)
     controls = parameters.initial_controls.clone().requires_grad_()
     (of_potential,) = torch.autograd.grad(energy(scene, parameters, controls).sum(), controls)
     terms = energy.terms(scene, parameters, controls)
@@ -301,7 +301,7 @@ def test_the_potential_is_each_agents_own_cost_up_to_what_the_agent_cannot_chang
 )
 def test_bad_energies_are_refused(arguments, message):
     with pytest.raises(ConfigError, match=message):
-        Energy(**arguments)
+        FeatureEnergy(**arguments)
 
 
 def replaced(parameters, **changes):
@@ -312,7 +312,7 @@ def test_shapes_that_do_not_fit_are_refused_by_name(monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checks would come first
     scene = random_scene(2, 2)
     parameters = random_game(scene)
-    energy = Energy(ALL, bounds=BOUNDS)
+    energy = FeatureEnergy(ALL, bounds=BOUNDS)
     controls = parameters.initial_controls
     with pytest.raises(ValueError, match="controls have shape"):
         energy.validate(scene, parameters, controls[:1])
@@ -338,6 +338,6 @@ def test_shapes_that_do_not_fit_are_refused_by_name(monkeypatch):
         energy.validate(replaced(scene, reference_speed=None), parameters, controls)
     with pytest.raises(ValueError, match=r"'steer', but scene\.size is None"):
         energy.validate(replaced(scene, size=None), parameters, controls)
-    energy = Energy(["goal"])
+    energy = FeatureEnergy(["goal"])
     with pytest.raises(ValueError, match=r"radii from scene\.size"):
         energy.validate(replaced(scene, size=None), parameters, controls)

@@ -10,7 +10,7 @@ import torch
 from games import leaves_of, random_game, random_scene
 
 from epo_lightning.game import features
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Status
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
@@ -42,7 +42,7 @@ def test_documented_features_work_in_the_layer(documented):
     parameters = random_game(scene, own=own)
     parameters.pair_weights["comfort"] = parameters.pair_weights["proximity"]
     leaves = leaves_of(parameters)
-    solution = LevenbergMarquardt()(Energy(own, ["proximity", "comfort"]), scene, leaves)
+    solution = LevenbergMarquardt()(FeatureEnergy(own, ["proximity", "comfort"]), scene, leaves)
     assert (solution.status == Status.SOLVED).all()
     assert (solution.energy < solution.initial_energy).all()
     solution.states.sum().backward()

@@ -14,7 +14,7 @@ from games import ALL, BOUNDS, feet_held, leaves_of, pad, random_game, random_sc
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Status
 
 
@@ -57,7 +57,7 @@ class Draw:
     absent: int
     seed: int
 
-    def make(self) -> tuple[Energy, Scene, GameParameters]:
+    def make(self) -> tuple[FeatureEnergy, Scene, GameParameters]:
         torch.manual_seed(self.seed)
         horizon = self.horizon if self.agents <= 3 else min(self.horizon, 12)  # the reference is dense
         bounds = BOUNDS if self.bounded else dict.fromkeys(BOUNDS, (-99.0, 99.0))
@@ -66,7 +66,7 @@ class Draw:
         mask[1, self.absent : self.absent + 2] = False
         scene = dataclasses.replace(scene, agent_mask=mask)
         return (
-            Energy(sorted(self.own), self.pair, bounds, pair_stride=self.stride),
+            FeatureEnergy(sorted(self.own), self.pair, bounds, pair_stride=self.stride),
             scene,
             random_game(scene, 2, horizon),
         )
@@ -153,7 +153,7 @@ class BackendSuite:
     def test_samples_do_not_depend_on_their_batch_by_a_single_bit(self, dtype, agents):
         scene = random_scene(19, agents, history=2, size=1.5, dtype=dtype)
         parameters = random_game(scene, modes=3, horizon=9)
-        energy = Energy(ALL, bounds=BOUNDS)
+        energy = FeatureEnergy(ALL, bounds=BOUNDS)
         leaves = leaves_of(parameters)
         together = self.damped(energy, scene, leaves)
         (together.states.sum() + together.controls.square().sum()).backward()
@@ -171,7 +171,7 @@ class BackendSuite:
     def test_padding_changes_no_bit(self, filling):
         scene = random_scene(5, 3, history=2, size=1.5)
         parameters = random_game(scene)
-        energy = Energy(ALL, bounds=BOUNDS)
+        energy = FeatureEnergy(ALL, bounds=BOUNDS)
         leaves, wide = leaves_of(parameters), leaves_of(widen(parameters, filling=filling))
         alone, padded = self.damped(energy, scene, leaves), self.damped(energy, pad(scene, filling=filling), wide)
         assert torch.equal(padded.controls[:, :, :3], alone.controls)
@@ -193,7 +193,7 @@ class BackendSuite:
     def test_a_poisoned_sample_stops_and_leaves_the_others_bit_identical(self, kind):
         scene, damping = random_scene(4, 2, history=2, size=3.0), 10.0
         parameters = random_game(scene)
-        energy = Energy(ALL, bounds=BOUNDS)
+        energy = FeatureEnergy(ALL, bounds=BOUNDS)
         sound = self.damped(energy, scene, parameters, damping=damping)
         poisoned = parameters.map(torch.clone)
         if kind == "history":
@@ -233,13 +233,13 @@ class BackendSuite:
         parameters = random_game(scene, own=("acc", "turnr"))
         for weight in parameters.own_weights.values():
             weight[1] = 0.0
-        solution = self.damped(Energy(["acc", "turnr"]), scene, parameters, damping=0.0)
+        solution = self.damped(FeatureEnergy(["acc", "turnr"]), scene, parameters, damping=0.0)
         assert (solution.status == torch.tensor([0, 1, 0, 0])[:, None]).all()
         assert torch.equal(solution.controls[1], parameters.initial_controls[1]), "nothing pulls anywhere"
         assert (solution.controls[0] - 0.49 * parameters.initial_controls[0]).abs().max() < 1e-5, "two steps of 0.3"
 
     def test_lines_that_do_not_exist_pull_nobody(self):
-        scene, energy = random_scene(3, 2, history=2, dtype=torch.float64), Energy(["lane", "acc", "turnr"])
+        scene, energy = random_scene(3, 2, history=2, dtype=torch.float64), FeatureEnergy(["lane", "acc", "turnr"])
         parameters = random_game(scene)
         mask = torch.rand(3, 2, 2) < 0.5
         lines = torch.where(mask[..., None, None], scene.references, torch.nan)
@@ -264,14 +264,14 @@ class BackendSuite:
         parameters = random_game(scene)
         parameters.initial_controls[0, :, 1] = parameters.initial_controls[0, :, 0]
         leaves = leaves_of(parameters)
-        solution = self.damped(Energy(ALL, bounds=BOUNDS), dataclasses.replace(scene, history=history), leaves)
+        solution = self.damped(FeatureEnergy(ALL, bounds=BOUNDS), dataclasses.replace(scene, history=history), leaves)
         assert (solution.status == Status.SOLVED).all()
         solution.states.sum().backward()
         assert all(gradient.isfinite().all() for gradient in gradients(leaves).values())
 
     def test_two_steps_of_time_and_no_steps_of_the_solver(self):
         scene = random_scene(2, 2, history=2, dtype=torch.float64)
-        energy = Energy(ALL, bounds=BOUNDS)
+        energy = FeatureEnergy(ALL, bounds=BOUNDS)
         parameters = random_game(scene, horizon=2)
         expected = reference(energy, scene, parameters, 2, 0.3, torch.full((2, 2), 10.0, dtype=torch.float64))
         torch.testing.assert_close(self.damped(energy, scene, parameters).controls, expected[-1], rtol=0, atol=1e-9)
@@ -287,15 +287,15 @@ class BackendSuite:
         scene = random_scene(2, 2, history=2, size=0.01)
         parameters = random_game(scene)
         parameters.pair_weights["proximity"][1] = torch.nan
-        solution = self.damped(Energy(ALL, bounds=BOUNDS), scene, parameters, steps=0)
+        solution = self.damped(FeatureEnergy(ALL, bounds=BOUNDS), scene, parameters, steps=0)
         assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2]
 
     def test_stiff_rates_leave_single_precision_enough_digits(self):
         scene, own = random_scene(8, 2, history=2, size=1.0), ("goal", "acc", "turnr", "jerk")
         parameters = random_game(scene, 1, 40, own=own, spread=0.2)
         parameters.own_weights["jerk"].fill_(30.0)
-        single = self.damped(Energy(own), scene, parameters, steps=1)
-        exact = self.damped(Energy(own), scene.to(torch.float64), parameters.to(torch.float64), steps=1)
+        single = self.damped(FeatureEnergy(own), scene, parameters, steps=1)
+        exact = self.damped(FeatureEnergy(own), scene.to(torch.float64), parameters.to(torch.float64), steps=1)
         torch.testing.assert_close(single.controls.double(), exact.controls, rtol=0, atol=5e-5)
         assert (single.status == Status.SOLVED).all()
 
@@ -304,14 +304,14 @@ class BackendSuite:
         scene.history[..., :2] = 1e4
         scene.history[..., 3] = 0.3
         parameters = random_game(scene, horizon=40, own=own, spread=0.01)
-        energy = Energy(own)
+        energy = FeatureEnergy(own)
         single = self.damped(energy, scene, parameters, steps=0)
         exact = self.damped(energy, scene.to(torch.float64), parameters.to(torch.float64), steps=0)
         # A unit in the last place of the coordinates themselves is 1 mm there.
         assert (single.states.double() - exact.states)[..., :2].abs().max() < 1.1e-3
 
     def test_nothing_it_was_given_is_changed(self):
-        scene, energy = random_scene(3, 3, history=2, size=2.0), Energy(ALL, bounds=BOUNDS)
+        scene, energy = random_scene(3, 3, history=2, size=2.0), FeatureEnergy(ALL, bounds=BOUNDS)
         parameters = random_game(scene)
         before = parameters.map(torch.clone)
         leaves = leaves_of(parameters)
@@ -324,7 +324,7 @@ class BackendSuite:
 
     def test_broadcast_and_permuted_inputs(self):
         """Decoders hand over views: weights that were unbound, goals that were expanded over modes."""
-        scene, energy = random_scene(3, 3, history=2, size=2.0), Energy(ALL, bounds=BOUNDS)
+        scene, energy = random_scene(3, 3, history=2, size=2.0), FeatureEnergy(ALL, bounds=BOUNDS)
         parameters = random_game(scene)
         own = torch.stack(list(parameters.own_weights.values()), -1)
         views = dataclasses.replace(

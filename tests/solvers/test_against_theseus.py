@@ -6,7 +6,7 @@ import pytest
 import torch
 from games import ALL, BOUNDS, random_game, random_scene
 
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
 theseus = pytest.importorskip(
@@ -18,7 +18,7 @@ def test_steps_equal_theseus():
     scene = random_scene(3, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, modes=1, horizon=6)
     # Automatic differentiation lets the nearest point of a lane slide along it, where our model holds it.
-    energy = Energy([name for name in ALL if name != "lane"], bounds=BOUNDS)
+    energy = FeatureEnergy([name for name in ALL if name != "lane"], bounds=BOUNDS)
     shape = parameters.initial_controls.shape
 
     def residuals(optim_vars, aux_vars):

@@ -8,7 +8,7 @@ from games import ALL, BOUNDS, normal_equations, random_game, random_scene
 
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.edges import Group
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.solvers import blocks
 
@@ -19,7 +19,7 @@ from epo_lightning.solvers import blocks
 def test_solutions_are_those_of_the_dense_matrix(integrator, agents, horizon, own):
     scene = random_scene(2, agents, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, 1, horizon)
-    energy = Energy(own, bounds=BOUNDS, dynamics=Unicycle(integrator), pair_stride=1 + horizon % 2)
+    energy = FeatureEnergy(own, bounds=BOUNDS, dynamics=Unicycle(integrator), pair_stride=1 + horizon % 2)
     controls = parameters.initial_controls
     damping = torch.tensor([1.0, 20.0], dtype=torch.float64)
     model = QuadraticModel(energy, scene, parameters, controls, every_pair=True)

@@ -17,7 +17,7 @@ from backends import BackendSuite, gradients
 from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Status
 from epo_lightning.solvers import compiled
 from epo_lightning.solvers.kernel import build
@@ -36,7 +36,7 @@ def test_the_kernel_was_built_from_these_sources():
 
 
 def test_all_levels_of_instructions_agree():
-    scene, energy = random_scene(9, 3, history=2, size=1.5, dtype=torch.float64), Energy(ALL, bounds=BOUNDS)
+    scene, energy = random_scene(9, 3, history=2, size=1.5, dtype=torch.float64), FeatureEnergy(ALL, bounds=BOUNDS)
     parameters = random_game(scene, modes=3, horizon=9)
     library = compiled._library()
     count = library.epo_levels()
@@ -57,7 +57,7 @@ def test_all_levels_of_instructions_agree():
 
 
 def test_threads_change_no_bit():
-    scene, energy = random_scene(23, 3, history=2, size=1.0), Energy(ALL, bounds=BOUNDS)
+    scene, energy = random_scene(23, 3, history=2, size=1.0), FeatureEnergy(ALL, bounds=BOUNDS)
     parameters = random_game(scene, modes=3, horizon=9)
     results = []
     for threads in (1, 3):
@@ -82,7 +82,7 @@ def test_memory_goes_back_when_a_solution_is_dropped():
             released.append(self.address)
             super().__del__()
 
-    scene, energy = random_scene(3, 2, history=2), Energy(["acc", "turnr"])
+    scene, energy = random_scene(3, 2, history=2), FeatureEnergy(["acc", "turnr"])
     original, compiled._Tape = compiled._Tape, Watched
     try:
         for keep in (False, True):
@@ -95,7 +95,7 @@ def test_memory_goes_back_when_a_solution_is_dropped():
 
 
 def test_a_reference_line_that_does_not_exist_stops_that_sample():
-    scene, energy = random_scene(3, 2, history=2), Energy(["lane", "acc", "turnr"])
+    scene, energy = random_scene(3, 2, history=2), FeatureEnergy(["lane", "acc", "turnr"])
     parameters = random_game(scene)
     parameters.reference[1, 0, 1] = 99
     solution = compiled.solve(energy, scene, parameters, 2, 0.3, torch.full((3, 2), 10.0))
@@ -105,9 +105,9 @@ def test_a_reference_line_that_does_not_exist_stops_that_sample():
 @pytest.mark.parametrize(
     ("energy", "agents", "dtype", "reason"),
     [
-        (Energy(["acc"], dynamics=Unicycle("heun")), 2, torch.float32, "integrates by euler, not heun"),
-        (Energy(["acc"]), 65, torch.float32, "up to 64 agents, not 65"),
-        (Energy(["acc"]), 2, torch.float16, "not torch.float16"),
+        (FeatureEnergy(["acc"], dynamics=Unicycle("heun")), 2, torch.float32, "integrates by euler, not heun"),
+        (FeatureEnergy(["acc"]), 65, torch.float32, "up to 64 agents, not 65"),
+        (FeatureEnergy(["acc"]), 2, torch.float16, "not torch.float16"),
     ],
 )
 def test_what_it_cannot_solve_it_says(energy, agents, dtype, reason):
@@ -118,7 +118,10 @@ def test_what_it_cannot_solve_it_says(energy, agents, dtype, reason):
 
 
 def test_sixty_four_agents():
-    scene, energy = random_scene(1, 64, history=2, size=0.7, dtype=torch.float64), Energy(["acc", "turnr", "goal"])
+    scene, energy = (
+        random_scene(1, 64, history=2, size=0.7, dtype=torch.float64),
+        FeatureEnergy(["acc", "turnr", "goal"]),
+    )
     parameters = random_game(scene, modes=1, horizon=3)
     damping = torch.ones(1, 1, dtype=torch.float64)
     solution = compiled.solve(energy, scene, parameters, 200, 1.0, damping)
@@ -127,7 +130,7 @@ def test_sixty_four_agents():
 
 
 def test_the_layer_takes_it_where_it_can_and_says_once_where_it_cannot(monkeypatch):
-    scene, energy = random_scene(2, 2, history=2), Energy(ALL, bounds=BOUNDS)
+    scene, energy = random_scene(2, 2, history=2), FeatureEnergy(ALL, bounds=BOUNDS)
     parameters = random_game(scene)
     by_default = LevenbergMarquardt()(energy, scene, parameters).controls
     assert torch.equal(by_default, LevenbergMarquardt(backend="compiled")(energy, scene, parameters).controls)
@@ -179,7 +182,7 @@ def test_a_machine_without_a_compiler_is_told_so(tmp_path):
 
 def test_a_scene_that_changed_before_the_backward_pass_is_noticed():
     for name in ("history", "size", "references", "reference_speed", "agent_mask"):
-        scene, energy = random_scene(3, 2, history=2, size=2.0), Energy(ALL, bounds=BOUNDS)
+        scene, energy = random_scene(3, 2, history=2, size=2.0), FeatureEnergy(ALL, bounds=BOUNDS)
         solution = compiled.solve(energy, scene, leaves_of(random_game(scene)), 2, 0.3, torch.full((3, 2), 10.0))
         getattr(scene, name)[0] = getattr(scene, name)[1].clone()
         with pytest.raises(RuntimeError, match="modified by an inplace operation"):
@@ -190,10 +193,10 @@ _FORK = """
 import os, sys, torch
 sys.path[:0] = {path!r}
 from games import random_game, random_scene
-from epo_lightning import Energy, LevenbergMarquardt
+from epo_lightning import FeatureEnergy, LevenbergMarquardt
 torch.set_num_threads(2)
 scene = random_scene(64, 2, history=2)
-solve, energy = LevenbergMarquardt(backend="compiled"), Energy(["acc", "turnr"])
+solve, energy = LevenbergMarquardt(backend="compiled"), FeatureEnergy(["acc", "turnr"])
 parameters = random_game(scene, own=("acc", "turnr"))
 expected = solve(energy, scene, parameters).controls
 child = os.fork()
@@ -228,14 +231,14 @@ _SHORT_OF_MEMORY = """
 import resource, sys, torch
 sys.path[:0] = {path!r}
 from games import leaves_of, random_game, random_scene
-from epo_lightning import Energy, LevenbergMarquardt
+from epo_lightning import FeatureEnergy, LevenbergMarquardt
 torch.set_num_threads(1)
 scene, own = random_scene(1, 64, history=2, size=50.0), ("acc", "turnr")
 leaves = leaves_of(random_game(scene, 1, 40, own=own))
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 400 * 2**20,) * 2)
 try:
-    LevenbergMarquardt(6, backend="compiled")(Energy(own), scene, leaves)
+    LevenbergMarquardt(6, backend="compiled")(FeatureEnergy(own), scene, leaves)
 except MemoryError as error:
     print(error)
 """
@@ -251,7 +254,7 @@ def test_too_little_memory_is_an_exception():
 
 
 def test_headings_beyond_reduction_stop_a_sample():
-    scene, energy = random_scene(3, 2, history=2), Energy(["acc", "turnr", "goal"])
+    scene, energy = random_scene(3, 2, history=2), FeatureEnergy(["acc", "turnr", "goal"])
     scene.history[1, 0, -1, 2] = 3e9
     solution = compiled.solve(energy, scene, random_game(scene), 2, 0.3, torch.full((3, 2), 10.0))
     assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2, [0, 0]]

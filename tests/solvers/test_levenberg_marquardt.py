@@ -9,7 +9,7 @@ import pytest
 import torch
 from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Status
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -32,7 +32,7 @@ def central_differences(function, tensor, cotangent, step=1e-5):
 def test_unrolled_gradients_equal_central_differences(size, bounds, agents):
     scene = random_scene(2, agents, history=2, size=size, dtype=torch.float64)
     parameters = random_game(scene, modes=2, horizon=5)
-    energy = Energy(ALL, bounds=bounds)
+    energy = FeatureEnergy(ALL, bounds=bounds)
     residuals = energy.residuals(scene, parameters, parameters.initial_controls)
     assert (residuals["proximity"] != 0).any() == (size == 2.0)
     assert (residuals["velb"] != 0).any() == (bounds is BOUNDS)
@@ -71,7 +71,7 @@ def test_a_linear_quadratic_game_is_solved_in_one_full_step():
     """With speed and control features alone the energy is quadratic, and its minimiser is known in closed form."""
     scene = random_scene(2, 2, history=2, dtype=torch.float64)
     parameters = random_game(scene, horizon=6)
-    energy = Energy(["vel", "acc", "turnr"], pair=[])
+    energy = FeatureEnergy(["vel", "acc", "turnr"], pair=[])
     solution = LevenbergMarquardt(1, 1.0, 0.0)(energy, scene, parameters)
     # Nothing pulls on turn rates, so they vanish; accelerations solve (w_v^2 S^T S + w_a^2 I) a = -w_v^2 S^T v0.
     sums = 0.1 * torch.ones(6, 6, dtype=torch.float64).tril()
@@ -91,7 +91,7 @@ def test_a_linear_quadratic_game_is_solved_in_one_full_step():
 def test_many_steps_reach_an_equilibrium():
     scene = random_scene(4, 3, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, horizon=8)
-    energy = Energy(["goal", "vel", "acc", "turnr"])
+    energy = FeatureEnergy(["goal", "vel", "acc", "turnr"])
     solution = LevenbergMarquardt(200, 1.0, 1.0, keep_iterates=True)(energy, scene, parameters)
     assert solution.gradient_norm.max() < 1e-8
     assert (solution.energy < solution.initial_energy).all()
@@ -124,7 +124,7 @@ def test_bad_settings_are_refused(arguments, message):
 def test_the_gradient_of_a_float32_layer_is_close_to_float64(backend):
     scene = random_scene(16, 2, size=0.5, dtype=torch.float64)
     parameters = random_game(scene, horizon=40, spread=0.1)
-    energy, solve = Energy(ALL, bounds=BOUNDS), LevenbergMarquardt(backend=backend)
+    energy, solve = FeatureEnergy(ALL, bounds=BOUNDS), LevenbergMarquardt(backend=backend)
 
     def gradient(dtype):
         leaves = leaves_of(parameters.to(dtype))
@@ -139,7 +139,7 @@ def test_the_gradient_of_a_float32_layer_is_close_to_float64(backend):
 
 
 def test_the_ten_line_example_of_the_readme():
-    from epo_lightning import Energy, GameParameters, LevenbergMarquardt, Scene
+    from epo_lightning import FeatureEnergy, GameParameters, LevenbergMarquardt, Scene
 
     history = torch.tensor([[[[-2.0, 0.0, 0.0, 1.0]], [[2.0, 0.1, torch.pi, 1.0]]]])  # [B=1, N=2, H=1, 4]
     scene = Scene(history, dt=0.1, size=torch.full((1, 2, 2), 0.5))
@@ -150,7 +150,7 @@ def test_the_ten_line_example_of_the_readme():
         initial_controls=torch.zeros(1, 1, 2, 40, 2),
     )
     solve = LevenbergMarquardt(steps=100, step_size=0.3, damping=1.0)
-    solution = solve(Energy(own=["goal", "acc", "turnr"], pair=["proximity"]), scene, parameters)
+    solution = solve(FeatureEnergy(own=["goal", "acc", "turnr"], pair=["proximity"]), scene, parameters)
     gap = (solution.states[0, 0, 0, :, :2] - solution.states[0, 0, 1, :, :2]).norm(dim=-1).min()
     assert gap > 0.4, "they start on a collision course and should pass each other"
     assert solution.energy < solution.initial_energy
@@ -172,7 +172,7 @@ def solved_game(own, agents=2, horizon=4, scenes=2):
 @pytest.mark.parametrize("own", [SMOOTH, [*SMOOTH, "lane"], ["goal", "acc", "turnr", "accb", "velb", "turnrb"]])
 def test_implicit_gradients_equal_central_differences_of_the_minimum(own):
     scene, parameters, solve = solved_game(own)
-    energy = Energy(own, bounds=BOUNDS)
+    energy = FeatureEnergy(own, bounds=BOUNDS)
     leaves = leaves_of(parameters)
     solution = solve(energy, scene, leaves)
     assert solution.gradient_norm.max() < 1e-9
@@ -205,7 +205,7 @@ def test_implicit_gradients_equal_central_differences_of_the_minimum(own):
 
 def test_gauss_newton_hessians_give_another_implicit_gradient():
     scene, parameters, solve = solved_game(SMOOTH)
-    energy, gradients = Energy(SMOOTH), []
+    energy, gradients = FeatureEnergy(SMOOTH), []
     for hessian in ("exact", "gauss_newton"):
         leaves = leaves_of(parameters)
         dataclasses.replace(solve, hessian=hessian)(energy, scene, leaves).controls.sum().backward()
@@ -220,7 +220,7 @@ def test_what_is_no_minimum_has_no_implicit_gradient():
     parameters.own_weights["goal"][1] = 0.0
     scene.history[0, :, :, 2] = 0.0  # both drive on to goals ahead, which they have yet to reach
     leaves = leaves_of(parameters)
-    solution = LevenbergMarquardt(2, differentiation="implicit")(Energy(["goal"], []), scene, leaves)
+    solution = LevenbergMarquardt(2, differentiation="implicit")(FeatureEnergy(["goal"], []), scene, leaves)
     assert (solution.status[1] == Status.STOPPED).all()
     solution.states.sum().backward()
     assert (leaves.own_weights["goal"].grad[1] == 0).all()
@@ -231,7 +231,7 @@ def test_what_is_no_minimum_has_no_implicit_gradient():
 def test_truncated_gradients_are_those_of_the_last_steps(adaptive):
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, horizon=5)
-    energy = Energy(ALL, bounds=BOUNDS)
+    energy = FeatureEnergy(ALL, bounds=BOUNDS)
     solve = LevenbergMarquardt(5, 0.3, 10.0, True, "truncated", truncated_steps=2, adaptive=adaptive)
     leaves = leaves_of(parameters)
     solution = solve(energy, scene, leaves)
@@ -253,7 +253,7 @@ def test_truncated_gradients_are_those_of_the_last_steps(adaptive):
 def test_detached_solutions_teach_nothing():
     scene = random_scene(2, 2, history=2)
     solution = LevenbergMarquardt(differentiation="detached")(
-        Energy(ALL, bounds=BOUNDS), scene, leaves_of(random_game(scene))
+        FeatureEnergy(ALL, bounds=BOUNDS), scene, leaves_of(random_game(scene))
     )
     assert not solution.controls.requires_grad
     assert not solution.states.requires_grad
@@ -263,7 +263,7 @@ def test_adaptive_steps_never_raise_an_energy_and_every_sample_decides_for_itsel
     scene = random_scene(6, 3, history=2, size=2.0, dtype=torch.float64)
     scene = dataclasses.replace(scene, dt=0.5)  # long ways, on which a linearised heading is far from the truth
     parameters = random_game(scene, horizon=10, spread=1.0)
-    energy = Energy(["goal", "vel", "acc", "turnr"])
+    energy = FeatureEnergy(["goal", "vel", "acc", "turnr"])
     solve = LevenbergMarquardt(12, 1.0, 1e-3, keep_iterates=True, adaptive=True)
     solution = solve(energy, scene, parameters)
     energies = torch.stack([energy(scene, parameters, controls) for controls in solution.iterates])
@@ -284,7 +284,7 @@ def test_adaptive_steps_never_raise_an_energy_and_every_sample_decides_for_itsel
 def test_adaptive_gradients_equal_central_differences():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, 1, 5, spread=2.0)
-    energy, solve = Energy(SMOOTH), LevenbergMarquardt(4, 1.0, 1.0, adaptive=True)
+    energy, solve = FeatureEnergy(SMOOTH), LevenbergMarquardt(4, 1.0, 1.0, adaptive=True)
     leaves = leaves_of(parameters)
     cotangent = torch.randn_like(parameters.initial_controls)
     (solve(energy, scene, leaves).controls * cotangent).sum().backward()
@@ -308,7 +308,7 @@ def test_another_number_of_steps_outside_training():
 def test_no_game_at_all_has_an_empty_solution(backend, differentiation, scenes, modes, agents):
     scene = random_scene(scenes, agents, history=2)
     solution = LevenbergMarquardt(backend=backend, differentiation=differentiation)(
-        Energy(ALL, bounds=BOUNDS), scene, random_game(scene, modes)
+        FeatureEnergy(ALL, bounds=BOUNDS), scene, random_game(scene, modes)
     )
     assert solution.states.shape == (scenes, modes, agents, 7, 4)
     assert solution.status.shape == (scenes, modes)
@@ -318,7 +318,7 @@ def test_no_game_at_all_has_an_empty_solution(backend, differentiation, scenes, 
 def test_scenes_follow_the_precision_of_their_game(backend):
     scene = random_scene(2, 2, history=2, dtype=torch.float64)
     parameters = random_game(scene).to(torch.float32)
-    solve, energy = LevenbergMarquardt(backend=backend), Energy(ALL, bounds=BOUNDS)
+    solve, energy = LevenbergMarquardt(backend=backend), FeatureEnergy(ALL, bounds=BOUNDS)
     mixed = solve(energy, scene, parameters)
     assert torch.equal(mixed.controls, solve(energy, scene.to(torch.float32), parameters).controls)
     with pytest.raises(ValueError, match=r"torch\.float16; the layer takes float32 and float64"):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, SPEED, TURN_RATE, Source, own_feature, pair_feature
 from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import Status
@@ -88,7 +88,7 @@ def test_steps_and_gradients_equal_a_dense_reference(size, absent, own, pair, le
     if pair:
         weights = dict.fromkeys(pair, parameters.pair_weights["proximity"])
         parameters = dataclasses.replace(parameters, pair_weights=weights)
-    energy = Energy(sorted(own), pair, BOUNDS, Unicycle(integrator), stride)
+    energy = FeatureEnergy(sorted(own), pair, BOUNDS, Unicycle(integrator), stride)
     expected = with_gradients(lambda leaves: dense(energy, scene, leaves), parameters)
     if absent == 0:
         assert_same(
@@ -120,7 +120,7 @@ def scattered(scenes, agents, dtype=torch.float32):
 def test_samples_depend_on_neither_batch_nor_padding_to_the_last_bit(agents, horizon, make):
     scene = make(5, agents)
     parameters = random_game(scene, 2, horizon, spread=0.2)
-    energy = Energy(ALL, bounds=BOUNDS)
+    energy = FeatureEnergy(ALL, bounds=BOUNDS)
 
     def result(scene, parameters, chosen=slice(None)):
         leaves = leaves_of(parameters)
@@ -144,7 +144,7 @@ def test_components_are_those_of_the_active_pairs():
     scene.agent_mask[0, 2:] = False
     parameters = random_game(scene, 2, 5)
     parameters.pair_weights["proximity"][:, 1] = 0.0  # no weight, no edge
-    energy = Energy(["goal"], ["proximity"])
+    energy = FeatureEnergy(["goal"], ["proximity"])
     model = QuadraticModel(energy, scene, parameters, parameters.initial_controls, every_pair=False)
     groups = structured._components(model)
     residuals = energy.residuals(scene, parameters, parameters.initial_controls)["proximity"].flatten(0, 1)
@@ -183,7 +183,7 @@ def test_the_unsplit_path_never_asks_the_device_for_a_number(integrator, pair):
     parameters = random_game(scene)
     weights = {pair: parameters.pair_weights["proximity"]}
     parameters = leaves_of(dataclasses.replace(parameters, pair_weights=weights))
-    energy = Energy(ALL, [pair], BOUNDS, Unicycle(integrator))
+    energy = FeatureEnergy(ALL, [pair], BOUNDS, Unicycle(integrator))
     with HostMustNotWait():
         solve(energy, scene, parameters, split=False).states.sum().backward()
     assert parameters.initial_controls.grad.isfinite().all()
@@ -194,7 +194,7 @@ def test_the_unsplit_path_never_asks_the_device_for_a_number(integrator, pair):
 def test_without_splitting_a_sample_without_a_factor_stops_alone():
     scene = random_scene(3, 2, history=2)
     parameters = random_game(scene)
-    energy = Energy(["goal", "acc", "turnr"])
+    energy = FeatureEnergy(["goal", "acc", "turnr"])
     sound = solve(energy, scene, parameters, damping=0.0, split=False)
     for weight in parameters.own_weights.values():
         weight[1] = 0.0
@@ -241,7 +241,7 @@ def test_undeclared_features_solve_to_what_declared_ones_do(twins, split, stride
 
     def run(own, name):
         game = dataclasses.replace(parameters, own_weights=dict.fromkeys(own, weight), pair_weights={name: pair})
-        energy = Energy(own, [name], pair_stride=stride)
+        energy = FeatureEnergy(own, [name], pair_stride=stride)
         controls, by = with_gradients(lambda leaves: solve(energy, scene, leaves, split=split).controls, game)
         return controls, [by[0], sum(by[2:-1]), by[-1]]
 
@@ -260,7 +260,7 @@ def test_undeclared_features_have_the_implicit_gradients_of_declared_ones(twins)
         own = [*own, "acc"]  # or accelerations would have no minimum
         game = dataclasses.replace(parameters, own_weights=dict.fromkeys(own, weight), pair_weights={name: pair})
         leaves = leaves_of(game)
-        solution = minimise(Energy(own, [name]), scene, leaves)
+        solution = minimise(FeatureEnergy(own, [name]), scene, leaves)
         assert solution.gradient_norm.max() < 1e-8
         assert (solution.status == Status.SOLVED).all()
         solution.states.sum().backward()
