@@ -260,6 +260,25 @@ class Status(IntEnum):
 
 
 @dataclass(frozen=True)
+class Tables(_Batch):
+    """Energies of C candidate strategies of every agent, and the density p(k) = exp(-E(k)) / Z over who takes which.
+
+    Attributes:
+        states: the candidates; agents' candidates of one number do not belong together.
+        unary: E_i of every candidate.
+        pair: E_ij of every two candidates, (k, l) for i's k-th and j's l-th, pairs in the order of ``torch.triu_indices``.
+        log_marginals: log p(k_i), exact or as sum-product finds them; zero for absent agents' first candidate.
+        log_partition: log Z, exact or Bethe's approximation.
+    """
+
+    states: Float[Tensor, "B C N K 4"]
+    unary: Float[Tensor, "B N C"]
+    pair: Float[Tensor, "B P C C"]
+    log_marginals: Float[Tensor, "B N C"]
+    log_partition: Float[Tensor, " B"]
+
+
+@dataclass(frozen=True)
 class Solution(_Batch):
     """Joint strategies that a solver found, and how well.
 
@@ -270,6 +289,7 @@ class Solution(_Batch):
         gradient_norm: Euclidean norm of dE/du at ``controls``.
         status: a :class:`Status` per scene and mode.
         iterates: u_0 .. u_S, when asked for.
+        tables: of the candidates, for solvers that choose among some; the joint modes are then the most likely choices.
     """
 
     controls: Float[Tensor, "B M N K 2"]
@@ -279,6 +299,7 @@ class Solution(_Batch):
     gradient_norm: Float[Tensor, "B M"]
     status: Int[Tensor, "B M"]
     iterates: tuple[Float[Tensor, "B M N K 2"], ...] | None = None
+    tables: Tables | None = None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The energy-based potential game layer (Section 4.3): S damped Gauss-Newton steps, differentiable in several ways.
+"""The energy-based potential game layer (Section 4.3): S damped Gauss-Newton steps, differentiable.
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
 modes are solved at once and none of them can disturb another: where a factorisation fails, that sample alone is tried again
@@ -15,38 +15,28 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
-from epo_lightning.solvers import compiled, implicit, structured
+from epo_lightning.solvers import compiled, structured
+from epo_lightning.solvers.base import PATH, STATIONARY, Stepwise
 
 Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool], Solution]
 """(energy, scene, parameters, steps, step size, damping [B, M], keep iterates) -> solution."""
 
 _LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e7
 """Between which adaptive damping stays."""
-_CHOICES = {
-    "differentiation": ("unrolled", "truncated", "implicit", "detached"),
-    "hessian": ("exact", "gauss_newton"),
-    "backend": ("auto", "pytorch", "compiled"),
-}
+BACKENDS = ("auto", "pytorch", "compiled")
 
 
 @register("solver", "levenberg_marquardt")
 @dataclass(frozen=True)
-class LevenbergMarquardt:
+class LevenbergMarquardt(Stepwise):
     """S steps of damped Gauss-Newton from the initial strategies (Section 4.3, "Differentiable Optimization").
 
-    What is learned through the solution depends on ``differentiation``:
-
-    - ``unrolled``, the paper's: the derivative of what was computed, all S steps of it, also by the initial controls.
-    - ``truncated``: that of the last ``truncated_steps`` steps, the iterate before them taken as given.
-    - ``implicit``: that of the minimum which the steps approach (implicit function theorem), whatever led there. It is right
-      only where the solution is a minimum, so take many steps; a sample whose Hessian is not positive definite is no minimum
-      and gets a gradient of zero and the status STOPPED. A minimum does not move when all weights of a game are scaled
-      together, so the gradient has no component along them, w . dL/dw = 0: their overall scale is not learned and drifts.
-      Fix one weight, or normalise.
-    - ``detached``: none.
+    What is learned through the solution is said by a :class:`~epo_lightning.solvers.backward.Backward`; called by itself, the
+    solver unrolls.
 
     Example::
 
@@ -59,22 +49,19 @@ class LevenbergMarquardt:
         step_size: alpha, 0 < alpha <= 1.
         damping: lambda >= 0, added to the diagonal of J^T J.
         keep_iterates: whether the solution carries u_0 .. u_S.
-        differentiation: see above.
-        truncated_steps: how many of the last steps are differentiated when truncated.
-        hessian: ``exact``, or ``gauss_newton`` to leave out second derivatives of residuals, when implicit.
         adaptive: whether every sample rejects steps that do not lower its energy and multiplies its damping by 10 then (at
             most 1e7), and accepts the others and divides it by 10 (at least 1e-7). Decisions are constants to the gradient.
         test_steps: the number of steps that forecasters take outside training; None for the same.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it can serve.
     """
 
+    needs = frozenset({FEATURES})
+    provides = frozenset({PATH, STATIONARY})
+
     steps: int = 2
     step_size: float = 0.3
     damping: float = 10.0
     keep_iterates: bool = False
-    differentiation: str = "unrolled"
-    truncated_steps: int = 1
-    hessian: str = "exact"
     adaptive: bool = False
     test_steps: int | None = None
     backend: str = "auto"
@@ -84,62 +71,41 @@ class LevenbergMarquardt:
             raise ConfigError(f"solver.steps must be 0 or more, not {self.steps}")
         if self.test_steps is not None and self.test_steps < 0:
             raise ConfigError(f"solver.test_steps must be 0 or more, not {self.test_steps}")
-        if self.truncated_steps < 1:
-            raise ConfigError(f"solver.truncated_steps must be 1 or more, not {self.truncated_steps}")
         if not 0 < self.step_size <= 1:
             raise ConfigError(f"solver.step_size must be in (0, 1], not {self.step_size}")
         if not 0 <= self.damping < float("inf"):
             raise ConfigError(f"solver.damping must be 0 or more, and finite, not {self.damping}")
-        for name, choices in _CHOICES.items():
-            chosen = getattr(self, name)
-            if chosen not in choices:
-                raise ConfigError(f"unknown solver.{name} {chosen!r}: {nearest(str(chosen), choices)}")
+        if self.backend not in BACKENDS:
+            raise ConfigError(f"unknown solver.backend {self.backend!r}: {nearest(str(self.backend), BACKENDS)}")
 
     def for_test(self) -> LevenbergMarquardt:
         """The solver to use outside training."""
-        return self if self.test_steps is None else dataclasses.replace(self, steps=self.test_steps)
+        return self if self.test_steps is None else self.with_steps(self.test_steps)
 
-    def __call__(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Solution:
-        """Minimise the energy of every scene and mode, starting at ``parameters.initial_controls``.
+    def with_steps(self, steps: int) -> LevenbergMarquardt:
+        """The same with another S."""
+        return dataclasses.replace(self, steps=steps)
+
+    def run(
+        self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Tensor | None = None
+    ) -> tuple[Solution, Tensor]:
+        """Take a number of steps; returns the solution and the damping with which one would go on.
 
         Raises:
             ValueError: scene and parameters do not fit together (the message names the tensor and its expected shape), or
                 the backend asked for cannot solve this game.
         """
+        if not isinstance(energy, FeatureEnergy):
+            raise ValueError(f"the solver takes energies made of features, not {type(energy).__name__}")
         start = parameters.initial_controls
         energy.validate(scene, parameters, start)
         if start.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"initial_controls are of type {start.dtype}; the layer takes float32 and float64")
         if scene.history.dtype != start.dtype:
             scene = scene.to(start.dtype)
+        damping = start.new_full(start.shape[:2], self.damping) if memory is None else memory
         if start.numel() == 0:
-            return _nothing(start)
-        damping = start.new_full(start.shape[:2], self.damping)
-        if self.differentiation == "unrolled":
-            return self._run(energy, scene, parameters, self.steps, damping)[0]
-        taught = min(self.truncated_steps, self.steps) if self.differentiation == "truncated" else 0
-        with torch.no_grad():
-            solution, damping = self._run(energy, scene, parameters, self.steps - taught, damping)
-        if taught:
-            onward = dataclasses.replace(parameters, initial_controls=solution.controls)
-            last, _ = self._run(energy, scene, onward, taught, damping)
-            return dataclasses.replace(
-                last,
-                initial_energy=solution.initial_energy,
-                status=torch.maximum(solution.status, last.status),
-                iterates=(*solution.iterates, *last.iterates[1:]) if solution.iterates and last.iterates else None,
-            )
-        if self.differentiation == "implicit" and torch.is_grad_enabled():
-            controls, status = implicit.attach(energy, scene, parameters, solution.controls, self.hessian == "exact")
-            states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
-            status = torch.maximum(solution.status, status)
-            return dataclasses.replace(solution, controls=controls, states=states, status=status)
-        return solution
-
-    def _run(
-        self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, steps: int, damping: Tensor
-    ) -> tuple[Solution, Tensor]:
-        """Take a number of steps; returns the solution and the damping with which one would go on."""
+            return _nothing(start), damping
         solve = _backend(self.backend, energy, scene, parameters)
         if not self.adaptive:
             return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates), damping

@@ -1,0 +1,57 @@
+"""What an objective is: what a forecaster's network is trained to do (the paper's Table 1, column 3)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar
+
+from torch import Tensor
+
+from epo_lightning.game.energy import Energy
+from epo_lightning.scene import JointForecast, Scene
+
+Terms = dict[str, tuple[float, Tensor]]
+"""Weight lambda and value of every named term of a training loss; their weighted sum is minimised, and all are logged."""
+
+
+class Objective(ABC):
+    """The interface of all objectives: weighted, named terms from a scene with its future and a forecast of it.
+
+    Attributes:
+        terms: names of the weights lambda that a configuration gives.
+        through_solution: whether it learns through the derivative of the minimiser's solution, or from energies alone.
+        needs: of what a minimiser may provide, any one is enough; nothing if empty.
+        of_energy: what the energy has to offer.
+    """
+
+    terms: ClassVar[tuple[str, ...]]
+    through_solution: ClassVar[bool] = False
+    needs: ClassVar[frozenset[str]] = frozenset()
+    of_energy: ClassVar[frozenset[str]] = frozenset()
+    weights: Mapping[str, float]
+
+    @abstractmethod
+    def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
+        """The terms of a batch.
+
+        Args:
+            scene: with its future.
+            forecast: of the scene, with ``parameters``, ``solution`` and ``initial_states``.
+            energy: that was minimised.
+            step: number of optimisation steps so far.
+
+        Raises:
+            ValueError: the scene has no future.
+        """
+
+
+def checked_weights(weights: Mapping[str, float], names: tuple[str, ...]) -> dict[str, float]:
+    """The weights lambda: all of them and no others.
+
+    Raises:
+        ValueError: a missing or an unknown name.
+    """
+    if set(weights) != set(names):
+        raise ValueError(f"weights must name {list(names)}, not {sorted(weights)}")
+    return dict(weights)
