@@ -246,6 +246,21 @@ class GameParameters(_Batch):
     context: Float[Tensor, "B N D"] | None = None
     order: Float[Tensor, "B M P"] | None = None
 
+    def for_modes(self, modes: int) -> GameParameters:
+        """These games for M modes: one game becomes that of them all. Initial strategies stay as they are."""
+
+        def widen(tensor: Tensor | None) -> Tensor | None:
+            return None if tensor is None else tensor.expand(-1, modes, *tensor.shape[2:])
+
+        return dataclasses.replace(
+            self,
+            own_weights={name: weight.expand(-1, modes, -1) for name, weight in self.own_weights.items()},
+            pair_weights={name: weight.expand(-1, modes, -1) for name, weight in self.pair_weights.items()},
+            goals=widen(self.goals),
+            reference=widen(self.reference),
+            order=widen(self.order),
+        )
+
 
 class Status(IntEnum):
     """How the minimisation of one scene and mode went."""
@@ -316,6 +331,7 @@ class JointForecast(_Batch):
         parameters: the inferred game.
         solution: how the game was solved.
         goal_probabilities: of each agent's goal candidates, for forecasters that choose among them.
+        order_logits: of every pair's order being +1, for forecasters whose modes are orders.
         own_energy: energy by feature and agent at the solution.
         pair_energy: energy by feature and pair at the solution.
     """
@@ -328,5 +344,6 @@ class JointForecast(_Batch):
     parameters: GameParameters | None = None
     solution: Solution | None = None
     goal_probabilities: Float[Tensor, "B N G"] | None = None
+    order_logits: Float[Tensor, "B P"] | None = None
     own_energy: Mapping[str, Float[Tensor, "B M N"]] | None = None
     pair_energy: Mapping[str, Float[Tensor, "B M P"]] | None = None

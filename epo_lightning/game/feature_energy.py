@@ -242,7 +242,7 @@ class FeatureEnergy(Energy):
                 if name not in given:
                     raise ValueError(f"{kind} lacks the feature {name!r}; it has {sorted(given)}")
                 shape = list(given[name].shape) if isinstance(given[name], Tensor) else given[name]
-                if shape != [batch, modes, count]:
+                if shape not in ([batch, modes, count], [batch, 1, count]):
                     raise ValueError(f"{kind}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}")
         needed: dict[str, tuple[tuple[str, Tensor | None], ...]] = {
             "goals": (("parameters.goals", parameters.goals),),
@@ -254,9 +254,11 @@ class FeatureEnergy(Energy):
             for what, value in needed[feature.needs] if feature.needs else ():
                 if value is None:
                     raise ValueError(f"the energy has the feature {name!r}, but {what} is None")
-                takes = {"parameters.goals": [batch, modes, agents, 2], "parameters.reference": [batch, modes, agents]}
-                if list(value.shape) != takes.get(what, list(value.shape)):
-                    raise ValueError(f"{what} has shape {list(value.shape)}; these controls take {takes[what]}")
+                takes = {"parameters.goals": [agents, 2], "parameters.reference": [agents]}.get(what)
+                if takes and list(value.shape) not in ([batch, modes, *takes], [batch, 1, *takes]):
+                    raise ValueError(
+                        f"{what} has shape {list(value.shape)}; these controls take {[batch, modes, *takes]}"
+                    )
         if "reference" in self.needs and parameters.reference.is_floating_point():  # type: ignore[union-attr]
             raise ValueError("parameters.reference holds indices of lines: it takes whole numbers, not floats")
         if "reference" in self.needs and controls.device.type == "cpu":  # elsewhere, looking would make the host wait

@@ -2,10 +2,10 @@
 
 - ``unrolled``, the paper's: the derivative of what was computed, all S steps of it, also by the initial strategies.
 - ``truncated``: that of the last few steps, the iterate before them taken as given.
-- ``implicit``: that of the minimum which the steps approach (implicit function theorem), whatever led there. It is right only
-  where the solution is a minimum, so take many steps; a sample whose Hessian is not positive definite is no minimum and gets
-  a gradient of zero and the status STOPPED. A minimum does not move when all weights of a game are scaled together, so the
-  gradient has no component along them, w . dL/dw = 0: their overall scale is not learned and drifts. Fix one weight, or
+- ``implicit``: that of the minimum which the steps approach (implicit function theorem), whatever led there. It is right
+  only where the solution is a minimum, so take many steps; a sample whose Hessian is not positive definite is no minimum and
+  gets a gradient of zero and the status STOPPED. A minimum does not move when all weights of a game are scaled together, so
+  the gradient has no component along them, w . dL/dw = 0: their overall scale is not learned and drifts. Fix one weight, or
   normalise.
 - ``detached``: none, for objectives that compare energies instead of solutions.
 """
@@ -23,7 +23,7 @@ from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution
 from epo_lightning.solvers import dense, implicit
-from epo_lightning.solvers.base import PATH, STATIONARY, Minimiser, Stepwise
+from epo_lightning.solvers.base import PATH, STATIONARY, TABLES, Minimiser, Stepwise
 
 HESSIANS = ("exact", "gauss_newton")
 
@@ -32,7 +32,7 @@ class Backward(ABC):
     """The interface: runs a minimiser and gives its solution a derivative.
 
     Attributes:
-        needs: what a minimiser has to provide.
+        needs: of what a minimiser may provide, any one is enough; nothing if empty.
         teaches: whether anything is learned through the solution.
         teaches_start: whether initial strategies are.
     """
@@ -56,7 +56,7 @@ class Backward(ABC):
 class Unrolled(Backward):
     """Differentiate every step (Section 4.3)."""
 
-    needs = frozenset({PATH})
+    needs = frozenset({PATH, TABLES})
     teaches_start = True
 
     def __call__(self, minimiser: Minimiser, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:

@@ -6,8 +6,9 @@ cannot work together is refused before anything runs (:mod:`epo_lightning.foreca
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from epo_lightning.game.energy import Energy
 from epo_lightning.scene import GameParameters, Scene, Solution
@@ -71,6 +72,6 @@ class Stepwise(Minimiser):
         """Take all S steps; see :meth:`Minimiser.__call__`."""
         return self.run(energy, scene, parameters, self.steps)[0]
 
-    def with_steps(self, steps: int) -> Self:
+    def with_steps(self, steps: int) -> Stepwise:
         """The same with another S."""
-        raise NotImplementedError
+        return dataclasses.replace(self, steps=steps)  # type: ignore[type-var]  # minimisers are dataclasses

@@ -35,8 +35,8 @@ BACKENDS = ("auto", "pytorch", "compiled")
 class LevenbergMarquardt(Stepwise):
     """S steps of damped Gauss-Newton from the initial strategies (Section 4.3, "Differentiable Optimization").
 
-    What is learned through the solution is said by a :class:`~epo_lightning.solvers.backward.Backward`; called by itself, the
-    solver unrolls.
+    What is learned through the solution is said by a :class:`~epo_lightning.solvers.backward.Backward`; called by itself,
+    the solver unrolls.
 
     Example::
 
@@ -78,13 +78,9 @@ class LevenbergMarquardt(Stepwise):
         if self.backend not in BACKENDS:
             raise ConfigError(f"unknown solver.backend {self.backend!r}: {nearest(str(self.backend), BACKENDS)}")
 
-    def for_test(self) -> LevenbergMarquardt:
+    def for_test(self) -> Stepwise:
         """The solver to use outside training."""
         return self if self.test_steps is None else self.with_steps(self.test_steps)
-
-    def with_steps(self, steps: int) -> LevenbergMarquardt:
-        """The same with another S."""
-        return dataclasses.replace(self, steps=steps)
 
     def run(
         self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Tensor | None = None
@@ -99,6 +95,7 @@ class LevenbergMarquardt(Stepwise):
             raise ValueError(f"the solver takes energies made of features, not {type(energy).__name__}")
         start = parameters.initial_controls
         energy.validate(scene, parameters, start)
+        parameters = parameters.for_modes(start.shape[1])
         if start.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"initial_controls are of type {start.dtype}; the layer takes float32 and float64")
         if scene.history.dtype != start.dtype:

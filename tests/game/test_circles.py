@@ -21,6 +21,7 @@ from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Status
 from epo_lightning.solvers import compiled, structured
+from epo_lightning.solvers.backward import Implicit, Unrolled
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
 OWN = ("goal", "velref", "acc", "turnr", "jerk")
@@ -200,10 +201,11 @@ def test_gradients_of_the_layer_equal_finite_differences(mode):
     scene, parameters = traffic(scenes=6, agents=3 if mode == "unrolled" else 2, apart=0.7)
     parameters = dataclasses.replace(parameters, initial_controls=0.2 * parameters.initial_controls)
     energy = FeatureEnergy(OWN, ["circles"])
-    few, many = LevenbergMarquardt(3), LevenbergMarquardt(120, 1.0, 1e-2, differentiation="implicit")
+    few, many = LevenbergMarquardt(3), LevenbergMarquardt(120, 1.0, 1e-2)
     solve = dataclasses.replace(few if mode == "unrolled" else many, backend="pytorch")
     leaves = leaves_of(parameters)
-    solution = solve(energy, scene, leaves)
+    backward = Unrolled() if mode == "unrolled" else Implicit()
+    solution = backward(solve, energy, scene, leaves)
     solved = solution.status == Status.SOLVED
     cotangent = torch.randn_like(solution.controls)
     if mode == "unrolled":
@@ -216,11 +218,11 @@ def test_gradients_of_the_layer_equal_finite_differences(mode):
         touching = energy.residuals(scene, parameters, solution.controls.detach())["circles"].flatten(2).any(-1)
         assert (smooth & touching).any()
     (solution.controls * cotangent).sum().backward()
-    again = dataclasses.replace(solve, differentiation="detached")
+    again = solve
     kinds = ["own_weights", "pair_weights", "goals", "initial_controls"]
     if mode == "implicit":
         kinds.pop()
-        again = dataclasses.replace(again, steps=40)
+        again = solve.with_steps(40)
         parameters = dataclasses.replace(parameters, initial_controls=solution.controls.detach())
     used = {"own_weights": OWN, "pair_weights": ["circles"]}
     for kind in kinds:
@@ -249,10 +251,9 @@ def test_coincident_vehicles_stay_finite():
     depth.sum().backward()
     assert (states.grad == 0).all()
     leaves = leaves_of(parameters)
-    for mode in ("unrolled", "implicit"):
-        solution = LevenbergMarquardt(2, differentiation=mode, backend="pytorch")(
-            FeatureEnergy(OWN, ["circles"]), scene, leaves
-        )
+    for backward in (Unrolled(), Implicit()):
+        solve = LevenbergMarquardt(2, backend="pytorch")
+        solution = backward(solve, FeatureEnergy(OWN, ["circles"]), scene, leaves)
         solution.states.sum().backward()
         assert solution.states.isfinite().all()
     grads = [leaves.initial_controls.grad, leaves.goals.grad, leaves.pair_weights["circles"].grad]

@@ -12,6 +12,7 @@ from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Status
+from epo_lightning.solvers.backward import Detached, Implicit, Truncated, Unrolled
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
 
@@ -109,15 +110,19 @@ def test_many_steps_reach_an_equilibrium():
         ({"damping": float("nan")}, "solver.damping"),
         ({"damping": float("inf")}, "solver.damping"),
         ({"test_steps": -1}, "solver.test_steps"),
-        ({"truncated_steps": 0}, "solver.truncated_steps"),
-        ({"differentiation": "implict"}, "did you mean 'implicit'"),
-        ({"hessian": "newton"}, "unknown solver.hessian"),
         ({"backend": "cuda"}, "unknown solver.backend"),
     ],
 )
 def test_bad_settings_are_refused(arguments, message):
     with pytest.raises(ConfigError, match=message):
         LevenbergMarquardt(**arguments)
+
+
+def test_bad_settings_of_derivatives_are_refused():
+    with pytest.raises(ConfigError, match=r"backward\.steps must be 1 or more"):
+        Truncated(0)
+    with pytest.raises(ConfigError, match=r"unknown backward\.hessian 'newton'"):
+        Implicit("newton")
 
 
 @pytest.mark.parametrize("backend", ["compiled", "pytorch"])
@@ -166,7 +171,7 @@ def solved_game(own, agents=2, horizon=4, scenes=2):
     scene = random_scene(scenes, agents, history=2, size=1.0, dtype=torch.float64)
     scene.history[..., :2] *= 0.3
     parameters = random_game(scene, 1, horizon, tuple(own), spread=0.1)
-    return scene, parameters, LevenbergMarquardt(300, 1.0, 1e-2, differentiation="implicit")
+    return scene, parameters, LevenbergMarquardt(300, 1.0, 1e-2)
 
 
 @pytest.mark.parametrize("own", [SMOOTH, [*SMOOTH, "lane"], ["goal", "acc", "turnr", "accb", "velb", "turnrb"]])
@@ -174,14 +179,14 @@ def test_implicit_gradients_equal_central_differences_of_the_minimum(own):
     scene, parameters, solve = solved_game(own)
     energy = FeatureEnergy(own, bounds=BOUNDS)
     leaves = leaves_of(parameters)
-    solution = solve(energy, scene, leaves)
+    solution = Implicit()(solve, energy, scene, leaves)
     assert solution.gradient_norm.max() < 1e-9
     assert (energy.residuals(scene, parameters, solution.controls.detach())["proximity"] != 0).any()
     assert (solution.status == Status.SOLVED).all()
     cotangent = torch.randn_like(parameters.initial_controls)
     (solution.controls * cotangent).sum().backward()
     assert leaves.initial_controls.grad is None
-    again = dataclasses.replace(solve, steps=40, differentiation="detached")
+    again = solve.with_steps(40)
     for kind, name in [*(("own_weights", name) for name in own), ("pair_weights", "proximity"), ("goals", None)]:
         given = getattr(parameters, kind)
         tensor = given if name is None else given[name]
@@ -208,7 +213,7 @@ def test_gauss_newton_hessians_give_another_implicit_gradient():
     energy, gradients = FeatureEnergy(SMOOTH), []
     for hessian in ("exact", "gauss_newton"):
         leaves = leaves_of(parameters)
-        dataclasses.replace(solve, hessian=hessian)(energy, scene, leaves).controls.sum().backward()
+        Implicit(hessian)(solve, energy, scene, leaves).controls.sum().backward()
         gradients.append(leaves.goals.grad.flatten())
     cosine = torch.nn.functional.cosine_similarity(*gradients, dim=0)
     assert 0.9 < cosine < 1.0 - 1e-9
@@ -220,7 +225,7 @@ def test_what_is_no_minimum_has_no_implicit_gradient():
     parameters.own_weights["goal"][1] = 0.0
     scene.history[0, :, :, 2] = 0.0  # both drive on to goals ahead, which they have yet to reach
     leaves = leaves_of(parameters)
-    solution = LevenbergMarquardt(2, differentiation="implicit")(FeatureEnergy(["goal"], []), scene, leaves)
+    solution = Implicit()(LevenbergMarquardt(2), FeatureEnergy(["goal"], []), scene, leaves)
     assert (solution.status[1] == Status.STOPPED).all()
     solution.states.sum().backward()
     assert (leaves.own_weights["goal"].grad[1] == 0).all()
@@ -232,10 +237,10 @@ def test_truncated_gradients_are_those_of_the_last_steps(adaptive):
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, horizon=5)
     energy = FeatureEnergy(ALL, bounds=BOUNDS)
-    solve = LevenbergMarquardt(5, 0.3, 10.0, True, "truncated", truncated_steps=2, adaptive=adaptive)
+    solve = LevenbergMarquardt(5, 0.3, 10.0, True, adaptive=adaptive)
     leaves = leaves_of(parameters)
-    solution = solve(energy, scene, leaves)
-    full = dataclasses.replace(solve, differentiation="unrolled")(energy, scene, parameters)
+    solution = Truncated(2)(solve, energy, scene, leaves)
+    full = solve(energy, scene, parameters)
     for name in ("controls", "states", "energy", "initial_energy", "gradient_norm", "status"):
         torch.testing.assert_close(getattr(solution, name), getattr(full, name), rtol=0, atol=0)
     assert len(solution.iterates) == 6
@@ -252,9 +257,8 @@ def test_truncated_gradients_are_those_of_the_last_steps(adaptive):
 
 def test_detached_solutions_teach_nothing():
     scene = random_scene(2, 2, history=2)
-    solution = LevenbergMarquardt(differentiation="detached")(
-        FeatureEnergy(ALL, bounds=BOUNDS), scene, leaves_of(random_game(scene))
-    )
+    energy, leaves = FeatureEnergy(ALL, bounds=BOUNDS), leaves_of(random_game(scene))
+    solution = Detached()(LevenbergMarquardt(), energy, scene, leaves)
     assert not solution.controls.requires_grad
     assert not solution.states.requires_grad
 
@@ -303,13 +307,12 @@ def test_another_number_of_steps_outside_training():
 
 
 @pytest.mark.parametrize("backend", ["compiled", "pytorch"])
-@pytest.mark.parametrize("differentiation", ["unrolled", "truncated", "implicit", "detached"])
+@pytest.mark.parametrize("backward", [Unrolled(), Truncated(), Implicit(), Detached()])
 @pytest.mark.parametrize(("scenes", "modes", "agents"), [(0, 2, 2), (2, 0, 2), (2, 2, 0)])
-def test_no_game_at_all_has_an_empty_solution(backend, differentiation, scenes, modes, agents):
+def test_no_game_at_all_has_an_empty_solution(backend, backward, scenes, modes, agents):
     scene = random_scene(scenes, agents, history=2)
-    solution = LevenbergMarquardt(backend=backend, differentiation=differentiation)(
-        FeatureEnergy(ALL, bounds=BOUNDS), scene, random_game(scene, modes)
-    )
+    energy, game = FeatureEnergy(ALL, bounds=BOUNDS), random_game(scene, modes)
+    solution = backward(LevenbergMarquardt(backend=backend), energy, scene, game)
     assert solution.states.shape == (scenes, modes, agents, 7, 4)
     assert solution.status.shape == (scenes, modes)
 

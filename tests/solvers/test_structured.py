@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, SPEED, TURN
 from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import Status
 from epo_lightning.solvers import structured
+from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
 
@@ -254,7 +256,7 @@ def test_undeclared_features_have_the_implicit_gradients_of_declared_ones(twins)
     parameters = random_game(scene, 1, 5, spread=0.1)
     parameters = dataclasses.replace(parameters, goals=torch.zeros_like(parameters.goals))
     weight, pair = parameters.own_weights["acc"], parameters.pair_weights["proximity"]
-    minimise = LevenbergMarquardt(300, 1.0, 1e-1, differentiation="implicit", backend="pytorch")
+    minimise = partial(Implicit(), LevenbergMarquardt(300, 1.0, 1e-1, backend="pytorch"))
 
     def run(own, name):
         own = [*own, "acc"]  # or accelerations would have no minimum
