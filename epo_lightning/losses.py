@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -102,3 +103,21 @@ def marginal_probability(
 def log(probabilities: Tensor) -> Tensor:
     """The logarithm, finite also where a probability is too small for its precision."""
     return probabilities.clamp_min(torch.finfo(probabilities.dtype).tiny).log()
+
+
+def joint_density(log_density: Float[Tensor, " B"], mask: Bool[Tensor, "B N K"]) -> Float[Tensor, ""]:
+    """-log p of what was observed of every scene; 0 where that is nothing."""
+    return torch.where(mask.flatten(1).any(1), surprise(log_density), 0.0).mean()
+
+
+def marginal_density(
+    log_density: Float[Tensor, "B M N"], mode: Int[Tensor, "B N"], mask: Bool[Tensor, "B N K"]
+) -> Float[Tensor, ""]:
+    """As :func:`marginal_probability`, but of logarithms: the least likely future is still learned from."""
+    return _mean_over_agents(surprise(log_density.gather(1, mode[:, None])[:, 0]), mask).mean()
+
+
+def surprise(log_density: Tensor) -> Tensor:
+    """-log p; what cannot happen, or has no probability, costs what the smallest number would, and teaches nothing."""
+    least = torch.finfo(log_density.dtype).tiny
+    return -torch.where(log_density.isfinite(), log_density, math.log(least))

@@ -1,0 +1,88 @@
+"""Conditional density estimation over candidates: what was observed becomes likely among what could have been."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from epo_lightning import losses
+from epo_lightning.game.energy import Energy
+from epo_lightning.objectives.base import Objective, Terms, checked_weights
+from epo_lightning.objectives.terms import observed_future
+from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.solvers import assignments
+from epo_lightning.solvers.base import TABLES
+
+DENSITIES = ("joint", "marginal")
+
+
+@register("objective", "conditional")
+class Conditional(Objective):
+    """-log p(k*) with p(k) = exp(-E(k)) / Z, and k*_i agent i's candidate that is closest to what it did.
+
+    - ``joint`` (JFP, Luo et al., CoRL 2022): -log p(k*_1, ..., k*_N) = E(k*) + log Z, the joint assignment of a scene.
+    - ``marginal`` (DSDNet, Zeng et al., ECCV 2020): -log p(k*_i), averaged over agents.
+
+    Agents of whom nothing was observed are summed over in the joint density, which is then that of the others, and do not
+    count in the rest; scenes of which nothing was observed cost nothing. k* is chosen among the candidates that the energy
+    allows. Where it allows each k*_i but not all of them together, or where energies are no numbers, the scene costs as much
+    as the smallest probability of its precision, and teaches nothing: an infinite energy has no derivative.
+
+    Args:
+        weights: lambda of ``density``; of ``marginal``, the cross entropy of every agent's candidates by their own energies
+            alone, exp(-E_i) (JFP's auxiliary loss); and of ``regression``, the distance of the closest candidate, which
+            moves it where candidates are learned, and elsewhere tells how well they cover what happened.
+        density: ``joint`` or ``marginal``.
+    """
+
+    terms = ("density", "marginal", "regression")
+    through_solution = True
+    needs = frozenset({TABLES})
+
+    def __init__(self, weights: Mapping[str, float], density: str = "joint") -> None:
+        if density not in DENSITIES:
+            raise ConfigError(f"unknown objective.density {density!r}: {nearest(str(density), DENSITIES)}")
+        self.weights = checked_weights(weights, self.terms)
+        self.density = density
+
+    def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
+        """The terms of a batch; see :meth:`Objective.__call__`.
+
+        Raises:
+            ValueError: the scene has no future, or the forecast no tables of candidates.
+        """
+        tables = None if forecast.solution is None else forecast.solution.tables
+        if tables is None:
+            raise ValueError("learning a density takes forecast.solution.tables: choose a solver over candidates")
+        future, mask = observed_future(scene)
+        # What is no number must not even be differentiated.
+        known = tables.log_partition.isfinite()
+        unary = torch.where(known[:, None, None], tables.unary, 0.0)
+        pair = torch.where(known[:, None, None, None], tables.pair, 0.0)
+
+        distance = losses.distances(tables.states[..., :2], future, mask)
+        allowed = unary.transpose(1, 2).isfinite()
+        closest = torch.where(allowed, distance, torch.inf).argmin(1)
+        if self.density == "joint":
+            log_density = _joint(unary, pair, scene.agent_mask, closest, mask.any(-1)) - tables.log_partition
+            density = losses.joint_density(log_density, mask)
+        else:
+            density = losses.marginal_density(tables.log_marginals.transpose(1, 2), closest, mask)
+        alone = torch.where(known[:, None, None], (-unary).log_softmax(-1), torch.nan).transpose(1, 2)
+        regression, _ = losses.marginal_imitation(distance.gather(1, closest[:, None]), mask)
+        return {
+            "density": (self.weights["density"], density),
+            "marginal": (self.weights["marginal"], losses.marginal_density(alone, closest, mask)),
+            "regression": (self.weights["regression"], regression),
+        }
+
+
+def _joint(unary: Tensor, pair: Tensor, present: Tensor, closest: Tensor, observed: Tensor) -> Tensor:
+    """log of the sum of exp(-E) over all assignments in which everyone observed takes its closest candidate."""
+    candidate = torch.arange(unary.shape[2], device=unary.device)
+    other = observed[..., None] & (candidate != closest[..., None])
+    _, log_sum = assignments.partition(torch.where(other, torch.inf, unary), pair, present)
+    return log_sum
