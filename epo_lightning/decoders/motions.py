@@ -1,4 +1,4 @@
-"""Candidates from a model of motion instead of a network (DSDNet, Zeng et al., ECCV 2020, Section 3.3).
+"""Candidates from a model of motion instead of a network (DSDNet, Zeng et al., ECCV 2020).
 
 A mixture of 30% straight lines, 20% circular arcs and 50% clothoids around how agents move now. What is drawn at random
 there comes from a quasi-random sequence here: forecasts repeat, and few candidates still cover the ranges evenly.
