@@ -82,6 +82,8 @@ class FeatureEnergy(Energy):
                 raise ConfigError(f"feature {name!r} needs energy.bounds.{feature.signal}: [lowest, highest]")
         if not isinstance(self.pair_stride, int) or self.pair_stride < 1:
             raise ConfigError(f"energy.pair_stride must be a whole number, 1 or more, not {self.pair_stride}")
+        for name, pair in self.pair_features.items():
+            _refuse_asymmetry(name, pair)
         signals = {feature.signal for feature in OWN_FEATURES.values() if feature.bounded}
         for name, bound in self.bounds.items():
             if name not in signals:
@@ -366,6 +368,34 @@ class FeatureEnergy(Energy):
         if feature.function is overlap:
             return overlap(distance, reach), -(distance < reach).to(distance.dtype)
         return slope(feature.function, distance, reach)
+
+
+def _refuse_asymmetry(name: str, feature: PairFeature) -> None:
+    """Two agents must share a pair's cost, or the game has no potential.
+
+    Raises:
+        ConfigError: a feature that depends on the order of the agents, or a function that fails on a trial.
+    """
+    try:
+        costs = feature.asymmetry
+    except Exception as error:
+        takes = (
+            "states [.., K, 4] and sizes [.., 1, 2] of two agents"
+            if feature.needs
+            else "states [.., K, 4] of two agents"
+        )
+        raise ConfigError(
+            f"pair feature {name!r} fails on a trial: {type(error).__name__}: {error}. It takes the {takes} "
+            "and returns residuals [.., R]"
+        ) from error
+    if costs is not None:
+        raise ConfigError(
+            f"pair feature {name!r} is not symmetric: for some two agents 1/2 |r|^2 is {costs[0]:.4g}, and {costs[1]:.4g} "
+            "when they are swapped. Then this is not a potential game: no energy of this form has its equilibria as minima. "
+            "Make the feature symmetric, for instance by returning the residuals of both orders. If agents only mind it to "
+            "different degrees, a_i E_ij with a_i > 0, keep E_ij symmetric: that is the same as dividing the own terms of "
+            "every agent by its a_i, which decoded own weights can do already"
+        )
 
 
 def along(

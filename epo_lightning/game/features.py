@@ -26,12 +26,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from epo_lightning.game import symmetry
 from epo_lightning.game.circles import disc, overlap, row_extent, row_overlap
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import ACCELERATION, SPEED, TURN_RATE
@@ -104,6 +106,13 @@ class PairFeature:
     needs: str | None = None
     stepwise: bool = False
     extent: Callable[[Tensor], Tensor] | None = None
+
+    @cached_property
+    def asymmetry(self) -> tuple[float, float] | None:
+        """What two agents cost in one order and in the other, where it is not the same; see :mod:`.symmetry`."""
+        if self.source is Source.DISTANCE:
+            return None
+        return symmetry.difference(self.function, sizes=self.needs == "size")
 
 
 def _with_bounds(features: Mapping[str, OwnFeature]) -> dict[str, OwnFeature]:
@@ -190,8 +199,8 @@ def pair_feature(
         name: how energies call it.
         source: DISTANCE for an elementwise function of distance [.., K] and reach [.., 1], the sum of both radii;
             TRAJECTORY for any differentiable function of the states [.., K, 4] of the first and of the second agent,
-            elementwise over all leading dimensions, that returns residuals [.., R]. Either sees only the steps at which
-            the energy evaluates pairs.
+            elementwise over all leading dimensions, that returns residuals [.., R]; energies refuse one whose sum of
+            squares depends on who comes first. Either sees only the steps at which the energy evaluates pairs.
         needs: ``size`` for a function of states that takes the length and width [.., 1, 2] of the first and of the second
             agent too; those of absent agents are zero.
 
@@ -233,7 +242,7 @@ class Surroundings:
 
 
 def foot(
-    position: Float[Tensor, "*batch K 2"], line: Float[Tensor, "*batch Q 2"]
+    position: Float[Tensor, "*batch K 2"], line: Float[Tensor, "*#batch Q 2"]
 ) -> tuple[Float[Tensor, "*batch K 2"], Float[Tensor, "*batch K 2"]]:
     """The nearest point of a polyline, and how it slides: the segment's unit tangent, zero at the end of a segment.
 

@@ -1,0 +1,117 @@
+"""What energies that are networks are made of: trajectories as an agent itself sees them, encounters, and small networks.
+
+All of it is smooth in the states but for the step at which two agents are nearest, which is a constant: gradients exist
+where implicit differentiation needs second ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from epo_lightning.game.circles import length_of
+from epo_lightning.scene import HEADING, SPEED
+
+MOTION, ENCOUNTER = 5, 6
+"""How many numbers say what an agent does at one step, and how two agents meet."""
+
+
+def turned(vector: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch 2"]:
+    """R(-angle) times a vector: the vector as somebody sees it who looks along the angle."""
+    cos, sin = angle.cos(), angle.sin()
+    x, y = vector.unbind(-1)
+    return torch.stack((cos * x + sin * y, cos * y - sin * x), -1)
+
+
+def motion(
+    states: Float[Tensor, "*batch K 4"], initial: Float[Tensor, "*#batch 4"], scale: float
+) -> Float[Tensor, "*batch K 5"]:
+    """What an agent does, in its own frame at t0: place (x, y), cosine and sine of its heading, and speed.
+
+    Explicit Euler's last position does not depend on the last controls, but heading and speed do.
+
+    Args:
+        states: x_1 .. x_K.
+        initial: x_0, whose place and heading are the frame.
+        scale: metres, and metres per second, that a value of one stands for.
+    """
+    start = initial[..., None, :]
+    place = turned(states[..., :2] - start[..., :2], start[..., HEADING]) / scale
+    heading = states[..., HEADING] - start[..., HEADING]
+    return torch.cat((place, torch.stack((heading.cos(), heading.sin(), states[..., SPEED] / scale), -1)), -1)
+
+
+@torch.no_grad()
+def squared_distances(
+    first: Float[Tensor, "*#batch K 4"], second: Float[Tensor, "*#batch K 4"]
+) -> Iterator[Float[Tensor, "..."]]:
+    """How far two agents are apart at one step after the other, squared [m^2].
+
+    Step by step, so that of many pairs of candidates no more is in memory than one number each. Constants.
+    """
+    (ours_x, ours_y), (theirs_x, theirs_y) = (states[..., :2].unbind(-1) for states in (first, second))
+    for k in range(first.shape[-2]):
+        x, y = ours_x[..., k] - theirs_x[..., k], ours_y[..., k] - theirs_y[..., k]
+        yield x.mul_(x).addcmul_(y, y)
+
+
+@torch.no_grad()
+def nearest(first: Float[Tensor, "*#batch K 4"], second: Float[Tensor, "*#batch K 4"]) -> Int[Tensor, "*batch"]:
+    """The step at which two agents are nearest to each other, the first one on a tie. A constant."""
+    distances = squared_distances(first, second)
+    least = next(distances)
+    step = torch.zeros_like(least, dtype=torch.int64)
+    for k, squared in enumerate(distances, 1):
+        step, least = torch.where(squared < least, k, step), torch.minimum(least, squared)
+    return step
+
+
+def encounter(
+    first: Float[Tensor, "*#batch K 4"], second: Float[Tensor, "*#batch K 4"], scale: float
+) -> Float[Tensor, "*batch 6"]:
+    """How the first agent meets the second, g_ij: their least distance, its time as a share of the horizon, and where the
+    second is and looks in the end (x, y, cosine, sine), as the first then sees it.
+
+    Where they coincide, the distance has a gradient of zero.
+    """
+    step = nearest(first, second)
+    shape = step.shape
+    at = step[..., None, None]
+    ours, theirs = (
+        torch.take_along_dim(states[..., :2].expand(*shape, *states.shape[-2:-1], 2), at, -2)[..., 0, :]
+        for states in (first, second)
+    )
+    last, their_last = (states[..., -1, :].expand(*shape, 4) for states in (first, second))
+    heading = their_last[..., HEADING] - last[..., HEADING]
+    place = turned(their_last[..., :2] - last[..., :2], last[..., HEADING]) / scale
+    time = (step + 1).to(first.dtype) / first.shape[-2]
+    distance = length_of(ours - theirs) / scale
+    return torch.cat((place, torch.stack((distance, time, heading.cos(), heading.sin()), -1)), -1)
+
+
+class Layers(nn.Module):
+    """Two linear layers, each followed by SiLU; the first takes several inputs.
+
+    Every input is mapped by itself before they are broadcast and added: what belongs to many rows is mapped once. A layer
+    on top needs no bias, because adding a constant to an energy changes nothing.
+
+    Args:
+        inputs: sizes of the inputs.
+        width: size of the features.
+    """
+
+    def __init__(self, inputs: Sequence[int], width: int) -> None:
+        super().__init__()
+        self.first = nn.ModuleList(nn.Linear(size, width, bias=number == 0) for number, size in enumerate(inputs))
+        self.second = nn.Linear(width, width)
+        self.activation = nn.SiLU()
+
+    def forward(self, *inputs: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """Features of all inputs together [.., width]; the inputs [.., size] broadcast."""
+        features = self.first[0](inputs[0])
+        for linear, values in zip(list(self.first)[1:], inputs[1:], strict=True):
+            features = features + linear(values)
+        return self.activation(self.second(self.activation(features)))

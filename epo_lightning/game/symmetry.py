@@ -1,0 +1,62 @@
+"""Whether a pair feature costs both agents the same, without which there is no potential (Theorem 1).
+
+A function of the states of two agents can be anything, so it is tried on some: agents of all sizes, from 10 cm to 100 m
+apart, slow and fast, in all directions. What is symmetric passes for certain; what is not is found unless it is symmetric
+on all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_PAIRS, _STEPS, _DT = (4, 64), 40, 0.1
+_TOLERANCE = 1e-6
+
+
+@cache
+def _agents() -> tuple[tuple[Float[Tensor, "*batch K 4"], Float[Tensor, "*batch 1 2"]], ...]:
+    """States and sizes of the first and of the second agents, always the same."""
+    generator = torch.Generator().manual_seed(0)
+
+    def drawn(*shape: int) -> Tensor:
+        return torch.rand(*_PAIRS, *shape, generator=generator, dtype=torch.float64, device="cpu")
+
+    apart = 10.0 ** (3.0 * drawn(1, 1) - 1.0)
+    time = _DT * torch.arange(1, _STEPS + 1, dtype=torch.float64, device="cpu")[:, None]
+    both = []
+    for _ in range(2):
+        heading = 7.0 * drawn(1, 1) - 3.5 + (drawn(1, 1) - 0.5) * time
+        speed = 30.0 * drawn(1, 1).square() + (drawn(1, 1) - 0.5) * time
+        way = _DT * (speed * torch.cat((heading.cos(), heading.sin()), -1)).cumsum(-2)
+        states = torch.cat((apart * (drawn(1, 2) - 0.5) + way, heading, speed), -1)
+        both.append((states, torch.tensor([10.0, 2.5], dtype=torch.float64, device="cpu") * (0.1 + 0.9 * drawn(1, 2))))
+    return tuple(both)
+
+
+@torch.no_grad()
+def difference(function: Callable[..., Tensor], sizes: bool) -> tuple[float, float] | None:
+    """1/2 |r|^2 of a pair of agents and of the same two in the other order, where they differ most; None where they do not.
+
+    What is not a finite number in either order is left out.
+
+    Args:
+        function: of the states of the first and of the second agent [.., K, 4], and where ``sizes`` of their sizes
+            [.., 1, 2], that returns residuals [.., R].
+        sizes: whether it takes sizes.
+    """
+
+    def cost(*agents: tuple[Tensor, Tensor]) -> Tensor:
+        states, their_sizes = ([tensor.clone() for tensor in tensors] for tensors in zip(*agents, strict=True))
+        return 0.5 * function(*states, *(their_sizes if sizes else ())).square().sum(-1).flatten()
+
+    first, second = _agents()
+    here, there = cost(first, second), cost(second, first)
+    known = here.isfinite() & there.isfinite()
+    share = torch.where(known, (here - there).abs() / (here + there).clamp_min(1e-12), 0.0)
+    worst = share.argmax()
+    return (here[worst].item(), there[worst].item()) if share[worst] > _TOLERANCE else None
