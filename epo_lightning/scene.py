@@ -230,7 +230,8 @@ class GameParameters(_Batch):
         own_weights: weight of each named feature of an agent; enters the energy squared.
         pair_weights: weight of each named feature of a pair i < j, in the order of ``torch.triu_indices(N, N, 1)``.
         goals: where each agent is heading [m]; None for energies without a goal feature.
-        initial_controls: the strategies from which the solver starts.
+        initial_controls: the strategies from which the solver starts, one for every mode; or between which it chooses, any
+            number C of them.
         reference: index of the reference line that an agent follows, the one its goal lies on; None for energies without a
             lane feature.
         context: features z of the agents, for energies that are networks.
@@ -240,7 +241,7 @@ class GameParameters(_Batch):
 
     own_weights: Mapping[str, Float[Tensor, "B M N"]]
     pair_weights: Mapping[str, Float[Tensor, "B M P"]]
-    initial_controls: Float[Tensor, "B M N K 2"]
+    initial_controls: Float[Tensor, "B _ N K 2"]
     goals: Float[Tensor, "B M N 2"] | None = None
     reference: Int[Tensor, "B M N"] | None = None
     context: Float[Tensor, "B N D"] | None = None

@@ -19,6 +19,7 @@ CHECKED = (
     "decoders",
     "forecasters",
     "losses",
+    "objectives",
     "metrics",
     "optimizers",
 )
