@@ -1,0 +1,106 @@
+"""Orders as modes: who goes first, or who passes on which side, of every pair of agents (TGL's subspace predictor).
+
+A game that is convex given the order has one solution for each order, so joint modes are orders: the M most likely ones.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from epo_lightning.decoders.mlp import MLP
+from epo_lightning.game.convex_energy import ConvexEnergy
+from epo_lightning.game.energy import pairs
+from epo_lightning.scene import Scene
+
+
+class Orders(nn.Module):
+    """phi_order: how likely the order of a pair is +1, from the features of both agents, shared by all pairs.
+
+    p(s_ij = +1) = sigmoid(l_ij), and pairs are independent of each other given the features. The logit is
+    l_ij = f(z_i, z_j) - f(z_j, z_i), so agents that swap names swap the sign of their order, as who goes first asks for; or
+    f(z_i, z_j) + f(z_j, z_i) for orders that are the same for both, as the side on which they pass.
+
+    Args:
+        width: size of the agent features.
+        modes: number M of joint modes.
+        symmetric: whether the order is the same for both agents (:attr:`ConvexEnergy.symmetric`).
+    """
+
+    def __init__(self, width: int, modes: int, symmetric: bool = False) -> None:
+        super().__init__()
+        if modes < 1:
+            raise ValueError(f"modes must be 1 or more, not {modes}")
+        self.modes, self.symmetric = modes, symmetric
+        self.mlp = MLP(2 * width, 64, 1, norm="layer")
+
+    def forward(
+        self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]
+    ) -> tuple[Float[Tensor, "B M P"], Float[Tensor, "B M"], Float[Tensor, "B P"]]:
+        """The M most likely orders, their log-probabilities among each other, and the logits, zero for absent pairs."""
+        first, second = pairs(z.shape[1], z.device)
+        z = torch.where(mask[..., None], z, 0.0)
+        forth = self.mlp(torch.cat((z[:, first], z[:, second]), -1))[..., 0]
+        back = self.mlp(torch.cat((z[:, second], z[:, first]), -1))[..., 0]
+        present = mask[:, first] & mask[:, second]
+        logits = torch.where(present, forth + back if self.symmetric else forth - back, 0.0)
+        order = most_likely(logits, present, self.modes)
+        score = torch.where(present[:, None], F.logsigmoid(order * logits[:, None]), 0.0).sum(-1)
+        return order, score.log_softmax(-1), logits
+
+
+@torch.no_grad()
+def most_likely(logits: Float[Tensor, "B P"], present: Bool[Tensor, "B P"], modes: int) -> Float[Tensor, "B M P"]:
+    """The M most likely orders of independent pairs, in that order; where there are fewer, they begin anew.
+
+    The likeliest order has the sign of every logit, and to turn the sign of a pair costs |l| of log-probability. The M
+    cheapest sets of signs to turn are found pair by pair: those of some pairs are among the M cheapest of the pairs before,
+    with and without the next one. Absent pairs keep +1.
+    """
+    batch, count = logits.shape
+    cost = logits.new_full((batch, modes), torch.inf)
+    cost[:, 0] = 0.0
+    turned = torch.zeros(batch, modes, count, dtype=torch.bool, device=logits.device)
+    price = torch.where(present, logits.abs(), torch.inf)
+    for pair in range(count):
+        both = torch.cat((cost, cost + price[:, pair, None]), 1)
+        cost, kept = both.sort(dim=1, stable=True)
+        cost, kept = cost[:, :modes], kept[:, :modes]
+        turned = turned.gather(1, (kept % modes)[..., None].expand_as(turned))
+        turned[:, :, pair] = kept >= modes
+    rank = torch.arange(modes, device=logits.device) % (cost < torch.inf).sum(1, keepdim=True).clamp_min(1)
+    turned = turned.gather(1, rank[..., None].expand_as(turned))
+    likeliest = torch.where(present & (logits < 0), -1.0, 1.0).to(logits.dtype)[:, None]
+    return torch.where(turned, -likeliest, likeliest)
+
+
+def observed_order(energy: ConvexEnergy, scene: Scene) -> tuple[Float[Tensor, "B P"], Bool[Tensor, "B P"]]:
+    """The orders that agents took: the side on which i was of j where they came closest; and of which pairs it is known.
+
+    Known is the order of pairs that were observed at some step together. Others have +1.
+
+    Raises:
+        ValueError: the scene has no future.
+    """
+    if scene.future is None or scene.future_mask is None:
+        raise ValueError("the observed order is that of scene.future [B, N, K, 4], which is None")
+    first, second = pairs(scene.agent_mask.shape[1], scene.agent_mask.device)
+    observed = scene.future_mask & scene.agent_mask[..., None]
+    together = observed[:, first] & observed[:, second]
+    position = torch.where(observed[..., None], scene.future[..., :2], 0.0)
+    apart = position[:, first] - position[:, second]
+    closest = torch.where(together, apart.square().sum(-1), torch.inf).argmin(-1)[..., None, None]
+    way = apart.gather(2, closest.expand(-1, -1, 1, 2))[:, :, 0]
+    known = together.any(-1)
+    behind = known & ((energy.directions(scene) * way).sum(-1) < 0)
+    return torch.where(behind, -1.0, 1.0).to(position.dtype), known
+
+
+def order_loss(
+    logits: Float[Tensor, "B P"], order: Float[Tensor, "B P"], known: Bool[Tensor, "B P"]
+) -> Float[Tensor, ""]:
+    """Cross entropy between the pairs' probabilities and the orders they took: mean over scenes of that over known pairs."""
+    entropy = torch.where(known, -F.logsigmoid(order * torch.where(known, logits, 0.0)), 0.0)
+    return (entropy.sum(-1) / known.sum(-1).clamp_min(1)).mean()

@@ -1,0 +1,323 @@
+"""An energy that is convex in the controls, once it is given who goes first: one solution for every order (TGL).
+
+Geiger and Straehle (AAAI 2021) divide the strategies of two vehicles that merge into subspaces, one for each order in which
+they do so, such that the game has a single equilibrium in each. Here an order is a sign s_ij for every pair, and a decoder
+says which orders are likely (:mod:`epo_lightning.decoders.orders`). What differs from their game:
+
+- Their order and forward motion are hard constraints, by a monotone parametrisation. Here the order is a penalty, a hinge
+  that is zero where the order is kept by a distance, and nothing forbids to drive backwards.
+- They have two vehicles in the frame of a lane; here are N agents in the plane, and the distance is measured along a
+  direction for every pair that the present states fix.
+- Their distance term -alpha / (0.1 + d^2) and smooth maximum at the end of the lane are left out, their desired speed is the
+  scene's reference speed, and their lane centre is the line through the goal along the present heading.
+- Their weights are made positive by elu(.) + 1 + 1e-5; here weights enter squared, accelerations across have a floor of
+  1e-3, and the weight of accelerations along is held at 1, because the minimum does not depend on a common scale of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning.game.circles import disc
+from epo_lightning.game.double_integrator import DoubleIntegrator, rotate
+from epo_lightning.game.energy import CONVEX, GRADIENT, RESIDUALS, Energy, pairs
+from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.scene import HEADING, SPEED, GameParameters, Scene
+
+FLOOR = 1e-3
+"""What is added to the squared weight of accelerations across: a curvature in every control, large enough for float32."""
+ALONG, ACROSS = "along", "across"
+DIRECTIONS = (ALONG, ACROSS)
+_STILL = 1e-3
+"""Speed [m/s], distance [m] or length below which a vector has no direction."""
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What residuals of agents are made of, along and across the heading at t0.
+
+    Attributes:
+        controls, velocity: accelerations, and the velocities that they lead to.
+        to_goal: the way from the goal; None for energies that do not ask for goals.
+        reference_speed: how fast agents would like to be; None likewise.
+    """
+
+    controls: Float[Tensor, "B C N K 2"]
+    velocity: Float[Tensor, "B C N K 2"]
+    dt: float
+    to_goal: Float[Tensor, "B C N K 2"] | None
+    reference_speed: Float[Tensor, "B 1 N"] | None
+
+
+def _goal(motion: _Motion) -> Tensor:
+    assert motion.to_goal is not None
+    return motion.to_goal[..., -1, :]
+
+
+def _lateral(motion: _Motion) -> Tensor:
+    assert motion.to_goal is not None
+    return motion.to_goal[..., 1]
+
+
+def _velref(motion: _Motion) -> Tensor:
+    assert motion.reference_speed is not None
+    return motion.velocity[..., 0] - motion.reference_speed[..., None]
+
+
+_OWN: Mapping[str, tuple[Callable[[_Motion], Tensor], str | None]] = {
+    "goal": (_goal, "goals"),
+    "lateral": (_lateral, "goals"),
+    "velref": (_velref, "reference_speed"),
+    "lat_vel": (lambda motion: motion.velocity[..., 1], None),
+    "acc": (lambda motion: motion.controls[..., 0], None),
+    "lat_acc": (lambda motion: motion.controls[..., 1], None),
+    "jerk": (lambda motion: motion.controls[..., 0].diff(dim=-1) / motion.dt, None),
+    "lat_jerk": (lambda motion: motion.controls[..., 1].diff(dim=-1) / motion.dt, None),
+}
+"""Name to residuals [B, C, N, R], and what they refer to."""
+
+
+@register("energy", "convex")
+@dataclass(frozen=True)
+class ConvexEnergy(Energy):
+    """Half the sum of squares of residuals that are linear in the controls, or hinges of such.
+
+        E = 1/2 sum_i |w_i c(u_i)|^2 + 1/2 sum_{i<j} w_ij^2 sum_t a_t max(0, d_ij - s_ij n_ij . (p_i - p_j))^2
+
+    Own terms: ``goal``, the way from the goal at the end [m]; ``lateral``, the way from it across the heading at t0 at every
+    step [m]; ``velref``, what the speed along exceeds the reference speed by [m/s]; ``lat_vel``, the velocity across [m/s];
+    ``acc`` and ``lat_acc``, the accelerations along and across [m/s^2]; ``jerk`` and ``lat_jerk``, their rates [m/s^3].
+
+    The pair term ``order`` keeps a distance d_ij, half the sum of both lengths and a gap, on one side: s_ij = +1 where agent
+    i is to be ahead of agent j in the direction n_ij, -1 where behind. Only those steps count (a_t) at which both, going on
+    at constant velocity, would be near each other: an order says nothing about agents that are far apart.
+
+    - ``along``: n_ij is the mean heading of both at t0, and the order who goes first (merges). Agents that swap names swap
+      the sign of their order. Where headings oppose each other, n_ij is their common line, towards positive x.
+    - ``across``: n_ij is their relative velocity v_i - v_j at t0, turned to the left, and the order on which side they pass:
+      +1 where each leaves the other on its right. That is the same for both, whoever is called i. Without a relative
+      velocity, n_ij is the line that joins them, turned; without that too, the y axis.
+
+    Attributes:
+        own: names as above, of which ``acc`` (of weight 1, not decoded) and ``lat_acc`` must be two: they give every control
+            a curvature, without which there would be more than one solution.
+        pair: ``["order"]``, or nothing.
+        gap: distance [m] to be kept besides half the lengths.
+        direction: ``along`` or ``across``.
+        within: distance [m] up to which agents are near each other.
+        dynamics: a :class:`~epo_lightning.game.double_integrator.DoubleIntegrator`.
+    """
+
+    offers = frozenset({GRADIENT, RESIDUALS, CONVEX})
+
+    own: Sequence[str]
+    pair: Sequence[str] = ("order",)
+    gap: float = 1.0
+    direction: str = ALONG
+    within: float = 20.0
+    dynamics: Any = field(default_factory=DoubleIntegrator)  # what else is given is refused below, with a reason
+
+    def __post_init__(self) -> None:
+        for kind, names, known in (("own", self.own, tuple(_OWN)), ("pair", self.pair, ("order",))):
+            if isinstance(names, str):
+                raise ConfigError(f"energy.{kind} takes a list of names, not the one name {names!r}")
+            for name in names:
+                if name not in known:
+                    raise ConfigError(f"unknown {kind} term {name!r} of a convex energy: {nearest(str(name), known)}")
+            if len(set(names)) < len(names):
+                raise ConfigError(f"energy.{kind} names a term twice: {list(names)}")
+        if not {"acc", "lat_acc"} <= set(self.own):
+            raise ConfigError(
+                "energy.own of a convex energy must name acc and lat_acc: without them controls have no single best value"
+            )
+        if self.direction not in DIRECTIONS:
+            raise ConfigError(
+                f"unknown energy.direction {self.direction!r}: {nearest(str(self.direction), DIRECTIONS)}"
+            )
+        if not 0 <= self.gap < float("inf"):
+            raise ConfigError(f"energy.gap must be 0 or more, and finite [m], not {self.gap}")
+        if not self.within > 0:
+            raise ConfigError(f"energy.within must be positive [m], not {self.within}")
+        if not isinstance(self.dynamics, DoubleIntegrator):
+            raise ConfigError(
+                f"energy=convex is convex for linear dynamics: it goes with dynamics=double_integrator, "
+                f"not with {type(self.dynamics).__name__}"
+            )
+
+    @property
+    def weighted(self) -> tuple[Sequence[str], Sequence[str]]:
+        return [name for name in self.own if name != "acc"], self.pair
+
+    @cached_property
+    def needs(self) -> set[str]:
+        of_agents = {what for name in self.own if (what := _OWN[name][1])}
+        return of_agents | ({"size", "order"} if self.pair else set())
+
+    @property
+    def heading(self) -> set[str]:
+        """Names of the terms of goals."""
+        return {name for name in self.own if _OWN[name][1] == "goals"}
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether an order is the same for both of a pair, whoever comes first, or the opposite."""
+        return self.direction == ACROSS
+
+    def residuals(
+        self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+    ) -> dict[str, Float[Tensor, "B M _ _"]]:
+        """Weighted residuals by term: [B, M, N, R] for agents, R being K, K - 1 or 2, and [B, M, P, K] for pairs.
+
+        Absent agents have residuals of zero.
+
+        Raises:
+            ValueError: shapes or names of scene, parameters and controls that do not fit together.
+        """
+        self.validate(scene, parameters, controls)
+        controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
+        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
+        first, second = pairs(controls.shape[2], controls.device)
+        of_agents = dict(self._of_agents(scene, parameters, states, controls))
+        return of_agents | dict(self._of_pairs(scene, parameters, states[:, :, first], states[:, :, second]))
+
+    def own_terms(
+        self,
+        scene: Scene,
+        parameters: GameParameters,
+        states: Float[Tensor, "B C N K 4"],
+        controls: Float[Tensor, "B C N K 2"],
+    ) -> dict[str, Float[Tensor, "B C N"]]:
+        """1/2 |w c|^2 by own term."""
+        named = self._of_agents(scene, parameters, states, controls)
+        return {name: 0.5 * residual.square().sum(-1) for name, residual in named}
+
+    def pair_terms(
+        self,
+        scene: Scene,
+        parameters: GameParameters,
+        first: Float[Tensor, "B C P K 4"],
+        second: Float[Tensor, "B C P K 4"],
+    ) -> dict[str, Float[Tensor, "B C P"]]:
+        """Half the squared hinges of the order."""
+        named = self._of_pairs(scene, parameters, first, second)
+        return {name: 0.5 * residual.square().sum(-1) for name, residual in named}
+
+    def _of_agents(
+        self, scene: Scene, parameters: GameParameters, states: Tensor, controls: Tensor
+    ) -> Iterator[tuple[str, Tensor]]:
+        initial, present = self.initial(scene), scene.agent_mask[:, None]
+        to_goal = reference_speed = None
+        if "goals" in self.needs:
+            assert parameters.goals is not None
+            goals = torch.where(present[..., None], parameters.goals, 0.0)
+            to_goal = rotate(states[..., :2] - goals[..., None, :], -initial[..., None, HEADING])
+        if "reference_speed" in self.needs:
+            assert scene.reference_speed is not None
+            reference_speed = torch.where(present, scene.reference_speed[:, None], 0.0)
+        before = torch.stack((initial[..., SPEED], torch.zeros_like(initial[..., SPEED])), -1)
+        velocity = before[..., None, :] + scene.dt * controls.cumsum(-2)
+        motion = _Motion(controls, velocity, scene.dt, to_goal, reference_speed)
+        for name in self.own:
+            yield name, self._own_weight(scene, parameters, name)[..., None] * _OWN[name][0](motion)
+
+    def _own_weight(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B M N"]:
+        """Weights of an own term, zero for absent agents."""
+        present = scene.agent_mask[:, None]
+        if name == "acc":
+            return present.to(parameters.initial_controls.dtype)
+        weight = torch.where(present, parameters.own_weights[name], 0.0)
+        return torch.where(present, (weight.square() + FLOOR).sqrt(), 0.0) if name == "lat_acc" else weight
+
+    def _of_pairs(
+        self, scene: Scene, parameters: GameParameters, first: Tensor, second: Tensor
+    ) -> Iterator[tuple[str, Tensor]]:
+        if not self.pair:
+            return
+        assert parameters.order is not None
+        exists = self.pair_mask(scene)[:, None]
+        order = torch.where(exists, parameters.order, 1.0)[..., None]
+        weight = torch.where(exists, parameters.pair_weights["order"], 0.0)[..., None]
+        ahead = (self.directions(scene)[:, None, :, None] * (first - second)[..., :2]).sum(-1)
+        short = torch.relu(self.distance(scene)[:, None, :, None] - order * ahead)
+        counts = (self.near(scene, first.shape[3]) & exists[:, 0, :, None])[:, None]
+        yield "order", weight * torch.where(counts, short, 0.0)
+
+    def directions(self, scene: Scene) -> Float[Tensor, "B P 2"]:
+        """The unit vectors n_ij, in which i is ahead of j for an order of +1. Constants of the scene."""
+        initial = self.initial(scene)[:, 0]
+        first, second = pairs(initial.shape[1], initial.device)
+        axis = torch.stack((initial[..., HEADING].cos(), initial[..., HEADING].sin()), -1)
+        if self.direction == ALONG:
+            line = axis[:, first]
+            # Towards positive x, or positive y for what is upright: the same for both, whoever comes first.
+            upright = line[..., 0].abs() < _STILL
+            towards = torch.where(upright, line[..., 1], line[..., 0])
+            line = torch.where((towards < 0)[..., None], -line, line)
+            return _direction(axis[:, first] + axis[:, second], line)
+        velocity = initial[..., SPEED, None] * axis
+        joining = initial[:, first, :2] - initial[:, second, :2]
+        upwards = torch.stack((torch.ones_like(joining[..., 0]), torch.zeros_like(joining[..., 0])), -1)
+        towards = _direction(velocity[:, first] - velocity[:, second], _direction(joining, upwards))
+        return torch.stack((-towards[..., 1], towards[..., 0]), -1)
+
+    def distance(self, scene: Scene) -> Float[Tensor, "B P"]:
+        """d_ij, what is to be kept: half of both lengths, as discs have them, and the gap."""
+        radius = disc(self.size(scene))
+        first, second = pairs(radius.shape[1], radius.device)
+        return radius[:, first] + radius[:, second] + self.gap
+
+    def near(self, scene: Scene, steps: int) -> Bool[Tensor, "B P K"]:
+        """a_t, the steps 1 .. K at which both would be near each other at constant velocity."""
+        initial = self.initial(scene)[:, 0]
+        first, second = pairs(initial.shape[1], initial.device)
+        axis = torch.stack((initial[..., HEADING].cos(), initial[..., HEADING].sin()), -1)
+        time = scene.dt * torch.arange(1, steps + 1, dtype=initial.dtype, device=initial.device)
+        position = initial[..., None, :2] + time[:, None] * (initial[..., SPEED, None] * axis)[..., None, :]
+        return (position[:, first] - position[:, second]).square().sum(-1) <= self.within**2
+
+    def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
+        """Refuse tensors that do not fit together, naming the one that does not and the shape it should have.
+
+        Raises:
+            ValueError: a wrong shape, a missing weight, missing goals, orders, reference speeds or sizes.
+        """
+        super().validate(scene, parameters, controls)
+        batch, agents = scene.agent_mask.shape
+        count = agents * (agents - 1) // 2
+        own, pair = self.weighted
+        given: list[tuple[str, Tensor | None, list[int]]] = []
+        for kind, names, weights, entries in (
+            ("own_weights", own, parameters.own_weights, agents),
+            ("pair_weights", pair, parameters.pair_weights, count),
+        ):
+            for name in names:
+                if name not in weights:
+                    raise ValueError(f"{kind} lacks the term {name!r}; it has {sorted(weights)}")
+                given.append((f"{kind}[{name!r}]", weights[name], [entries]))
+        if "goals" in self.needs:
+            given.append(("parameters.goals", parameters.goals, [agents, 2]))
+        if self.pair:
+            given.append(("parameters.order", parameters.order, [count]))
+        modes = controls.shape[1]
+        for what, tensor, rest in given:
+            if tensor is None:
+                raise ValueError(f"{what} is None; this energy takes {[batch, modes, *rest]}")
+            if list(tensor.shape) not in ([batch, modes, *rest], [batch, 1, *rest]):
+                raise ValueError(f"{what} has shape {list(tensor.shape)}; these controls take {[batch, modes, *rest]}")
+        if "reference_speed" in self.needs and scene.reference_speed is None:
+            raise ValueError("the energy has the term 'velref', but scene.reference_speed [B, N] is None")
+        if self.pair and scene.size is None:
+            raise ValueError("orders keep distances, for which scene.size [B, N, 2] is needed, which is None")
+
+
+def _direction(vector: Float[Tensor, "*batch 2"], otherwise: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+    """The unit vector, or that of another one where it vanishes."""
+    length = vector.norm(dim=-1, keepdim=True)
+    return torch.where(length > _STILL, vector / length.clamp_min(_STILL), otherwise)

@@ -1,0 +1,163 @@
+"""Orders of pairs: the most likely ones against all of them, names that are swapped, and what was observed."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import pytest
+import torch
+from games import pad, random_scene, reordered
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from epo_lightning.decoders.orders import Orders, most_likely, observed_order, order_loss
+from epo_lightning.game.convex_energy import ConvexEnergy
+from epo_lightning.scene import Scene
+
+
+@settings(max_examples=40, deadline=None)
+@given(count=st.integers(0, 7), modes=st.integers(1, 12), ties=st.booleans(), seed=st.integers(0, 1000))
+def test_the_most_likely_orders_are_those_of_all(count, modes, ties, seed):
+    torch.manual_seed(seed)
+    logits = torch.randn(3, count, dtype=torch.float64)
+    logits = logits.round() if ties else logits
+    present = torch.rand(3, count) < 0.7
+    order = most_likely(logits, present, modes)
+    assert order.shape == (3, modes, count)
+    for scene in range(3):
+        exist = present[scene].nonzero()[:, 0].tolist()
+        scores = {}
+        for signs in itertools.product((1.0, -1.0), repeat=len(exist)):
+            pattern = torch.ones(count, dtype=torch.float64)
+            pattern[exist] = torch.tensor(signs, dtype=torch.float64)
+            scores[tuple(pattern.tolist())] = (pattern * logits[scene])[exist].sigmoid().log().sum().item()
+        best = sorted(scores.values(), reverse=True)[:modes]
+        found = [tuple(one.tolist()) for one in order[scene]]
+        distinct = found[: len(best)]
+        assert len(set(distinct)) == len(distinct)
+        assert [scores[one] for one in distinct] == pytest.approx(best, abs=1e-12)
+        assert found == [distinct[m % len(distinct)] for m in range(modes)]
+
+
+def decoder(symmetric: bool, modes: int = 3) -> Orders:
+    made = Orders(8, modes, symmetric).double()
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.copy_(torch.randn_like(parameter))
+    return made
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_names_of_agents_do_not_matter(symmetric):
+    orders, z, mask = decoder(symmetric), torch.randn(2, 4, 8, dtype=torch.float64), torch.ones(2, 4, dtype=torch.bool)
+    names = [2, 0, 3, 1]
+    _, scores, logits = orders(z, mask)
+    _, again, renamed = orders(z[:, names], mask)
+    matrix = torch.zeros(2, 4, 4, dtype=torch.float64)
+    first, second = torch.triu_indices(4, 4, 1)
+    matrix[:, first, second] = logits
+    matrix[:, second, first] = logits if symmetric else -logits
+    expected = matrix[:, names][:, :, names][:, first, second]
+    torch.testing.assert_close(renamed, expected, rtol=0, atol=1e-12)
+    torch.testing.assert_close(again, scores, rtol=0, atol=1e-12)
+
+
+def test_absent_agents_do_not_matter():
+    orders, z = decoder(False), torch.randn(2, 3, 8, dtype=torch.float64)
+    mask = torch.ones(2, 3, dtype=torch.bool)
+    order, scores, logits = orders(z, mask)
+    wide = torch.cat((z, torch.full_like(z[:, :1], torch.nan)), 1).requires_grad_()
+    padded, again, more = orders(wide, torch.cat((mask, torch.zeros_like(mask[:, :1])), 1))
+    _, second = torch.triu_indices(4, 4, 1)
+    real = second < 3
+    assert torch.equal(padded[:, :, real], order)
+    assert (padded[:, :, ~real] == 1).all()
+    assert (more[:, ~real] == 0).all()
+    torch.testing.assert_close(more[:, real], logits, rtol=0, atol=1e-12)
+    torch.testing.assert_close(again, scores, rtol=0, atol=1e-12)
+    again[:, 0].sum().backward()
+    assert wide.grad.isfinite().all()
+    assert (wide.grad[:, :3] != 0).any()
+
+
+def test_log_probabilities_are_those_of_the_modes_among_each_other():
+    orders = decoder(False, modes=4)
+    z, mask = torch.randn(2, 3, 8, dtype=torch.float64), torch.ones(2, 3, dtype=torch.bool)
+    order, scores, logits = orders(z, mask)
+    joint = (order * logits[:, None]).sigmoid().prod(-1)
+    torch.testing.assert_close(scores.exp(), joint / joint.sum(-1, keepdim=True), rtol=1e-12, atol=0)
+    assert (scores.diff(dim=-1) <= 0).all()
+
+
+def test_a_lone_agent_has_nobody_to_go_before():
+    order, scores, logits = Orders(8, 3)(torch.randn(2, 1, 8), torch.ones(2, 1, dtype=torch.bool))
+    assert order.shape == (2, 3, 0)
+    assert logits.shape == (2, 0)
+    torch.testing.assert_close(scores.exp(), torch.full((2, 3), 1 / 3))
+
+
+def crossing(future: list[list[tuple[float, float]]], speeds=(1.0, 1.0), headings=(0.0, 0.0)) -> Scene:
+    positions = torch.tensor(future, dtype=torch.float64)[None]
+    current = torch.tensor(
+        [[x[0], x[1], h, v] for x, h, v in zip(((0.0, 0.0), (0.0, 3.0)), headings, speeds, strict=True)]
+    )
+    return Scene(
+        history=current[None, :, None].double(),
+        dt=1.0,
+        future=torch.cat((positions, torch.zeros_like(positions)), -1),
+        size=torch.ones(1, 2, 2, dtype=torch.float64),
+    )
+
+
+def test_who_goes_first_is_seen_where_they_are_closest():
+    energy = ConvexEnergy(["acc", "lat_acc"], direction="along")
+    # The second one is ahead at the end, but behind where they meet.
+    scene = crossing([[(1.0, 0.0), (2.0, 0.0), (3.0, 0.0)], [(0.5, 3.0), (1.5, 1.0), (6.0, 0.0)]])
+    order, known = observed_order(energy, scene)
+    assert order.tolist() == [[1.0]]
+    assert known.all()
+    unseen = dataclasses.replace(scene, future_mask=torch.tensor([[[True, False, True], [True, True, True]]]))
+    assert observed_order(energy, unseen)[0].tolist() == [[-1.0]]  # the last step is the closest one that was seen
+    apart = dataclasses.replace(scene, future_mask=torch.tensor([[[True, False, False], [False, True, True]]]))
+    assert not observed_order(energy, apart)[1].any()
+    with pytest.raises(ValueError, match=r"scene\.future"):
+        observed_order(energy, dataclasses.replace(scene, future=None, future_mask=None))
+
+
+def test_on_which_side_they_pass():
+    energy = ConvexEnergy(["acc", "lat_acc"], direction="across")
+    # Oncoming along x; the first keeps left of the second as it drives, which thus is on its right.
+    scene = crossing([[(1.0, 0.5), (2.0, 0.5)], [(3.0, -0.5), (2.0, -0.5)]], headings=(0.0, torch.pi))
+    assert observed_order(energy, scene)[0].tolist() == [[1.0]]
+    assert observed_order(energy, reordered(scene, [1, 0]))[0].tolist() == [[1.0]]
+    mirrored = crossing([[(1.0, -0.5), (2.0, -0.5)], [(3.0, 0.5), (2.0, 0.5)]], headings=(0.0, torch.pi))
+    assert observed_order(energy, mirrored)[0].tolist() == [[-1.0]]
+
+
+@pytest.mark.parametrize("direction", ["along", "across"])
+def test_observed_orders_of_padded_and_renamed_agents(direction):
+    energy = ConvexEnergy(["acc", "lat_acc"], direction=direction)
+    scene = random_scene(4, 3, horizon=5, history=2, dtype=torch.float64)
+    order, known = observed_order(energy, scene)
+    padded, unknown = observed_order(energy, pad(scene, 1))
+    _, second = torch.triu_indices(4, 4, 1)
+    assert torch.equal(padded[:, second < 3], order)
+    assert torch.equal(unknown[:, second < 3], known)
+    assert not unknown[:, second == 3].any()
+    swapped, _ = observed_order(energy, reordered(scene, [2, 1, 0]))
+    sign = 1.0 if energy.symmetric else -1.0
+    assert torch.equal(swapped, sign * order[:, [2, 1, 0]])
+    assert order.min() < order.max()
+
+
+def test_the_loss_is_the_cross_entropy_of_known_pairs():
+    logits = torch.tensor([[1.0, -2.0, torch.nan], [0.5, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    order = torch.tensor([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0]], dtype=torch.float64)
+    known = torch.tensor([[True, True, False], [False, False, False]])
+    loss = order_loss(logits, order, known)
+    expected = torch.nn.functional.binary_cross_entropy(logits[0, :2].detach().sigmoid(), torch.ones(2).double()) / 2
+    torch.testing.assert_close(loss.detach(), expected)
+    loss.backward()
+    assert logits.grad.isfinite().all()
+    assert (logits.grad[~known] == 0).all()
