@@ -1,0 +1,151 @@
+"""Steps against the gradient: for energies of which no more is known than that.
+
+    u <- u - eta S^2 dE/du
+
+S = diag(scale) says how far controls of either channel move for the same force; it is gradient descent in u / S. Near a
+minimum with the Hessian H the steps contract if eta lambda_max(S H S) < 2 and run away beyond that, so the stiffest
+direction limits eta and the softest ones take 1 / (eta lambda) steps. On highways a turn rate moves positions by the speed
+more than an acceleration does, and a scale like [1, 0.05] makes both about as stiff. Nothing is clipped: a step that is too
+long is seen, because energies rise or cease to be numbers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning.game.energy import GRADIENT, Energy
+from epo_lightning.game.selection import evaluated
+from epo_lightning.registry import ConfigError, register
+from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.solvers.base import PATH, STATIONARY, Stepwise
+from epo_lightning.solvers.dense import gradient
+
+
+@register("solver", "gradient_descent")
+@dataclass(frozen=True)
+class GradientDescent(Stepwise):
+    """S steps against the gradient, differentiable: EBIOC's "optimisation variant" of its synthesis (arXiv 1904.05453).
+
+    A step that would lead to where the energy or its gradient is no number is not taken: that sample keeps its last good
+    iterate and has the status STOPPED.
+
+    Example::
+
+        solve = GradientDescent(steps=16, step_size=0.005, scale=[1.0, 0.05])
+        solution = solve(energy, scene, parameters)
+
+    Attributes:
+        steps: number S of steps.
+        step_size: eta.
+        scale: of the channels acceleration [m/s^2] and turn rate [rad/s].
+    """
+
+    needs = frozenset({GRADIENT})
+    provides = frozenset({PATH, STATIONARY})
+
+    steps: int = 16
+    step_size: float = 0.005
+    scale: Sequence[float] = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        check_steps(self.steps, self.scale)
+        if not 0 < self.step_size < float("inf"):
+            raise ConfigError(f"solver.step_size must be positive and finite, not {self.step_size}")
+
+    def with_steps(self, steps: int) -> GradientDescent:
+        """The same with another S."""
+        return dataclasses.replace(self, steps=steps)
+
+    def run(
+        self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Any = None
+    ) -> tuple[Solution, None]:
+        """Take a number of steps; there is nothing to remember.
+
+        Raises:
+            ValueError: scene and parameters do not fit together.
+        """
+        return descend(energy, scene, parameters, steps, self.step_size, self.scale), None
+
+
+def check_steps(steps: int, scale: Sequence[float]) -> None:
+    """Refuse a number of steps or a scale that cannot be.
+
+    Raises:
+        ConfigError: as said.
+    """
+    if steps < 0:
+        raise ConfigError(f"solver.steps must be 0 or more, not {steps}")
+    if isinstance(scale, str) or len(scale) != 2 or not all(0 < channel < float("inf") for channel in scale):
+        raise ConfigError(f"solver.scale takes two positive numbers, of accelerations and turn rates, not {scale}")
+
+
+def descend(
+    energy: Energy,
+    scene: Scene,
+    parameters: GameParameters,
+    steps: int,
+    step_size: float,
+    scale: Sequence[float],
+    noise: float = 0.0,
+) -> Solution:
+    """Take steps u <- u - eta S^2 dE/du + noise S z from the initial strategies, with z ~ N(0, I).
+
+    Differentiable if gradients are recorded. Absent agents' controls are zero.
+
+    Raises:
+        ValueError: scene and parameters do not fit together.
+    """
+    start = parameters.initial_controls
+    energy.validate(scene, parameters, start)
+    if scene.history.dtype != start.dtype:
+        scene = scene.to(start.dtype)
+    present = scene.agent_mask[:, None, :, None, None]
+    controls = torch.where(present, start, 0.0)
+    channels = start.new_tensor(list(scale))
+    everyone = torch.ones(start.shape[:2], dtype=torch.bool, device=start.device)
+    energies, slope, going = _look(energy, scene, parameters, controls, everyone)
+    initial_energy = energies
+    for step in range(steps):
+        moved = controls - step_size * channels.square() * slope
+        if noise:
+            moved = moved + noise * channels * torch.where(present, torch.randn_like(start), 0.0)
+        # Nothing comes after the last gradient that would have to be differentiated.
+        with torch.set_grad_enabled(torch.is_grad_enabled() and step < steps - 1):
+            value, ahead, going = _look(energy, scene, parameters, moved, going)
+        keep = going[..., None, None, None]
+        controls, slope = torch.where(keep, moved, controls), torch.where(keep, ahead, slope)
+        energies = torch.where(going, value, energies)
+    return Solution(
+        controls=controls,
+        states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt),
+        initial_energy=initial_energy,
+        energy=energies,
+        gradient_norm=slope.detach().flatten(2).norm(dim=-1),
+        status=torch.where(going, Status.SOLVED, Status.STOPPED),
+    )
+
+
+def _look(
+    energy: Energy,
+    scene: Scene,
+    parameters: GameParameters,
+    controls: Float[Tensor, "B M N K 2"],
+    going: Bool[Tensor, "B M"],
+) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M N K 2"], Bool[Tensor, "B M"]]:
+    """The energy, its gradient, and which samples go on: both are numbers."""
+    value, slope = gradient(energy, scene, parameters, controls)
+    going = going & value.isfinite() & slope.flatten(2).isfinite().all(-1)
+    if torch.is_grad_enabled() and not going.all():
+
+        def again(*game: Any) -> tuple[Tensor, Tensor]:
+            return gradient(energy, *game)
+
+        _, slope = evaluated(again, scene, parameters, controls, going)
+    return value.detach(), slope, going
