@@ -1,0 +1,91 @@
+"""Learning from energies of what happened and of what the energy itself would have: EBIOC's analysis (arXiv 1904.05453).
+
+The negative log-likelihood of p(u | o) = exp(-E(u; o)) / Z(o) has the gradient
+
+    dE(u_obs) / dtheta - < dE(u_s) / dtheta >,   u_s ~ p(u | o),
+
+so what was observed becomes cheaper, and what the energy wrongly prefers dearer. Samples are constants: nothing is learned
+through how they were found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning import losses
+from epo_lightning.game.energy import GRADIENT, Energy
+from epo_lightning.game.selection import games
+from epo_lightning.game.tracking import demonstrated, observed_controls
+from epo_lightning.objectives.base import Objective, Terms, checked_weights
+from epo_lightning.objectives.terms import goal_term, observed_future
+from epo_lightning.registry import register
+from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
+
+
+@register("objective", "contrastive")
+class Contrastive(Objective):
+    """Energy of the demonstration minus that of the forecast, in the mode that came closest to what happened.
+
+    Every mode is a game of its own with one sample. The one whose forecast is closest to the observed future answers for a
+    scene, and alone is taught; the others would only learn to dislike what they forecast. The controls that were observed
+    are found by tracking (:mod:`~epo_lightning.game.tracking`). Those after an agent's last observed step are not known:
+    they are filled in with the sample's, so that both energies are of a whole game, and a scene of which nothing was
+    observed teaches nothing.
+
+    Besides the weighted terms, ``tracking`` is logged: the distance [m] between observed positions and those of the
+    controls that stand for them.
+
+    Args:
+        weights: lambda of ``contrastive``; of ``magnitude``, the squares of both energies, which keeps them from drifting
+            away together; of ``initial``, the distance between initial strategies and samples (cooperative training: the
+            network that proposes where chains start learns where they end); of ``goal`` (idle where no goal is decoded)
+            and of ``probability``, of the mode that answers.
+    """
+
+    terms = ("contrastive", "magnitude", "initial", "goal", "probability")
+    needs = frozenset({SAMPLES, STATIONARY, PATH})
+    of_energy = frozenset({GRADIENT})
+
+    def __init__(self, weights: Mapping[str, float]) -> None:
+        self.weights = checked_weights(weights, self.terms)
+
+    def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
+        future, mask = observed_future(scene)
+        parameters, solution, starts = forecast.parameters, forecast.solution, forecast.initial_states
+        assert parameters is not None
+        assert solution is not None
+        assert starts is not None
+        distance = losses.distances(forecast.states[..., :2].detach(), future, mask)
+        _, mode = losses.scene_imitation(distance, mask)
+        index = torch.arange(len(mode), device=mode.device)
+        game = games(parameters, index, mode)
+        controls, missed = observed_controls(energy.dynamics, scene)
+        drawn = solution.controls.detach()[index, mode][:, None]
+        shown = torch.where(demonstrated(scene)[:, None, ..., None], controls[:, None], drawn)
+        of_shown, of_drawn = energy(scene, game, shown)[:, 0], energy(scene, game, drawn)[:, 0]
+        values = {
+            "contrastive": (of_shown - of_drawn).mean(),
+            "magnitude": (of_shown.square() + of_drawn.square()).mean(),
+            "initial": proposal(starts, solution.states.detach(), scene.agent_mask),
+            "probability": losses.scene_probability(forecast.probabilities, mode, mask),
+        }
+        followed = mask.any(-1)
+        return {
+            **{name: (self.weights[name], value) for name, value in values.items()},
+            **goal_term(scene, forecast, self.weights["goal"]),
+            "tracking": (0.0, missed.sum() / followed.sum().clamp_min(1)),
+        }
+
+
+def proposal(
+    starts: Float[Tensor, "B M N K 4"], ends: Float[Tensor, "B M N K 4"], present: Bool[Tensor, "B N"]
+) -> Float[Tensor, ""]:
+    """Mean distance [m] between the positions of initial strategies and those of what chains made of them."""
+    between = torch.where(present[:, None, :, None, None], starts[..., :2] - ends[..., :2], 0.0)
+    distance = torch.linalg.vector_norm(between, dim=-1).mean((1, 3))
+    return (distance.sum(-1) / present.sum(-1).clamp_min(1)).mean()

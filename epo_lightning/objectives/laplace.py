@@ -1,0 +1,294 @@
+"""Learning the density exp(-E) / Z without sampling: where the energy is a parabola, Z is a determinant.
+
+With g and H the gradient and the curvature of E at the demonstrated controls u, of which there are d,
+
+    -log p(u) = 1/2 g^T H^-1 g - 1/2 log det H + d/2 log 2 pi,
+
+exactly so for quadratic energies, and Laplace's approximation for others. The first term draws the minimum towards what was
+observed, the second makes it as narrow there as the data allow. H is the Gauss-Newton matrix J^T J + eps I, which a
+Levenberg-Marquardt step factorises anyway.
+
+Controls that were not observed are integrated out. With g_B and H_B the rows of those, the density of the others has
+
+    -log p(u_A) = (1/2 g^T H^-1 g - 1/2 log det H) - (1/2 g_B^T H_B^-1 g_B - 1/2 log det H_B) + d_A/2 log 2 pi.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from epo_lightning import losses
+from epo_lightning.game.circles import separation
+from epo_lightning.game.energy import RESIDUALS, Energy, pairs
+from epo_lightning.game.feature_energy import FeatureEnergy, along
+from epo_lightning.game.features import Source, signal, signal_change
+from epo_lightning.game.selection import evaluated
+from epo_lightning.game.tracking import demonstrated, observed_controls
+from epo_lightning.objectives.base import Objective, Terms, checked_weights
+from epo_lightning.objectives.terms import goal_term, observed_future
+from epo_lightning.registry import register
+from epo_lightning.scene import ACCELERATION, GameParameters, JointForecast, Scene
+from epo_lightning.solvers import dense
+
+_LINEAR = (Source.CONTROL, Source.RATE, Source.SPEED)
+"""What features read that is linear in the controls of one channel."""
+
+
+@register("objective", "laplace")
+class Laplace(Objective):
+    """Negative log-likelihood of the demonstration under a mixture of Gaussians, one around every mode's game.
+
+    L = -log sum_m pi_m p_m(u) / d with the forecast's probabilities pi; which mode answers for which scene, and how likely
+    it was, is learned along with the energies. Controls have no common unit: the likelihood is per control, of m/s^2 and
+    rad/s, and may be negative. The controls that were observed are found by tracking
+    (:mod:`~epo_lightning.game.tracking`); an agent's after its last observed step are integrated out.
+
+    Besides the weighted terms, ``tracking`` is logged, the distance [m] between observed positions and those of the controls
+    that stand for them; and ``flat``, the share of games without a density, because their H is singular or no number: these
+    are left out of the mixture, and scenes without any game teach nothing.
+
+    Args:
+        weights: lambda of ``density``; of ``initial``, minSADE of the initial strategies, which no likelihood teaches; and
+            of ``goal`` (idle where no goal is decoded).
+        damping: eps; keeps H positive definite where no feature looks at a control.
+    """
+
+    terms = ("density", "initial", "goal")
+    of_energy = frozenset({RESIDUALS})
+
+    def __init__(self, weights: Mapping[str, float], damping: float = 1e-3) -> None:
+        if not 0 <= damping < float("inf"):
+            raise ValueError(f"damping must be 0 or more, and finite, not {damping}")
+        self.weights = checked_weights(weights, self.terms)
+        self.damping = damping
+
+    def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
+        future, mask = observed_future(scene)
+        assert forecast.parameters is not None
+        assert forecast.initial_states is not None
+        controls, missed = observed_controls(energy.dynamics, scene)
+        modes = forecast.probabilities.shape[1]
+        log_density, sound = log_densities(
+            energy, scene, forecast.parameters, controls[:, None].expand(-1, modes, -1, -1, -1), self.damping
+        )
+        known = sound.any(1)
+        joint = losses.log(forecast.probabilities) + torch.where(sound, log_density, -torch.inf)
+        joint = torch.where(known[:, None], joint, 0.0)
+        count = 2 * demonstrated(scene).sum((1, 2)).clamp_min(1)
+        density = torch.where(known, -joint.logsumexp(1) / count, 0.0).mean()
+        distance = losses.distances(forecast.initial_states[..., :2], future, mask)
+        initial, _ = losses.scene_imitation(distance, mask)
+        followed = mask.any(-1)
+        return {
+            "density": (self.weights["density"], density),
+            "initial": (self.weights["initial"], initial),
+            **goal_term(scene, forecast, self.weights["goal"]),
+            "tracking": (0.0, missed.sum() / followed.sum().clamp_min(1)),
+            "flat": (0.0, (~sound).to(density.dtype).mean()),
+        }
+
+
+def log_densities(
+    energy: Energy,
+    scene: Scene,
+    parameters: GameParameters,
+    controls: Float[Tensor, "B M N K 2"],
+    damping: float,
+) -> tuple[Float[Tensor, "B M"], Bool[Tensor, "B M"]]:
+    """log p of the demonstrated ones among the controls of present agents, and where there is one; zero elsewhere."""
+
+    def linearised(*game: Any) -> tuple[Tensor, Tensor]:
+        return _linearised(energy, *game)
+
+    slope, matrix = linearised(scene, parameters, controls)
+    # What is no number anywhere in J is none on the diagonal of J^T J.
+    finite = (slope.flatten(2) + matrix.diagonal(dim1=-2, dim2=-1)).isfinite().all(-1)
+    if not finite.all():
+        slope, matrix = evaluated(linearised, scene, parameters, controls, finite)
+    slope = slope.flatten(2)
+    present = scene.agent_mask[:, :, None, None].expand(-1, *controls.shape[2:]).flatten(1)
+    told = demonstrated(scene)[..., None].expand(-1, -1, -1, 2).flatten(1)
+    # Absent agents have unit rows, which are worth nothing.
+    diagonal = torch.where(present, damping, 1.0).to(slope)[:, None].expand_as(slope)
+    value, sound = _Parabola.apply(slope, matrix, diagonal)
+    if not (told | ~present).all():
+        # Rows that are demonstrated become unit rows too.
+        rest = (present & ~told)[:, None].to(slope)
+        diagonal = torch.where(rest > 0, diagonal, 1.0)
+        value_of_rest, known = _Parabola.apply(slope * rest, matrix * rest[..., None] * rest[..., None, :], diagonal)
+        value, sound = value - value_of_rest, sound & known
+    value = value + 0.5 * math.log(2.0 * math.pi) * told.sum(-1, keepdim=True)
+    sound = sound & finite
+    return -torch.where(sound, value, 0.0).to(controls.dtype), sound
+
+
+class _Parabola(torch.autograd.Function):
+    """1/2 g^T H^-1 g - 1/2 log det H, H = matrix + diag(diagonal), zero and without gradient where H has no Cholesky factor.
+
+    With a = H^-1 g the gradient by g is a, and that by H is -1/2 (a a^T + H^-1): cheaper and steadier than to differentiate
+    the factorisation.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        slope: Float[Tensor, "B M n"],
+        matrix: Float[Tensor, "B M n n"],
+        diagonal: Float[Tensor, "B M n"],
+    ) -> tuple[Tensor, Tensor]:
+        matrix = matrix.clone()
+        matrix.diagonal(dim1=-2, dim2=-1).add_(diagonal)
+        factor, info = torch.linalg.cholesky_ex(matrix)
+        sound = info == 0
+        if not sound.all():
+            identity = torch.eye(slope.shape[-1], dtype=slope.dtype, device=slope.device)
+            factor = torch.where(sound[..., None, None], factor, identity)
+        half = torch.linalg.solve_triangular(factor, slope[..., None], upper=False)
+        value = 0.5 * half.square().sum((-2, -1)) - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        ctx.save_for_backward(half, factor, sound)
+        ctx.mark_non_differentiable(sound)
+        return torch.where(sound, value, 0.0), sound
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Float[Tensor, "B M"], _: Tensor) -> tuple[Tensor, Tensor, None]:
+        half, factor, sound = ctx.saved_tensors
+        cotangent = torch.where(sound, cotangent, 0.0)[..., None]
+        solved = torch.linalg.solve_triangular(factor.mT, half, upper=True)
+        by_matrix = torch.cholesky_inverse(factor).add_(solved * solved.mT).mul_(-0.5 * cotangent[..., None])
+        return cotangent * solved[..., 0], by_matrix, None
+
+
+def _linearised(
+    energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+) -> tuple[Float[Tensor, "B M N K 2"], Float[Tensor, "B M n n"]]:
+    """The gradient J^T r and the matrix J^T J, differentiable, in double precision.
+
+    In single precision, matrices of highways may have no Cholesky factor. Energies whose features are not known take the
+    dense way.
+    """
+    if not isinstance(energy, FeatureEnergy):
+        controls = controls.contiguous()  # what is expanded takes no tangents
+        _, slope = dense.gradient(energy, scene, parameters, controls)
+        return slope.double(), dense.gauss_newton(energy, scene, parameters, controls).double()
+    energy.validate(scene, parameters, controls)
+    batch, modes, agents, steps, _ = controls.shape
+    controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
+    states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
+    # Every agent's own 2 K unit directions, all of acceleration before all of turn rate.
+    unit = torch.eye(2 * steps, dtype=controls.dtype, device=controls.device).view(-1, 2, steps).mT[:, None, None, None]
+    directions = unit.expand(-1, *controls.shape)
+    moved = energy.dynamics.tangent(states, directions, scene.dt)
+
+    own_slope, own = _of_agents(energy, scene, parameters, (states, controls), (moved, directions))
+    everyone = torch.arange(agents, device=controls.device)
+    blocks = own.new_zeros(agents * agents, *own.shape[:2], 2 * steps, 2 * steps)
+    blocks = blocks.index_add(0, everyone * (agents + 1), own.movedim(2, 0))
+    slope = own_slope
+    first, second = pairs(agents, controls.device)
+    if energy.pair and len(first):
+        rows, one, other = _of_pairs(energy, scene, parameters, states, moved)
+        ends = ((first, one), (second, other))
+        for row, left in ends:
+            slope = slope.index_add(2, row, (left @ rows[..., None])[..., 0])
+            for column, right in ends:
+                blocks = blocks.index_add(0, row * agents + column, (left @ right.mT).movedim(2, 0))
+    # From agent, channel, step to the order of controls.
+    shape = batch, modes, *2 * (2 * agents * steps,)
+    matrix = blocks.view(agents, agents, batch, modes, 2, steps, 2, steps).permute(2, 3, 0, 5, 4, 1, 7, 6)
+    return slope.unflatten(-1, (2, steps)).mT, matrix.reshape(shape)
+
+
+def _of_agents(
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    at: tuple[Tensor, Tensor],
+    along_: tuple[Tensor, Tensor],
+) -> tuple[Float[Tensor, "B M N D"], Float[Tensor, "B M N D D"]]:
+    """What own features give to the gradient and to the blocks of the matrix on its diagonal.
+
+    Controls, their rates and speeds change with the controls of one channel, always in the same way A: they give
+    A^T diag((w c')^2) A, and all features that read the same of these share one product. Others give theirs row by row.
+    """
+    states, controls = at
+    steps = controls.shape[3]
+    around = energy.surroundings(scene, parameters)
+    linear: dict[tuple[Source, int], list[tuple[Tensor, Tensor]]] = {}
+    rows, changes = [], []
+    for name, feature in energy.own_features.items():
+        weight = energy.own_weight(scene, parameters, name)[..., None]
+        if feature.source is Source.TRAJECTORY:
+            assert feature.function is not None
+            value, change = along(feature.function, at, along_)
+            present = scene.agent_mask[:, None, :, None]
+            value, change = torch.where(present, value, 0.0), torch.where(present, change, 0.0)
+        else:
+            value, steepness = energy.shape(feature, signal(feature, *at, around))
+            if feature.source in _LINEAR:
+                channel = ACCELERATION if feature.source is Source.SPEED else feature.channel
+                force, stiffness = weight.square() * steepness * value, (weight * steepness).square()
+                linear.setdefault((feature.source, channel), []).append((force, stiffness))
+                continue
+            change = steepness * signal_change(feature, *at, *along_, around)
+        rows.append(weight * value)
+        changes.append(weight * change)
+
+    slope = states.new_zeros(*states.shape[:3], 2 * steps, dtype=torch.float64)
+    matrix = slope.new_zeros(*slope.shape, 2 * steps)
+    if rows:
+        jacobian = torch.cat(changes, -1).double().movedim(0, -2)
+        slope = (jacobian @ torch.cat(rows, -1).double()[..., None])[..., 0]
+        matrix = jacobian @ jacobian.mT
+    forces = list(slope.unflatten(-1, (2, steps)).unbind(-2))
+    blocks = [torch.zeros_like(matrix[..., :steps, :steps]) for _ in range(2)]
+    unit = torch.eye(steps, dtype=slope.dtype, device=slope.device)
+    for (source, channel), parts in linear.items():
+        reads = unit  # A [R, K]
+        if source is Source.RATE:
+            reads = unit.diff(dim=0) / scene.dt
+        elif source is Source.SPEED:
+            reads = scene.dt * unit.cumsum(0)
+        force, stiffness = (sum(several).double() for several in zip(*parts, strict=True))
+        forces[channel] = forces[channel] + force @ reads
+        outer = (reads[:, :, None] * reads[:, None, :]).flatten(1)
+        blocks[channel] = blocks[channel] + (stiffness @ outer).unflatten(-1, (steps, steps))
+    pad = torch.nn.functional.pad
+    matrix = matrix + pad(blocks[0], (0, steps, 0, steps)) + pad(blocks[1], (steps, 0, steps, 0))
+    return torch.cat(forces, -1), matrix
+
+
+def _of_pairs(
+    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, states: Tensor, moved: Tensor
+) -> tuple[Float[Tensor, "B M P R"], Float[Tensor, "B M P D R"], Float[Tensor, "B M P D R"]]:
+    """Residuals of pairs, and how they change with the controls of the first and of the second agent."""
+    first, second = pairs(states.shape[2], states.device)
+    both = [energy.at_pair_steps(states[:, :, members]) for members in (first, second)]
+    apart = [energy.at_pair_steps(moved[:, :, :, members]) for members in (first, second)]
+    distance, normal = separation(both[0][..., :2], both[1][..., :2])
+    exists = energy.pair_mask(scene)[:, None, :, None]
+    rows: list[Tensor] = []
+    changes: tuple[list[Tensor], list[Tensor]] = [], []
+    for name, pair in energy.pair_features.items():
+        if pair.source is Source.TRAJECTORY:
+            sizes = [energy.size(scene)[:, None, members, None] for members in (first, second) if pair.needs]
+            still = torch.zeros_like(apart[0])
+            value, by_first = along(pair.function, (both[0], both[1]), (apart[0], still), *sizes)
+            _, by_second = along(pair.function, (both[0], both[1]), (still, apart[1]), *sizes)
+        else:
+            value, steepness = energy.pair_shape(pair, distance, energy.reach(scene)[:, None, :, None])
+            by_first = steepness * (normal * apart[0][..., :2]).sum(-1)
+            by_second = -steepness * (normal * apart[1][..., :2]).sum(-1)
+        weight = energy.pair_weight(scene, parameters, name)[..., None]
+        rows.append(weight * torch.where(exists, value, 0.0))
+        for end, change in zip(changes, (by_first, by_second), strict=True):
+            end.append(weight * torch.where(exists, change, 0.0))
+    one, other = (torch.cat(end, -1).double().movedim(0, -2) for end in changes)
+    return torch.cat(rows, -1).double(), one, other
