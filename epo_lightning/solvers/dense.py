@@ -17,7 +17,7 @@ from epo_lightning.game.energy import RESIDUALS, Energy
 from epo_lightning.scene import GameParameters, Scene, Status
 
 _PRODUCTS = 64
-"""Products of Hessians and vectors that are computed together: a bound on memory."""
+"""Products of matrices and vectors that are computed together: a bound on memory."""
 
 
 def gradient(
@@ -82,7 +82,8 @@ def gauss_newton(
             named = energy.residuals(scene, parameters, at)  # type: ignore[attr-defined]
             return torch.cat([residual.flatten(2) for residual in named.values()], -1)
 
-        changes = torch.func.vmap(lambda unit: torch.func.jvp(residuals, (controls,), (unit,))[1])(_units(controls))
+        along = torch.func.vmap(lambda unit: torch.func.jvp(residuals, (controls,), (unit,))[1], chunk_size=_PRODUCTS)
+        changes = along(_units(controls))
     jacobian = changes.movedim(0, -1)
     return _of_present(scene, jacobian.mT @ jacobian)
 
@@ -134,7 +135,7 @@ def factorise(matrix: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batc
 
 def _units(controls: Tensor) -> Float[Tensor, "n B M N K 2"]:
     """All n unit vectors of controls, the same for every sample."""
-    count = controls[0, 0].numel() if controls.shape[:2].numel() else controls.shape[2:].numel()
+    count = controls.shape[2:].numel()
     units = torch.eye(count, dtype=controls.dtype, device=controls.device)
     return units.view(count, 1, 1, *controls.shape[2:]).expand(count, *controls.shape)
 
