@@ -5,8 +5,8 @@ With g and H the gradient and the curvature of E at the demonstrated controls u,
     -log p(u) = 1/2 g^T H^-1 g - 1/2 log det H + d/2 log 2 pi,
 
 exactly so for quadratic energies, and Laplace's approximation for others. The first term draws the minimum towards what was
-observed, the second makes it as narrow there as the data allow. H is the Gauss-Newton matrix J^T J + eps I, which a
-Levenberg-Marquardt step factorises anyway.
+observed, the second makes it as narrow there as the data allow. H is the Gauss-Newton matrix J^T J + eps I of the residuals'
+Jacobian J.
 
 Controls that were not observed are integrated out. With g_B and H_B the rows of those, the density of the others has
 
@@ -28,7 +28,7 @@ from epo_lightning import losses
 from epo_lightning.game.circles import separation
 from epo_lightning.game.energy import RESIDUALS, Energy, pairs
 from epo_lightning.game.feature_energy import FeatureEnergy, along
-from epo_lightning.game.features import Source, signal, signal_change
+from epo_lightning.game.features import Source, foot, signal, signal_change
 from epo_lightning.game.selection import evaluated
 from epo_lightning.game.tracking import demonstrated, observed_controls
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
@@ -187,11 +187,8 @@ def _linearised(
     directions = unit.expand(-1, *controls.shape)
     moved = energy.dynamics.tangent(states, directions, scene.dt)
 
-    own_slope, own = _of_agents(energy, scene, parameters, (states, controls), (moved, directions))
-    everyone = torch.arange(agents, device=controls.device)
-    blocks = own.new_zeros(agents * agents, *own.shape[:2], 2 * steps, 2 * steps)
-    blocks = blocks.index_add(0, everyone * (agents + 1), own.movedim(2, 0))
-    slope = own_slope
+    slope, own = _of_agents(energy, scene, parameters, (states, controls), (moved, directions))
+    where, parts = [torch.arange(agents, device=controls.device) * (agents + 1)], [own]
     first, second = pairs(agents, controls.device)
     if energy.pair and len(first):
         rows, one, other = _of_pairs(energy, scene, parameters, states, moved)
@@ -199,10 +196,13 @@ def _linearised(
         for row, left in ends:
             slope = slope.index_add(2, row, (left @ rows[..., None])[..., 0])
             for column, right in ends:
-                blocks = blocks.index_add(0, row * agents + column, (left @ right.mT).movedim(2, 0))
+                where.append(row * agents + column)
+                parts.append(left @ right.mT)
+    blocks = own.new_zeros(batch, modes, agents * agents, 2 * steps, 2 * steps)
+    blocks = blocks.index_add(2, torch.cat(where), torch.cat(parts, 2))
     # From agent, channel, step to the order of controls.
     shape = batch, modes, *2 * (2 * agents * steps,)
-    matrix = blocks.view(agents, agents, batch, modes, 2, steps, 2, steps).permute(2, 3, 0, 5, 4, 1, 7, 6)
+    matrix = blocks.view(batch, modes, agents, agents, 2, steps, 2, steps).permute(0, 1, 2, 5, 4, 3, 7, 6)
     return slope.unflatten(-1, (2, steps)).mT, matrix.reshape(shape)
 
 
@@ -217,6 +217,8 @@ def _of_agents(
 
     Controls, their rates and speeds change with the controls of one channel, always in the same way A: they give
     A^T diag((w c')^2) A, and all features that read the same of these share one product. Others give theirs row by row.
+    The nearest point of a line slides as an agent moves along it: how far agents get says nothing about how well they keep
+    to their lane. (Minimisers hold it, which makes steps shorter and changes no solution; a density would be changed.)
     """
     states, controls = at
     steps = controls.shape[3]
@@ -230,6 +232,12 @@ def _of_agents(
             value, change = along(feature.function, at, along_)
             present = scene.agent_mask[:, None, :, None]
             value, change = torch.where(present, value, 0.0), torch.where(present, change, 0.0)
+        elif feature.source is Source.POSITION:
+            assert around.line is not None
+            position, ahead = states[..., :2], along_[0][..., :2]
+            nearest, tangent = foot(position, around.line)
+            value = (position - nearest).flatten(-2)
+            change = (ahead - (ahead * tangent).sum(-1, keepdim=True) * tangent).flatten(-2)
         else:
             value, steepness = energy.shape(feature, signal(feature, *at, around))
             if feature.source in _LINEAR:

@@ -145,6 +145,24 @@ def test_controls_that_were_not_observed_are_integrated_out():
     assert (parameters.own_weights["jerk"].grad[2] == 0).all()
 
 
+class Other(Energy):
+    """An energy of a kind of which nothing is known but residuals."""
+
+    offers = frozenset({GRADIENT, RESIDUALS})
+
+    def __init__(self, energy):
+        self.energy, self.own, self.pair, self.dynamics = energy, energy.own, energy.pair, energy.dynamics
+
+    def own_terms(self, *arguments):
+        return self.energy.own_terms(*arguments)
+
+    def pair_terms(self, *arguments):
+        return self.energy.pair_terms(*arguments)
+
+    def residuals(self, *arguments):
+        return self.energy.residuals(*arguments)
+
+
 @pytest.mark.parametrize("energy", [GAME, FeatureEnergy(own=EXID, pair=["proximity", "circles"], pair_stride=2)])
 def test_any_game_gives_its_gradient_and_gauss_newton_matrix(energy):
     scene, parameters, controls = setting(tuple(energy.own), agents=3)
@@ -153,7 +171,7 @@ def test_any_game_gives_its_gradient_and_gauss_newton_matrix(energy):
     value, sound = log_densities(energy, scene, parameters, shown, 0.1)
     assert sound.all()
     _, slope = dense.gradient(energy, scene, parameters, shown)
-    matrix = dense.gauss_newton(energy, scene, parameters, shown)
+    matrix = dense.gauss_newton(Other(energy), scene, parameters, shown.contiguous())
     blocks = matrix.unflatten(-1, (3, -1)).unflatten(-3, (3, -1))
     assert (blocks[:, :, 0, :, 1] != 0).any()  # pairs touch
     matrix = matrix + 0.1 * torch.eye(matrix.shape[-1], dtype=torch.float64)
@@ -167,35 +185,34 @@ def test_any_game_gives_its_gradient_and_gauss_newton_matrix(energy):
         assert_close(one, other)
 
 
-class Other(Energy):
-    """The same energy, but of a kind of which nothing is known but residuals."""
-
-    offers = frozenset({GRADIENT, RESIDUALS})
-    own, pair, dynamics = GAME.own, GAME.pair, GAME.dynamics
-
-    def own_terms(self, *arguments):
-        return GAME.own_terms(*arguments)
-
-    def pair_terms(self, *arguments):
-        return GAME.pair_terms(*arguments)
-
-    def residuals(self, *arguments):
-        return GAME.residuals(*arguments)
-
-
-def test_energies_of_other_kinds_are_linearised_in_general():
-    own = tuple(name for name in ALL if name != "lane")  # whose nearest point slides under automatic differentiation
-    scene, parameters, controls = setting(modes=2)
-    parameters = leaves_of(random_game(scene, 2, HORIZON))
-    for name in ALL:
-        if name not in own:
-            parameters.own_weights[name] = torch.zeros(3, 2, 2, dtype=torch.float64, requires_grad=True)
-    shown = controls[:, None].expand(-1, 2, -1, -1, -1)
-    known, unknown = (log_densities(energy, scene, parameters, shown, 0.1)[0] for energy in (GAME, Other()))
+def test_energies_of_other_kinds_have_the_same_likelihood():
+    scene, parameters, controls = setting(ALL)
+    shown = controls[:, None].expand(-1, 3, -1, -1, -1)
+    known, unknown = (log_densities(energy, scene, parameters, shown, 0.1)[0] for energy in (GAME, Other(GAME)))
     assert_close(unknown, known)
-    leaves = [parameters.own_weights[name] for name in own]
+    leaves = list(parameters.own_weights.values())
     for one, other in zip(*(torch.autograd.grad(v.sum(), leaves) for v in (unknown, known)), strict=True):
         assert_close(one, other)
+
+
+def test_how_far_agents_get_says_nothing_about_their_lane():
+    # A straight line ahead, and an agent on it: acceleration costs nothing that the lane would see.
+    energy = FeatureEnergy(own=["lane", "acc", "turnr"], pair=[])
+    scene, parameters, controls = setting(tuple(energy.own), modes=1, agents=1)
+    history, way = scene.history.clone(), torch.linspace(-50.0, 50.0, 6, dtype=torch.float64)
+    history[..., 0] = history[..., 1] = history[..., 2] = 0.0
+    line = torch.stack((way, torch.zeros_like(way)), -1).expand(3, 1, 2, 6, 2)
+    controls = torch.where(torch.tensor([True, False]), controls, 0.0)
+    future = Unicycle().rollout(history[:, :, -1], controls, scene.dt)
+    scene = dataclasses.replace(scene, history=history, references=line, future=future)
+    heavy = dataclasses.replace(
+        parameters, own_weights={**parameters.own_weights, "turnr": torch.full((3, 1, 1), 1e4).double()}
+    )
+    value, _ = log_densities(energy, scene, heavy, controls[:, None], 0.0)
+    acc = torch.distributions.Normal(torch.zeros(3, 1, 1).double(), 1.0 / heavy.own_weights["acc"])
+    turn = torch.distributions.Normal(torch.zeros(3, 1, 1).double(), 1e-4)
+    along = acc.log_prob(controls[..., 0]) + turn.log_prob(controls[..., 1])
+    assert_close(value[:, 0], along.sum((1, 2)), rtol=1e-5, atol=1e-5)
 
 
 def test_padding_and_the_rest_of_the_batch_do_not_matter():
