@@ -177,7 +177,9 @@ def _linearised(
     if not isinstance(energy, FeatureEnergy):
         controls = controls.contiguous()  # what is expanded takes no tangents
         _, slope = dense.gradient(energy, scene, parameters, controls)
-        return slope.double(), dense.gauss_newton(energy, scene, parameters, controls).double()
+        matrix = dense.gauss_newton(energy, scene, parameters, controls).double()
+        absent = ~scene.agent_mask[:, None, :, None, None].expand_as(controls).flatten(2)
+        return slope.double(), matrix - absent.to(matrix).diag_embed()  # absent agents' unit rows are added later
     energy.validate(scene, parameters, controls)
     batch, modes, agents, steps, _ = controls.shape
     controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)

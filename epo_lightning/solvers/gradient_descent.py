@@ -5,7 +5,7 @@
 S = diag(scale) says how far controls of either channel move for the same force; it is gradient descent in u / S. Near a
 minimum with the Hessian H the steps contract if eta lambda_max(S H S) < 2 and run away beyond that, so the stiffest
 direction limits eta and the softest ones take 1 / (eta lambda) steps. On highways a turn rate moves positions by the speed
-more than an acceleration does, and a scale like [1, 0.05] makes both about as stiff. Nothing is clipped: a step that is too
+more than an acceleration does, and a scale like [1, 0.03] makes both about as stiff. Nothing is clipped: a step that is too
 long is seen, because energies rise or cease to be numbers.
 """
 
@@ -38,7 +38,7 @@ class GradientDescent(Stepwise):
 
     Example::
 
-        solve = GradientDescent(steps=16, step_size=0.005, scale=[1.0, 0.05])
+        solve = GradientDescent(steps=16, step_size=0.005, scale=[1.0, 0.03])
         solution = solve(energy, scene, parameters)
 
     Attributes:

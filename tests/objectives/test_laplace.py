@@ -193,6 +193,9 @@ def test_energies_of_other_kinds_have_the_same_likelihood():
     leaves = list(parameters.own_weights.values())
     for one, other in zip(*(torch.autograd.grad(v.sum(), leaves) for v in (unknown, known)), strict=True):
         assert_close(one, other)
+    padded, wide = pad(scene), widen(parameters.map(torch.Tensor.detach), filling=7.0)
+    shown = torch.nn.functional.pad(shown, (0, 0, 0, 0, 0, 2))
+    assert_close(log_densities(Other(GAME), padded, wide, shown, 0.1)[0], known)
 
 
 def test_how_far_agents_get_says_nothing_about_their_lane():
