@@ -306,6 +306,7 @@ class Solution(_Batch):
         status: a :class:`Status` per scene and mode.
         iterates: u_0 .. u_S, when asked for.
         tables: of the candidates, for solvers that choose among some; the joint modes are then the most likely choices.
+        assignment: which candidates these are, where the joint modes are choices among those of ``tables``.
     """
 
     controls: Float[Tensor, "B M N K 2"]
@@ -316,6 +317,27 @@ class Solution(_Batch):
     status: Int[Tensor, "B M"]
     iterates: tuple[Float[Tensor, "B M N K 2"], ...] | None = None
     tables: Tables | None = None
+    assignment: Int[Tensor, "B M N"] | None = None
+
+
+@dataclass(frozen=True)
+class Equilibrium(_Batch):
+    """How close the most likely joint mode of a forecast is to an open-loop Nash equilibrium of its game.
+
+    Attributes:
+        initial, energy: E at the strategies from which the solver started, and at the forecast.
+        optimum: E at the local minimum that a tightly converged descent from the forecast leads to; never above ``energy``.
+        gradient_norm: Euclidean norm of dE/du at the forecast; NaN where strategies are chosen among candidates.
+        nash_gap: what each agent could gain by changing its strategy alone, to a local best response; zero where absent.
+        objective: J_i, what each agent minimises, at the forecast; zero where absent.
+    """
+
+    initial: Float[Tensor, " B"]
+    energy: Float[Tensor, " B"]
+    optimum: Float[Tensor, " B"]
+    gradient_norm: Float[Tensor, " B"]
+    nash_gap: Float[Tensor, "B N"]
+    objective: Float[Tensor, "B N"]
 
 
 @dataclass(frozen=True)
@@ -335,6 +357,7 @@ class JointForecast(_Batch):
         order_logits: of every pair's order being +1, for forecasters whose modes are orders.
         own_energy: energy by feature and agent at the solution.
         pair_energy: energy by feature and pair at the solution.
+        equilibrium: how close the most likely mode is to an equilibrium, where that was asked for.
     """
 
     states: Float[Tensor, "B M N K 4"]
@@ -348,3 +371,4 @@ class JointForecast(_Batch):
     order_logits: Float[Tensor, "B P"] | None = None
     own_energy: Mapping[str, Float[Tensor, "B M N"]] | None = None
     pair_energy: Mapping[str, Float[Tensor, "B M P"]] | None = None
+    equilibrium: Equilibrium | None = None

@@ -102,12 +102,14 @@ def _times(matrix: Float[Tensor, "C a b"], vector: Float[Tensor, "C b 1"]) -> Fl
     return (matrix * vector.mT).sum(-1, keepdim=True)
 
 
-def factorise(model: QuadraticModel, damping: Float[Tensor, " S"], group: Group) -> tuple[Factors, Bool[Tensor, " C"]]:
+def factorise(
+    model: QuadraticModel, damping: Float[Tensor, "S *agents"], group: Group
+) -> tuple[Factors, Bool[Tensor, " C"]]:
     """Factors of a group's matrices, and which of them have none.
 
     Args:
         model: the energy around an iterate.
-        damping: lambda of every sample, a multiple of the identity in the controls.
+        damping: lambda of every sample or of every agent, a multiple of the identity in their controls.
     """
     parts = _Parts(model, damping, group)
     failed = torch.zeros(group.count, dtype=torch.bool, device=damping.device)
@@ -125,7 +127,7 @@ def factorise(model: QuadraticModel, damping: Float[Tensor, " S"], group: Group)
 class _Parts:
     """A model's stiffnesses for one group, laid out [C, .., nodes, .., m]."""
 
-    def __init__(self, model: QuadraticModel, damping: Float[Tensor, " S"], group: Group) -> None:
+    def __init__(self, model: QuadraticModel, damping: Float[Tensor, "S *agents"], group: Group) -> None:
         self.model, self.group, self.size = model, group, group.size
 
         # In double precision: nodes see rates of controls divided by dt^4, for which single precision has no digits.
@@ -133,7 +135,7 @@ class _Parts:
             return values.to(torch.float64)
 
         # Absent agents get unit matrices of their own, so that they are regular even without damping.
-        control = exact(model.control_stiffness) + damping[:, None, None, None]
+        control = exact(model.control_stiffness) + damping.reshape(len(damping), -1, 1, 1)
         control = torch.where(model.present[..., None, None], control, 1.0)
         moves, node, pull = exact(model.moves), exact(model.node_stiffness), exact(model.pull[:, :, 2:])
         rows = [model.dt * moves.flatten(2, 3), control / model.dt**2, node, pull]

@@ -153,7 +153,7 @@ def solve(
     parameters: GameParameters,
     steps: int,
     step_size: float,
-    damping: Float[Tensor, "B M"],
+    damping: Float[Tensor, "B M *agents"],
     keep_iterates: bool = False,
 ) -> Solution:
     """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.structured.solve` takes them.
@@ -267,7 +267,8 @@ class _Call:
         self.states: Tensor | None = controls.new_empty((*shape[:-1], 4))
         self.initial_energy, self.energy, self.gradient_norm = controls.new_empty((3, *shape[:2])).unbind(0)
         self.status = torch.empty(shape[:2], dtype=torch.int64)
-        self.damping = _as(controls.dtype, damping).contiguous()
+        by_agent = damping if damping.dim() == 3 else damping[..., None]
+        self.damping = _as(controls.dtype, by_agent).expand(shape[:3]).contiguous()
         self.start = controls.detach().contiguous()
         self.arguments = _Run(
             steps=self.steps,

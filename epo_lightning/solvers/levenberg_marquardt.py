@@ -23,9 +23,11 @@ from epo_lightning.solvers import compiled, structured
 from epo_lightning.solvers.base import PATH, STATIONARY, Stepwise
 
 Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool], Solution]
-"""(energy, scene, parameters, steps, step size, damping [B, M], keep iterates) -> solution."""
+"""(energy, scene, parameters, steps, step size, damping [B, M] or [B, M, N], keep iterates) -> solution.
 
-_LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e7
+An agent whose damping is infinite stays exactly where it is, and the others move as if it were part of the scenery."""
+
+LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e7
 """Between which adaptive damping stays."""
 BACKENDS = ("auto", "pytorch", "compiled")
 
@@ -103,7 +105,7 @@ class LevenbergMarquardt(Stepwise):
         damping = start.new_full(start.shape[:2], self.damping) if memory is None else memory
         if start.numel() == 0:
             return _nothing(start), damping
-        solve = _backend(self.backend, energy, scene, parameters)
+        solve = backend(self.backend, energy, scene, parameters)
         if not self.adaptive:
             return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates), damping
         solution = solve(energy, scene, parameters, 0, self.step_size, damping, True)
@@ -112,14 +114,18 @@ class LevenbergMarquardt(Stepwise):
             trial = solve(energy, scene, here, 1, self.step_size, damping, False)
             better = trial.energy < solution.energy
             damping = torch.where(
-                better, (damping / 10.0).clamp_min(_LEAST_DAMPING), (damping * 10.0).clamp_max(_MOST_DAMPING)
+                better, (damping / 10.0).clamp_min(LEAST_DAMPING), (damping * 10.0).clamp_max(MOST_DAMPING)
             )
             solution = _chosen(better, trial, solution, self.keep_iterates)
         return solution if self.keep_iterates else dataclasses.replace(solution, iterates=None), damping
 
 
-def _backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Backend:
-    """What computes the steps of a game."""
+def backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Backend:
+    """What computes the steps of a game.
+
+    Raises:
+        ValueError: the backend asked for cannot solve this game.
+    """
     if name == "pytorch":
         return structured.solve
     obstacle = compiled.obstacle(energy, scene, parameters)

@@ -39,6 +39,8 @@ _RETRIES = 4
 """How often the damping of a sample that cannot be factorised is raised tenfold."""
 _LEAST_RAISED_DAMPING = 1e-3
 """Where raising starts from when the damping is smaller."""
+_HOLDING = 1e30
+"""Stands for an infinite damping in the matrices: beside it no curvature is seen, and nobody else is disturbed by it."""
 
 
 def solve(
@@ -47,7 +49,7 @@ def solve(
     parameters: GameParameters,
     steps: int,
     step_size: float,
-    damping: Float[Tensor, "B M"],
+    damping: Float[Tensor, "B M *agents"],
     keep_iterates: bool = False,
     split: bool | None = None,
 ) -> Solution:
@@ -60,13 +62,13 @@ def solve(
         energy, scene, parameters: what to minimise; they fit together.
         steps: number S of steps.
         step_size: alpha.
-        damping: lambda of every sample.
+        damping: lambda of every sample, or of every agent; an infinite one holds the agent exactly where it is.
         keep_iterates: whether the solution carries u_0 .. u_S.
         split: whether samples fall apart into components; by default, on a CPU.
     """
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
     split = controls.device.type == "cpu" if split is None else split
-    game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(), split)
+    game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(0, 1), split)
     tensors = game.tensors(parameters)
     status = torch.where(game.known, Status.SOLVED, Status.STOPPED)
     iterates = [controls]
@@ -101,7 +103,7 @@ class Game:
     scene: Scene
     parameters: GameParameters
     step_size: float
-    damping: Float[Tensor, " S"]
+    damping: Float[Tensor, "S *agents"]
     split: bool
 
     @cached_property
@@ -158,14 +160,19 @@ class Game:
         return dataclasses.replace(self.energy, own=own, pair=pair) if own or pair else None
 
 
-def _components(model: QuadraticModel) -> list[Group]:
-    """The agents of every sample, grouped by the active pairs that connect them; absent agents are in no group."""
+def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) -> list[Group]:
+    """The agents of every sample, grouped by the active pairs that connect them; the absent and the held are in no group."""
     edges, mask = model.edges, model.scene.agent_mask
     samples, agents = edges.samples, edges.agents
-    linked = bool(model.linked.all())
-    if edges.every and linked and bool(mask.all()) and agents > 0:
+    moving = mask[:, None].expand(-1, samples // len(mask), -1).flatten()
+    links = model.linked
+    if held is not None:  # a pair of which one is held pulls at the other, and that is all
+        moving = moving & ~held.flatten()
+        links = links & moving[edges.first] & moving[edges.second]
+    linked = bool(links.all())
+    if edges.every and linked and bool(moving.all()) and agents > 0:
         return [Group.whole(edges)]
-    chosen = None if linked else model.linked.nonzero()[:, 0]
+    chosen = None if linked else links.nonzero()[:, 0]
     first, second = edges.first, edges.second
     if chosen is not None:
         first, second = first[chosen], second[chosen]
@@ -178,8 +185,7 @@ def _components(model: QuadraticModel) -> list[Group]:
         if torch.equal(lower, label):
             break
         label = lower
-    present = mask[:, None].expand(-1, samples // len(mask), -1).flatten()
-    size_of = torch.bincount(label, minlength=len(label))[label] * present
+    size_of = torch.bincount(label, minlength=len(label))[label] * moving
     order = label.argsort(stable=True)
     sizes = size_of[order]
     groups = []
@@ -217,21 +223,26 @@ class Factors:
         groups: the agents that were factorised together.
         factors: of each group.
         status: a :class:`Status` per sample.
+        held: the agents that stay where they are, where agents have a damping each.
     """
 
-    model: Model
+    model: QuadraticModel
     groups: list[Group]
     factors: list[blocks.Factors]
     status: Int[Tensor, " S"]
+    held: Bool[Tensor, "S N"] | None = None
 
     def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
         """(J^T J + lambda I)^-1 times a covector of the controls."""
         exact = self.model.to_nodes(right.to(torch.float64))
         parts = [f.solve(_gather(group, exact)) for f, group in zip(self.factors, self.groups, strict=True)]
-        return self.model.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
+        solved = self.model.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
+        return solved if self.held is None else torch.where(self.held[..., None, None], 0.0, solved)
 
 
-def factorise(model: QuadraticModel, damping: Float[Tensor, " S"], split: bool, retry: bool | None = None) -> Factors:
+def factorise(
+    model: QuadraticModel, damping: Float[Tensor, "S *agents"], split: bool, retry: bool | None = None
+) -> Factors:
     """Factorise the matrices of all samples, of each component on its own where they are split.
 
     Where retrying is allowed, a matrix without a factor gets ten, a hundred, ... times the damping, and the others keep
@@ -239,11 +250,14 @@ def factorise(model: QuadraticModel, damping: Float[Tensor, " S"], split: bool, 
 
     Args:
         model: the energy around an iterate.
-        damping: lambda of every sample.
+        damping: lambda of every sample, or of every agent.
         split: whether samples fall apart into components.
         retry: whether what has no factor is tried again with more damping; by default, where samples are split.
     """
-    groups = _components(model) if split else [Group.whole(model.edges)]
+    held = damping.isinf() if damping.dim() == 2 else None
+    if held is not None:
+        damping = damping.clamp_max(_HOLDING)
+    groups = _components(model, held) if split else [Group.whole(model.edges)]
     factors = []
     status = torch.zeros(model.samples, dtype=torch.long, device=damping.device)
     for group in groups:
@@ -256,12 +270,12 @@ def factorise(model: QuadraticModel, damping: Float[Tensor, " S"], split: bool, 
             status = outcome
         else:  # of a sample, the worst one of its components
             status = status.scatter_reduce(0, group.agents[:, 0] // model.agents, outcome, "amax")
-    return Factors(model, groups, factors, status)
+    return Factors(model, groups, factors, status, held)
 
 
 def _retry(
     model: QuadraticModel,
-    damping: Float[Tensor, " S"],
+    damping: Float[Tensor, "S *agents"],
     group: Group,
     factors: blocks.Factors,
     outcome: Int[Tensor, " C"],

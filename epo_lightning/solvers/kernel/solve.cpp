@@ -257,16 +257,22 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
                 group.template find_feet<false>(Feet<T>::at(arena.take(Feet<T>::size(n, game.K)), n, game.K));
             Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game.K) : reused[n].data();
             const auto factors = Factors<T>::at(memory, n, game.K);
-            Vec<T>*turn = arena.take(n * game.K), *thrust = arena.take(n * game.K), energy, given;
-            for (int lane = 0; lane < W; ++lane) given[lane] = static_cast<const T*>(run.damping)[group.problem[lane]];
-            Vec<T> damping = given, raised = most<T>(given, splat<T>(T(kLeastRaised)));
+            Vec<T>*turn = arena.take(n * game.K), *thrust = arena.take(n * game.K), energy;
+            Vec<T>*given = arena.take(n), *damping = arena.take(n), *raised = arena.take(n);
+            for (int i = 0; i < n; ++i) {
+                for (int lane = 0; lane < W; ++lane) given[i][lane] = static_cast<const T*>(run.damping)[group.row_of(i, lane)];
+                damping[i] = given[i];
+                raised[i] = most<T>(given[i], splat<T>(T(kLeastRaised)));
+            }
             Mask<T> sound, failed{};
             for (int attempt = 0;; ++attempt) {
                 solve_step(group, damping, factors, turn, thrust, energy, sound);
                 if (attempt == kRetries || !any<T>(~sound)) break;
                 failed |= ~sound;
-                raised *= T(10);
-                damping = sound ? damping : given + raised;
+                for (int i = 0; i < n; ++i) {
+                    raised[i] *= T(10);
+                    damping[i] = sound ? damping[i] : given[i] + raised[i];
+                }
             }
             for (int lane = 0; lane < filled; ++lane) {
                 const int problem = group.problem[lane];

@@ -127,9 +127,11 @@ INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* 
 }
 
 /// The damped Gauss-Newton direction of every lane, [n, K] turn rates and accelerations; its factors; the energy.
+///
+/// Agents [n] have a damping each. Where it is infinite, the reciprocal pivots are zero, and so is the direction.
 template <class T, int N>
 void solve_step(
-    const Group<T, N>& g, Vec<T> damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust, Vec<T>& energy, Mask<T>& sound) {
+    const Group<T, N>& g, const Vec<T>* damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust, Vec<T>& energy, Mask<T>& sound) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
     Vec<T>*P = g.arena.take(ld * ld), *y = g.arena.take(ld), *h = g.arena.take(g.K * m), *damped = g.arena.take(m);
     Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
@@ -144,7 +146,7 @@ void solve_step(
         costs.set(g, k);
         energy += costs.energy;
         g.motions(k, Z);
-        for (int r = 0; r < m; ++r) damped[r] = costs.stiffness[r] + damping;
+        for (int r = 0; r < m; ++r) damped[r] = costs.stiffness[r] + damping[r / 2];
         control_block(g.count, P, g.dt, damped, L);
         factorise<T>(g.count, L, sound);
         if (k > 0) {
