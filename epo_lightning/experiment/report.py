@@ -59,12 +59,12 @@ def of_sweep(sweep: Sweep) -> Report:
             f"none of the {len(jobs)} runs of the sweep {sweep.label} is evaluated: `epo sweep status {sweep.label}` says "
             f"how far they are, epo evaluate runs={os.path.relpath(sweep.root)} evaluates those that are finished"
         )
-    splits = {job.run.path: job.score for job in jobs}
+    asked = {job.run.path: job.measures for job in jobs}
     with_scores = [job.run for job in done if scored(job.run)]
     evaluated = [
         run
         for run in (collect(with_scores) if with_scores else ())
-        if splits[run.path] is None or run.split == splits[run.path]
+        if not asked[run.path] or run.split in asked[run.path]
     ]
     measured = {run.path for run in evaluated} | {job.run.path for job in done if is_timed(job.run)}
     left_out = []
@@ -155,7 +155,10 @@ def draw(rows: Iterable[Row], folder: Path) -> tuple[list[Path], list[str]]:
         forecasts = {title: forecast_of(forecaster, scenes[shown]) for title, forecaster in forecasters.items()}
         drawn.append(joint_predictions(scenes[shown], forecasts, folder / "joint_predictions.png", other))
     many = spread(scenes, GAMES)
-    games = {title: forecast_of(forecasters[title], many) for title, f in forecasts.items() if f.parameters is not None}
+    # An energy may be a network, without weights that have names.
+    inferred = {title: forecast.parameters for title, forecast in forecasts.items()}
+    weighted = [title for title, game in inferred.items() if game is not None and game.own_weights]
+    games = {title: forecast_of(forecasters[title], many) for title in weighted}
     if games:
         names = () if is_traffic(scenes, shape) else AGENTS
         drawn.append(learned_weights(games, folder / "learned_weights.png", names))

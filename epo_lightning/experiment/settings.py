@@ -15,6 +15,8 @@ from typing import Any, Literal
 
 from epo_lightning.registry import ConfigError, check, lookup, nearest
 
+Measured = Literal["test", "val", "time"]
+"""What may be measured of a run: its scores on a split, or the time of a forecast."""
 PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "optimizer")
 
 
@@ -166,7 +168,7 @@ class Settings:
     run_dir: str | None = None
     existing: Literal["error", "continue"] = "error"
     resume: str | None = None
-    score: Literal["test", "val", "time"] | None = None
+    score: Measured | Sequence[Measured] | None = None
     sweep: str | None = None
     experiment: str | None = None
     variant: str = ""
@@ -174,6 +176,17 @@ class Settings:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**32:
             raise ConfigError(f"seed must be between 0 and {2**32 - 1}, not {self.seed}")
+
+    @property
+    def measures(self) -> tuple[Measured, ...]:
+        """What ``score`` asks for."""
+        return measures(self.score)
+
+
+def measures(score: str | Sequence[str] | None) -> tuple[Measured, ...]:
+    """What ``score`` asks for, however it says so: each once, in one order, and nothing for null."""
+    asked = (score,) if isinstance(score, str) else score or ()
+    return tuple(which for which in typing.get_args(Measured) if which in asked)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from typing import Any, Literal
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.orphans import end_with
-from epo_lightning.experiment.settings import Settings, read
+from epo_lightning.experiment.settings import Measured, Settings, measures, read
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_json, write_text
@@ -59,7 +59,7 @@ class Job:
         run: where it lies.
         identity: what makes it this run.
         title, seed: how to call it.
-        score: what is measured when it is trained; None for nothing.
+        measures: what is measured when it is trained.
     """
 
     overrides: tuple[str, ...]
@@ -67,7 +67,7 @@ class Job:
     identity: str
     title: str
     seed: int
-    score: str | None
+    measures: tuple[Measured, ...]
 
     @classmethod
     def of(cls, config: Mapping[str, Any], overrides: Sequence[str]) -> Job:
@@ -79,7 +79,13 @@ class Job:
         settings = read(Settings, config)
         data, _ = assembly.check(settings)
         run = training.folder_for(settings)
-        return cls(tuple(overrides), run, identity(config, data.digest), settings.title, settings.seed, settings.score)
+        name = identity(config, data.digest)
+        return cls(tuple(overrides), run, name, settings.title, settings.seed, settings.measures)
+
+    @property
+    def measured(self) -> bool:
+        """Whether all that is measured lies in the run's folder."""
+        return all(self.run.metrics_file(which).is_file() for which in self.measures)
 
 
 @dataclass(frozen=True)
@@ -143,7 +149,8 @@ class Sweep:
 
     def _job(self, entry: Mapping[str, Any]) -> Job:
         run = RunFolder(Path(os.path.relpath(self.root / entry["folder"])))
-        return Job(tuple(entry["overrides"]), run, entry["identity"], entry["title"], entry["seed"], entry["score"])
+        measured = measures(entry["score"])  # null or a word in records of older versions
+        return Job(tuple(entry["overrides"]), run, entry["identity"], entry["title"], entry["seed"], measured)
 
     def _entry(self, job: Job) -> dict[str, Any]:
         return {
@@ -152,7 +159,7 @@ class Sweep:
             "identity": job.identity,
             "title": job.title,
             "seed": job.seed,
-            "score": job.score,
+            "score": list(job.measures),
         }
 
     def state(self, job: Job) -> State:
@@ -162,7 +169,7 @@ class Sweep:
         except ConfigError:
             return "failed"
         if state == "finished":
-            if job.score is None or job.run.metrics_file(job.score).is_file():
+            if job.measured:
                 return "done"
             state = "running" if job.run.locked else "interrupted"
         return "failed" if state in ("waiting", "interrupted") and self._failure(job.run).is_file() else state

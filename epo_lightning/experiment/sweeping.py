@@ -90,7 +90,7 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Jo
             raise ConfigError(
                 f"{job.run.path} exists and is not a run folder: move it away, or choose another runs=<folder>"
             )
-        if job.score == "time":
+        if "time" in job.measures:
             _set_aside(job.run, read(Settings, config).trainer)
         data = json.dumps(config["data"], sort_keys=True)
         if data not in ready and sweep.state(job) != "done":

@@ -52,7 +52,7 @@ def measure(run: RunFolder, settings: Settings, forecaster: Any = None) -> dict[
     solver = getattr(forecaster, "solver", None)
     measured = {
         "agents": scenes[0].history.shape[1],
-        "steps": None if solver is None else solver.for_test().steps,
+        "steps": None if solver is None else getattr(solver.for_test(), "steps", None),
         "modes": forecast.states.shape[1],
         "batch": 1,
         "samples": SAMPLES,

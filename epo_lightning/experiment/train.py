@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
+from lightning.pytorch.callbacks import Timer
 
 from epo_lightning.experiment import assembly, callbacks, distributed, gpus, logs
 from epo_lightning.experiment.compose import PACKAGE
@@ -124,15 +125,16 @@ def refuse_other(run: RunFolder, config: dict[str, Any]) -> None:
 
 
 def _score(settings: Settings, run: RunFolder) -> None:
-    """Measure what the configuration asks for, unless that was done already."""
-    if settings.score is None or run.metrics_file(settings.score).is_file():
-        return
-    if settings.score == "time":
-        from epo_lightning.experiment.timing import measure
+    """Measure what the configuration asks for, except what was measured already."""
+    for which in settings.measures:
+        if run.metrics_file(which).is_file():
+            continue
+        if which == "time":
+            from epo_lightning.experiment.timing import measure
 
-        measure(run, settings)
-    else:
-        score(run, EvaluateSettings(run=str(run.path), split=settings.score), settings.trainer)
+            measure(run, settings)
+        else:
+            score(run, EvaluateSettings(run=str(run.path), split=which), settings.trainer)
 
 
 def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None = None) -> None:
@@ -151,12 +153,13 @@ def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path 
 
 def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None) -> None:
     started = time.monotonic()
+    timer = Timer()  # it is kept in the checkpoint: what a killed process had done counts
     seed_everything(settings.seed, workers=True, verbose=False)
     data = ready(settings)
     model = assembly.build_model(settings, data)
     step = _steps_in(last, model) if last else 0
     with logs.open_logs(settings, config, run, step) as loggers:
-        watchers = callbacks.watchers(settings.callbacks, run, f"{settings.title}, seed {settings.seed}")
+        watchers = [*callbacks.watchers(settings.callbacks, run, f"{settings.title}, seed {settings.seed}"), timer]
         bar = any(isinstance(watcher, callbacks.TQDMProgressBar) for watcher in watchers)
         learns = assembly.parameters(model) > 0 and settings.trainer.max_steps != 0
         strategy = distributed.strategy(settings.trainer.devices, run, config, last) if learns else None
@@ -174,7 +177,7 @@ def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Pat
         epochs=trainer.fit_loop.epoch_progress.current.ready,  # current_epoch lags where there was no step left to make
         steps=trainer.global_step,
         best={settings.callbacks.monitor: best},
-        seconds=round(run.record.get("seconds", 0.0) + time.monotonic() - started, 1),
+        seconds=round(timer.time_elapsed() if learns else time.monotonic() - started, 3),
     )
 
 

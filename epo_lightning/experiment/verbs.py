@@ -11,6 +11,7 @@ from epo_lightning.experiment.settings import (
     PredictSettings,
     ReportSettings,
     check_part,
+    measures,
     read,
 )
 from epo_lightning.run_folder import RunFolder
@@ -74,7 +75,8 @@ def _trained(run: RunFolder) -> float | None:
     best = next(iter(record.get("best", {}).items()), None)
     score = f", best {best[0]} {best[1]:.4f}" if best and best[1] is not None else ""
     print(f"{record['title']}, seed {record['seed']}: {record.get('parameters', 0)} parameters{score}")
-    scored = run.metrics_file(run.config().get("score") or "test").is_file()
+    asked = measures(run.config().get("score")) or ("test",)
+    scored = all(run.metrics_file(which).is_file() for which in asked)
     print(f"run folder: {run.path}\nnext: epo {f'report runs={run.path}' if scored else f'evaluate run={run.path}'}")
     return best[1] if best else None
 

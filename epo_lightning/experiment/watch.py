@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from epo_lightning.experiment.sweep import Job, State, Sweep
+from epo_lightning.report.timings import duration
 from epo_lightning.run_folder import read_json
 
 STYLES: dict[State, str] = {
@@ -48,12 +49,13 @@ def status(sweep: Sweep) -> Counter[State]:
 
 def names_of(jobs: Sequence[Job]) -> dict[Path, str]:
     """How to call each run among the others: title and seed, and the folder's name where those do not tell them apart."""
-    counts = Counter((job.title, job.seed) for job in jobs)
-    return {
-        job.run.path: f"{job.title}, seed {job.seed}"
-        + (f" ({job.run.path.name})" if counts[job.title, job.seed] > 1 else "")
-        for job in jobs
-    }
+    names = {job.run.path: f"{job.title}, seed {job.seed}" for job in jobs}
+    counts = Counter(names.values())
+    folders = Counter((names[job.run.path], job.run.path.name) for job in jobs)
+    for path, name in names.items():
+        if counts[name] > 1:
+            names[path] = f"{name} ({'/'.join(path.parts[-2 if folders[name, path.name] > 1 else -1 :])})"
+    return names
 
 
 def summary(counts: Counter[State]) -> str:
@@ -89,21 +91,16 @@ def how_far(job: Job) -> str:
 
 
 def result(job: Job) -> str:
-    """What a finished run has come to: its best validation score and how long it took, or how long a forecast takes."""
-    if job.score == "time":
-        return f"{1000 * read_json(job.run.metrics_file('time'))['seconds']['median']:.1f} ms per forecast"
-    record = job.run.record
-    best = next(((key, value) for key, value in record.get("best", {}).items() if value is not None), None)
-    score = f"{best[0]} {best[1]:.4f}, " if best else ""
-    return f"{score}{duration(record.get('seconds', 0.0))}"
-
-
-def duration(seconds: float) -> str:
-    """``75 s``, ``12 min``, ``3 h 10 min``"""
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+    """What a finished run has come to: its best validation score and how long it took, and how long a forecast takes."""
+    told = []
+    if job.measures != ("time",):
+        record = job.run.record
+        best = next(((key, value) for key, value in record.get("best", {}).items() if value is not None), None)
+        told = [*([f"{best[0]} {best[1]:.4f}"] if best else []), duration(record.get("seconds", 0.0))]
+    if "time" in job.measures:
+        seconds = read_json(job.run.metrics_file("time"))["seconds"]["median"]
+        told.append(f"{1000 * seconds:.1f} ms per forecast")
+    return ", ".join(told)
 
 
 @contextmanager

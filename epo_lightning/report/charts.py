@@ -22,7 +22,7 @@ from epo_lightning.report.made import distinct
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
 from epo_lightning.report.runtime import draw_modes, heat_map
 from epo_lightning.report.tables import Row, Table
-from epo_lightning.report.timings import Timing, grid, over_modes, places, time
+from epo_lightning.report.timings import Timing, grid, methods, over_modes, places, time
 
 Size = tuple[float, float]
 
@@ -140,8 +140,9 @@ def _of_steps(curve: StepsCurve) -> Iterable[tuple[str, ...]]:
 
 
 def _runtimes(timings: Sequence[Timing]) -> Iterable[Chart]:
-    found = places(timings)
-    for number, (where, members) in enumerate(found.items(), 1):
+    found = [(where, same) for where, members in places(timings).items() for same in methods(members)]
+    found = [(where, same) for where, same in found if len({(t.agents, t.steps, t.modes) for t in same}) > 1]
+    for number, (where, members) in enumerate(found, 1):
         suffix = f"_{number}" if len(found) > 1 else ""
         header = ("N", "S", "M", "mean", "median", "10% to 90%", "samples", "run")
         numbers = tuple(_of_timing(timing) for timing in sorted(members, key=_position))

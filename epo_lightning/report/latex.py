@@ -14,12 +14,11 @@ from epo_lightning.report.render import (
     comparison_sheet,
     difference_text,
     legend,
-    number,
     paper_text,
     with_ends,
 )
 from epo_lightning.report.statistics import Comparisons
-from epo_lightning.report.tables import Column, Row, Table
+from epo_lightning.report.tables import MISSING, Column, Row, Table
 
 SPECIAL = {
     **{letter: rf"\{letter}" for letter in "&%$#_{}"},
@@ -86,17 +85,17 @@ def sheet_to_latex(
 
     Args:
         rows: those that are behind its numbers, named in the comments.
-        caption: LaTeX that follows the title.
+        caption: LaTeX that follows the title; the sheet's note if not given.
         label, caveat: as in :func:`to_latex`.
     """
     lines = []
     for index, line in enumerate(sheet.lines):
-        numbers = (re.sub(r"(?<!\w)-(?=\d)", "$-$", latex_text(text)) for text in line[sheet.left :])
+        numbers = (_minus(latex_text(text)) for text in line[sheet.left :])
         lines.append(_line([*map(latex_text, line[: sheet.left]), *numbers]))
         if index in sheet.ends and index + 1 < len(sheet.lines):
             lines.append(r"\midrule")
     columns = "l" * sheet.left + "r" * (len(sheet.header) - sheet.left)
-    caption = _caption(sheet.title, caveat, caption)
+    caption = _caption(sheet.title, caveat, caption or latex_text(sheet.note))
     header = [latex_text(text) for text in sheet.header]
     return _float(behind(rows), header, columns, lines, caption, label or slug(sheet.title))
 
@@ -128,10 +127,15 @@ def slug(title: str) -> str:
 def _cell(row: Row, column: Column) -> str:
     cell = row.cells.get(column.metric)
     if cell is None:
-        return ""
+        return MISSING
     form = {1: r"\textbf{%s}", 2: r"\underline{%s}"}.get(cell.rank or 0, "%s")
-    deviation = "" if cell.deviation is None else rf"\,{{\scriptsize$\pm$\,{number(cell.deviation, column.digits)}}}"
-    return form % number(cell.mean, column.digits) + deviation
+    deviation = "" if cell.deviation is None else rf"\,{{\scriptsize$\pm$\,{_minus(column.text(cell.deviation))}}}"
+    return form % _minus(column.text(cell.mean)) + deviation
+
+
+def _minus(text: str) -> str:
+    """Text in which the sign of a number is one."""
+    return re.sub(r"(?<![^\We])-(?=\d)", "$-$", text)
 
 
 def _paper(row: Row, column: Column) -> str:

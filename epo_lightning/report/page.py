@@ -12,7 +12,7 @@ from typing import Any
 
 from epo_lightning.report.charts import Chart
 from epo_lightning.report.made import Made, distinct
-from epo_lightning.report.render import Sheet, difference_text, number, own_text, paper_text, signed, with_ends
+from epo_lightning.report.render import Sheet, difference_text, own_text, paper_text, signed, with_ends
 from epo_lightning.report.style import svg
 from epo_lightning.report.tables import Row, Table
 
@@ -30,7 +30,7 @@ class Content:
         title: of the page.
         command: that writes it again.
         preface, legend, comparison_legend: Markdown, of which bold, underlined and code is understood.
-        tables, comparisons, settings: in their order; the latter two as text in columns.
+        tables, costs, comparisons, settings: in their order; the latter three as text in columns.
         charts: with their section.
         pictures: PNG files.
         made: how every row was made.
@@ -45,6 +45,7 @@ class Content:
     legend: str
     comparison_legend: str
     tables: Sequence[Table]
+    costs: Sequence[Sheet]
     comparisons: Sequence[Sheet]
     settings: Sequence[Sheet]
     charts: Sequence[Chart]
@@ -126,12 +127,12 @@ def _table(table: Table, cells: list[dict[str, Any]], place: Any) -> dict[str, A
                 {
                     "row": place(row),
                     "what": f"{column.label}, {table.data}, {table.split} split",
-                    "mean": number(cell.mean, 6),
-                    "std": None if cell.deviation is None else number(cell.deviation, 6),
+                    "mean": column.long_text(cell.mean),
+                    "std": None if cell.deviation is None else column.long_text(cell.deviation),
                     "n": cell.n,
                     "paper": paper or None,
                     "difference": None if cell.difference is None else signed(cell.difference, 6),
-                    "values": [number(run.metrics[column.metric], 6) for run in row.runs],
+                    "values": [column.long_text(run.metrics[column.metric]) for run in row.runs],
                 }
             )
         rows.append({"name": row.name, "n": len(row.runs), "cells": shown, "last": last})

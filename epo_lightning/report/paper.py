@@ -5,6 +5,9 @@ Keys are (data, backbone, forecaster) in this project's names. Displacements in 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp")
 
 PAPER: dict[tuple[str, str, str], tuple[float, ...]] = {
@@ -63,6 +66,22 @@ RUNTIME: dict[tuple[int, int], float] = {
 
 RUNTIME_MODES: dict[int, float] = {1: 0.169, 2: 0.170, 4: 0.172, 8: 0.174, 12: 0.175}
 """Its second part: seconds by M with S = 2 and N = 4. At M = 4 it disagrees with the heat map's 0.12."""
+
+
+PARTS = {
+    "energy": "features",
+    "solver": "levenberg_marquardt",
+    "backward": "unrolled",
+    "objective": "imitation",
+}
+"""What the paper's own row is made of, its "Ours"; other methods of its Table 1 share the forecaster."""
+
+
+def is_papers(forecaster: str, config: Mapping[str, Any]) -> bool:
+    """Whether a row is made of the parts of the paper's; runs of older versions do not name all of them."""
+    if forecaster != "epo":
+        return True
+    return all((config.get(kind) or {}).get("name", name) == name for kind, name in PARTS.items())
 
 
 def paper_values(

@@ -18,13 +18,20 @@ from rich.text import Text
 
 from epo_lightning.report.selection import BestSetting
 from epo_lightning.report.statistics import Comparisons, Difference
-from epo_lightning.report.tables import Cell, Column, Row, Table, distinct
+from epo_lightning.report.tables import GAME, MISSING, OF_MODES, Cell, Column, Row, Table, distinct, number
 
 COMPARISON_LEGEND = (
     "Differences of the scores of two rows, paired by seed: the first row minus the second, so that negative is better for "
     "the first; n is the number of pairs. The interval covers the mean difference with 95 % confidence; p is that of the "
     "two-sided paired t-test, not corrected for the number of comparisons. With three seeds such a test has little power: "
     "a large p does not say that two rows are equally good."
+)
+
+GAMES = (
+    "Energies are those of the most likely joint mode: at the initial strategies, as forecast (solved), and at a tightly "
+    "solved optimum near the forecast. The Nash gap is the most that an agent could gain by changing its strategy alone; "
+    "relative, as a share of its own objective. Energies of different methods, their gradients and gaps are in different "
+    "units; relative gaps compare, and lower is better."
 )
 
 CSV_HEADER = (
@@ -48,6 +55,7 @@ class Sheet:
         lines: one text per column each.
         left: how many columns from the left hold text; the others hold numbers.
         ends: indices of lines below which a group ends.
+        note: how to read it, below it.
     """
 
     title: str
@@ -55,11 +63,7 @@ class Sheet:
     lines: tuple[tuple[str, ...], ...]
     left: int = 1
     ends: frozenset[int] = field(default_factory=frozenset)
-
-
-def number(value: float, digits: int) -> str:
-    """A number as tables print it; a dash where there is none."""
-    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+    note: str = ""
 
 
 def signed(value: float, digits: int) -> str:
@@ -72,8 +76,8 @@ def signed(value: float, digits: int) -> str:
 
 def own_text(cell: Cell, column: Column) -> str:
     """Mean ± deviation."""
-    mean = number(cell.mean, column.digits)
-    return mean if cell.deviation is None else f"{mean} ± {number(cell.deviation, column.digits)}"
+    mean = column.text(cell.mean)
+    return mean if cell.deviation is None else f"{mean} ± {column.text(cell.deviation)}"
 
 
 def paper_text(row: Row, column: Column) -> str:
@@ -103,8 +107,11 @@ def legend(
     cells = [
         row.cells[c.metric] for table in tables for row in table.rows for c in table.columns if c.metric in row.cells
     ]
-    overlaps = any("overlap" in column.metric for table in tables for column in table.columns)
+    metrics = {column.metric for table in tables for column in table.columns}
+    overlaps = any("overlap" in metric for metric in metrics)
     rates = "; overlap rates (OR) of the most likely joint mode" if overlaps else ""
+    few = "; with k, over the k most likely" if any(map(OF_MODES.fullmatch, metrics)) else ""
+    errors = any(metric not in GAME and "overlap" not in metric for metric in metrics)
     mean = "Mean ± sample standard deviation over n seeds" if any(cell.deviation is not None for cell in cells) else ""
     paper = (
         f"{where}, the paper's value and ours minus the paper's"
@@ -120,10 +127,11 @@ def legend(
         "pairs divided by agents, as the authors' code does."
     )
     parts = (
-        f"Displacements in m, minimum over the modes{rates}; lower is better.",
+        f"Displacements in m, minimum over the modes{few}{rates}; lower is better." if errors else "",
         f"{numbers[0].upper()}{numbers[1:]}." if numbers else "",
         ranked if any(cell.rank for cell in cells) else "",
         rules if overlaps else "",
+        GAMES if metrics & {*GAME} else "",
     )
     return " ".join(part for part in parts if part)
 
@@ -181,6 +189,7 @@ def to_rich(table: Table | Sheet) -> RichTable:
     """For the terminal, where 80 columns have to do: deviations stand under their means, the paper's values below a row."""
     rich = RichTable(title=table.title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     if isinstance(table, Sheet):
+        rich.caption, rich.caption_justify = Text(table.note, style="dim") if table.note else None, "left"
         for place, name in enumerate(table.header):
             is_text = place < table.left
             rich.add_column(name, justify="left" if is_text else "right", no_wrap=False, overflow="fold")
@@ -205,10 +214,10 @@ def to_rich(table: Table | Sheet) -> RichTable:
 def _rich_cell(row: Row, column: Column) -> Text:
     cell = row.cells.get(column.metric)
     if cell is None:
-        return Text("")
+        return Text(MISSING)
     style = {1: "bold", 2: "underline"}.get(cell.rank or 0, "")
-    deviation = "" if cell.deviation is None else f"\n±{number(cell.deviation, column.digits)}"
-    return Text.assemble((number(cell.mean, column.digits), style), (deviation, "dim"))
+    deviation = "" if cell.deviation is None else f"\n±{column.text(cell.deviation)}"
+    return Text.assemble((column.text(cell.mean), style), (deviation, "dim"))
 
 
 def to_markdown(table: Table | Sheet) -> str:
@@ -223,7 +232,8 @@ def to_markdown(table: Table | Sheet) -> str:
         ]
     rule = "|" + ":--|" * left + "--:|" * (len(header) - left)
     rows = ["| " + " | ".join(line) + " |" for line in (header, *lines)]
-    return "\n".join([f"### {_plain(table.title)}", "", rows[0], rule, *rows[1:]]) + "\n"
+    note = ["", _plain(table.note)] if isinstance(table, Sheet) and table.note else []
+    return "\n".join([f"### {_plain(table.title)}", "", rows[0], rule, *rows[1:], *note]) + "\n"
 
 
 def _plain(text: str) -> str:
@@ -237,7 +247,7 @@ def _plain(text: str) -> str:
 def _markdown_cell(row: Row, column: Column) -> str:
     cell = row.cells.get(column.metric)
     if cell is None:
-        return ""
+        return MISSING
     form = {1: "**{}**", 2: "<u>{}</u>"}.get(cell.rank or 0, "{}")
     paper = paper_text(row, column)
     return form.format(own_text(cell, column)) + (f" ({paper}, {difference_text(row, column)})" if paper else "")

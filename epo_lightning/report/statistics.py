@@ -11,6 +11,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from epo_lightning.report.paper import is_papers
 from epo_lightning.report.tables import Column, Row, Table
 
 CONFIDENCE = 0.95
@@ -109,7 +110,9 @@ def build_comparisons(tables: Sequence[Table]) -> list[Comparisons]:
             compare_rows(one, other, metrics)
             for one in table.rows
             for other in table.rows
-            if (one.forecaster, other.forecaster) == ("epo", "scene_consistent") and one.group == other.group
+            if (one.forecaster, other.forecaster) == ("epo", "scene_consistent")
+            and one.group == other.group
+            and is_papers("epo", one.runs[0].config)
         )
         if pairs:
             found.append(Comparisons(f"{table.title}: +EPO against +SC, seed by seed", table.columns, pairs))

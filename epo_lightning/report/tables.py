@@ -8,6 +8,7 @@ but their seed. A *group* is what may be ranked against each other: rows of the 
 from __future__ import annotations
 
 import math
+import re
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,12 +17,15 @@ from typing import Any
 from epo_lightning.identity import differences
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import labels, natural, value_text, varying
-from epo_lightning.report.paper import PAPER, paper_values
+from epo_lightning.report.paper import PAPER, is_papers, paper_values
 from epo_lightning.report.runs import EvaluatedRun
 
 BACKBONES = tuple(dict.fromkeys(backbone for _, backbone, _ in PAPER))
 FORECASTERS = ("marginal", "scene_consistent", "epo")
 """The paper's order of groups, and of rows within a group; what it does not have follows in the order of the runs."""
+
+MISSING = "-"
+"""Stands where a row has no such number."""
 
 CONDITIONS = ("data", "trainer", "callbacks")
 """Sections of the configuration that the learned rows of one table share; the others are what a table compares."""
@@ -38,6 +42,40 @@ class Column:
     def digits(self) -> int:
         """Rates are small: a single overlap in 6000 scenes should be seen."""
         return 4 if "overlap" in self.metric else 3
+
+    @property
+    def ranked(self) -> bool:
+        """Whether rows compare in it: energies, and what is made of them, are in units of each row's own."""
+        return self.metric not in OWN_UNITS
+
+    def text(self, value: float) -> str:
+        """A number as tables print it; what has no size of its own has three digits, wherever they are."""
+        return significant(value) if self.metric in GAME else number(value, self.digits)
+
+    def long_text(self, value: float) -> str:
+        """The same with six digits."""
+        return f"{value:.6g}" if self.metric in GAME and not math.isnan(value) else number(value, 6)
+
+
+OWN_UNITS = ("energy_initial", "energy_solved", "energy_optimum", "gradient_norm", "nash_gap")
+GAME = (*OWN_UNITS, "nash_gap_relative")
+"""Metrics of the game that a forecaster plays, of which those above have the units of its energy."""
+
+
+def number(value: float, digits: int) -> str:
+    """A number as tables print it; a dash where there is none."""
+    return MISSING if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def significant(value: float) -> str:
+    """A number with three digits or more: ``1534``, ``15.3``, ``0.00153``, ``1.5e-05``; a dash where there is none."""
+    if math.isnan(value):
+        return MISSING
+    rounded = float(f"{value:.3g}")
+    if rounded and not 1e-3 <= abs(rounded) < 1e5:
+        return f"{value:.1e}"
+    digits = 2 - math.floor(math.log10(abs(rounded))) if rounded else 0
+    return f"{value:.{max(digits, 0)}f}"
 
 
 @dataclass(frozen=True)
@@ -152,9 +190,24 @@ MAIN = (
     Column("overlap_authors", "OR (authors)"),
 )
 
+EQUILIBRIUM = (
+    Column("energy_initial", "energy, initial"),
+    Column("energy_solved", "energy, solved"),
+    Column("energy_optimum", "energy, optimum"),
+    Column("gradient_norm", "gradient norm"),
+    Column("nash_gap", "Nash gap"),
+    Column("nash_gap_relative", "Nash gap, relative"),
+)
+
+OF_MODES = re.compile(r"minSADE_(\d+)")
+"""minSADE among the k most likely joint modes."""
+
 
 def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
-    """For every data set and split: the main table, the subsets apart, and initial beside solved strategies.
+    """For every data set and split: the main table, and of the rows that have them subsets, modes and games.
+
+    The further tables show the subsets apart, the k most likely modes, initial beside solved strategies, and how close to
+    an equilibrium of its game a forecast is.
 
     Raises:
         ConfigError: rows of one table that were not made under the same conditions, or the same run twice.
@@ -173,12 +226,18 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
         short = (Column("minSADE", "SADE"), Column("minSFDE", "SFDE"))
         columns = tuple(Column(f"{name}/{c.metric}", f"{name} {c.label}") for name in subsets for c in short)
         tables += _shown(f"{where}: {' and '.join(subsets)} apart", columns, rows)
+        found = (OF_MODES.fullmatch(metric) for row in rows for metric in row.cells)
+        most = max((int(match[1]) for match in found if match), default=0)
+        if most > 1:  # of one mode it is the main table's
+            modes = tuple(Column(f"minSADE_{k}", f"SADE, k={k}") for k in range(1, most + 1))
+            tables += _partly_shown(f"{where}: accuracy of the k most likely modes", modes, rows)
         initial = tuple(
             Column(prefix + metric, f"{stage} {metric.removeprefix('min')}")
             for metric in ("minSADE", "minSFDE")
             for prefix, stage in (("initial/", "initial"), ("", "solved"))
         )
         tables += _shown(f"{where}: initial and solved strategies", initial, rows)
+        tables += _partly_shown(f"{where}: equilibrium", EQUILIBRIUM, [row for row in rows if "nash_gap" in row.cells])
     return tables
 
 
@@ -195,6 +254,13 @@ def _shown(title: str, columns: tuple[Column, ...], rows: Sequence[Row]) -> list
     """The table of those rows that have all of the columns, ranked among themselves, if there are any."""
     having = tuple(row for row in rows if all(column.metric in row.cells for column in columns))
     return [Table(title, columns, _with_ranks(having))] if columns and having else []
+
+
+def _partly_shown(title: str, columns: Sequence[Column], rows: Sequence[Row]) -> list[Table]:
+    """The table of those rows and columns that have a cell, ranked among themselves, if there are any."""
+    having = tuple(row for row in rows if any(column.metric in row.cells for column in columns))
+    known = tuple(column for column in columns if any(column.metric in row.cells for row in having))
+    return [Table(title, known, _with_ranks(having))] if having else []
 
 
 def build_rows(runs: Sequence[EvaluatedRun]) -> tuple[Row, ...]:
@@ -249,8 +315,8 @@ def group_of(run: EvaluatedRun) -> tuple[str, str]:
 def require_comparable(runs: Sequence[EvaluatedRun]) -> None:
     """Refuse runs that no table may compare: other data, budgets, checkpoints, lengths or sizes of training.
 
-    What may differ is what tables compare: backbone, forecaster, energy, solver, optimiser, goal and seed. Commits may
-    differ as well, they are shown.
+    What may differ is what tables compare: backbone, forecaster, dynamics, energy, solver, what is learned through it,
+    objective, optimiser, goal and seed. Commits may differ as well, they are shown.
 
     Raises:
         ConfigError: the message names the rows, and the key and values in which they differ.
@@ -308,7 +374,8 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
                 f"epo evaluate run={other.path} split={run.split} scores it again"
             )
     steps = _setting(first.config, "solver.steps") if first.forecaster == "epo" else None
-    paper = paper_values(first.data, first.backbone, first.forecaster, first.goal, first.experiment, first.split, steps)
+    known = (first.data, first.backbone, first.forecaster, first.goal, first.experiment, first.split, steps)
+    paper = paper_values(*known) if is_papers(first.forecaster, first.config) else {}
     cells = {}
     for metric in first.metrics:
         values = [run.metrics[metric] for run in runs]
@@ -327,10 +394,10 @@ def _ranked(row: Row, group: Sequence[Row]) -> Row:
     """Mark the best and the second best; what prints the same ranks the same, and a row alone is not ranked."""
     cells = {}
     for metric, cell in row.cells.items():
-        digits = Column(metric, "").digits
+        column = Column(metric, "")
         means = [other.cells[metric].mean for other in group if metric in other.cells]
-        places = sorted({round(mean, digits) for mean in means if math.isfinite(mean)})
-        own = round(cell.mean, digits) if math.isfinite(cell.mean) else math.nan
-        rank = places.index(own) + 1 if len(means) > 1 and own in places else None
+        places = sorted({float(column.text(mean)) for mean in means if math.isfinite(mean)})
+        own = float(column.text(cell.mean)) if math.isfinite(cell.mean) else math.nan
+        rank = places.index(own) + 1 if column.ranked and len(means) > 1 and own in places else None
         cells[metric] = replace(cell, rank=rank if rank in (1, 2) else None)
     return replace(row, cells=cells)

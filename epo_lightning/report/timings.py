@@ -9,10 +9,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from epo_lightning.identity import canonical, essence
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
 from epo_lightning.report.render import Sheet
 from epo_lightning.run_folder import RunFolder, read_json
+
+METHOD = ("forecaster", "dynamics", "energy", "solver", "backward", "objective")
+SIZES = ("modes", "steps", "test_steps")
+"""Sections of the configuration that make a method, and their keys that are sizes of it."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +26,8 @@ class Timing:
 
     Attributes:
         where: what was timed and on what: timings with the same words compare.
+        machine: the second of these: processor, device, threads and batch.
+        method: what timings whose sizes alone differ share; empty for a forecaster that solves no game.
         agents, steps, modes: N, S (None for a forecaster that solves no game) and M.
         samples: how often it was measured.
         mean, median, p10, p90: seconds.
@@ -28,6 +35,8 @@ class Timing:
     """
 
     where: str
+    machine: str
+    method: str
     agents: int
     steps: int | None
     modes: int
@@ -59,14 +68,14 @@ def _read(run: RunFolder) -> Timing:
         if not all(math.isfinite(value) and value > 0 for value in seconds.values()):
             raise ValueError("seconds must be positive numbers")
         threads, batch = int(content["threads"]), int(content["batch"])
-        where = [
-            f"{config['data'].get('dataset', config['data']['name'])}, {config['backbone']['name']}",
-            f"{content['machine']} ({content['device']}, {threads} thread{'s' if threads > 1 else ''})",
-            *([f"batches of {batch}"] if batch > 1 else []),
-        ]
+        what = f"{config['data'].get('dataset', config['data']['name'])}, {config['backbone']['name']}"
+        machine = f"{content['machine']} ({content['device']}, {threads} thread{'s' if threads > 1 else ''})"
+        machine += f", batches of {batch}" if batch > 1 else ""
         steps = content["steps"]
         return Timing(
-            where=", ".join(where),
+            where=f"{what}, {machine}",
+            machine=machine,
+            method=_method(config),
             agents=int(content["agents"]),
             steps=None if steps is None else int(steps),
             modes=int(content["modes"]),
@@ -80,12 +89,30 @@ def _read(run: RunFolder) -> Timing:
         ) from error
 
 
+def _method(config: Mapping[str, Any]) -> str:
+    """The parts of a configuration that make a method, without the sizes that a figure of the runtime varies.
+
+    Forecasters that solve no game have none of these parts, and stand in the figures of those that do.
+    """
+    if config["forecaster"]["name"] != "epo":
+        return ""
+    known = essence(config)
+    parts = {kind: known.get(kind) or {} for kind in METHOD}
+    return canonical({kind: {k: v for k, v in part.items() if k not in SIZES} for kind, part in parts.items()})
+
+
 def places(timings: Sequence[Timing]) -> dict[str, list[Timing]]:
     """Timings that compare with each other, by what was timed and on what."""
     found: dict[str, list[Timing]] = {}
     for timing in timings:
         found.setdefault(timing.where, []).append(timing)
     return dict(sorted(found.items()))
+
+
+def methods(timings: Sequence[Timing]) -> list[list[Timing]]:
+    """Timings whose sizes alone differ, together: of these a figure can be drawn."""
+    games = list(dict.fromkeys(timing.method for timing in timings if timing.method)) or [""]
+    return [[timing for timing in timings if timing.method in ("", method)] for method in games]
 
 
 def grid(timings: Sequence[Timing]) -> tuple[int, dict[tuple[int, int | None], float]]:
@@ -104,17 +131,19 @@ def over_modes(timings: Sequence[Timing]) -> tuple[tuple[int, int | None], dict[
 
 
 def timing_sheet(where: str, timings: Sequence[Timing]) -> Sheet:
-    """What was measured at one place, by sizes, with the paper's values where it has them."""
+    """What was measured at one place, by sizes, with the paper's values where it has them, and methods by their titles."""
     lines = []
+    named = len({timing.method for timing in timings}) > 1
     for t in sorted(timings, key=lambda t: (t.agents, t.steps or 0, t.modes)):
         paper = RUNTIME.get((t.agents, t.steps or 0)) if t.modes == 4 else None
         if paper is None and (t.agents, t.steps) == (4, 2):
             paper = RUNTIME_MODES.get(t.modes)
         sizes = (str(t.agents), "-" if t.steps is None else str(t.steps), str(t.modes))
         times = (time(t.mean), time(t.median), f"{time(t.p10)} to {time(t.p90)}")
-        lines.append((*sizes, *times, str(t.samples), "" if paper is None else time(paper)))
-    header = ("N", "S", "M", "mean", "median", "10 % to 90 %", "forecasts", "paper")
-    return Sheet(f"Time of a forecast: {where}", header, tuple(lines), left=0)
+        names = (str(t.run.config().get("title", "untitled")),) if named else ()
+        lines.append((*names, *sizes, *times, str(t.samples), "" if paper is None else time(paper)))
+    header = (*(("method",) if named else ()), "N", "S", "M", "mean", "median", "10 % to 90 %", "forecasts", "paper")
+    return Sheet(f"Time of a forecast: {where}", header, tuple(lines), left=int(named))
 
 
 def _means(keys: Mapping[Timing, Any]) -> dict[Any, float]:
@@ -123,6 +152,14 @@ def _means(keys: Mapping[Timing, Any]) -> dict[Any, float]:
     for timing, key in keys.items():
         groups.setdefault(key, []).append(timing.mean)
     return {key: statistics.fmean(values) for key, values in groups.items()}
+
+
+def duration(seconds: float) -> str:
+    """``75 s``, ``12 min``, ``3 h 10 min``"""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def time(seconds: float) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.costs import cost_sheets, timings_of
 from epo_lightning.report.latex import comparisons_to_latex, sheet_to_latex, to_latex
 from epo_lightning.report.made import Made, how_made
 from epo_lightning.report.render import (
@@ -121,7 +122,9 @@ def write_report(
     settings = [settings_sheet(best)] if best else []
     notes = [*notes, *damaged, *([hint] if hint else [])]
     made, charts = how_made(tables, timings), charts_of(tables, timings)
-    timed = [timing_sheet(where, same) for where, same in places(timings).items()]
+    costs = cost_sheets(tables, timings)
+    others = [timing for timing in timings if timing not in timings_of(tables, timings)]  # a cost is said once
+    timed = [timing_sheet(where, same) for where, same in places(others).items()]
     shown: list[Sheet] = [*settings, *compared, *timed]
     links = [f"figures/{chart.name}.png" for chart in charts] + [os.path.relpath(figure, out) for figure in figures]
     markdown = "\n".join(
@@ -133,6 +136,7 @@ def write_report(
             *(note + "\n" for note in notes),
             *(to_markdown(table) for table in tables),
             legend(tables) + "\n" if tables else "",
+            *(to_markdown(sheet) for sheet in costs),
             *(to_markdown(sheet) for sheet in shown),
             COMPARISON_LEGEND + "\n" if compared else "",
             _how_made(made, report),
@@ -147,6 +151,7 @@ def write_report(
         legend=legend(tables, "below"),
         comparison_legend=COMPARISON_LEGEND,
         tables=tables,
+        costs=costs,
         comparisons=compared,
         settings=settings,
         charts=charts,
@@ -161,6 +166,7 @@ def write_report(
         files["results.csv"] = to_csv(tables)
         caveat = _caveat(tables) if preface.strip() else ""
         latex = [to_latex(table, caveat=caveat) for table in tables]
+        latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in costs]
         latex += [comparisons_to_latex(entry, caveat=caveat) for entry in comparisons]
         latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in settings]
         files["results.tex"] = "\n".join(latex)
@@ -174,7 +180,7 @@ def write_report(
     console = console or Console()
     for note in notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
-    for rich in (*map(to_rich, tables), *map(to_rich, shown)):
+    for rich in (*map(to_rich, tables), *map(to_rich, costs), *map(to_rich, shown)):
         console.print(rich)
     if report.left_out:
         console.print(_summary(report.left_out), style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,8 @@ import pytest
 from experiment.conftest import TINY, Epo
 
 from epo_lightning.experiment.compose import compose, jobs
-from epo_lightning.experiment.sweep import Sweep, label
+from epo_lightning.experiment.sweep import Job, Sweep, label
+from epo_lightning.experiment.watch import names_of, result
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json
 
@@ -150,6 +152,45 @@ def test_times_on_other_threads_are_other_times(epo: Epo) -> None:
         (job,) = the_sweep().jobs
         assert json.loads(job.run.metrics_file("time").read_text())["threads"] == threads
     assert json.loads((job.run.path / "runtime-cpu-1.json").read_text())["threads"] == 1, "nothing is lost"
+
+
+def test_a_run_is_done_when_all_is_measured(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("sweep", "rpi_main", "data=drawn", "data.scenes=32", "budget=untrained", "seed=0", "experiment=rpi/v_lstm")
+    assert epo(*words, "score=test") == 0
+    (job,) = the_sweep().jobs
+    folder, scores = job.run.path, job.run.metrics_file().stat().st_mtime_ns
+    assert epo(*words, "score=[time,test]") == 0
+    sweep = Sweep.find("rpi_main", (*words[2:], "score=[time,test]"), "runs")
+    (job,) = sweep.jobs
+    assert job.measures == ("test", "time")
+    assert job.run.path == folder, "what is measured makes it another run"
+    assert sweep.state(job) == "done"
+    assert job.run.metrics_file().stat().st_mtime_ns == scores, "it was scored again"
+    capsys.readouterr()
+    for which in job.measures:
+        job.run.metrics_file(which).rename(folder / "aside")
+        assert sweep.state(job) == "interrupted"
+        (folder / "aside").rename(job.run.metrics_file(which))
+    assert re.fullmatch(r"val/minSADE \d+\.\d{4}, \d+ s, \d+\.\d ms per forecast", result(job))
+    assert epo(*words, "score=[time,test]", "trainer.threads=2") == 0
+    assert (folder / "runtime-cpu-1.json").is_file(), "another time that was measured as well"
+
+
+def test_records_of_older_versions_are_read(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path / "runs" / "sweeps" / "old")
+    job = {"overrides": [], "folder": "a", "identity": "0", "title": "a", "seed": 0}
+    jobs = [{**job, "score": score} for score in ("test", None, "time")]
+    write_json(sweep.folder / "sweep.json", {"name": "old", "jobs": jobs})
+    assert [job.measures for job in sweep.jobs] == [("test",), (), ("time",)]
+
+
+def test_runs_of_one_title_and_seed_are_told_apart(tmp_path: Path) -> None:
+    places = ("rpi/a/paper-s0", "rpi/b/paper-s0", "rpi/c/short-s0")
+    jobs = [Job((), RunFolder(tmp_path / place), "0", "EPO", 0, ()) for place in places]
+    names = names_of([*jobs, Job((), RunFolder(tmp_path / "d"), "0", "EPO", 1, ())])
+    assert list(names.values()) == [
+        *("EPO, seed 0 (a/paper-s0)", "EPO, seed 0 (b/paper-s0)", "EPO, seed 0 (short-s0)", "EPO, seed 1"),
+    ]
 
 
 def test_damaged_runs_are_named_before_anything_runs(epo: Epo, refused: Callable[..., str]) -> None:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from report.methods import of_methods
 from report.page_runs import timed
 from report.run_folders import make_run, scores
 
@@ -16,7 +17,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json, write_text
 
 
-def begin(runs: Path, name: str, folders: dict[str, str | None], score: str = "test") -> Sweep:
+def begin(runs: Path, name: str, folders: dict[str, str | None], score: str | list[str] = "test") -> Sweep:
     """The record of a sweep over these folders; of a score of its own where one is given."""
     jobs = [
         {
@@ -92,6 +93,32 @@ def test_a_sweep_that_measures_time(runs: Path) -> None:
     assert (out / "figures" / "runtime.png").is_file()
     assert not (out / "results.csv").exists()
     assert "Budget:" not in (out / "results.md").read_text()  # a time does not depend on it
+
+
+def test_a_sweep_that_measures_scores_and_time(runs: Path) -> None:
+    for run in of_methods(runs):
+        finish(run)
+    not_asked_for = {"data_digest": "abc", "split": "val", "metrics": scores(0.9)}
+    write_json(runs / "EPO-s0" / "metrics-val.json", not_asked_for)
+    folders = [f"{title}-s{seed}" for title in ("JFP", "EPO", "Laplace") for seed in (0, 1)]
+    sweep = begin(runs, "table1", dict.fromkeys(folders), score=["test", "time"])
+    (runs / "Laplace-s1" / "runtime.json").unlink()
+    assert [sweep.state(job) for job in sweep.jobs] == ["done"] * 5 + ["interrupted"]
+    assert {run.split for run in of_sweep(sweep).evaluated} == {"test"}
+    written = (report(ReportSettings(sweep="table1")) / "results.md").read_text()
+    titles = [line for line in written.splitlines() if line.startswith("### ")]
+    assert titles == [
+        "### rpi, test split",
+        "### rpi, test split: accuracy of the k most likely modes",
+        "### rpi, test split: equilibrium",
+        "### Cost: rpi",
+        "### How this was made",
+    ]
+    assert [line.split(" | ")[0] for line in written.splitlines() if line.endswith(" ms |")] == [
+        "| JFP",
+        "| EPO",
+        "| Laplace",
+    ]
 
 
 def test_what_cannot_be_reported_is_said(runs: Path) -> None:

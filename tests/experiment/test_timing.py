@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from experiment.conftest import Epo
+from experiment.conftest import TINY, Epo
 
 import epo_lightning
-from epo_lightning.experiment import assembly
-from epo_lightning.experiment.settings import Settings, read
+from epo_lightning.experiment import assembly, verbs
+from epo_lightning.experiment.callbacks import RandomStates
+from epo_lightning.experiment.settings import Settings, measures, read
 from epo_lightning.experiment.timing import SAMPLES, measure
+from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, discover, read_json
+from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
 
 DRAWN = ("data=drawn", "data.scenes=32", "callbacks.progress=none")
 
@@ -89,6 +93,81 @@ def test_an_untrained_run_is_a_whole_one(untrained: RunFolder, epo: Epo) -> None
         assert torch.equal(parameter, kept.get_parameter(name)), name
     assert epo("evaluate", f"run={untrained.path}") == 0
     assert read_json(untrained.metrics_file("test"))["metrics"]["minSADE"] > 0
+
+
+def test_scores_and_the_time_of_one_run(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("experiment=rpi/v_lstm_epo", "data.like=rpi", "budget=smoke", "score=[time,test]")
+    run = timed(epo, tmp_path, *words)
+    assert "next: epo report runs=" in capsys.readouterr().out
+    assert run.metrics_file("test").is_file()
+    assert not run.metrics_file("val").exists()
+    measured = {which: run.metrics_file(which).stat().st_mtime_ns for which in ("test", "time")}
+    run.metrics_file("time").unlink()
+    assert epo("train", *DRAWN, *words, "existing=continue") == 0
+    assert run.metrics_file("test").stat().st_mtime_ns == measured["test"], "it was scored again"
+    assert run.metrics_file("time").stat().st_mtime_ns > measured["time"]
+
+
+def test_a_run_that_lacks_what_it_was_asked_for_is_not_ready_for_a_report(
+    untrained: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, asked in {"test": None, "time": ["test", "time"]}.items():
+        config = untrained.config() | {"score": asked}
+        untrained.begin(config, untrained.record)
+        untrained.update(status="finished")
+        verbs._trained(untrained)
+        assert f"next: epo evaluate run={untrained.path}" in capsys.readouterr().out
+        write_json(untrained.metrics_file(name), {})
+        verbs._trained(untrained)
+        left = "report" if asked is None else "evaluate"
+        assert f"next: epo {left} run" in capsys.readouterr().out
+        untrained.metrics_file(name).unlink()
+
+
+@pytest.mark.parametrize(
+    ("score", "found"),
+    [
+        *((None, ()), ([], ()), ("test", ("test",)), (["test"], ("test",)), ("val", ("val",)), ("time", ("time",))),
+        *((("time", "test"), ("test", "time")), (["test", "time", "test"], ("test", "time"))),
+    ],
+)
+def test_what_is_measured_is_said_in_one_way(score: Any, found: tuple[str, ...]) -> None:
+    assert measures(score) == found
+
+
+@pytest.mark.parametrize("score", ["[test,tiem]", "speed", "[[test]]", "1"])
+def test_what_cannot_be_measured_is_refused(refused: Callable[..., str], score: str) -> None:
+    message = refused("train", "experiment=rpi/v_lstm", *DRAWN, f"score={score}")
+    assert "score must be one of test, val, time or a list of one of test, val, time or null" in message
+
+
+def test_a_run_is_the_same_whatever_is_measured(untrained: RunFolder) -> None:
+    config = untrained.config()
+    names = {identity({**config, "score": score}, "digest") for score in (None, "test", ["test", "time"])}
+    assert len(names) == 1
+
+
+def test_the_time_of_a_training_that_was_stopped_counts(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
+    original, epochs = RandomStates.on_train_epoch_start, []
+
+    def slow_then_stop(self: RandomStates, *words: Any) -> None:
+        epochs.append(1)
+        time.sleep(1.5 if len(epochs) == 1 else 0.0)
+        if len(epochs) == 3:
+            raise RuntimeError("power failure")
+        original(self, *words)
+
+    words = ("experiment=rpi/v_lstm", *TINY, "trainer.max_epochs=4", "run_dir=run")
+    with monkeypatch.context() as patch:
+        patch.setattr(RandomStates, "on_train_epoch_start", slow_then_stop)
+        with pytest.raises(RuntimeError, match="power failure"):
+            epo("train", *words)
+    run = RunFolder(Path("run"))
+    before = torch.load(run.checkpoint("last"), weights_only=True)["callbacks"]["Timer"]["time_elapsed"]["train"]
+    assert before > 1.5
+    assert epo("train", "resume=run") == 0
+    assert run.record["epochs"] == 4
+    assert run.record["seconds"] > before
 
 
 def test_a_lost_checkpoint_is_said(untrained: RunFolder) -> None:

@@ -56,7 +56,7 @@ def over_steps(folder: Path) -> None:
 
 def timed(folder: Path, agents: int, steps: int | None, modes: int, mean: float, **changes: Any) -> RunFolder:
     """A run that was timed and not scored."""
-    settings = {"data.agents": agents, "solver.steps": steps or 0, "backbone.modes": modes}
+    settings = {"data.agents": agents, "solver.steps": steps or 0, "forecaster.modes": modes, "forecaster.note": ""}
     name = f"N{agents}-S{steps}-M{modes}"
     run = make_run(folder / name, name, "epo" if steps else "marginal", None, settings=settings)
     seconds = {"mean": mean, "median": mean * 0.98, "p10": mean * 0.9, "p90": mean * 1.1}

@@ -54,7 +54,7 @@ def make_run(
     }
     for key, value in (settings or {}).items():
         section, last = key.split(".")
-        config[section][last] = value
+        config.setdefault(section, {})[last] = value
     record = {
         "data_digest": trained_digest or digest,
         "git_commit": "0123456789abcdef",

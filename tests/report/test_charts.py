@@ -139,11 +139,13 @@ def test_timings_are_a_table_as_well(tmp_path: Path) -> None:
     timed(tmp_path, 4, 2, 1, 0.003)
     timed(tmp_path, 4, None, 1, 0.0009)
     sheet = timing_sheet("here", read_timings(find_runs(tmp_path))[0])
-    assert [(*line[:4], line[-1]) for line in sheet.lines] == [
-        ("4", "-", "1", "900 µs", ""),
-        ("4", "2", "1", "3.0 ms", "170 ms"),
-        ("12", "8", "4", "7.6 ms", "320 ms"),
+    assert sheet.header[:4] == ("method", "N", "S", "M")
+    assert [(*line[:5], line[-1]) for line in sheet.lines] == [
+        ("N4-SNone-M1", "4", "-", "1", "900 µs", ""),
+        ("N4-S2-M1", "4", "2", "1", "3.0 ms", "170 ms"),
+        ("N12-S8-M4", "12", "8", "4", "7.6 ms", "320 ms"),
     ]
+    assert timing_sheet("here", read_timings(find_runs(tmp_path / "N4-S2-M1"))[0]).header[0] == "N"  # one method
 
 
 def test_runtime_over_modes(tmp_path: Path) -> None:

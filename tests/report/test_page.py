@@ -22,7 +22,10 @@ from .page_runs import over_runtime, over_steps, rows_with_seeds
 from .run_folders import make_run, scores
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
-TABS = ["Tables", "Best settings", "Paired tests", "Learning curves", "S curve", "Runtime", "Scenes", "Learned weights"]
+TABS = [
+    *("Tables", "Cost", "Best settings", "Paired tests", "Learning curves", "S curve", "Runtime", "Scenes"),
+    "Learned weights",
+]
 
 
 def write_page(folder: Path) -> Path:

@@ -115,12 +115,12 @@ def test_the_legend_and_captions_speak_of_what_is_there(tmp_path: Path) -> None:
 
 def test_captions_carry_the_caveat_of_the_preface(tmp_path: Path) -> None:
     rows_with_seeds(tmp_path / "runs")
-    for preface, count in (("**Budget: reduced.**", 3), ("", 0)):
+    for preface, count in (("**Budget: reduced.**", 4), ("", 0)):
         report(tmp_path / "runs", tmp_path / "out", preface=preface)
         captions = [
             line for line in (tmp_path / "out/results.tex").read_text().splitlines() if line.startswith("\\caption")
         ]
-        assert len(captions) == 3
+        assert len(captions) == 4
         assert sum("\\textbf{Budget: reduced, " in line and "does not reproduce" in line for line in captions) == count
 
 
@@ -140,7 +140,7 @@ def test_latex_and_comparisons_lie_beside(tmp_path: Path) -> None:
     rows_with_seeds(tmp_path / "runs")
     report(tmp_path / "runs", tmp_path / "out")
     latex = (tmp_path / "out" / "results.tex").read_text()
-    assert latex.count("\\begin{tabular}") == 3  # all rows, initial and solved, comparisons
+    assert latex.count("\\begin{tabular}") == 4  # all rows, initial and solved, costs, comparisons
     compared = list(csv.DictReader((tmp_path / "out" / "comparisons.csv").open()))
     assert {(line["method"], line["other"], line["n"]) for line in compared} == {("V-LSTM + EPO", "V-LSTM + SC", "3")}
 

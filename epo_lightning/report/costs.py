@@ -1,0 +1,91 @@
+"""What every row of a report costs: its training, its parameters, and a forecast where that was timed."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from epo_lightning.report.made import distinct
+from epo_lightning.report.render import Sheet
+from epo_lightning.report.tables import MISSING, Row, Table
+from epo_lightning.report.timings import Timing, duration, time
+from epo_lightning.run_folder import RunFolder
+
+TRAINED = ("training", "steps", "ms per step")
+
+
+def cost_sheets(tables: Sequence[Table], timings: Sequence[Timing]) -> list[Sheet]:
+    """For every data set the costs of the rows of its tables; nothing where no cost is known.
+
+    Times are means over seeds. Forecasts that were timed on different machines stand in columns of their own.
+    """
+    by_data: dict[str, dict[tuple[Path, ...], Row]] = {}
+    for row in distinct(tables):  # a row that was evaluated on two splits cost once
+        by_data.setdefault(row.runs[0].data, {}).setdefault(tuple(run.path for run in row.runs), row)
+    shown = timings_of(tables, timings)
+    machines = list(dict.fromkeys(timing.machine for timing in shown))
+    labels = {
+        machine: "forecast" if len(machines) == 1 else f"forecast ({number})"
+        for number, machine in enumerate(machines, 1)
+    }
+    return [
+        sheet
+        for data, rows in by_data.items()
+        if (sheet := _sheet(f"Cost: {data}", list(rows.values()), shown, labels)) is not None
+    ]
+
+
+def timings_of(tables: Sequence[Table], timings: Iterable[Timing]) -> list[Timing]:
+    """The timings of the runs of these tables, in the tables' order of rows."""
+    places: dict[Path, int] = {}
+    for row in distinct(tables):
+        for run in row.runs:
+            places.setdefault(run.path, len(places))
+    found = [timing for timing in timings if timing.run.path in places]
+    return sorted(found, key=lambda timing: places[timing.run.path])
+
+
+def _sheet(title: str, rows: Sequence[Row], timings: Sequence[Timing], labels: dict[str, str]) -> Sheet | None:
+    columns = ("method", "n", *TRAINED, "parameters", *labels.values())
+    lines = [_line(row, timings, labels) for row in rows]
+    known = [place for place, name in enumerate(columns) if any(line[place] != MISSING for line in lines)]
+    if not {*TRAINED, *labels.values()} & {columns[place] for place in known}:
+        return None  # parameters alone are no cost, and stand below
+    header = tuple(columns[place] for place in known)
+    shown = tuple(tuple(line[place] for place in known) for line in lines)
+    return Sheet(title, header, shown, note=_note(header, labels))
+
+
+def _line(row: Row, timings: Sequence[Timing], labels: dict[str, str]) -> tuple[str, ...]:
+    records = [RunFolder(run.path).record for run in row.runs]
+    trained = [
+        (float(record["seconds"]), int(record["steps"]))
+        for record in records
+        if record.get("steps") and record.get("seconds") is not None
+    ]
+    training = [MISSING] * len(TRAINED)
+    if trained:
+        seconds, steps = (statistics.fmean(values) for values in zip(*trained, strict=True))
+        training = [duration(seconds), f"{steps:.0f}", f"{1000 * seconds / steps:.3g}"]
+    paths = {run.path for run in row.runs}
+    forecasts = []
+    for machine in labels:
+        medians = [t.median for t in timings if t.run.path in paths and t.machine == machine]
+        forecasts.append(time(statistics.fmean(medians)) if medians else MISSING)
+    parameters = ", ".join(dict.fromkeys(str(run.parameters) for run in row.runs if run.parameters is not None))
+    return row.name, str(len(row.runs)), *training, parameters or MISSING, *forecasts
+
+
+def _note(header: Sequence[str], labels: dict[str, str]) -> str:
+    """What the columns of a sheet are, and where forecasts were timed."""
+    training = "Training: until the last step, validation included; divided by the steps, ms per step."
+    where = [
+        f"{label.removeprefix('forecast')} on {machine}".strip() for machine, label in labels.items() if label in header
+    ]
+    parts = (
+        training if {*header} & {*TRAINED} else "",
+        f"Forecast: median time of one joint forecast, {'; '.join(where)}." if where else "",
+        "Means over n seeds.",
+    )
+    return " ".join(part for part in parts if part)
