@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 SECTIONS = (
-    *("data", "backbone", "forecaster", "dynamics", "energy", "solver", "optimizer"),
+    *("data", "backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective", "optimizer"),
     *("trainer", "callbacks", "goal", "seed"),
 )
 """Everything else in a configuration says what a run is called, where it is written, or who watches it."""

@@ -51,11 +51,13 @@ def register(kind: str, name: str) -> Callable[[Part], Part]:
 
 _HOMES = {
     "backbone": "backbones",
+    "backward": "solvers",
     "data": "data",
     "dynamics": "game",
     "energy": "game",
     "format": "data",
     "forecaster": "forecasters",
+    "objective": "objectives",
     "optimizer": "optimizers",
     "solver": "solvers",
 }
@@ -71,6 +73,12 @@ def _load(kind: str) -> None:
             import_module(module.name)
     for entry in entry_points(group="epo_lightning.parts"):
         entry.load()
+
+
+def parts(kind: str) -> Mapping[str, Callable[..., Any]]:
+    """All parts of a kind, by name."""
+    _load(kind)
+    return dict(sorted(_PARTS.get(kind, {}).items()))
 
 
 def lookup(kind: str, name: str) -> Callable[..., Any]:

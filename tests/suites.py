@@ -17,6 +17,7 @@ from epo_lightning.scene import Scene
 
 OWN = ["goal", "vel", "acc", "turnr", "jerk", "turnacc", "velb", "accb", "turnrb", "jerkb", "turnaccb"]
 LOSS_WEIGHTS = {"imitation": 1.0, "probability": 0.1}
+IMITATION = {"name": "imitation", "weights": {**LOSS_WEIGHTS, "goal": 0.1, "initial": 1.0}}
 
 
 def model(forecaster: dict[str, Any], **changes: Any) -> dict[str, Any]:
@@ -34,6 +35,8 @@ def model(forecaster: dict[str, Any], **changes: Any) -> dict[str, Any]:
         "dynamics": {"name": "unicycle"},
         "energy": {"name": "features", "own": OWN, "pair": ["proximity"], "bounds": bounds},
         "solver": {"name": "levenberg_marquardt", "steps": 2, "step_size": 0.3, "damping": 10.0},
+        "backward": {"name": "unrolled"},
+        "objective": IMITATION,
         "optimizer": {"name": "adam"},
         "goal": "energy",
         "horizon": 40,

@@ -22,8 +22,10 @@ FLOORS = {
     "decoders": {"scene", "game"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
     "data": {"scene", "registry"},
+    "objectives": {"scene", "registry", "game", "solvers", "decoders", "losses"},
     "forecasters": {
         "scene",
+        "objectives",
         "registry",
         "game",
         "solvers",

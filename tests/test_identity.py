@@ -27,7 +27,7 @@ def changed(key: str, value: Any) -> dict[str, Any]:
     ("key", "value"),
     [
         *(("solver.steps", 4), ("optimizer.lr", 0.1), ("trainer.max_epochs", 3), ("energy.own", ["goal"])),
-        *(("data.batch_size", 16), ("goal", "all"), ("forecaster.loss_weights.goal", 7.0), ("callbacks.patience", 2)),
+        *(("data.batch_size", 16), ("goal", "all"), ("objective.weights.goal", 7.0), ("callbacks.patience", 2)),
     ],
 )
 def test_what_decides_on_the_result_is_part_of_it(key: str, value: Any) -> None:

@@ -14,6 +14,9 @@ from epo_lightning.experiment.settings import EvaluateSettings, Settings, Traine
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, write_json
 
+ARCHITECTURE = ("forecaster", "backbone", "energy", "dynamics", "solver", "backward")
+"""Sections that a checkpoint has to share with its run."""
+
 
 def evaluate(config: dict[str, Any]) -> list[tuple[RunFolder, dict[str, float]]]:
     """Score one run, or all runs below a folder, and write each one's metrics file.
@@ -101,7 +104,7 @@ def open_checkpoint(settings: Settings, path: Path) -> Any:
     forecaster = epo_lightning.load(path)
     expected = assembly.describe_model(settings, assembly.build_data(settings.data))
     found = forecaster.configuration
-    for section in ("forecaster", "backbone", "energy", "dynamics", "solver", "goal", "horizon", "dt"):
+    for section in (*ARCHITECTURE, "goal", "horizon", "dt"):
         if found.get(section) != expected[section]:
             raise ConfigError(
                 f"{path} holds another architecture than this run: {section} is {found.get(section)} in the checkpoint "

@@ -17,7 +17,7 @@ from epo_lightning.registry import ConfigError, check, lookup, nearest
 
 Measured = Literal["test", "val", "time"]
 """What may be measured of a run: its scores on a split, or the time of a forecast."""
-PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "optimizer")
+PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective", "optimizer")
 
 
 @dataclass(frozen=True)
@@ -155,6 +155,8 @@ class Settings:
     dynamics: Mapping[str, Any]
     energy: Mapping[str, Any]
     solver: Mapping[str, Any]
+    backward: Mapping[str, Any]
+    objective: Mapping[str, Any]
     optimizer: Mapping[str, Any]
     trainer: TrainerSettings
     callbacks: CallbackSettings

@@ -15,8 +15,13 @@ from epo_lightning.registry import ConfigError, build, check, lookup, nearest
 
 __all__ = ["Forecaster", "Task", "build_forecaster", "check_model", "load"]
 
-_PARTS = ("backbone", "dynamics", "energy", "solver")
+_PARTS = ("backbone", "dynamics", "energy", "solver", "backward", "objective")
 _SECTIONS = ("forecaster", "optimizer", *_PARTS)
+_SUPPLIED = {
+    "backbone": ("goal_input", "map_input", "scale"),
+    "energy": ("dynamics", "width", "horizon", "shape", "scale"),
+}
+"""What parts are told, if they ask, by whoever builds them."""
 _TASK = ("horizon", "dt", "subsets", "shape", "candidates", "map", "scale")
 GOALS = ("energy", "all")
 """Who is told a given goal: the energy alone (the paper), or the network of every learned forecaster as well."""
@@ -44,37 +49,22 @@ def check_model(model: Mapping[str, Any]) -> None:
     check("optimizer", model["optimizer"])
     check("forecaster", model["forecaster"], supplied=("task", "optimizer", *_PARTS))
     for kind in _PARTS:
-        check(kind, model[kind], supplied=("goal_input", "map_input", "scale", "dynamics"))
+        check(kind, model[kind], supplied=_SUPPLIED.get(kind, ()))
 
 
 def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
     """Build a forecaster and the parts that its constructor asks for.
 
     Args:
-        model: the sections ``forecaster``, ``backbone``, ``dynamics``, ``energy``, ``solver`` and ``optimizer``, each with
-            the ``name`` of a part and its arguments; ``goal`` (``energy`` or ``all``); and the task: ``horizon``, ``dt``,
-            ``subsets``, ``shape``, ``candidates``, ``map`` and ``scale``.
+        model: the sections ``forecaster``, ``backbone``, ``dynamics``, ``energy``, ``solver``, ``backward``, ``objective``
+            and ``optimizer``, each with the ``name`` of a part and its arguments; ``goal`` (``energy`` or ``all``); and the
+            task: ``horizon``, ``dt``, ``subsets``, ``shape``, ``candidates``, ``map`` and ``scale``.
 
     Raises:
         ConfigError: as :func:`check_model`, or a value that a part refuses.
     """
     check_model(model)
     wanted = inspect.signature(lookup("forecaster", model["forecaster"]["name"])).parameters
-    parts: dict[str, Any] = {}
-    if "dynamics" in wanted or "energy" in wanted:
-        motion = build("dynamics", model["dynamics"])
-        if "dynamics" in wanted:
-            parts["dynamics"] = motion
-        if "energy" in wanted:
-            parts["energy"] = build("energy", model["energy"], dynamics=motion)
-    if "solver" in wanted:
-        parts["solver"] = build("solver", model["solver"])
-    if "backbone" in wanted:
-        inputs = {"goal_input": model["goal"] == "all"}
-        told = {"map_input": model.get("map", False), "scale": model.get("scale", 1.0)}
-        asked = inspect.signature(lookup("backbone", model["backbone"]["name"])).parameters
-        inputs |= {name: value for name, value in told.items() if name in asked}
-        parts["backbone"] = build("backbone", model["backbone"], **inputs)
     task = Task(
         model["horizon"],
         model["dt"],
@@ -84,6 +74,18 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
         model.get("map", False),
         model.get("scale", 1.0),
     )
+    told: dict[str, Any] = {"horizon": task.horizon, "shape": task.shape, "scale": task.scale, "map_input": task.map}
+    told["goal_input"] = model["goal"] == "all"
+    parts: dict[str, Any] = {}
+    for kind in _PARTS:
+        # An energy is made of the dynamics, and knows the width of the backbone's features.
+        if kind in wanted or (kind == "dynamics" and "energy" in wanted):
+            asked = inspect.signature(lookup(kind, model[kind]["name"])).parameters
+            supplied = {name: told[name] for name in _SUPPLIED.get(kind, ()) if name in asked}
+            parts[kind] = built = build(kind, model[kind], **supplied)
+            told |= {"dynamics": built} if kind == "dynamics" else {}
+            told |= {"width": built.width} if kind == "backbone" else {}
+    parts = {kind: part for kind, part in parts.items() if kind in wanted}
     optimizer = build("optimizer", model["optimizer"])
     forecaster: Forecaster = build("forecaster", model["forecaster"], task=task, optimizer=optimizer, **parts)
     forecaster.configuration = dict(model)

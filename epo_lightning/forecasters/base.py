@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool
 from lightning import LightningModule
 from torch import Tensor
 
 from epo_lightning.metrics import ForecastMetrics
+from epo_lightning.objectives.base import Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.scene import JointForecast, Scene
 
@@ -62,7 +61,7 @@ class Forecaster(LightningModule):
         self.val_metrics = ForecastMetrics(task.subsets, task.shape)
         self.test_metrics = ForecastMetrics(task.subsets, task.shape)
 
-    def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
+    def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         """Weight and value of every term of the training objective (Eq. 12)."""
         raise NotImplementedError
 
@@ -97,6 +96,10 @@ class Forecaster(LightningModule):
         """Add what is of interest to a reader but not to training."""
         return forecast
 
+    def examine(self, scene: Scene, forecast: JointForecast) -> JointForecast:
+        """Add what is measured in tests but is too dear for every validation."""
+        return forecast
+
     def training_step(self, scene: Scene, _: int) -> Tensor:
         terms = self.losses(scene, self(scene))
         total = torch.stack([weight * value for weight, value in terms.values()]).sum()
@@ -113,7 +116,7 @@ class Forecaster(LightningModule):
         self._log_metrics("val", self.val_metrics)
 
     def test_step(self, scene: Scene, _: int) -> None:
-        self.test_metrics.update(self(scene), scene)
+        self.test_metrics.update(self.examine(scene, self(scene)), scene)
 
     def on_test_epoch_end(self) -> None:
         self._log_metrics("test", self.test_metrics)
@@ -135,28 +138,6 @@ class Forecaster(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["configuration"] = self.configuration
-
-
-def observed_future(scene: Scene) -> tuple[Tensor, Bool[Tensor, "B N K"]]:
-    """The futures that a forecaster learns from, and which of their steps are real.
-
-    Raises:
-        ValueError: the scene has no future.
-    """
-    if scene.future is None or scene.future_mask is None:
-        raise ValueError("learning needs scene.future, which is None")
-    return scene.future, scene.future_mask & scene.agent_mask[..., None]
-
-
-def weights_of(weights: Mapping[str, float], names: tuple[str, ...], idle: tuple[str, ...] = ()) -> dict[str, float]:
-    """The loss weights lambda, all of them and no others but those of ``idle`` terms.
-
-    Raises:
-        ValueError: a missing or an unknown name.
-    """
-    if set(weights) - set(idle) != set(names):
-        raise ValueError(f"loss_weights must name {list(names)}, not {sorted(weights)}")
-    return dict(weights)
 
 
 def _blank(tensor: Tensor, scenes: list[int]) -> Tensor:

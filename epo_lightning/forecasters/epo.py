@@ -1,28 +1,40 @@
-"""The paper's own forecaster: the network infers a game, and the forecast is its solution (+EPO, Algorithm 1)."""
+"""Energy-based potential games: the network infers a game, and the forecast is what minimises its energy (Sections 3, 4).
+
+The paper's own method (+EPO, Algorithm 1) is one choice of energy, minimiser, derivative and objective; the others of its
+Table 1, and the cells that the literature left empty, are other choices of the same four parts.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 
-from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
-from epo_lightning.decoders.goals import NO_CANDIDATE, GoalDecoder, choose, given_goals, goal_candidates, most_likely
+from epo_lightning.decoders.goals import NO_CANDIDATE, GoalDecoder, choose, given_goals, most_likely
+from epo_lightning.decoders.motions import Motions
+from epo_lightning.decoders.orders import Orders
 from epo_lightning.decoders.probabilities import SceneProbabilities
 from epo_lightning.decoders.strategies import InitialStrategies
 from epo_lightning.decoders.weights import OwnWeights, PairWeights
-from epo_lightning.forecasters.base import Forecaster, Task, observed_future, weights_of
-from epo_lightning.forecasters.scene_consistent import joint_losses
-from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.forecasters.base import Forecaster, Task
+from epo_lightning.forecasters.combination import Combination
+from epo_lightning.game.convex_energy import ConvexEnergy
+from epo_lightning.game.energy import Energy
+from epo_lightning.game.features import OWN_FEATURES
+from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import GameParameters, JointForecast, Scene
-from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
+from epo_lightning.scene import GameParameters, JointForecast, Scene, Status
+from epo_lightning.solvers.backward import Backward
+from epo_lightning.solvers.base import TABLES, Minimiser
+from epo_lightning.solvers.equilibrium import equilibrium
 
-INITIAL = ("decoded", "zero")
-"""Where solutions start: at strategies of the network's, or (the paper's ablation "no init") at controls of zero."""
+INITIAL = ("decoded", "zero", "motions")
+"""Where solutions start, or between what they choose: strategies of the network's, (the paper's ablation "no init") controls
+of zero, or motions that the dynamics allows."""
 
 
 @register("forecaster", "epo")
@@ -30,22 +42,24 @@ class EPO(Forecaster):
     """Weights, goals and initial strategies from the network; joint strategies from the energy's minimisation.
 
     Where the data has several goal candidates and the energy a goal or a lane, mode m of an agent heads for its m-th most
-    likely candidate, along the line on which that lies. A single candidate is a given goal, of all modes.
+    likely candidate, along the line on which that lies. A single candidate is a given goal, of all modes. A minimiser that
+    chooses among candidates plays one game, and its M best joint choices are the modes; others play a game per mode.
 
     Args:
         backbone: the observation encoder phi_glob.
         energy: what the network's parameters weigh.
         solver: what minimises the energy.
+        backward: which derivative the solution has.
+        objective: what is learned.
         modes: number M of joint modes.
-        loss_weights: lambda of ``imitation``, ``goal`` (idle where no goal is decoded) and ``probability``.
         own_start: own weights that a network output of zero stands for, which scale it as well: one number, or some by the
             feature's name while the others are 1. ``vel`` pulls speeds towards zero and has to start small on highways.
         pair_start: pair weight that a network output of zero stands for.
         symmetric_pairs: whether pair weights ignore which agent comes first, so that forecasts do not depend on the order of
             agents.
-        initial: ``decoded`` or ``zero``.
+        initial: ``decoded``, ``zero`` or ``motions``.
         control_scale: initial control that a network output of one stands for.
-        relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
+        motions: largest ``acceleration`` [m/s^2] and ``curvature`` [1/m] of initial motions.
     """
 
     def __init__(
@@ -53,92 +67,118 @@ class EPO(Forecaster):
         task: Task,
         optimizer: Adam,
         backbone: Backbone,
-        energy: FeatureEnergy,
-        solver: LevenbergMarquardt,
+        energy: Energy,
+        solver: Minimiser,
+        backward: Backward,
+        objective: Objective,
         modes: int,
-        loss_weights: Mapping[str, float],
         own_start: float | Mapping[str, float] = 1.0,
         pair_start: float = 3.0,
         symmetric_pairs: bool = False,
         initial: str = "decoded",
         control_scale: float = 0.3,
-        relaxation: float = 0.0,
-        relaxation_steps: int = 1000,
+        motions: Mapping[str, float] | None = None,
     ) -> None:
-        known = {"size"} | ({"goals"} if task.candidates else set())
-        lacking = energy.needs - known - ({"reference", "reference_speed"} if task.candidates > 1 else set())
-        if lacking:
-            raise ConfigError(
-                f"features of energy.own need {', '.join(sorted(lacking))}, which this data does not give: leave them out, "
-                "or choose data with a map"
-            )
+        Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
+        _check_needs(energy, task)
+        chooses = TABLES in solver.provides
         if initial not in INITIAL:
             raise ConfigError(f"unknown forecaster.initial {initial!r}: {nearest(str(initial), INITIAL)}")
+        if chooses and initial == "zero":
+            raise ConfigError(
+                "the solver chooses among candidates, and with forecaster.initial=zero they are all the same: decoded "
+                "learns them, motions samples them"
+            )
         super().__init__(task, optimizer)
-        self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver, modes
-        width, scale = backbone.width, task.scale
-        decodes_goals = task.candidates > 1 and bool(energy.needs & {"goals", "reference"})
-        if decodes_goals:
-            self.loss_weights = weights_of(loss_weights, ("imitation", "goal", "probability"))
-        else:
-            self.loss_weights = weights_of(loss_weights, ("imitation", "probability"), idle=("goal",))
-        self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
-        self.own_weights = OwnWeights(width, modes, energy.own, _checked(own_start, energy.own))
-        self.pair_weights = PairWeights(width, modes, energy.pair, pair_start, symmetric_pairs)
-        decodes_strategies = initial == "decoded"
-        self.strategies = InitialStrategies(width, modes, task.horizon, control_scale) if decodes_strategies else None
-        self.probabilities = SceneProbabilities(width, modes, task.horizon, scale)
-        self.goals = GoalDecoder(width, scale) if decodes_goals else None
+        self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
+        self.differentiate, self.objective = backward, objective  # Lightning calls something else `backward`
+        games, starts = solver.games(modes), solver.starts(modes)
+        width, scale, horizon = backbone.width, task.scale, task.horizon
+        own, pair = energy.weighted
+        start = _checked(own_start, own)
+        self.own_weights = OwnWeights(width, games, own, start) if own else None
+        self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs) if pair else None
+        self.strategies = InitialStrategies(width, starts, horizon, control_scale) if initial == "decoded" else None
+        self.motions = Motions(horizon, starts, **(motions or {})) if initial == "motions" else None
+        self.goals = GoalDecoder(width, scale) if task.candidates > 1 and energy.needs & {"goals", "reference"} else None
+        self.orders = None
+        if "order" in energy.needs:
+            assert isinstance(energy, ConvexEnergy)
+            self.orders = Orders(width, games, energy.symmetric)
+        # Where energies or orders do not say how likely a mode is, the network does.
+        says = chooses or self.orders is not None
+        self.probabilities = None if says else SceneProbabilities(width, modes, horizon, scale)
 
     def forward(self, scene: Scene) -> JointForecast:
         z = self.backbone(scene)
         logits = None if self.goals is None else self.goals(z, scene)
-        parameters = self.infer(scene, z, logits)
+        orders = None if self.orders is None else self.orders(z, scene.agent_mask)
+        parameters = self.infer(scene, z, logits, None if orders is None else orders[0])
         solver = self.solver if self.training else self.solver.for_test()
-        solution = solver(self.energy, scene, parameters)
-        current = scene.current.where(scene.agent_mask[..., None], 0.0)
-        initial_states = self.energy.dynamics.rollout(current[:, None], parameters.initial_controls, scene.dt)
+        solution = self.differentiate(solver, self.energy, scene, parameters)
+        if solution.tables is not None:
+            stopped = (solution.status == Status.STOPPED).any(1, keepdim=True)
+            probabilities, initial = (-torch.where(stopped, 0.0, solution.energy)).softmax(1), None
+        else:
+            starts = parameters.initial_controls
+            # Initial strategies that learn through the solution do not learn from their own states as well.
+            starts = starts.detach() if self.differentiate.teaches_start else starts
+            initial = self.energy.dynamics.rollout(self.energy.initial(scene), starts, scene.dt)
+            if orders is not None:
+                probabilities = orders[1].softmax(1)
+            else:
+                assert self.probabilities is not None
+                current = scene.current.where(scene.agent_mask[..., None], 0.0)
+                positions = solution.states[..., :2]
+                probabilities = self.probabilities(z, positions, current[..., :2], scene.agent_mask)
         return JointForecast(
             states=solution.states,
-            probabilities=self.probabilities(z, solution.states[..., :2], current[..., :2], scene.agent_mask),
+            probabilities=probabilities,
             controls=solution.controls,
-            initial_states=initial_states,
+            initial_states=initial,
             parameters=parameters,
             solution=solution,
             goal_probabilities=None if logits is None else logits.softmax(-1).where(logits > NO_CANDIDATE, 0.0),
+            order_logits=None if orders is None else orders[2],
         )
 
-    def infer(self, scene: Scene, z: Tensor, logits: Tensor | None = None) -> GameParameters:
+    def infer(
+        self, scene: Scene, z: Tensor, logits: Tensor | None = None, order: Tensor | None = None
+    ) -> GameParameters:
         """The game of every mode: decoded weights and initial strategies, and goals, given or chosen by their ``logits``.
 
         Raises:
             ValueError: the scene lacks the goals or the reference lines that the energy asks for.
         """
-        own_weights = self.own_weights(z, scene.agent_mask)
+        own_weights = {} if self.own_weights is None else self.own_weights(z, scene.agent_mask)
         goals = reference = None
         if logits is not None:
-            goals, reference = choose(scene, most_likely(logits, self.modes))
+            goals, reference = choose(scene, most_likely(logits, self.solver.games(self.modes)))
             if "reference" in self.energy.needs and reference is None:
                 raise ValueError("the energy follows reference lines, but scene.goal_reference [B, N, G] is None")
             # Who has no candidate heads nowhere, not for the origin.
             heads = (logits > NO_CANDIDATE).any(-1)[:, None]
-            for name, feature in self.energy.own_features.items():
-                if feature.needs in ("goals", "reference"):
-                    own_weights[name] = own_weights[name].where(heads, 0.0)
-        elif self.energy.needs_goals:
-            goals = given_goals(scene)[:, None].expand(-1, self.modes, -1, -1)
-        if self.strategies is None:
-            batch, agents, _ = z.shape
-            initial_controls = z.new_zeros(batch, self.modes, agents, self.task.horizon, 2)
-        else:
-            initial_controls = self.strategies(z)
+            own_weights |= {name: own_weights[name].where(heads, 0.0) for name in self.energy.heading & own_weights.keys()}
+        elif "goals" in self.energy.needs:
+            goals = given_goals(scene)[:, None].expand(-1, self.solver.games(self.modes), -1, -1)
         return GameParameters(
             own_weights=own_weights,
-            pair_weights=self.pair_weights(z),
-            initial_controls=initial_controls,
+            pair_weights={} if self.pair_weights is None else self.pair_weights(z),
+            initial_controls=self._starts(scene, z),
             goals=goals,
             reference=reference,
+            context=z if "context" in self.energy.needs else None,
+            order=order,
         )
+
+    def _starts(self, scene: Scene, z: Tensor) -> Tensor:
+        """Initial strategies."""
+        if self.strategies is not None:
+            return self.strategies(z)
+        if self.motions is not None:
+            return self.motions(scene.current.where(scene.agent_mask[..., None], 0.0), scene.dt)
+        batch, agents, _ = z.shape
+        return z.new_zeros(batch, self.solver.starts(self.modes), agents, self.task.horizon, 2)
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
         assert forecast.parameters is not None
@@ -150,26 +190,42 @@ class EPO(Forecaster):
             pair_energy={name: terms[name] for name in self.energy.pair},
         )
 
-    def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
-        terms = joint_losses(scene, forecast, self.loss_weights, self.relaxation.at(self.global_step))
-        if forecast.goal_probabilities is not None:
-            future, mask = observed_future(scene)
-            final, observed = future[:, :, -1, :2], mask[:, :, -1]
-            goal = losses.goal(forecast.goal_probabilities, *goal_candidates(scene), final, observed)
-            terms["goal"] = (self.loss_weights["goal"], goal)
-        return terms
+    @torch.no_grad()
+    def examine(self, scene: Scene, forecast: JointForecast) -> JointForecast:
+        assert forecast.parameters is not None
+        assert forecast.solution is not None
+        report = equilibrium(self.energy, scene, forecast)
+        return dataclasses.replace(forecast, equilibrium=report)
+
+    def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
+        return self.objective(scene, forecast, self.energy, self.global_step)
+
+
+def _check_needs(energy: Energy, task: Task) -> None:
+    """Refuse an energy that refers to what the data does not give.
+
+    Raises:
+        ConfigError: the message names what is lacking.
+    """
+    known = {"size", "context", "order"} | ({"goals"} if task.candidates else set())
+    lacking = energy.needs - known - ({"reference", "reference_speed"} if task.candidates > 1 else set())
+    if lacking:
+        raise ConfigError(
+            f"features of energy.own need {', '.join(sorted(lacking))}, which this data does not give: leave them out, "
+            "or choose data with a map"
+        )
 
 
 def _checked(start: float | Mapping[str, float], features: Sequence[str]) -> float | Mapping[str, float]:
-    """The weights that own features start from.
+    """The weights that own features start from. Names of features that other energies have are idle.
 
     Raises:
-        ConfigError: the name of a feature that the energy does not have, or a weight that is not positive.
+        ConfigError: the name of no feature, or a weight that is not positive.
     """
-    named = start if isinstance(start, Mapping) else dict.fromkeys(features, start)
+    named, known = start if isinstance(start, Mapping) else {"all": start}, {"all", *features, *OWN_FEATURES}
     for name, value in named.items():
-        if name not in features:
-            raise ConfigError(f"unknown feature forecaster.own_start.{name}: {nearest(name, features)}")
+        if name not in known:
+            raise ConfigError(f"unknown feature forecaster.own_start.{name}: {nearest(name, known)}")
         if not value > 0:
             raise ConfigError(f"forecaster.own_start must be positive, but {name} would start at {value}")
     return start

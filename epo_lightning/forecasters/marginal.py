@@ -10,8 +10,10 @@ from torch import Tensor
 from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.trajectories import Trajectories
-from epo_lightning.forecasters.base import Forecaster, Task, observed_future, weights_of
+from epo_lightning.forecasters.base import Forecaster, Task
 from epo_lightning.metrics.functional import marginal_to_joint
+from epo_lightning.objectives.base import Terms, checked_weights
+from epo_lightning.objectives.terms import observed_future
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
 from epo_lightning.scene import HEADING, JointForecast, Scene
@@ -42,7 +44,7 @@ class Marginal(Forecaster):
     ) -> None:
         super().__init__(task, optimizer)
         self.backbone = backbone
-        self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))
+        self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"))
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.decoder = Trajectories(backbone.width, modes, task.horizon, task.scale)
 
@@ -58,7 +60,7 @@ class Marginal(Forecaster):
             agent_probabilities=probabilities,
         )
 
-    def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
+    def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         future, mask = observed_future(scene)
         distance = losses.distances(forecast.states[..., :2], future, mask)
         imitation, mode = losses.marginal_imitation(distance, mask, self.relaxation.at(self.global_step))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from torch import Tensor
-
 from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.probabilities import SceneProbabilities
 from epo_lightning.decoders.strategies import InitialStrategies
-from epo_lightning.forecasters.base import Forecaster, Task, observed_future, weights_of
+from epo_lightning.forecasters.base import Forecaster, Task
 from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.objectives.base import Terms, checked_weights
+from epo_lightning.objectives.terms import imitation_terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
 from epo_lightning.scene import JointForecast, Scene
@@ -45,7 +45,7 @@ class SceneConsistent(Forecaster):
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.dynamics = dynamics
-        self.loss_weights = weights_of(loss_weights, ("imitation", "probability"))
+        self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"))
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
         self.probabilities = SceneProbabilities(backbone.width, modes, task.horizon, task.scale)
@@ -61,16 +61,6 @@ class SceneConsistent(Forecaster):
             controls=controls,
         )
 
-    def losses(self, scene: Scene, forecast: JointForecast) -> dict[str, tuple[float, Tensor]]:
-        return joint_losses(scene, forecast, self.loss_weights, self.relaxation.at(self.global_step))
+    def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
+        return imitation_terms(scene, forecast, self.loss_weights, self.relaxation.at(self.global_step))
 
-
-def joint_losses(
-    scene: Scene, forecast: JointForecast, weights: Mapping[str, float], relaxation: float
-) -> dict[str, tuple[float, Tensor]]:
-    """Imitation of the closest joint future, and the probability that it was given."""
-    future, mask = observed_future(scene)
-    distance = losses.distances(forecast.states[..., :2], future, mask)
-    imitation, mode = losses.scene_imitation(distance, mask, relaxation)
-    probability = losses.scene_probability(forecast.probabilities, mode, mask)
-    return {"imitation": (weights["imitation"], imitation), "probability": (weights["probability"], probability)}

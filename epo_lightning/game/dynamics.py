@@ -11,7 +11,7 @@ with beta = 1 for explicit Euler (the paper), 0 for semi-implicit Euler and 1/2 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -32,6 +32,7 @@ def _turn_left(vector: Float[Tensor, "... 2"]) -> Float[Tensor, "... 2"]:
     return torch.stack((-vector[..., 1], vector[..., 0]), -1)
 
 
+@runtime_checkable
 class Dynamics(Protocol):
     """What turns controls into states; each agent's on its own."""
 

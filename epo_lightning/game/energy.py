@@ -58,6 +58,11 @@ class Energy(ABC):
         """Of ``goals``, ``reference``, ``reference_speed``, ``size``, ``context`` and ``order``, what the terms refer to."""
         return set()
 
+    @property
+    def heading(self) -> set[str]:
+        """Names of the own terms that say where an agent is heading."""
+        return set()
+
     @abstractmethod
     def own_terms(
         self,
@@ -106,7 +111,9 @@ class Energy(ABC):
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> Float[Tensor, "B M"]:
         """The energy of every joint strategy."""
-        return torch.stack([term.sum(-1) for term in self.terms(scene, parameters, controls).values()]).sum(0)
+        # One after the other: stacked, they would be added up differently in batches of other sizes.
+        first, *others = (term.sum(-1) for term in self.terms(scene, parameters, controls).values())
+        return sum(others, first)
 
     def objectives(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]

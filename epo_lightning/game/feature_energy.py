@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -54,7 +55,7 @@ class FeatureEnergy(Energy):
         pair: names out of :data:`~epo_lightning.game.features.PAIR_FEATURES`. Discs have half an agent's length as radius;
             for the rows of circles see :mod:`~epo_lightning.game.circles`.
         bounds: lowest and highest value of a signal, for features whose name ends in ``b``: ``{"vel": (-0.05, 2.0)}``.
-        dynamics: what turns controls into states.
+        dynamics: a :class:`~epo_lightning.game.dynamics.Unicycle`.
         pair_stride: pairs are looked at in every step (1), every second step (2), ...: k = stride, 2 stride, ...
     """
 
@@ -63,7 +64,7 @@ class FeatureEnergy(Energy):
     own: Sequence[str]
     pair: Sequence[str] = ("proximity",)
     bounds: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    dynamics: Unicycle = field(default_factory=Unicycle)
+    dynamics: Any = field(default_factory=Unicycle)  # what else is given is refused below, with a reason
     pair_stride: int = 1
 
     def __post_init__(self) -> None:
@@ -77,6 +78,11 @@ class FeatureEnergy(Energy):
                 raise ConfigError(f"energy.{kind} names a feature twice: {list(names)}")
         if not self.own and not self.pair:
             raise ConfigError("an energy needs at least one feature")
+        if not isinstance(self.dynamics, Unicycle):
+            raise ConfigError(
+                "named features are those of a unicycle: they go with dynamics=unicycle, not with "
+                f"{type(self.dynamics).__name__}; energy=convex goes with dynamics=double_integrator"
+            )
         for name, feature in self.own_features.items():
             if feature.bounded and feature.signal not in self.bounds:
                 raise ConfigError(f"feature {name!r} needs energy.bounds.{feature.signal}: [lowest, highest]")
@@ -105,6 +111,11 @@ class FeatureEnergy(Energy):
     def needs(self) -> set[str]:
         """What the own features refer to: some of ``goals``, ``reference``, ``reference_speed``, ``size``."""
         return {feature.needs for feature in self.own_features.values() if feature.needs}
+
+    @property
+    def heading(self) -> set[str]:
+        """Names of the features of goals and of lines."""
+        return {name for name, feature in self.own_features.items() if feature.needs in ("goals", "reference")}
 
     @cached_property
     def needs_goals(self) -> bool:

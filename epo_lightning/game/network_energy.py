@@ -56,7 +56,7 @@ class NetworkEnergy(nn.Module, Energy):
         self.dynamics, self.width, self.horizon, self.scale = dynamics, width, horizon, scale
         self.features: FeatureEnergy | None = None
         if own or pair or bounds:
-            self.features = FeatureEnergy(own, pair, bounds or {}, dynamics, pair_stride)  # type: ignore[arg-type]
+            self.features = FeatureEnergy(own, pair, bounds or {}, dynamics, pair_stride)
         for name in (*own, *pair):
             if name in (self.term, self.pair_term):
                 raise ConfigError(f"a feature is called {name!r}, like a term of this energy: give it another name")

@@ -19,7 +19,8 @@ from typing import ClassVar
 
 import torch
 
-from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy
+from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution
 from epo_lightning.solvers import dense, implicit
@@ -123,8 +124,11 @@ class Implicit(Backward):
             solution = minimiser(energy, scene, parameters)
         if not torch.is_grad_enabled() or solution.controls.numel() == 0:
             return solution
-        attach = implicit.attach if FEATURES in energy.offers else dense.attach
-        controls, status = attach(energy, scene, parameters, solution.controls, self.hessian == "exact")
+        exact, games = self.hessian == "exact", parameters.for_modes(solution.controls.shape[1])
+        if isinstance(energy, FeatureEnergy):
+            controls, status = implicit.attach(energy, scene, games, solution.controls, exact)
+        else:
+            controls, status = dense.attach(energy, scene, games, solution.controls, exact)
         states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
         status = torch.maximum(solution.status, status)
         return dataclasses.replace(solution, controls=controls, states=states, status=status)

@@ -48,6 +48,10 @@ class Minimiser(ABC):
         """How many initial strategies of every agent it takes for M modes."""
         return modes
 
+    def for_modes(self, modes: int) -> Minimiser:
+        """The minimiser for M joint modes."""
+        return self
+
     def games(self, modes: int) -> int:
         """How many games it takes for M modes: one each, or one for all of them."""
         return modes

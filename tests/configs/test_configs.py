@@ -36,7 +36,8 @@ def test_experiments_can_be_built(experiment: str) -> None:
 @pytest.mark.parametrize("data", sorted(folder.name for folder in (CONF / "experiment").iterdir()))
 def test_titles_are_told_apart(data: str) -> None:
     rows = [name for name in names(CONF / "experiment") if name.startswith(f"{data}/")]
-    titles = [compose("train", [f"experiment={name}"])["title"] for name in rows]
+    configs = [compose("train", [f"experiment={name}"]) for name in rows]
+    titles = [(config["title"], config["data"]["name"]) for config in configs]
     assert len(set(titles)) == len(titles)
 
 
@@ -50,7 +51,13 @@ def test_the_papers_settings() -> None:
         "step_size": 0.3,
         "damping": 10.0,
     }
-    assert config["forecaster"]["loss_weights"] == {"imitation": 1.0, "goal": 0.1, "probability": 0.1}
+    assert config["backward"] == {"name": "unrolled"}
+    weights = config["objective"]["weights"]
+    assert {name: weights[name] for name in ("imitation", "goal", "probability")} == {
+        "imitation": 1.0,
+        "goal": 0.1,
+        "probability": 0.1,
+    }
     assert config["forecaster"]["modes"] == 2
     assert config["goal"] == "energy"
 

@@ -52,7 +52,7 @@ class TestSceneConsistent(ForecasterSuite):
 
 
 class TestEPO(ForecasterSuite):
-    config = {"name": "epo", "modes": 2, "loss_weights": LOSS_WEIGHTS}
+    config = {"name": "epo", "modes": 2}
 
     def test_the_forecast_is_the_solution_of_the_inferred_game(self):
         forecaster, scene = self.forecaster(), random_scene(3, 2)
@@ -99,7 +99,7 @@ EPO = TestEPO.config
         ({"solver": {"name": "levenberg_marquardt", "stepsize": 1}}, "did you mean 'step_size'"),
         ({"optimizer": {"name": "adam", "lr": -1.0}}, "optimizer.lr must be positive"),
         ({"optimizer": {"name": "adam", "schedule": "cosin"}}, "did you mean 'cosine'"),
-        ({"forecaster": {**EPO, "loss_weights": {"imitation": 1.0}}}, "loss_weights must name"),
+        ({"objective": {"name": "imitation", "weights": {"imitation": 1.0}}}, "weights must name"),
         ({"forecaster": {**EPO, "modes": 0}}, "modes must be 1 or more"),
         ({"speed": 1}, "unknown key 'speed'"),
     ],

@@ -25,7 +25,6 @@ CONFIGS = {
     "epo": {
         "name": "epo",
         "modes": 3,
-        "loss_weights": {"imitation": 1.0, "goal": 0.1, "probability": 0.1},
         "own_start": {"vel": 0.02, "velref": 0.1},
         "symmetric_pairs": True,
     },

@@ -11,11 +11,9 @@ from epo_lightning.forecasters import build_forecaster
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
-ALL_WEIGHTS = {"imitation": 1.0, "goal": 0.1, "probability": 0.1}
 EPO = {
     "name": "epo",
     "modes": 3,
-    "loss_weights": ALL_WEIGHTS,
     "own_start": {"vel": 0.05},
     "symmetric_pairs": True,
 }
@@ -146,7 +144,7 @@ def test_an_agent_without_a_future_teaches_nothing():
         ({"forecaster": {**EPO, "own_start": {"val": 1.0}}}, "own_start.val: did you mean 'vel'"),
         ({"forecaster": {**EPO, "own_start": {"vel": 0.0}}}, "own_start must be positive, but vel would start at 0.0"),
         ({"forecaster": {**EPO, "own_start": -1.0}}, "own_start must be positive"),
-        ({"forecaster": {**EPO, "loss_weights": LOSS_WEIGHTS}}, "loss_weights must name"),
+        ({"objective": {"name": "imitation", "weights": LOSS_WEIGHTS}}, "weights must name"),
     ],
 )
 def test_configurations_that_cannot_work_are_refused(changes, message):
@@ -172,7 +170,7 @@ def test_scenes_that_lack_what_is_needed_are_refused(gone, message):
 
 def test_models_from_before_there_were_maps_still_build():
     """The keys that old checkpoints lack."""
-    old = model({"name": "epo", "modes": 2, "loss_weights": LOSS_WEIGHTS, "own_start": 1.0})
+    old = model({"name": "epo", "modes": 2, "own_start": 1.0})
     assert not {"candidates", "map"} & set(old)
     task = build_forecaster(old).task
     assert (task.candidates, task.map) == (1, False)

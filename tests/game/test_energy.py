@@ -321,15 +321,15 @@ def test_shapes_that_do_not_fit_are_refused_by_name(monkeypatch):
     with pytest.raises(ValueError, match="own_weights lacks the feature 'jerk'"):
         fewer = {name: w for name, w in parameters.own_weights.items() if name != "jerk"}
         energy.validate(scene, replaced(parameters, own_weights=fewer), controls)
-    with pytest.raises(ValueError, match=r"own_weights\['vel'\] has shape \[2, 1, 2\]"):
-        weights = {**parameters.own_weights, "vel": parameters.own_weights["vel"][:, :1]}
+    with pytest.raises(ValueError, match=r"own_weights\['vel'\] has shape \[2, 3, 2\]"):
+        weights = {**parameters.own_weights, "vel": parameters.own_weights["vel"][:, [0, 0, 1]]}
         energy.validate(scene, replaced(parameters, own_weights=weights), controls)
     with pytest.raises(ValueError, match=r"parameters\.goals is None"):
         energy.validate(scene, replaced(parameters, goals=None), controls)
     with pytest.raises(ValueError, match=r"'lane', but parameters\.reference is None"):
         energy.validate(scene, replaced(parameters, reference=None), controls)
-    with pytest.raises(ValueError, match=r"parameters\.reference has shape \[2, 1, 2\]"):
-        energy.validate(scene, replaced(parameters, reference=parameters.reference[:, :1]), controls)
+    with pytest.raises(ValueError, match=r"parameters\.reference has shape \[2, 3, 2\]"):
+        energy.validate(scene, replaced(parameters, reference=parameters.reference[:, [0, 0, 1]]), controls)
     with pytest.raises(ValueError, match=r"R = 2 lines"):
         energy.validate(scene, replaced(parameters, reference=parameters.reference - 2), controls)
     with pytest.raises(ValueError, match=r"'lane', but scene\.references is None"):

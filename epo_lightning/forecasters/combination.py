@@ -1,0 +1,111 @@
+"""Which energies, minimisers, derivatives and objectives work together: the paper's Table 1, with its empty cells.
+
+Every part declares what it needs of the others and what it provides. What follows from that is said before anything runs:
+why a combination cannot work, and which single change would make it work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from epo_lightning.game.energy import CONVEX, FEATURES, GRADIENT, RESIDUALS
+from epo_lightning.registry import ConfigError, parts
+from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, TABLES
+
+WORDS = {
+    GRADIENT: "a gradient",
+    RESIDUALS: "residuals, of which it is half the sum of squares",
+    FEATURES: "named features whose structure the solver knows",
+    CONVEX: "convexity",
+    PATH: "steps that can be differentiated",
+    STATIONARY: "strategies at which the gradient vanishes",
+    SAMPLES: "samples",
+    TABLES: "energies of candidates",
+}
+KINDS = ("energy", "solver", "backward", "objective")
+
+
+@dataclass(frozen=True)
+class Combination:
+    """One choice of each kind, parts or their classes, which declare the same.
+
+    Attributes:
+        names: of the parts, by kind.
+    """
+
+    energy: Any
+    solver: Any
+    backward: Any
+    objective: Any
+    names: dict[str, str]
+
+    @classmethod
+    def of(cls, **chosen: Any) -> Combination:
+        """That of four parts."""
+        return cls(**chosen, names={kind: _name(kind, part) for kind, part in chosen.items()})
+
+    @property
+    def obstacle(self) -> str | None:
+        """Why it cannot work; None where it can."""
+        energy, solver, backward, objective = (f"{kind}={self.names[kind]}" for kind in KINDS)
+        for who, needed in (
+            (solver, self.solver.needs),
+            (backward, self.backward.of_energy),
+            (objective, self.objective.of_energy),
+        ):
+            if lacking := needed - self.energy.offers:
+                return f"{who} needs an energy with {_and(lacking)}, which {energy} does not offer"
+        for who, needed in ((backward, self.backward.needs), (objective, self.objective.needs)):
+            if needed and not needed & self.solver.provides:
+                return f"{who} needs {_or(needed)}, and {solver} provides {_or(self.solver.provides)}"
+        if self.objective.through_solution and not self.backward.teaches:
+            return f"{objective} learns through the solution, which with {backward} has no derivative"
+        if self.backward.teaches and not self.objective.through_solution:
+            return f"{objective} learns from energies: the derivative of the solution, {backward}, would serve nothing"
+        return None
+
+    @property
+    def neighbours(self) -> Iterator[tuple[str, Combination]]:
+        """What differs from it in one part, with the word that makes the change."""
+        for kind in KINDS:
+            for name, part in parts(kind).items():
+                if name != self.names[kind]:
+                    # Derivatives need no setting, and some of them say what they need once they have theirs.
+                    changed = part() if kind == "backward" else part
+                    word = f"an energy named {name}" if kind == "energy" else f"{kind}={name}"
+                    yield word, replace(self, **{kind: changed}, names={**self.names, kind: name})
+
+    def check(self) -> None:
+        """Refuse what cannot work.
+
+        Raises:
+            ConfigError: the reason, and the changes with which it would work.
+        """
+        obstacle = self.obstacle
+        if obstacle is None:
+            return
+        working = [word for word, other in self.neighbours if other.obstacle is None]
+        if not working:
+            two = {
+                " with ".join(sorted((word, other))): None
+                for word, one in self.neighbours
+                for other, both in one.neighbours
+                if both.obstacle is None
+            }
+            working = list(two)[:6]
+        raise ConfigError(f"{obstacle}. With this instead it works: {', or '.join(working)}")
+
+
+def _name(kind: str, part: Any) -> str:
+    """What a part is registered as."""
+    return next((name for name, known in parts(kind).items() if type(part) is known), type(part).__name__)
+
+
+def _and(what: Iterable[str]) -> str:
+    return " and ".join(WORDS[word] for word in sorted(what))
+
+
+def _or(what: Iterable[str]) -> str:
+    return " or ".join(WORDS[word] for word in sorted(what))

@@ -1,0 +1,58 @@
+"""Learning from the solution: the joint future closest to the observed one is drawn towards it (Section 4.4, Eq. 12)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+from epo_lightning import losses
+from epo_lightning.decoders.orders import observed_order, order_loss
+from epo_lightning.game.convex_energy import ConvexEnergy
+from epo_lightning.game.energy import Energy
+from epo_lightning.objectives.base import Objective, Terms, checked_weights
+from epo_lightning.objectives.terms import goal_term, imitation_terms
+from epo_lightning.registry import register
+from epo_lightning.scene import JointForecast, Scene
+
+
+@register("objective", "imitation")
+class Imitation(Objective):
+    """The paper's loss, lambda_1 L_imit + lambda_2 L_goal + lambda_3 L_prob, through whatever derivative the solution has.
+
+    Args:
+        weights: lambda of ``imitation``, ``goal`` (idle where no goal is decoded) and ``probability``; and ``initial``, what
+            imitation by the initial strategies counts where no derivative reaches them through the solution (idle where one
+            does). Where orders of agents are decoded, their cross entropy takes the place of ``probability``.
+        power: of distances; 1 is the paper's, TGL's is 1.05.
+        relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
+    """
+
+    terms = ("imitation", "goal", "probability", "initial")
+    through_solution = True
+
+    def __init__(
+        self,
+        weights: Mapping[str, float],
+        power: float = 1.0,
+        relaxation: float = 0.0,
+        relaxation_steps: int = 1000,
+    ) -> None:
+        if power < 1:
+            raise ValueError(f"power must be 1 or more, not {power}")
+        self.weights = checked_weights(weights, self.terms)
+        self.power = power
+        self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
+
+    def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
+        relaxation = self.relaxation.at(step)
+        terms = imitation_terms(scene, forecast, self.weights, relaxation, self.power)
+        if forecast.order_logits is not None:
+            assert isinstance(energy, ConvexEnergy)
+            entropy = order_loss(forecast.order_logits, *observed_order(energy, scene))
+            terms["probability"] = (self.weights["probability"], entropy)
+        starts = forecast.initial_states
+        if starts is not None and starts.requires_grad:
+            initial = dataclasses.replace(forecast, states=starts)
+            closest = imitation_terms(scene, initial, self.weights, relaxation, self.power)["imitation"][1]
+            terms["initial"] = (self.weights["initial"], closest)
+        return terms | goal_term(scene, forecast, self.weights["goal"])

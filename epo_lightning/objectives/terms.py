@@ -1,0 +1,44 @@
+"""Terms that objectives share: what was observed, and which goals were reached."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning import losses
+from epo_lightning.decoders.goals import goal_candidates
+from epo_lightning.objectives.base import Terms
+from epo_lightning.scene import JointForecast, Scene
+
+
+def observed_future(scene: Scene) -> tuple[Float[Tensor, "B N K 4"], Bool[Tensor, "B N K"]]:
+    """The futures that a forecaster learns from, and which of their steps are real.
+
+    Raises:
+        ValueError: the scene has no future.
+    """
+    if scene.future is None or scene.future_mask is None:
+        raise ValueError("learning needs scene.future, which is None")
+    return scene.future, scene.future_mask & scene.agent_mask[..., None]
+
+
+def goal_term(scene: Scene, forecast: JointForecast, weight: float) -> Terms:
+    """L_goal for forecasters that choose among goal candidates; nothing for others."""
+    if forecast.goal_probabilities is None:
+        return {}
+    future, mask = observed_future(scene)
+    final, observed = future[:, :, -1, :2], mask[:, :, -1]
+    return {"goal": (weight, losses.goal(forecast.goal_probabilities, *goal_candidates(scene), final, observed))}
+
+
+def imitation_terms(
+    scene: Scene, forecast: JointForecast, weights: Mapping[str, float], relaxation: float, power: float = 1.0
+) -> Terms:
+    """Imitation of the closest joint future, and the probability that it was given."""
+    future, mask = observed_future(scene)
+    distance = losses.distances(forecast.states[..., :2], future, mask, power)
+    imitation, mode = losses.scene_imitation(distance, mask, relaxation)
+    probability = losses.scene_probability(forecast.probabilities, mode, mask)
+    return {"imitation": (weights["imitation"], imitation), "probability": (weights["probability"], probability)}

@@ -1,0 +1,109 @@
+"""Every energy with every minimiser, derivative and objective: it learns something in a step, or is refused with a reason."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+from games import random_scene
+from suites import model
+
+from epo_lightning.experiment.compose import compose
+from epo_lightning.forecasters import build_forecaster
+from epo_lightning.registry import ConfigError
+
+OPTIONS = {
+    "energy": ("rpi", "augmented_rpi", "neural", "collision", "convex"),
+    "solver": (
+        *("levenberg_marquardt", "gradient_descent", "newton", "lbfgs", "langevin"),
+        *("enumeration", "sum_product"),
+    ),
+    "backward": ("unrolled", "truncated", "implicit", "implicit backward.hessian=gauss_newton", "detached"),
+    "objective": ("imitation", "contrastive", "laplace", "conditional"),
+}
+DIFFERENTIABLE = ("rpi", "augmented_rpi", "neural", "convex")
+STEPS = ("levenberg_marquardt", "gradient_descent")
+MINIMA = (*STEPS, "newton", "lbfgs")
+TABLES = ("enumeration", "sum_product")
+
+
+def section(kind: str, option: str) -> dict:
+    return compose("train", ["experiment=rpi/v_lstm_epo", *f"{kind}={option}".split()])[kind]
+
+
+SECTIONS = {kind: {option: section(kind, option) for option in options} for kind, options in OPTIONS.items()}
+# A few steps will do here, and small ones where nobody has learned weights that bear larger ones.
+SECTIONS["solver"]["newton"]["steps"] = SECTIONS["solver"]["lbfgs"]["steps"] = 4
+SECTIONS["solver"]["gradient_descent"] |= {"steps": 3, "step_size": 1e-4}
+SECTIONS["solver"]["langevin"] |= {"steps": 3, "delta": 1e-2}
+
+
+def works(energy: str, solver: str, backward: str, objective: str) -> bool:
+    """Table 1 and its empty cells, written out once more."""
+    if solver == "levenberg_marquardt" and energy != "rpi":
+        return False  # knows the structure of features alone
+    if solver not in TABLES and energy not in DIFFERENTIABLE:
+        return False
+    if objective == "imitation":
+        return {
+            "unrolled": solver in STEPS or solver in TABLES,
+            "truncated": solver in STEPS,
+            "implicit": solver in MINIMA,
+            "implicit backward.hessian=gauss_newton": solver in MINIMA and energy in ("rpi", "convex"),
+            "detached": False,
+        }[backward]
+    if objective == "conditional":
+        return solver in TABLES and backward == "unrolled"
+    if backward != "detached":
+        return False
+    if objective == "contrastive":
+        return solver not in TABLES
+    return energy in ("rpi", "convex")  # laplace: sums of squares
+
+
+def configuration(chosen: dict[str, str]) -> dict:
+    convex = chosen["energy"] == "convex"
+    return model(
+        {"name": "epo", "modes": 2},
+        **{kind: SECTIONS[kind][option] for kind, option in chosen.items()},
+        dynamics={"name": "double_integrator" if convex else "unicycle"},
+        horizon=6,
+    )
+
+
+@pytest.mark.parametrize("energy", OPTIONS["energy"])
+@pytest.mark.parametrize("solver", OPTIONS["solver"])
+def test_every_combination_takes_a_step_or_is_refused(energy: str, solver: str) -> None:
+    torch.manual_seed(1)
+    scene = random_scene(4, 2, history=4, horizon=6, size=1.0)
+    for backward, objective in itertools.product(OPTIONS["backward"], OPTIONS["objective"]):
+        chosen = {"energy": energy, "solver": solver, "backward": backward, "objective": objective}
+        if not works(**chosen):
+            with pytest.raises(ConfigError, match="With this instead it works") as refusal:
+                build_forecaster(configuration(chosen))
+            remedies_work(str(refusal.value), chosen)
+            continue
+        forecaster = build_forecaster(configuration(chosen)).train()
+        terms = forecaster.losses(scene, forecaster(scene))
+        loss = sum(weight * value for weight, value in terms.values())
+        assert loss.isfinite(), chosen
+        loss.backward()
+        gradients = [p.grad for p in forecaster.parameters() if p.grad is not None]
+        assert all(gradient.isfinite().all() for gradient in gradients), chosen
+        assert sum(gradient.abs().sum() for gradient in gradients) > 0, chosen
+        # A step along the gradient, and the next forecast is another one.
+        before = forecaster(scene).states.detach()
+        torch.optim.SGD(forecaster.parameters(), 1e-2).step()
+        assert not torch.equal(forecaster(scene).states, before), chosen
+
+
+def remedies_work(message: str, chosen: dict[str, str]) -> None:
+    """Every change that a refusal names is one that works."""
+    remedies = message.split("With this instead it works: ")[1].split(", or ")
+    names = {"features": "rpi"}
+    for remedy in remedies:
+        words = [word.replace("an energy named ", "energy=").split("=") for word in remedy.split(" with ")]
+        after = {**chosen, **{kind: names.get(name, name) for kind, name in words}}
+        assert after != chosen
+        assert works(**after), (message, after)
