@@ -11,19 +11,32 @@ where the rollout of the guess u already is where the agent was, nothing is corr
 
 from __future__ import annotations
 
+from typing import Protocol, runtime_checkable
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.game.dynamics import Dynamics, Unicycle
+from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.scene import HEADING, SPEED, Scene
 
 _SMOOTHNESS = 1e-2
 """mu as a share of the mean of a channel's stiffness, the diagonal of J^T J, so that it has no unit."""
 
 
+@runtime_checkable
+class Rollout(Protocol):
+    """All that is asked of dynamics."""
+
+    def rollout(
+        self, initial: Float[Tensor, "*#batch 4"], controls: Float[Tensor, "*batch K 2"], dt: float
+    ) -> Float[Tensor, "*batch K 4"]:
+        """The states x_1 .. x_K that controls u_0 .. u_{K-1} lead to from x_0."""
+        ...
+
+
 def observed_controls(
-    dynamics: Dynamics, scene: Scene, steps: int = 2
+    dynamics: Rollout, scene: Scene, steps: int = 2
 ) -> tuple[Float[Tensor, "B N K 2"], Float[Tensor, "B N"]]:
     """Controls whose rollout follows the observed future, and the mean distance [m] to it that remains.
 
@@ -53,7 +66,9 @@ def observed_controls(
         states = dynamics.rollout(start, controls, dt)
         missed = torch.where(seen[..., None], future[..., :2] - states[..., :2], 0.0)
         for _ in range(steps):
-            trial = controls + _step(dynamics, states, missed, controls - guess, seen, told, dt)
+            trial = controls + _step(
+                _reach(dynamics, start, controls, states, dt), missed, controls - guess, seen, told
+            )
             reached = dynamics.rollout(start, trial, dt)
             left = torch.where(seen[..., None], future[..., :2] - reached[..., :2], 0.0)
             closer = (left.square().sum((-2, -1)) < missed.square().sum((-2, -1)))[..., None, None]
@@ -97,26 +112,42 @@ def _differences(
     return torch.where(ends[..., None], torch.stack((speed, turn), -1) / time[..., None], 0.0)
 
 
-def _step(
-    dynamics: Dynamics,
+def _reach(
+    dynamics: Rollout,
+    start: Float[Tensor, "B N 4"],
+    controls: Float[Tensor, "B N K 2"],
     states: Float[Tensor, "B N K 4"],
+    dt: float,
+) -> Float[Tensor, "D B N K 2"]:
+    """How positions change with each of an agent's D = 2 K controls."""
+    steps = controls.shape[-2]
+    unit = torch.eye(2 * steps, dtype=controls.dtype, device=controls.device).view(-1, 1, 1, steps, 2)
+    directions = unit.expand(-1, *controls.shape)
+    if isinstance(dynamics, Unicycle):
+        return dynamics.tangent(states, directions, dt)[..., :2]
+
+    def positions(at: Tensor) -> Tensor:
+        return dynamics.rollout(start, at, dt)[..., :2]
+
+    return torch.func.vmap(lambda direction: torch.func.jvp(positions, (controls,), (direction,))[1])(directions)
+
+
+def _step(
+    moved: Float[Tensor, "D B N K 2"],
     missed: Float[Tensor, "B N K 2"],
     corrected: Float[Tensor, "B N K 2"],
     seen: Bool[Tensor, "B N K"],
     told: Bool[Tensor, "B N K"],
-    dt: float,
 ) -> Float[Tensor, "B N K 2"]:
     """One Gauss-Newton step towards positions that the rollout missed, after what was corrected so far."""
     batch, agents, steps = seen.shape
-    unit = torch.eye(2 * steps, dtype=states.dtype, device=states.device).view(-1, 1, 1, steps, 2)
-    moved = dynamics.tangent(states, unit.expand(-1, batch, agents, -1, -1), dt)[..., :2]
     jacobian = torch.where(seen[..., None], moved, 0.0).flatten(3).permute(1, 2, 0, 3)  # [B, N, 2 K, 2 K]
     matrix = jacobian @ jacobian.mT
     stiffness = matrix.diagonal(dim1=-2, dim2=-1).unflatten(-1, (steps, 2))
     mean = stiffness.sum(-2) / told.sum(-1, keepdim=True).clamp_min(1)  # [B, N, 2]
     # Neighbours that both were told of hold on to each other.
-    link = told[..., 1:].to(states.dtype)
-    difference = torch.eye(steps, dtype=states.dtype, device=states.device).diff(dim=0)
+    link = told[..., 1:].to(missed)
+    difference = torch.eye(steps, dtype=missed.dtype, device=missed.device).diff(dim=0)
     smooth = difference.mT @ (link[..., None] * difference)  # [B, N, K, K]
     block = matrix.view(batch, agents, steps, 2, steps, 2)
     force = (jacobian @ missed.flatten(2)[..., None]).view(batch, agents, steps, 2)

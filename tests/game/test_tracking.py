@@ -10,6 +10,7 @@ import torch
 from games import pad, random_scene
 from torch.testing import assert_close
 
+from epo_lightning.game.double_integrator import DoubleIntegrator
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.tracking import demonstrated, observed_controls
 from epo_lightning.scene import HEADING, Scene
@@ -25,9 +26,6 @@ class Linear:
         velocity = start[..., 2:] + dt * controls.cumsum(-2)
         before = torch.cat((start[..., 2:], velocity[..., :-1, :]), -2)
         return torch.cat((start[..., :2] + dt * before.cumsum(-2), velocity), -1)
-
-    def tangent(self, states, direction, dt):
-        return self.rollout(torch.zeros_like(states[..., 0, :]), direction, dt)
 
 
 def turned(scene: Scene) -> Scene:
@@ -94,6 +92,15 @@ def test_linear_motion_is_found_from_nothing_in_one_step():
     # The problem is quadratic: its solution is where a step leads, and it stays there.
     again, _ = observed_controls(Linear(), scene, steps=3)
     assert_close(again, found, rtol=0, atol=1e-8)
+
+
+def test_a_double_integrator_follows_a_unicycle():
+    scene, _ = driven(spread=0.2)
+    found, error = observed_controls(DoubleIntegrator(), scene)
+    reached = DoubleIntegrator().rollout(scene.current, found, scene.dt)
+    assert_close(error, (reached - scene.future)[..., :2].norm(dim=-1).mean(-1))
+    assert (error < 0.01).all()
+    assert (found.abs() < 5.0).all()
 
 
 def test_the_solution_minimises_what_it_says():
