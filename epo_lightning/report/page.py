@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -132,7 +133,7 @@ def _table(table: Table, cells: list[dict[str, Any]], place: Any) -> dict[str, A
                     "n": cell.n,
                     "paper": paper or None,
                     "difference": None if cell.difference is None else signed(cell.difference, 6),
-                    "values": [column.long_text(run.metrics[column.metric]) for run in row.runs],
+                    "values": [column.long_text(run.metrics.get(column.metric, math.nan)) for run in row.runs],
                 }
             )
         rows.append({"name": row.name, "n": len(row.runs), "cells": shown, "last": last})

@@ -367,7 +367,7 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
                 f"row {run.name!r} has seed {run.seed} twice, {twin.path} and {run.path} are the same run: "
                 "move one of them away"
             )
-        for metric in {*first.metrics} ^ {*run.metrics}:
+        for metric in ({*first.metrics} ^ {*run.metrics}) - {*GAME}:  # an objective need not have a relative gap
             one, other = (first, run) if metric in first.metrics else (run, first)
             raise ConfigError(
                 f"row {run.name!r}: {one.path} was scored by {metric} and {other.path} was not: "
@@ -377,8 +377,8 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
     known = (first.data, first.backbone, first.forecaster, first.goal, first.experiment, first.split, steps)
     paper = paper_values(*known) if is_papers(first.forecaster, first.config) else {}
     cells = {}
-    for metric in first.metrics:
-        values = [run.metrics[metric] for run in runs]
+    for metric in dict.fromkeys(metric for run in runs for metric in run.metrics):
+        values = [run.metrics.get(metric, math.nan) for run in runs]
         constant = not first.learned and len({*values}) == 1
         sampled = len(values) > 1 and all(map(math.isfinite, values)) and not constant
         deviation = statistics.stdev(values) if sampled else None
