@@ -77,6 +77,7 @@ class _Run(ctypes.Structure):
         ("steps", _Integer),
         ("step_size", _Real),
         ("damping", _Address),
+        ("damping_strides", _Integer * 2),
         ("record", _Integer),
         ("start", _Address),
         ("iterates", _Address),
@@ -267,13 +268,14 @@ class _Call:
         self.states: Tensor | None = controls.new_empty((*shape[:-1], 4))
         self.initial_energy, self.energy, self.gradient_norm = controls.new_empty((3, *shape[:2])).unbind(0)
         self.status = torch.empty(shape[:2], dtype=torch.int64)
-        by_agent = damping if damping.dim() == 3 else damping[..., None]
-        self.damping = _as(controls.dtype, by_agent).expand(shape[:3]).contiguous()
+        self.damping = _as(controls.dtype, damping).contiguous()
+        by_agent = damping.dim() == 3
         self.start = controls.detach().contiguous()
         self.arguments = _Run(
             steps=self.steps,
             step_size=step_size,
             damping=self.damping.data_ptr(),
+            damping_strides=(shape[2], 1) if by_agent else (1, 0),
             record=self.record,
             start=self.start.data_ptr(),
             iterates=self.iterates.data_ptr(),

@@ -40,7 +40,8 @@ struct EpoGame {
 struct EpoRun {
     int64_t steps;
     double step_size;
-    const void* damping;       // [B, M, N]; infinite for agents that are held where they are
+    const void* damping;       // [B, M], or [B, M, N]: infinite for agents that are held where they are
+    int64_t damping_problem, damping_agent;
     int64_t record;            // whether to keep what the adjoint needs
     const void* start;
     void* iterates;            // [S + 1, ...], or one array that is overwritten where iterate_stride is 0

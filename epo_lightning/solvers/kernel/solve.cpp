@@ -260,7 +260,9 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
             Vec<T>*turn = arena.take(n * game.K), *thrust = arena.take(n * game.K), energy;
             Vec<T>*given = arena.take(n), *damping = arena.take(n), *raised = arena.take(n);
             for (int i = 0; i < n; ++i) {
-                for (int lane = 0; lane < W; ++lane) given[i][lane] = static_cast<const T*>(run.damping)[group.row_of(i, lane)];
+                for (int lane = 0; lane < W; ++lane)
+                    given[i][lane] = static_cast<const T*>(
+                        run.damping)[group.problem[lane] * run.damping_problem + group.agent[i * W + lane] * run.damping_agent];
                 damping[i] = given[i];
                 raised[i] = most<T>(given[i], splat<T>(T(kLeastRaised)));
             }
