@@ -110,6 +110,7 @@ class Candidates(Minimiser):
                 log_marginals=torch.where(sound[:, None, None], log_marginals, torch.nan),
                 log_partition=torch.where(sound, log_partition, torch.nan),
             ),
+            assignment=chosen,
         )
 
 
