@@ -329,7 +329,7 @@ class Equilibrium(_Batch):
         optimum: E at the local minimum that a tightly converged descent from the forecast leads to; never above ``energy``.
         gradient_norm: Euclidean norm of dE/du at the forecast; NaN where strategies are chosen among candidates.
         nash_gap: what each agent could gain by changing its strategy alone, to a local best response; zero where absent.
-        objective: J_i, what each agent minimises, at the forecast; zero where absent.
+        objective: J_i, what each agent minimises, at the forecast; zero where absent, NaN where it has no natural zero.
     """
 
     initial: Float[Tensor, " B"]

@@ -22,7 +22,7 @@ from epo_lightning.decoders.weights import OwnWeights, PairWeights
 from epo_lightning.forecasters.base import Forecaster, Task
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.game.convex_energy import ConvexEnergy
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.energy import RESIDUALS, Energy
 from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
@@ -195,6 +195,9 @@ class EPO(Forecaster):
         assert forecast.parameters is not None
         assert forecast.solution is not None
         report = equilibrium(self.energy, scene, forecast)
+        if report is not None and RESIDUALS not in self.energy.offers:
+            # Where an energy may be negative, zero means nothing, and a share of an objective neither.
+            report = dataclasses.replace(report, objective=torch.full_like(report.objective, torch.nan))
         return dataclasses.replace(forecast, equilibrium=report)
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torchmetrics import Metric
 
-from epo_lightning.metrics.functional import min_ade, min_fde, min_sade, min_sfde
+from epo_lightning.metrics.functional import min_ade, min_fde, min_sade, min_sade_of_likely, min_sfde
 from epo_lightning.metrics.functional.overlap import Shape, check_choice, overlap_rates
 from epo_lightning.scene import JointForecast, Scene
 
@@ -28,6 +28,9 @@ EQUILIBRIUM_METRICS = (
 )
 """How close the most likely joint mode is to an equilibrium of its game (:class:`~epo_lightning.scene.Equilibrium`): of the
 agents of a scene, the largest gap, and the largest share of its objective J_i that an agent could save."""
+MODE_METRICS = tuple(f"minSADE_{k}" for k in range(1, 17))
+"""The minSADE among the k most likely joint modes, for forecasts of several; more than sixteen are not told apart."""
+COLUMNS = METRICS + INITIAL_METRICS + EQUILIBRIUM_METRICS + MODE_METRICS
 _OF_SUBSETS = len(METRICS + INITIAL_METRICS)
 
 
@@ -56,9 +59,7 @@ class ForecastMetrics(Metric):
         check_choice("shape", shape, get_args(Shape))
         self.subsets, self.shape = tuple(subsets), shape
         # First row: all scenes; then one for each subset. Sums in double precision, see SceneMean.
-        zeros = torch.zeros(
-            1 + len(self.subsets), len(METRICS + INITIAL_METRICS + EQUILIBRIUM_METRICS), dtype=torch.float64
-        )
+        zeros = torch.zeros(1 + len(self.subsets), len(COLUMNS), dtype=torch.float64)
         self.add_state("total", zeros, dist_reduce_fx="sum")
         self.add_state("count", zeros.clone(), dist_reduce_fx="sum")
 
@@ -83,12 +84,12 @@ class ForecastMetrics(Metric):
         """Scores by name.
 
         The six metrics over all scenes are always there, NaN before the first scene; those of a subset, of initial
-        strategies and of equilibria only where there was one.
+        strategies, of equilibria and of some modes only where there was one.
         """
         mean = self.total / self.count
         scores = dict(zip(METRICS, mean[0], strict=False))
         for row, prefix in enumerate(("", *(f"{name}/" for name in self.subsets))):
-            for column, metric in enumerate(METRICS + INITIAL_METRICS + EQUILIBRIUM_METRICS):
+            for column, metric in enumerate(COLUMNS):
                 if self.count[row, column] > 0:
                     scores[prefix + metric] = mean[row, column]
         return scores
@@ -113,6 +114,10 @@ def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> Float[
         initial = forecast.initial_states
         columns.append(torch.full_like(columns[0], torch.nan) if initial is None else distance(initial, future, mask))
     columns += equilibrium_values(forecast)
+    none = torch.full_like(columns[0], torch.nan)
+    modes = min(states.shape[1], len(MODE_METRICS)) if states.shape[1] > 1 else 0
+    columns += min_sade_of_likely(states, forecast.probabilities, future, mask)[:, :modes].unbind(1)
+    columns += [none] * (len(MODE_METRICS) - modes)
     return torch.stack([column.double() for column in columns], dim=1)
 
 

@@ -43,11 +43,23 @@ def expected_scores(case: Case, shape: str, chosen: Tensor) -> dict[str, float]:
     return {name: torch.tensor(value).double()[chosen].nanmean().item() for name, value in values.items()}
 
 
+def likely_scores(case: Case) -> dict[str, float]:
+    """The minSADE of the likeliest modes of all scenes, scene by scene."""
+    scores: dict[str, list[float]] = {}
+    for b in range(len(case.states)):
+        order = sorted(range(case.states.shape[1]), key=lambda m: -case.probabilities[b, m].item())
+        for k in range(1, len(order) + 1):
+            states = case.states[b : b + 1, order[:k]]
+            value = reference.displacements(states, case.future[b : b + 1], case.mask[b : b + 1])["minSADE"]
+            scores.setdefault(f"minSADE_{k}", []).append(float(value[0]))
+    return {name: torch.tensor(values).double().nanmean().item() for name, values in scores.items()}
+
+
 @pytest.mark.parametrize("shape", ["disc", "box"])
 def test_scores_equal_the_reference_for_all_scenes_and_every_subset(shape: str) -> None:
     case, subset = big_case()
     scores = filled(case, subset, [slice(0, 8), slice(8, 9), slice(9, 23)], shape=shape)
-    expected = expected_scores(case, shape, subset >= 0)
+    expected = expected_scores(case, shape, subset >= 0) | likely_scores(case)
     for number, name in enumerate(SUBSETS[:2]):
         part = expected_scores(case, shape, subset == number)
         expected |= {f"{name}/{metric}": value for metric, value in part.items()}
@@ -63,7 +75,8 @@ def test_batches_do_not_matter() -> None:
 
 def test_subsets_need_names_and_numbers() -> None:
     case, _ = big_case()
-    assert set(filled(case, None, [slice(0, 23)])) == {*METRICS, "initial/minSADE", "initial/minSFDE"}
+    scores = {*METRICS, "initial/minSADE", "initial/minSFDE", *likely_scores(case)}
+    assert set(filled(case, None, [slice(0, 23)])) == scores
     beyond = filled(case, torch.full((23,), 7), [slice(0, 23)])
     assert not any(name.startswith(SUBSETS) for name in beyond)
 
@@ -72,7 +85,7 @@ def test_initial_scores_only_where_there_are_initial_strategies() -> None:
     case, _ = big_case()
     metrics = ForecastMetrics()
     metrics.update(case.forecast(), case.scene())
-    assert tuple(metrics.compute()) == METRICS
+    assert tuple(metrics.compute()) == (*METRICS, *likely_scores(case))
 
 
 @pytest.mark.filterwarnings("ignore:.*was called before the ``update``.*")

@@ -51,6 +51,19 @@ def min_sade(
     return _joint(*_average_errors(states, future, mask))
 
 
+def min_sade_of_likely(
+    states: Float[Tensor, "B M N K X"],
+    probabilities: Float[Tensor, "B M"],
+    future: Float[Tensor, "B N K _"],
+    mask: Bool[Tensor, "B N K"],
+) -> Float[Tensor, "B M"]:
+    """The minSADE among the k most likely joint modes, k = 1 .. M [m]; of equally likely ones the first count."""
+    error, counted = _average_errors(states, future, mask)
+    order = probabilities.argsort(dim=1, descending=True, stable=True)
+    joint = (error.sum(-1) / counted.sum(-1, keepdim=True)).gather(1, order)
+    return joint.cummin(1).values
+
+
 def min_sfde(
     states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, " B"]:
