@@ -269,7 +269,7 @@ class Status(IntEnum):
     SOLVED = 0
     """Every step was taken as the method defines it."""
     DAMPED = 1
-    """A factorisation failed at first and succeeded with more damping."""
+    """A factorisation succeeded with more damping only, or steps were shortened."""
     STOPPED = 2
     """A step could not be taken and the last good iterate was kept; or an implicit gradient was asked for where the Hessian
     is not positive definite."""

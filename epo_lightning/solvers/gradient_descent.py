@@ -5,8 +5,9 @@
 S = diag(scale) says how far controls of either channel move for the same force; it is gradient descent in u / S. Near a
 minimum with the Hessian H the steps contract if eta lambda_max(S H S) < 2 and run away beyond that, so the stiffest
 direction limits eta and the softest ones take 1 / (eta lambda) steps. On highways a turn rate moves positions by the speed
-more than an acceleration does, and a scale like [1, 0.03] makes both about as stiff. Nothing is clipped: a step that is too
-long is seen, because energies rise or cease to be numbers.
+more than an acceleration does, and a scale like [1, 0.03] makes both about as stiff. A step that is too long is seen,
+because the energy rises or ceases to be a number: it is not taken, and the sample's next ones are half as long. Weights are
+inferred, and a game with stiff ones would run away otherwise; learning from where it ran to would make it stiffer still.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from epo_lightning.solvers.dense import gradient
 class GradientDescent(Stepwise):
     """S steps against the gradient, differentiable: EBIOC's "optimisation variant" of its synthesis (arXiv 1904.05453).
 
-    A step that would lead to where the energy or its gradient is no number is not taken: that sample keeps its last good
-    iterate and has the status STOPPED.
+    A step that would raise a sample's energy is not taken, and the next ones are half as long: its status is DAMPED, or
+    STOPPED where no step could be taken at all.
 
     Example::
 
@@ -97,7 +98,8 @@ def descend(
 ) -> Solution:
     """Take steps u <- u - eta S^2 dE/du + noise S z from the initial strategies, with z ~ N(0, I).
 
-    Differentiable if gradients are recorded. Absent agents' controls are zero.
+    Differentiable if gradients are recorded, which steps are taken being constant. Absent agents' controls are zero. Noise
+    keeps an energy of n controls n / 2 above its lowest value: what lies ten times as far above was too long a step.
 
     Raises:
         ValueError: scene and parameters do not fit together.
@@ -110,25 +112,33 @@ def descend(
     controls = torch.where(present, start, 0.0)
     channels = start.new_tensor(list(scale))
     everyone = torch.ones(start.shape[:2], dtype=torch.bool, device=start.device)
-    energies, slope, going = _look(energy, scene, parameters, controls, everyone)
-    initial_energy = energies
+    energies, slope, sound = _look(energy, scene, parameters, controls, everyone)
+    initial_energy, length = energies, torch.ones_like(energies)
+    taken = torch.zeros_like(sound)
+    slack = 5.0 * (10.0 + scene.agent_mask.sum(1)[:, None] * start.shape[-2:].numel()) if noise else 0.0
+    lowest = energies
     for step in range(steps):
-        moved = controls - step_size * channels.square() * slope
+        reach = length[..., None, None, None]
+        moved = controls - step_size * reach * channels.square() * slope
         if noise:
-            moved = moved + noise * channels * torch.where(present, torch.randn_like(start), 0.0)
+            moved = moved + noise * reach.sqrt() * channels * torch.where(present, torch.randn_like(start), 0.0)
         # Nothing comes after the last gradient that would have to be differentiated.
         with torch.set_grad_enabled(torch.is_grad_enabled() and step < steps - 1):
-            value, ahead, going = _look(energy, scene, parameters, moved, going)
-        keep = going[..., None, None, None]
+            value, ahead, finite = _look(energy, scene, parameters, moved, sound)
+        good = finite & (value <= lowest + slack)
+        keep = good[..., None, None, None]
         controls, slope = torch.where(keep, moved, controls), torch.where(keep, ahead, slope)
-        energies = torch.where(going, value, energies)
+        energies, length = torch.where(good, value, energies), torch.where(good, length, 0.5 * length)
+        lowest = torch.minimum(lowest, energies)
+        taken |= good
+    shortened = torch.where(length < 1.0, Status.DAMPED, Status.SOLVED)
     return Solution(
         controls=controls,
         states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt),
         initial_energy=initial_energy,
         energy=energies,
         gradient_norm=slope.detach().flatten(2).norm(dim=-1),
-        status=torch.where(going, Status.SOLVED, Status.STOPPED),
+        status=torch.where(sound & (taken | (steps == 0)), shortened, Status.STOPPED),
     )
 
 

@@ -5,7 +5,8 @@
 This is the unadjusted Langevin algorithm, preconditioned by S = diag(scale). As delta goes to zero, its samples are those of
 exp(-E) for any S; a step that is clipped has no such limit. For a quadratic energy it converges if
 delta^2 / 2 lambda_max(S H S) < 2, and along a direction of curvature lambda of S H S samples then are wider than exp(-E) by
-the factor 1 / (1 - delta^2 lambda / 4) in variance.
+the factor 1 / (1 - delta^2 lambda / 4) in variance. Steps that lead far above what noise explains are not taken
+(:mod:`~epo_lightning.solvers.gradient_descent`).
 """
 
 from __future__ import annotations

@@ -68,14 +68,15 @@ def test_steps_on_a_quadratic_energy_are_powers():
     assert (solution.status == Status.SOLVED).all()
 
 
-def test_steps_contract_up_to_the_bound_and_no_further():
+def test_steps_contract_up_to_the_bound_and_are_shortened_beyond_it():
     scene, parameters = quadratic()
     parameters.own_weights["acc"].fill_(2.0)
     parameters.own_weights["turnr"].fill_(20.0)
     bound = 2.0 / max(2.0**2, 20.0**2 * 0.1**2)  # 2 / lambda_max(S H S)
-    for share, grows in ((0.99, False), (1.01, True)):
+    for share, status in ((0.99, Status.SOLVED), (1.01, Status.DAMPED), (50.0, Status.DAMPED)):
         solution = GradientDescent(60, share * bound, [1.0, 0.1])(QUADRATIC, scene, parameters)
-        assert ((solution.energy > solution.initial_energy) == grows).all()
+        assert (solution.energy < 0.2 * solution.initial_energy).all()
+        assert (solution.status == status).all()
 
 
 @pytest.mark.parametrize("steps", [1, 3])
