@@ -185,6 +185,48 @@ def test_any_game_gives_its_gradient_and_gauss_newton_matrix(energy):
         assert_close(one, other)
 
 
+def test_agents_that_touch_tell_of_each_other_while_controls_are_missing():
+    scene, parameters, controls = setting(ALL, agents=3)
+    mask = torch.ones(3, 3, HORIZON, dtype=torch.bool)
+    mask[0, 1, 2:] = False
+    mask[1, 0] = False
+    mask[2, 1:, 1:] = False
+    seen = dataclasses.replace(scene, future_mask=mask)
+    shown = controls[:, None].expand(-1, 3, -1, -1, -1).contiguous()
+    value, sound = log_densities(GAME, seen, parameters, shown, 0.1)
+    assert sound.all()
+    _, slope = dense.gradient(GAME, scene, parameters, shown)
+    matrix = dense.gauss_newton(Other(GAME), scene, parameters, shown)
+    covariance = torch.linalg.inv(matrix + 0.1 * torch.eye(matrix.shape[-1], dtype=torch.float64))
+    away = (covariance @ slope.flatten(2)[..., None])[..., 0]  # of the demonstration from the mean
+    expected = []
+    for index, told in enumerate(mask.flatten(1).repeat_interleave(2, 1)):
+        some = covariance[index][:, told][:, :, told]
+        distance = (away[index][:, told] * torch.linalg.solve(some, away[index][:, told])).sum(-1)
+        expected.append(-0.5 * (distance + torch.linalg.slogdet(some)[1] + told.sum() * math.log(2 * math.pi)))
+    expected = torch.stack(expected)
+    assert_close(value, expected)
+    leaves = list(parameters.own_weights.values()) + list(parameters.pair_weights.values())
+    found, correct = (torch.autograd.grad(v.sum(), leaves, retain_graph=True) for v in (value, expected))
+    assert (found[-1] != 0).any()
+    for one, other in zip(found, correct, strict=True):
+        assert_close(one, other)
+
+
+@pytest.mark.parametrize("pair", [[], ["proximity"], ["proximity", "circles"]])
+def test_an_agent_on_its_own_has_no_pairs(pair):
+    energy = FeatureEnergy(own=ALL, pair=pair, bounds=BOUNDS)
+    scene, parameters, controls = setting(ALL, modes=2, agents=1)
+    parameters.pair_weights["circles"] = parameters.pair_weights["proximity"]
+    shown = controls[:, None].expand(-1, 2, -1, -1, -1)
+    value, _ = log_densities(energy, scene, parameters, shown, 0.1)
+    expected, _ = log_densities(Other(dataclasses.replace(energy, pair=[])), scene, parameters, shown, 0.1)
+    assert_close(value, expected)
+    leaves = list(parameters.own_weights.values())
+    for one, other in zip(*(torch.autograd.grad(v.sum(), leaves) for v in (value, expected)), strict=True):
+        assert_close(one, other)
+
+
 def test_energies_of_other_kinds_have_the_same_likelihood():
     scene, parameters, controls = setting(ALL)
     shown = controls[:, None].expand(-1, 3, -1, -1, -1)
