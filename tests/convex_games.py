@@ -14,6 +14,16 @@ OWN = ("goal", "lateral", "velref", "lat_vel", "acc", "lat_acc", "jerk", "lat_je
 """Every own term."""
 
 
+class Unaware(ConvexEnergy):
+    """The same energy for those who have nothing but automatic differentiation."""
+
+    hessian = None
+
+
+def unaware(energy: ConvexEnergy) -> Unaware:
+    return Unaware(energy.own, energy.pair, energy.gap, energy.direction, energy.within, energy.dynamics)
+
+
 def convex_energy(
     own=OWN, direction: str = "along", gap: float = 0.5, within: float = 5.0, pair=("order",)
 ) -> ConvexEnergy:

@@ -84,6 +84,49 @@ _OWN: Mapping[str, tuple[Callable[[_Motion], Tensor], str | None]] = {
 """Name to residuals [B, C, N, R], and what they refer to."""
 
 
+@dataclass(frozen=True)
+class _Moves:
+    """What K controls of one direction change at every step, as matrices: controls, their rates, velocities, positions."""
+
+    control: Float[Tensor, "K K"]
+    rate: Float[Tensor, "_ K"]
+    velocity: Float[Tensor, "K K"]
+    position: Float[Tensor, "K K"]
+
+    @staticmethod
+    def of(dt: float, controls: Float[Tensor, "B M N K 2"]) -> _Moves:
+        """Those of :class:`~epo_lightning.game.double_integrator.DoubleIntegrator`."""
+        control = torch.eye(controls.shape[3], dtype=controls.dtype, device=controls.device)
+        velocity = dt * control.cumsum(0)
+        position = dt * (velocity.cumsum(0) - velocity)  # explicit Euler: a step's velocity moves the next one
+        return _Moves(control, control.diff(dim=0) / dt, velocity, position)
+
+
+def _curvature(
+    ahead: Callable[[_Moves], Tensor] | None, aside: Callable[[_Moves], Tensor] | None
+) -> Callable[[_Moves], Tensor]:
+    """Second derivatives [2, K, K] of half the squares of what controls along and across change, if anything."""
+
+    def both(moves: _Moves) -> Tensor:
+        rows = [torch.zeros_like(moves.control[:1]) if of is None else of(moves) for of in (ahead, aside)]
+        return torch.stack([row.mT @ row for row in rows])
+
+    return both
+
+
+_CURVATURE: Mapping[str, Callable[[_Moves], Tensor]] = {
+    "goal": _curvature(lambda moves: moves.position[-1:], lambda moves: moves.position[-1:]),
+    "lateral": _curvature(None, lambda moves: moves.position),
+    "velref": _curvature(lambda moves: moves.velocity, None),
+    "lat_vel": _curvature(None, lambda moves: moves.velocity),
+    "acc": _curvature(lambda moves: moves.control, None),
+    "lat_acc": _curvature(None, lambda moves: moves.control),
+    "jerk": _curvature(lambda moves: moves.rate, None),
+    "lat_jerk": _curvature(None, lambda moves: moves.rate),
+}
+"""Name to second derivatives of an own term of weight one."""
+
+
 @register("energy", "convex")
 @dataclass(frozen=True)
 class ConvexEnergy(Energy):
@@ -187,6 +230,53 @@ class ConvexEnergy(Energy):
         of_agents = dict(self._of_agents(scene, parameters, states, controls))
         return of_agents | dict(self._of_pairs(scene, parameters, states[:, :, first], states[:, :, second]))
 
+    def hessian(
+        self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+    ) -> Float[Tensor, "B M n n"]:
+        """d2E/du2 in closed form, n = 2 N K, in the order of ``controls.flatten(2)``; zero for absent agents.
+
+        Residuals are linear in the controls, so their second derivatives are constants of the scene, times squared weights:
+        of one direction of one agent for own terms, and for a pair, over the steps at which its hinge is active,
+
+            w_ij^2 sum_t g_a g_b P_t^T P_t,
+
+        with g, n_ij in the frames of both agents with opposite signs, and the row P_t of what controls move an agent by
+        until t. This is J^T J too. Differentiable with respect to weights; that hinges turn active is a jump, of which no
+        derivative knows.
+
+        Raises:
+            ValueError: shapes or names of scene, parameters and controls that do not fit together.
+        """
+        self.validate(scene, parameters, controls)
+        batch, modes, agents, steps, _ = controls.shape
+        motions = _Moves.of(scene.dt, controls)
+        curvatures = torch.stack([_CURVATURE[name](motions) for name in self.own]).flatten(1)
+        named = torch.broadcast_tensors(*(self._own_weight(scene, parameters, name) for name in self.own))
+        weights = torch.stack(named, -1)
+        own = (weights.square() @ curvatures).unflatten(-1, (2, steps, steps))  # [B, M, N, 2, K, K]
+        shape = batch, 2 * agents, 2 * agents, modes, steps, steps
+        first, second = pairs(agents, controls.device)
+        if self.pair and len(first):
+            present = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
+            states = self.dynamics.rollout(self.initial(scene), present, scene.dt)
+            active = self._short(scene, parameters, states[:, :, first], states[:, :, second]) > 0
+            count = torch.where(active, self._order_weight(scene, parameters).square()[..., None], 0.0)
+            between = (motions.position.mT * count.transpose(1, 2)[..., None, :]) @ motions.position  # [B, P, M, K, K]
+            heading = self.initial(scene)[:, 0, :, HEADING]
+            line = self.directions(scene)
+            ends = [rotate(line, -heading[:, which]) for which in (first, second)]
+            signed = torch.nn.functional.one_hot(torch.stack((first, second)), agents).to(controls.dtype)
+            sides = signed[0][..., None] * ends[0][:, :, None] - signed[1][..., None] * ends[1][:, :, None]
+            sides = sides.flatten(2)  # [B, P, 2 N]
+            products = (sides[..., :, None] * sides[..., None, :]).flatten(2).mT
+            matrix = (products @ between.flatten(2)).view(shape)
+        else:
+            matrix = controls.new_zeros(shape)
+        matrix.diagonal(dim1=1, dim2=2).add_(own.flatten(2, 3).movedim(2, -1))
+        matrix = matrix.unflatten(2, (agents, 2)).unflatten(1, (agents, 2)).permute(0, 5, 1, 6, 2, 3, 7, 4)
+        matrix = torch.stack(matrix.unbind(-1), -1)  # far faster than to reorder all at once
+        return matrix.view(batch, modes, 2 * agents * steps, 2 * agents * steps)
+
     def own_terms(
         self,
         scene: Scene,
@@ -240,14 +330,23 @@ class ConvexEnergy(Energy):
     ) -> Iterator[tuple[str, Tensor]]:
         if not self.pair:
             return
+        yield "order", self._order_weight(scene, parameters)[..., None] * self._short(scene, parameters, first, second)
+
+    def _order_weight(self, scene: Scene, parameters: GameParameters) -> Float[Tensor, "B M P"]:
+        """Weights of the order, zero where an agent is absent."""
+        return torch.where(self.pair_mask(scene)[:, None], parameters.pair_weights["order"], 0.0)
+
+    def _short(
+        self, scene: Scene, parameters: GameParameters, first: Tensor, second: Tensor
+    ) -> Float[Tensor, "B M P K"]:
+        """The hinges: what the distance falls short of [m], zero at steps that do not count and where an agent is absent."""
         assert parameters.order is not None
         exists = self.pair_mask(scene)[:, None]
         order = torch.where(exists, parameters.order, 1.0)[..., None]
-        weight = torch.where(exists, parameters.pair_weights["order"], 0.0)[..., None]
         ahead = (self.directions(scene)[:, None, :, None] * (first - second)[..., :2]).sum(-1)
         short = torch.relu(self.distance(scene)[:, None, :, None] - order * ahead)
         counts = (self.near(scene, first.shape[3]) & exists[:, 0, :, None])[:, None]
-        yield "order", weight * torch.where(counts, short, 0.0)
+        return torch.where(counts, short, 0.0)
 
     def directions(self, scene: Scene) -> Float[Tensor, "B P 2"]:
         """The unit vectors n_ij, in which i is ahead of j for an order of +1. Constants of the scene."""

@@ -8,6 +8,7 @@ and zeros elsewhere: they change no factorisation and no solution.
 from __future__ import annotations
 
 import dataclasses
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,6 +19,16 @@ from epo_lightning.scene import GameParameters, Scene, Status
 
 _PRODUCTS = 64
 """Products of matrices and vectors that are computed together: a bound on memory."""
+
+
+@runtime_checkable
+class PiecewiseQuadratic(Protocol):
+    """An energy of residuals that are linear by pieces, and which knows its curvature without automatic differentiation."""
+
+    def hessian(
+        self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+    ) -> Float[Tensor, "B M n n"]:
+        """d2E/du2, which is J^T J of the residuals too, n = 2 N K; zero for absent agents."""
 
 
 def gradient(
@@ -36,7 +47,12 @@ def gradient(
 def hessian(
     energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
 ) -> Float[Tensor, "B M n n"]:
-    """d2E/du2, n = 2 N K, by n reverse passes through the gradient; differentiable if gradients are recorded."""
+    """d2E/du2, n = 2 N K; differentiable if gradients are recorded.
+
+    By n reverse passes through the gradient, or by the energy itself if it is :class:`PiecewiseQuadratic`.
+    """
+    if isinstance(energy, PiecewiseQuadratic):
+        return _closed_form(energy, scene, parameters, controls)
     taped = torch.is_grad_enabled()
     with torch.enable_grad():
         if not controls.requires_grad:
@@ -73,6 +89,8 @@ def gauss_newton(
         raise ValueError(
             f"{type(energy).__name__} has no residuals, of which Gauss-Newton matrices are made; take the exact Hessian"
         )
+    if isinstance(energy, PiecewiseQuadratic):
+        return _closed_form(energy, scene, parameters, controls)
     energy.validate(scene, parameters, controls)
     if hasattr(energy, "linearisation"):
         _, changes = energy.linearisation(scene, parameters, controls, _units(controls))
@@ -126,10 +144,12 @@ def attach(
 
 def factorise(matrix: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
     """Lower Cholesky factors and which matrices have one; the identity in place of the others."""
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    # What is no number in the lower triangle reaches the diagonal of its row: what is above is never looked at.
+    sound = (failed == 0) & factor.diagonal(dim1=-2, dim2=-1).isfinite().all(-1)
+    if sound.device.type == "cpu" and sound.all():
+        return factor, sound
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    finite = matrix.isfinite().flatten(-2).all(-1)
-    factor, failed = torch.linalg.cholesky_ex(torch.where(finite[..., None, None], matrix, identity))
-    sound = finite & (failed == 0)
     return torch.where(sound[..., None, None], factor, identity), sound
 
 
@@ -138,6 +158,16 @@ def _units(controls: Tensor) -> Float[Tensor, "n B M N K 2"]:
     count = controls.shape[2:].numel()
     units = torch.eye(count, dtype=controls.dtype, device=controls.device)
     return units.view(count, 1, 1, *controls.shape[2:]).expand(count, *controls.shape)
+
+
+def _closed_form(
+    energy: PiecewiseQuadratic, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+) -> Float[Tensor, "B M n n"]:
+    """What the energy knows, with ones on the diagonal for absent agents."""
+    matrix = energy.hessian(scene, parameters, controls)
+    absent = ~scene.agent_mask.repeat_interleave(2 * controls.shape[3], 1)
+    matrix.diagonal(dim1=-2, dim2=-1).add_(absent[:, None])
+    return matrix
 
 
 def _of_present(scene: Scene, matrix: Float[Tensor, "B M n n"]) -> Float[Tensor, "B M n n"]:

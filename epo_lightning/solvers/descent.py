@@ -54,9 +54,13 @@ def level(
     Close to a minimum, energies tell points apart that are the root of the machine's precision away from each other, and
     gradients tell apart what is nearer (Hager and Zhang 2005, approximate Wolfe conditions).
     """
-    rounding = _ROUNDING * torch.finfo(value.dtype).eps * value.abs()
     flatter = trial_slope.flatten(2).norm(dim=-1) < slope.flatten(2).norm(dim=-1)
-    return (trial_value <= value + rounding) & flatter
+    return (trial_value <= value + rounding(value)) & flatter
+
+
+def rounding(value: Float[Tensor, "B M"]) -> Float[Tensor, "B M"]:
+    """Differences of energies that mean nothing."""
+    return _ROUNDING * torch.finfo(value.dtype).eps * value.abs()
 
 
 def ended(done: Bool[Tensor, "B M"]) -> bool:

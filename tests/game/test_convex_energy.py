@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 import yaml
-from convex_games import OWN, convex_energy, convex_game, widen_convex
+from convex_games import OWN, convex_energy, convex_game, unaware, widen_convex
 from games import pad, reordered
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,6 +19,7 @@ from epo_lightning.game.double_integrator import DoubleIntegrator
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.registry import ConfigError, build
 from epo_lightning.scene import Scene
+from epo_lightning.solvers import dense
 from epo_lightning.solvers.dense import gradient, hessian
 
 DIRECTIONS = ("along", "across")
@@ -160,6 +161,57 @@ def test_absent_agents_do_not_matter(direction):
     assert (more[:, :, 3:] == 0).all()
     matrix = hessian(energy, pad(scene, 2), wide, wide.initial_controls)
     assert matrix.isfinite().all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    direction=st.sampled_from(DIRECTIONS),
+    agents=st.integers(1, 4),
+    own=st.sets(st.sampled_from(OWN)),
+    pair=st.sampled_from([("order",), ()]),
+    modes=st.integers(1, 2),
+    shared=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_curvatures_in_closed_form_equal_automatic_ones(direction, agents, own, pair, modes, shared, seed):
+    torch.manual_seed(seed)
+    scene, game = convex_game(agents=agents, modes=1 if shared else modes)  # or one game for all modes
+    present = torch.rand(scene.agent_mask.shape) < 0.7
+    nobody = ~present[:, None, :, None, None]
+    controls = torch.where(nobody, torch.nan, torch.randn(2, modes, agents, 6, 2, dtype=torch.float64))
+    scene = dataclasses.replace(scene, agent_mask=present)
+    energy = convex_energy([*own | {"acc", "lat_acc"}], direction, pair=pair)
+    expected = hessian(unaware(energy), scene, game, controls)
+    torch.testing.assert_close(hessian(energy, scene, game, controls), expected, rtol=1e-12, atol=1e-10)
+    by_residuals = dense.gauss_newton(unaware(energy), scene, game, controls)
+    torch.testing.assert_close(dense.gauss_newton(energy, scene, game, controls), by_residuals, rtol=1e-12, atol=1e-10)
+    alone = hessian(energy, scene[1], game[1], controls[1:])
+    torch.testing.assert_close(alone, expected[1:], rtol=1e-12, atol=1e-10)
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_curvatures_have_active_hinges_and_are_differentiable_by_every_weight(direction):
+    scene, game = convex_game()
+    energy = convex_energy(direction=direction)
+    short = energy.residuals(scene, game, game.initial_controls)["order"]
+    assert (short > 0).any()
+    assert (short == 0).any()
+    shape = hessian(energy, scene, game, game.initial_controls).shape
+    cotangent = torch.randn(shape, dtype=torch.float64)
+    own, pair = energy.weighted
+    for kind, name in [("own_weights", name) for name in own] + [("pair_weights", name) for name in pair]:
+
+        def value(weights, kind=kind, name=name):
+            changed = dataclasses.replace(game, **{kind: {**getattr(game, kind), name: weights}})
+            return (cotangent * hessian(energy, scene, changed, game.initial_controls)).sum()
+
+        weights = getattr(game, kind)[name].clone().requires_grad_()
+        (slope,) = torch.autograd.grad(value(weights), weights)
+        shift = torch.randn_like(weights)
+        with torch.no_grad():
+            numeric = (value(weights + 1e-5 * shift) - value(weights - 1e-5 * shift)) / 2e-5
+        assert numeric != 0
+        torch.testing.assert_close((slope * shift).sum(), numeric, rtol=1e-5, atol=1e-7)
 
 
 def still(states) -> Scene:

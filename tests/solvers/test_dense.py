@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from convex_games import convex_energy, convex_game, widen_convex
+from convex_games import convex_energy, convex_game, unaware, widen_convex
 from games import leaves_of, normal_equations, pad, random_game, random_scene, widen
 from torch import nn
 
@@ -16,7 +16,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Status
 from epo_lightning.solvers import implicit
 from epo_lightning.solvers.backward import Implicit
-from epo_lightning.solvers.dense import attach, gauss_newton, gradient, hessian
+from epo_lightning.solvers.dense import attach, factorise, gauss_newton, gradient, hessian
 from epo_lightning.solvers.newton import Newton
 
 FEATURES = FeatureEnergy(["goal", "vel", "acc", "turnr"], ["proximity"])
@@ -90,7 +90,7 @@ def test_hessians_equal_central_differences_of_gradients():
 def test_gauss_newton_is_exact_where_residuals_are_linear():
     scene, game = convex_game()
     for direction in ("along", "across"):
-        energy = convex_energy(direction=direction)
+        energy = unaware(convex_energy(direction=direction))
         approximate = gauss_newton(energy, scene, game, game.initial_controls)
         torch.testing.assert_close(approximate, hessian(energy, scene, game, game.initial_controls), rtol=0, atol=1e-10)
 
@@ -131,6 +131,21 @@ def test_absent_agents_have_rows_of_the_identity(function, convex):
     assert (padded[..., :size, size:] == 0).all()
     rest = padded[..., size:, size:]
     assert torch.equal(rest, torch.eye(rest.shape[-1], dtype=torch.float64).expand_as(rest))
+
+
+def test_matrices_without_a_factor_are_found_and_leave_the_others_alone():
+    square = torch.randn(6, 4, 4, dtype=torch.float64)
+    matrix = square @ square.mT + torch.eye(4, dtype=torch.float64)
+    expected = torch.linalg.cholesky(matrix)
+    assert torch.equal(factorise(matrix)[0], expected)
+    matrix[1, 3, 0] = matrix[1, 0, 3] = torch.nan
+    matrix[2, 1, 1] = torch.inf
+    matrix[3, 2, 1] = matrix[3, 1, 2] = -torch.inf
+    matrix[4] -= 50.0 * torch.eye(4, dtype=torch.float64)
+    factor, sound = factorise(matrix)
+    assert sound.tolist() == [True, False, False, False, False, True]
+    assert torch.equal(factor[sound], expected[sound])
+    assert torch.equal(factor[~sound], torch.eye(4, dtype=torch.float64).expand(4, 4, 4))
 
 
 def test_energies_without_residuals_have_no_gauss_newton_matrix():

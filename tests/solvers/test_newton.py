@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from epo_lightning.experiment.compose import tree
-from epo_lightning.game.convex_energy import FLOOR
+from epo_lightning.game.convex_energy import FLOOR, ConvexEnergy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import GameParameters, Scene, Status
@@ -150,6 +150,52 @@ def test_newton_leaves_where_the_hessian_is_indefinite():
     assert (solution.energy < solution.initial_energy).all()
     assert solution.gradient_norm.max() < 1e-8
     assert (torch.linalg.eigvalsh(hessian(FEATURES, scene, game, solution.controls).detach())[..., 0] > 0).all()
+
+
+@pytest.mark.parametrize("direction", ["along", "across"])
+def test_hinges_are_left_behind_from_anywhere(direction):
+    """Whole Newton steps between the pieces of a quadratic may go up, or in a circle; here they are shortened."""
+    scene, game = convex_game(scenes=8, agents=4, modes=2, horizon=10)
+    scene = dataclasses.replace(scene, dt=0.4)
+    game = dataclasses.replace(
+        game,
+        initial_controls=100.0 * game.initial_controls,
+        pair_weights={name: 10.0 * weight for name, weight in game.pair_weights.items()},
+    )
+    energy = convex_energy(direction=direction, gap=2.0, within=20.0)
+    exact = PRECISE[0](energy, scene, game)
+    assert exact.gradient_norm.max() < 1e-8
+    assert (exact.status == Status.SOLVED).all()
+    energies = [Newton(steps, 1e-8)(energy, scene, game).energy for steps in (0, 1, 2, 3, 5, 8, 12, 40)]
+    for before, after in itertools.pairwise(energies):
+        assert (after <= before * (1 + 1e-14)).all()
+    torch.testing.assert_close(energies[-1], exact.energy, rtol=1e-12, atol=0)
+    single = Newton(40, 1e-4)(energy, scene, game.to(torch.float32))
+    assert (single.controls.double() - exact.controls).abs().max() < 0.01
+    torch.testing.assert_close(single.energy.double(), exact.energy, rtol=1e-5, atol=0)
+
+
+class Counted(ConvexEnergy):
+    """Remembers of how many scenes second derivatives were asked for."""
+
+    asked = ()
+
+    def hessian(self, scene, parameters, controls):
+        Counted.asked += (len(controls),)
+        return super().hessian(scene, parameters, controls)
+
+
+def test_hessians_are_of_scenes_that_have_not_converged():
+    scene, game = convex_game(scenes=4)
+    energy = Counted(convex_energy().own)
+    minimum = Newton(50, 1e-9)(energy, scene[:3], game[:3])
+    assert len(Counted.asked) < 12
+    start = torch.cat((minimum.controls, game.initial_controls[3:]))
+    Counted.asked = ()
+    solution = Newton(50, 1e-8)(energy, scene, dataclasses.replace(game, initial_controls=start))
+    assert set(Counted.asked) == {1}
+    assert torch.equal(solution.controls[:3], minimum.controls)
+    assert solution.gradient_norm.max() < 1e-7
 
 
 @pytest.mark.parametrize("minimise", [Newton(), LBFGS()], ids=["newton", "lbfgs"])
