@@ -36,6 +36,7 @@ from epo_lightning.objectives.terms import goal_term, observed_future
 from epo_lightning.registry import register
 from epo_lightning.scene import ACCELERATION, GameParameters, JointForecast, Scene
 from epo_lightning.solvers import dense
+from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
 
 _LINEAR = (Source.CONTROL, Source.RATE, Source.SPEED)
 """What features read that is linear in the controls of one channel."""
@@ -61,6 +62,7 @@ class Laplace(Objective):
     """
 
     terms = ("density", "initial", "goal")
+    needs = frozenset({PATH, STATIONARY, SAMPLES})  # a game for every mode, and strategies to start from
     of_energy = frozenset({RESIDUALS})
 
     def __init__(self, weights: Mapping[str, float], damping: float = 1e-3) -> None:

@@ -57,9 +57,9 @@ def works(energy: str, solver: str, backward: str, objective: str) -> bool:
         return solver in TABLES and backward == "unrolled"
     if backward != "detached":
         return False
-    if objective == "contrastive":
-        return solver not in TABLES
-    return energy in ("rpi", "convex")  # laplace: sums of squares
+    if solver in TABLES:
+        return False
+    return objective == "contrastive" or energy in ("rpi", "convex")  # laplace: sums of squares
 
 
 def configuration(chosen: dict[str, str]) -> dict:
