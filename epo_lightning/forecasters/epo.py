@@ -100,7 +100,9 @@ class EPO(Forecaster):
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs) if pair else None
         self.strategies = InitialStrategies(width, starts, horizon, control_scale) if initial == "decoded" else None
         self.motions = Motions(horizon, starts, **(motions or {})) if initial == "motions" else None
-        self.goals = GoalDecoder(width, scale) if task.candidates > 1 and energy.needs & {"goals", "reference"} else None
+        self.goals = (
+            GoalDecoder(width, scale) if task.candidates > 1 and energy.needs & {"goals", "reference"} else None
+        )
         self.orders = None
         if "order" in energy.needs:
             assert isinstance(energy, ConvexEnergy)
@@ -158,7 +160,9 @@ class EPO(Forecaster):
                 raise ValueError("the energy follows reference lines, but scene.goal_reference [B, N, G] is None")
             # Who has no candidate heads nowhere, not for the origin.
             heads = (logits > NO_CANDIDATE).any(-1)[:, None]
-            own_weights |= {name: own_weights[name].where(heads, 0.0) for name in self.energy.heading & own_weights.keys()}
+            own_weights |= {
+                name: own_weights[name].where(heads, 0.0) for name in self.energy.heading & own_weights.keys()
+            }
         elif "goals" in self.energy.needs:
             goals = given_goals(scene)[:, None].expand(-1, self.solver.games(self.modes), -1, -1)
         return GameParameters(

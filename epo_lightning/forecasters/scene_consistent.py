@@ -63,4 +63,3 @@ class SceneConsistent(Forecaster):
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         return imitation_terms(scene, forecast, self.loss_weights, self.relaxation.at(self.global_step))
-
