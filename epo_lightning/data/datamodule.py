@@ -8,7 +8,7 @@ there are none. A batch is what an optimisation step sees, on however many devic
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -30,6 +30,35 @@ class SceneDataset(Protocol):
 
     def set_epoch(self, epoch: int) -> None:
         """Make the choices that differ from epoch to epoch."""
+
+
+class Part:
+    """A share of a data set, drawn once, in its order: every seed and every row of a table sees the same scenes.
+
+    Args:
+        whole: the data set.
+        share: of its scenes, at least one of them.
+    """
+
+    def __init__(self, whole: SceneDataset, share: float) -> None:
+        count = max(1, round(share * len(whole)))
+        drawn = torch.randperm(len(whole), generator=torch.Generator().manual_seed(0))
+        self.whole, self.chosen = whole, drawn[:count].sort().values
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    @property
+    def provenance(self) -> Any:
+        """As of the whole."""
+        return getattr(self.whole, "provenance", None)
+
+    def __getitem__(self, indices: Tensor) -> Scene:
+        return self.whole[self.chosen[indices]]
+
+    def set_epoch(self, epoch: int) -> None:
+        """Make the choices that differ from epoch to epoch."""
+        self.whole.set_epoch(epoch)
 
 
 class BatchSampler(DistributedSampler):
@@ -110,6 +139,7 @@ class SceneDataModule(LightningDataModule):
         subsets: names of the subsets that ``Scene.subset`` counts; empty where there are none.
         dt: time step [s].
         horizon: future steps K.
+        share: of the scenes of every split that is used.
         num_agents: agents per scene N.
         order_seed: of the order of the batches; the data's own seed unless a run sets its own.
     """
@@ -120,15 +150,17 @@ class SceneDataModule(LightningDataModule):
     num_agents: int
     has_map = False
 
-    def __init__(self, batch_size: int, seed: int) -> None:
+    def __init__(self, batch_size: int, seed: int, share: float = 1.0) -> None:
         super().__init__()
+        if not 0 < share <= 1:
+            raise ConfigError(f"data.share is {share}, expected a share of the scenes of every split, in (0, 1]")
         if not isinstance(batch_size, int) or isinstance(batch_size, bool) or batch_size < 2:
             raise ConfigError(
                 f"batch_size is {batch_size!r}, but batch normalisation needs at least 2 scenes in a batch"
             )
         if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**31:
             raise ConfigError(f"seed is {seed!r}, expected a whole number from 0 to 2^31 - 1")
-        self.batch_size, self.seed = batch_size, seed
+        self.batch_size, self.seed, self.share = batch_size, seed, share
         self.order_seed = seed
         self._opened: dict[str, SceneDataset] = {}
 
@@ -141,7 +173,8 @@ class SceneDataModule(LightningDataModule):
         names = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
         for name in names.get(stage or "fit", ("train", "val")):
             if name not in self._opened:
-                self._opened[name] = self.open(name)
+                whole = self.open(name)
+                self._opened[name] = whole if self.share == 1 else Part(whole, self.share)
 
     def dataset(self, split: str) -> SceneDataset:
         """The opened data set of a split.

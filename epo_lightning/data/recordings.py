@@ -72,6 +72,7 @@ class RecordedData(SceneDataModule):
         root: folder of the cache; None for $EPO_CACHE or ``cache``.
         seed: of the draws, and of the batches' order where a run sets no other.
         batch_size: scenes per batch.
+        share: of the scenes of every split that is used, drawn once.
     """
 
     def __init__(
@@ -91,8 +92,9 @@ class RecordedData(SceneDataModule):
         root: str | None = None,
         seed: int = 0,
         batch_size: int = 32,
+        share: float = 1.0,
     ) -> None:
-        super().__init__(batch_size, seed)
+        super().__init__(batch_size, seed, share)
         self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
         self.list_sources = lookup("format", format)
         self.recipe = _recipe(windows)

@@ -1,4 +1,4 @@
-"""Every energy with every minimiser, derivative and objective: it learns something in a step, or is refused with a reason."""
+"""Every energy with every minimiser, derivative and objective: it learns in a step, or is refused with a reason."""
 
 from __future__ import annotations
 

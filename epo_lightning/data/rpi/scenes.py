@@ -96,6 +96,7 @@ class RPIData(SceneDataModule):
         sizes: most records of training, validation and test; None for all.
         targets: ``both``, ``executed`` or ``sampled``; see :class:`RPIDataset`.
         batch_size: scenes per batch.
+        share: of the scenes of every split that is used, drawn once.
     """
 
     subsets = SUBSETS
@@ -115,8 +116,9 @@ class RPIData(SceneDataModule):
         sizes: Sequence[int] | None = (47822, 6228, 6228),
         targets: str = "both",
         batch_size: int = 32,
+        share: float = 1.0,
     ) -> None:
-        super().__init__(batch_size, seed)
+        super().__init__(batch_size, seed, share)
         self.root = Path(root).expanduser() if root else cache.default_root()
         self.games = _whole("games", games, 3, "training, validation and test need main games of their own")
         self.placements = _whole("placements", placements, 1, "the pedestrian must start somewhere")

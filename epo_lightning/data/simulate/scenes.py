@@ -20,7 +20,7 @@ class SimulatedHighway(RecordedData):
         recordings: per layout.
         minutes: that each of them lasts.
         layouts: their ids; null for all.
-        dataset, windows, test, val_share, val_by, frame, scale, root, batch_size: as of
+        dataset, windows, test, val_share, val_by, frame, scale, root, batch_size, share: as of
             :class:`~epo_lightning.data.recordings.RecordedData`.
         seed: of the traffic and of the splits, and of the batches' order where a run sets no other.
     """
@@ -40,6 +40,7 @@ class SimulatedHighway(RecordedData):
         root: str | None = None,
         seed: int = 0,
         batch_size: int = 32,
+        share: float = 1.0,
     ) -> None:
         self.simulation = simulate.config(seed, recordings, minutes, layouts)
         home = Path(root).expanduser() if root else cache.default_root()
@@ -56,6 +57,7 @@ class SimulatedHighway(RecordedData):
             root=root,
             seed=seed,
             batch_size=batch_size,
+            share=share,
         )
 
     def sources(self) -> list[Source]:
