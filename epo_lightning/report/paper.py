@@ -11,11 +11,11 @@ from typing import Any
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp")
 
 PAPER: dict[tuple[str, str, str], tuple[float, ...]] = {
-    # Table 1: the RPI test split, M = 2.
+    # Table 2: the RPI test split, M = 2.
     ("rpi", "v_lstm", "marginal"): (0.12, 0.20, 0.13, 0.23, 0.006),
     ("rpi", "v_lstm", "scene_consistent"): (0.04, 0.11, 0.04, 0.11, 0.001),
     ("rpi", "v_lstm", "epo"): (0.03, 0.08, 0.03, 0.08, 0.000),
-    # Table 2: the exiD test split, M = 5.
+    # Table 3: the exiD test split, M = 5.
     ("exid", "v_lstm", "constant_velocity"): (1.16, 2.87, 1.16, 2.87, 0.010),
     ("exid", "v_lstm", "marginal"): (1.25, 3.64, 1.98, 3.90, 0.031),
     ("exid", "v_lstm", "scene_consistent"): (0.82, 1.95, 1.07, 2.63, 0.010),
@@ -32,7 +32,7 @@ counts as ``overlap_authors``, which is half of that for two agents."""
 
 
 ABLATIONS: dict[str, tuple[float, ...]] = {
-    # Table 3. Its text says V-LSTM, but its row "Ours (full)" is that of VIBES in Table 2.
+    # Table 4. Its text says V-LSTM, but its row "Ours (full)" is that of VIBES in Table 3.
     "exid/v_lstm_epo_no_init": (0.89, 2.04, 1.01, 2.47, 0.007),
     "exid/v_lstm_epo_no_goal": (0.89, 2.13, 1.10, 2.64, 0.009),
 }

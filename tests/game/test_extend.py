@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -10,8 +11,11 @@ import torch
 from games import leaves_of, random_game, random_scene
 
 from epo_lightning.game import features
+from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.neural_energy import NeuralEnergy
 from epo_lightning.scene import Status
+from epo_lightning.solvers.gradient_descent import GradientDescent
 from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
 
 PAGE = Path(__file__).parents[2] / "docs" / "extend.md"
@@ -49,3 +53,18 @@ def test_documented_features_work_in_the_layer(documented):
     for name in documented:
         assert leaves.own_weights[name].grad.abs().max() > 0, name
     assert leaves.pair_weights["comfort"].grad.abs().max() > 0
+
+
+def test_documented_features_work_beside_networks(documented):
+    scene = random_scene(3, 2, history=2, horizon=7, dtype=torch.float64)
+    parameters = random_game(scene, own=("lateral",))
+    context = torch.randn(3, 2, 8, dtype=torch.float64)
+    parameters = dataclasses.replace(
+        parameters, pair_weights={"comfort": parameters.pair_weights["proximity"]}, context=context
+    )
+    energy = NeuralEnergy(Unicycle(), 8, 7, 1.0, own=["lateral"], pair=["comfort"]).double()
+    leaves = leaves_of(parameters)
+    solution = GradientDescent(steps=3, step_size=1e-3)(energy, scene, leaves)
+    assert (solution.energy < solution.initial_energy).all()
+    solution.controls.square().sum().backward()
+    assert leaves.own_weights["lateral"].grad.abs().max() > 0

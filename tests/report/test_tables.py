@@ -198,7 +198,7 @@ def test_rows_of_one_title_are_told_apart_by_what_differs(tmp_path: Path) -> Non
     assert [rows[name].settings for name in epo] == [{"solver.steps": steps} for steps in (1, 2, 12)]
     assert {rows[name].title for name in epo} == {"V-LSTM + EPO"}
     assert [rows[name].cells["minADE"].n for name in epo] == [2, 2, 2]
-    # Table 1 is of two steps.
+    # Table 2 is of two steps.
     assert [rows[name].cells["minSADE"].paper for name in epo] == [None, 0.03, None]
 
 
