@@ -27,7 +27,7 @@ from torch import Tensor
 
 from epo_lightning.game.circles import disc
 from epo_lightning.game.double_integrator import DoubleIntegrator, rotate
-from epo_lightning.game.energy import CONVEX, GRADIENT, RESIDUALS, Energy, pairs
+from epo_lightning.game.energy import CONVEX, GRADIENT, RESIDUALS, Energy, check_names, pairs
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import HEADING, SPEED, GameParameters, Scene
 
@@ -168,14 +168,8 @@ class ConvexEnergy(Energy):
     dynamics: Any = field(default_factory=DoubleIntegrator)  # what else is given is refused below, with a reason
 
     def __post_init__(self) -> None:
-        for kind, names, known in (("own", self.own, tuple(_OWN)), ("pair", self.pair, ("order",))):
-            if isinstance(names, str):
-                raise ConfigError(f"energy.{kind} takes a list of names, not the one name {names!r}")
-            for name in names:
-                if name not in known:
-                    raise ConfigError(f"unknown {kind} term {name!r} of a convex energy: {nearest(str(name), known)}")
-            if len(set(names)) < len(names):
-                raise ConfigError(f"energy.{kind} names a term twice: {list(names)}")
+        check_names("own", self.own, _OWN, "term")
+        check_names("pair", self.pair, ("order",), "term")
         if not {"acc", "lat_acc"} <= set(self.own):
             raise ConfigError(
                 "energy.own of a convex energy must name acc and lat_acc: without them controls have no single best value"

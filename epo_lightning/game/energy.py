@@ -10,7 +10,7 @@ Everything in this family of methods (the paper's Table 1) needs an energy for n
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import ClassVar
 
 import torch
@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.game.dynamics import Dynamics
+from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import GameParameters, Scene
 
 GRADIENT, RESIDUALS, FEATURES, CONVEX = "gradient", "residuals", "features", "convex"
@@ -32,6 +33,21 @@ def pairs(agents: int, device: torch.device | None = None) -> tuple[Tensor, Tens
     """First and second agents i < j of all P pairs, in the order of every pairwise tensor."""
     first, second = torch.triu_indices(agents, agents, 1, device=device)
     return first, second
+
+
+def check_names(kind: str, names: Sequence[str], known: Iterable[str], what: str) -> None:
+    """Refuse a list of terms with an unknown name, or one twice.
+
+    Raises:
+        ConfigError: the message names the nearest known one.
+    """
+    if isinstance(names, str):
+        raise ConfigError(f"energy.{kind} takes a list of names, not the one name {names!r}")
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"unknown {kind} {what} {name!r}: {nearest(str(name), known)}")
+    if len(set(names)) < len(names):
+        raise ConfigError(f"energy.{kind} names a {what} twice: {list(names)}")
 
 
 class Energy(ABC):

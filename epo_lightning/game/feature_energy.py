@@ -13,7 +13,7 @@ from torch import Tensor
 
 from epo_lightning.game.circles import disc, overlap, separation
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, pairs
+from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, check_names, pairs
 from epo_lightning.game.features import (
     OWN_FEATURES,
     PAIR_FEATURES,
@@ -68,14 +68,8 @@ class FeatureEnergy(Energy):
     pair_stride: int = 1
 
     def __post_init__(self) -> None:
-        for kind, names, known in (("own", self.own, OWN_FEATURES), ("pair", self.pair, PAIR_FEATURES)):
-            if isinstance(names, str):
-                raise ConfigError(f"energy.{kind} takes a list of names, not the one name {names!r}")
-            for name in names:
-                if name not in known:
-                    raise ConfigError(f"unknown {kind} feature {name!r}: {nearest(str(name), known)}")
-            if len(set(names)) < len(names):
-                raise ConfigError(f"energy.{kind} names a feature twice: {list(names)}")
+        check_names("own", self.own, OWN_FEATURES, "feature")
+        check_names("pair", self.pair, PAIR_FEATURES, "feature")
         if not self.own and not self.pair:
             raise ConfigError("an energy needs at least one feature")
         if not isinstance(self.dynamics, Unicycle):
