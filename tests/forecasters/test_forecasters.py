@@ -126,3 +126,15 @@ def test_loading_a_checkpoint_of_another_architecture(tmp_path):
     torch.save({"configuration": configuration, "state_dict": forecaster.state_dict()}, tmp_path / "wide.ckpt")
     with pytest.raises(ConfigError, match="does not fit the architecture"):
         epo_lightning.load(tmp_path / "wide.ckpt")
+
+
+def test_what_is_dear_to_examine_is_examined_in_some_scenes(monkeypatch):
+    monkeypatch.setattr("epo_lightning.forecasters.epo.EXAMINED", 3)
+    solver = {"name": "gradient_descent", "steps": 2, "step_size": 1e-3}
+    forecaster = build_forecaster(model(EPO, energy={"name": "neural"}, solver=solver, horizon=5)).eval()
+    scene = random_scene(6, 2, horizon=5)
+    forecast = forecaster(scene)
+    report = forecaster.examine(scene, forecast).equilibrium
+    assert report.nash_gap.isfinite().all(1).tolist() == [True, False] * 3
+    alone = forecaster.examine(scene[[2]], forecast[[2]]).equilibrium
+    torch.testing.assert_close(report.energy[2], alone.energy[0])
