@@ -1,0 +1,231 @@
+"""The rows of the paper's Table 1 besides EPO: what every forecaster must do, with energies and solvers of the family.
+
+Models are those of ``conf/experiment/table1``, over short horizons; solvers take fewer steps or candidates here, so that all
+joint assignments can be looked at with and without absent agents, which an enumeration counts too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from games import random_scene
+from suites import ForecasterSuite, HighwaySuite, highway_model, model
+
+from epo_lightning import losses
+from epo_lightning.experiment.compose import compose
+from epo_lightning.forecasters import Forecaster
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.scene import Scene
+
+SECTIONS = ("forecaster", "backbone", "dynamics", "energy", "solver", "backward", "objective", "optimizer", "goal")
+HORIZON = 8
+
+
+@cache
+def written(row: str) -> dict[str, Any]:
+    """The model's sections of a row as its file has them."""
+    composed = compose("train", [f"experiment=table1/{row}"])
+    return {name: composed[name] for name in SECTIONS}
+
+
+class _Row(ForecasterSuite):
+    """What rows have besides: a file, and an objective whose every term learns.
+
+    Attributes:
+        row: its name.
+        data: the first half of the file's name.
+        solver: keys of the solver that are changed.
+        learned: terms of the objective that must fall by a fifth.
+    """
+
+    row: ClassVar[str]
+    data: ClassVar[str]
+    solver: ClassVar[dict[str, Any]] = {}
+    learned: ClassVar[tuple[str, ...]]
+
+    def sections(self) -> dict[str, Any]:
+        found = written(f"{self.data}_{self.row}")
+        assert self.solver.keys() <= found["solver"].keys()
+        forecaster = {**found["forecaster"], "modes": self.modes}
+        return {**found, "forecaster": forecaster, "solver": {**found["solver"], **self.solver}}
+
+    def test_learning_fits_a_batch(self):
+        forecaster, scene = self.forecaster().train(), self.lesson()
+        optimizer = torch.optim.Adam([p for p in forecaster.parameters() if p.requires_grad], 3e-3)
+        before, first = minsade(forecaster, scene), {}
+        for _ in range(self.lessons):
+            terms = forecaster.losses(scene, forecaster(scene))
+            optimizer.zero_grad()
+            sum(weight * value for weight, value in terms.values()).backward()
+            optimizer.step()
+            first = first or {name: value.item() for name, (_, value) in terms.items()}
+        last = {name: value.item() for name, (_, value) in terms.items()}
+        for name in self.learned:
+            assert last[name] < first[name] - 0.2 * abs(first[name]), name
+        assert minsade(forecaster, scene) < before
+
+
+def minsade(forecaster: Forecaster, scene: Scene) -> float:
+    """Distance of the closest mode of the forecast."""
+    assert scene.future is not None
+    assert scene.future_mask is not None
+    distance = losses.distances(forecaster.predict(scene).states[..., :2], scene.future, scene.future_mask)
+    return losses.scene_imitation(distance, scene.future_mask)[0].item()
+
+
+class Row(_Row):
+    """A row on scenes like those of RPI: two agents, each told its goal."""
+
+    data = "rpi"
+
+    def model(self, **changes: Any) -> dict[str, Any]:
+        found = self.sections()
+        return model(found.pop("forecaster"), **{"horizon": HORIZON, **found, **changes})
+
+    def scene(self, scenes: int, **details: Any) -> Scene:
+        return random_scene(scenes, 2, history=5, horizon=HORIZON, **details)
+
+    def lesson(self) -> Scene:
+        """Everybody speeds up at 1 m/s^2 and turns left at 1 rad/s, towards its goal."""
+        scene = self.scene(8)
+        future = Unicycle().rollout(scene.current, torch.ones(8, 2, HORIZON, 2), scene.dt)
+        return dataclasses.replace(scene, future=future, goal_candidates=future[:, :, -1:, :2])
+
+
+class HighwayRow(HighwaySuite, _Row):
+    """A row on highways: four agents, goal candidates, a map. With one backbone: test_highway.py has the others."""
+
+    data = "highway"
+
+    @pytest.fixture(autouse=True)
+    def name(self) -> None:
+        self.backbone = "v_lstm"
+
+    def model(self, **changes: Any) -> dict[str, Any]:
+        found = self.sections()
+        return highway_model(found.pop("forecaster"), **{**found, **changes})
+
+
+class Sampled(_Row):
+    """Samples are random in training: to compare two of them, real agents have to get the same noise in both."""
+
+    def test_padding_does_not_change_training(self, monkeypatch):
+        forecaster, scene = self.forecaster().train(), self.scene(6)
+        assert not torch.equal(forecaster(scene).states, forecaster(scene).states)
+        values = []
+        for given in (scene, self.padded(scene)):
+            noise = torch.Generator().manual_seed(3)
+
+            def draw(controls: torch.Tensor, noise: torch.Generator = noise) -> torch.Tensor:
+                batch, modes, agents, *rest = controls.shape
+                return torch.randn(batch, modes, 8, *rest, generator=noise)[:, :, :agents]
+
+            with monkeypatch.context() as patch:
+                patch.setattr(torch, "randn_like", draw)
+                terms = forecaster.losses(given, forecaster(given))
+            values.append({name: value for name, (_, value) in terms.items()})
+        assert values[0].keys() == values[1].keys()
+        for name, value in values[0].items():
+            torch.testing.assert_close(values[1][name], value, rtol=1e-5, atol=1e-5)
+
+
+class JFP(_Row):
+    row = "jfp"
+    learned = ("density", "marginal")
+
+
+class DSDNet(_Row):
+    row = "dsdnet"
+    learned = ("density", "marginal")
+
+    def test_motions_are_not_learned(self):
+        """``regression`` tells how well they cover what happened."""
+        forecaster, scene = self.forecaster().train(), self.lesson()
+        terms = forecaster.losses(scene, forecaster(scene))
+        assert {name for name, (_, value) in terms.items() if not value.requires_grad} == {"regression"}
+
+
+class TGL(_Row):
+    row = "tgl"
+    learned = ("probability", "initial")
+
+
+class EBIOC(Sampled):
+    row = "ebioc"
+    learned = ("contrastive", "probability")
+    solver: ClassVar[dict[str, Any]] = {"steps": 4}
+
+
+class Laplace(_Row):
+    """Whether an adaptive step is taken may hang on the last digit, which batches change: in float64 that is not seen."""
+
+    row = "laplace"
+    learned = ("density", "initial")
+    solver: ClassVar[dict[str, Any]] = {"steps": 6}
+    precision = torch.float32
+
+    def forecaster(self, **changes: Any) -> Forecaster:
+        return super().forecaster(**changes).to(self.precision)
+
+    def test_batch_independence(self):
+        self.precision, self.tolerance = torch.float64, {"rtol": 0.0, "atol": 1e-9}
+        super().test_batch_independence()
+
+    @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
+    def test_padding_independence(self, filling):
+        self.precision, self.tolerance = torch.float64, {"rtol": 0.0, "atol": 1e-9}
+        super().test_padding_independence(filling)
+
+
+class TestJFP(JFP, Row):
+    learned = ("density", "marginal", "regression")
+
+
+class TestDSDNet(DSDNet, Row):
+    pass
+
+
+class TestTGL(TGL, Row):
+    learned = ("imitation", "probability", "initial")
+
+
+class TestEBIOC(EBIOC, Row):
+    pass
+
+
+class TestLaplace(Laplace, Row):
+    pass
+
+
+class TestHighwayJFP(JFP, HighwayRow):
+    solver: ClassVar[dict[str, Any]] = {"candidates": 4}
+
+
+class TestHighwayDSDNet(DSDNet, HighwayRow):
+    solver: ClassVar[dict[str, Any]] = {"candidates": 4}
+    lessons = 40
+
+
+class TestHighwayTGL(TGL, HighwayRow):
+    def test_gradients_reach_every_parameter(self):
+        """All but the last bias of who goes first: f(z_i, z_j) - f(z_j, z_i) is the same whatever it is."""
+        forecaster, scene = self.forecaster().train(), self.crowded()
+        bias = forecaster.orders.mlp.output.bias
+        terms = forecaster.losses(scene, forecaster(scene))
+        sum(weight * value for weight, value in terms.values()).backward()
+        assert (bias.grad == 0).all()
+        idle = {name for name, p in forecaster.named_parameters() if p.requires_grad and not p.grad.abs().sum() > 0}
+        assert idle == {"orders.mlp.output.bias"}
+        assert all(p.grad.isfinite().all() for p in forecaster.parameters() if p.requires_grad)
+
+
+class TestHighwayEBIOC(EBIOC, HighwayRow):
+    pass
+
+
+class TestHighwayLaplace(Laplace, HighwayRow):
+    pass
