@@ -34,7 +34,7 @@ class Orders(nn.Module):
         if modes < 1:
             raise ValueError(f"modes must be 1 or more, not {modes}")
         self.modes, self.symmetric = modes, symmetric
-        self.mlp = MLP(2 * width, 64, 1, norm="layer")
+        self.mlp = MLP(2 * width, 64, 1, norm="layer", bias=symmetric)  # a difference takes a bias away
 
     def forward(
         self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]

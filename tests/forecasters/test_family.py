@@ -211,16 +211,7 @@ class TestHighwayDSDNet(DSDNet, HighwayRow):
 
 
 class TestHighwayTGL(TGL, HighwayRow):
-    def test_gradients_reach_every_parameter(self):
-        """All but the last bias of who goes first: f(z_i, z_j) - f(z_j, z_i) is the same whatever it is."""
-        forecaster, scene = self.forecaster().train(), self.crowded()
-        bias = forecaster.orders.mlp.output.bias
-        terms = forecaster.losses(scene, forecaster(scene))
-        sum(weight * value for weight, value in terms.values()).backward()
-        assert (bias.grad == 0).all()
-        idle = {name for name, p in forecaster.named_parameters() if p.requires_grad and not p.grad.abs().sum() > 0}
-        assert idle == {"orders.mlp.output.bias"}
-        assert all(p.grad.isfinite().all() for p in forecaster.parameters() if p.requires_grad)
+    pass
 
 
 class TestHighwayEBIOC(EBIOC, HighwayRow):
