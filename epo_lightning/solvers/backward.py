@@ -22,7 +22,7 @@ import torch
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers import dense, implicit
 from epo_lightning.solvers.base import PATH, STATIONARY, TABLES, Minimiser, Stepwise
 
@@ -92,7 +92,8 @@ class Truncated(Backward):
         return dataclasses.replace(
             last,
             initial_energy=first.initial_energy,
-            status=torch.maximum(first.status, last.status),
+            # Who could take no step at first and went on later was held up, not stopped.
+            status=torch.maximum(first.status.clamp_max(Status.DAMPED), last.status),
             iterates=(*first.iterates, *last.iterates[1:]) if first.iterates and last.iterates else None,
         )
 

@@ -29,6 +29,21 @@ from epo_lightning.solvers.base import PATH, STATIONARY, Stepwise
 from epo_lightning.solvers.dense import gradient
 
 
+@dataclass(frozen=True)
+class Progress:
+    """What the steps so far leave behind for the next ones.
+
+    Attributes:
+        length: share of the step size that a sample's next step has.
+        lowest: energy that it has come down to.
+        taken: whether it has taken any step.
+    """
+
+    length: Float[Tensor, "B M"]
+    lowest: Float[Tensor, "B M"]
+    taken: Bool[Tensor, "B M"]
+
+
 @register("solver", "gradient_descent")
 @dataclass(frozen=True)
 class GradientDescent(Stepwise):
@@ -65,14 +80,14 @@ class GradientDescent(Stepwise):
         return dataclasses.replace(self, steps=steps)
 
     def run(
-        self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Any = None
-    ) -> tuple[Solution, None]:
-        """Take a number of steps; there is nothing to remember.
+        self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Progress | None = None
+    ) -> tuple[Solution, Progress]:
+        """Take a number of steps; how long the next ones are is remembered.
 
         Raises:
             ValueError: scene and parameters do not fit together.
         """
-        return descend(energy, scene, parameters, steps, self.step_size, self.scale), None
+        return descend(energy, scene, parameters, steps, self.step_size, self.scale, progress=memory)
 
 
 def check_steps(steps: int, scale: Sequence[float]) -> None:
@@ -95,11 +110,21 @@ def descend(
     step_size: float,
     scale: Sequence[float],
     noise: float = 0.0,
-) -> Solution:
+    progress: Progress | None = None,
+) -> tuple[Solution, Progress]:
     """Take steps u <- u - eta S^2 dE/du + noise S z from the initial strategies, with z ~ N(0, I).
 
     Differentiable if gradients are recorded, which steps are taken being constant. Absent agents' controls are zero. Noise
     keeps an energy of n controls n / 2 above its lowest value: what lies ten times as far above was too long a step.
+
+    Args:
+        energy, scene, parameters: the game.
+        steps, step_size, scale, noise: S, eta, the diagonal of S, and how much noise.
+        progress: that of the steps which led to the initial strategies; None at the start. Steps in two parts are then
+            the same as in one, and the status is that of both.
+
+    Returns:
+        the solution, and the progress with which one would go on.
 
     Raises:
         ValueError: scene and parameters do not fit together.
@@ -113,10 +138,11 @@ def descend(
     channels = start.new_tensor(list(scale))
     everyone = torch.ones(start.shape[:2], dtype=torch.bool, device=start.device)
     energies, slope, sound = _look(energy, scene, parameters, controls, everyone)
-    initial_energy, length = energies, torch.ones_like(energies)
-    taken = torch.zeros_like(sound)
+    initial_energy = energies
+    if progress is None:
+        progress = Progress(torch.ones_like(energies), energies, torch.zeros_like(sound))
+    length, lowest, taken = progress.length, progress.lowest, progress.taken
     slack = 5.0 * (10.0 + scene.agent_mask.sum(1)[:, None] * start.shape[-2:].numel()) if noise else 0.0
-    lowest = energies
     for step in range(steps):
         reach = length[..., None, None, None]
         moved = controls - step_size * reach * channels.square() * slope
@@ -130,9 +156,9 @@ def descend(
         controls, slope = torch.where(keep, moved, controls), torch.where(keep, ahead, slope)
         energies, length = torch.where(good, value, energies), torch.where(good, length, 0.5 * length)
         lowest = torch.minimum(lowest, energies)
-        taken |= good
+        taken = taken | good
     shortened = torch.where(length < 1.0, Status.DAMPED, Status.SOLVED)
-    return Solution(
+    solution = Solution(
         controls=controls,
         states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt),
         initial_energy=initial_energy,
@@ -140,6 +166,7 @@ def descend(
         gradient_norm=slope.detach().flatten(2).norm(dim=-1),
         status=torch.where(sound & (taken | (steps == 0)), shortened, Status.STOPPED),
     )
+    return solution, Progress(length, lowest, taken)
 
 
 def _look(

@@ -14,6 +14,7 @@ from torch.testing import assert_close
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import GameParameters, Status
+from epo_lightning.solvers.backward import Truncated
 from epo_lightning.solvers.dense import gradient
 from epo_lightning.solvers.gradient_descent import GradientDescent
 from epo_lightning.solvers.langevin import Langevin
@@ -99,6 +100,49 @@ def test_path_derivative_is_that_of_the_truncated_problem(steps):
         numeric = (value(1e-6) - value(-1e-6)) / 2e-6
     analytic = sum((a * b).sum() for a, b in zip(found, moves, strict=True))
     assert_close(analytic, numeric, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("taught", [1, 3, 9, 20])
+def test_truncation_changes_what_is_learned_and_not_what_is_found(taught):
+    # Steps so long that samples halve them, some after others.
+    scene, parameters = game(scenes=4)
+    solve = GradientDescent(9, 0.5, [1.0, 0.3])
+    whole = solve(GAME, scene, leaves_of(parameters))
+    leaves = leaves_of(parameters)
+    parts = Truncated(taught)(solve, GAME, scene, leaves)
+    for name in ("controls", "states", "energy", "initial_energy", "gradient_norm", "status"):
+        assert torch.equal(getattr(parts, name), getattr(whole, name)), name
+    assert (whole.status == Status.DAMPED).sum() > 4
+    assert (whole.status != Status.STOPPED).all()
+    parts.controls.square().sum().backward()
+    gradients = torch.cat([leaves.own_weights[name].grad for name in ALL])
+    assert gradients.isfinite().all()
+    assert (gradients != 0).any()
+
+
+@torch.no_grad()
+def test_who_goes_on_remembers_how_far_to_go():
+    scene, parameters = game(scenes=4)
+    solve = GradientDescent(9, 0.5, [1.0, 0.3])
+    first, memory = solve.run(GAME, scene, parameters, 6)
+    onward = dataclasses.replace(parameters, initial_controls=first.controls)
+    whole = solve(GAME, scene, parameters).controls
+    assert torch.equal(solve.run(GAME, scene, onward, 3, memory)[0].controls, whole)
+    assert not torch.equal(solve.run(GAME, scene, onward, 3)[0].controls, whole)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("first", range(8))
+def test_status_is_that_of_all_steps(first):
+    # One control with curvature 1, nine times too long: halved thrice before anything is taken, or at the end.
+    scene, parameters = quadratic(scenes=1, modes=1, agents=1)
+    for name in QUADRATIC.own:
+        parameters.own_weights[name].fill_(1.0)
+    for steps, size, status in ((8, 9.0, Status.DAMPED), (8, 1e9, Status.STOPPED), (8, 1.0, Status.SOLVED)):
+        whole = GradientDescent(steps, size)(QUADRATIC, scene, parameters)
+        parts = Truncated(steps - first)(GradientDescent(steps, size), QUADRATIC, scene, parameters)
+        assert whole.status.item() == parts.status.item() == status
+        assert torch.equal(whole.controls, parts.controls)
 
 
 @torch.no_grad()
