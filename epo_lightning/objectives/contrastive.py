@@ -66,15 +66,17 @@ class Contrastive(Objective):
         game = games(parameters, index, mode)
         controls, missed = observed_controls(energy.dynamics, scene)
         drawn = solution.controls.detach()[index, mode][:, None]
+        followed = mask.any(-1)
+        taught = followed.any(-1)  # where nothing was observed, both energies are those of the sample
         shown = torch.where(demonstrated(scene)[:, None, ..., None], controls[:, None], drawn)
         of_shown, of_drawn = energy(scene, game, shown)[:, 0], energy(scene, game, drawn)[:, 0]
+        sizes = torch.where(taught, of_shown.square() + of_drawn.square(), 0.0)
         values = {
             "contrastive": (of_shown - of_drawn).mean(),
-            "magnitude": (of_shown.square() + of_drawn.square()).mean(),
-            "initial": proposal(starts, solution.states.detach(), scene.agent_mask),
+            "magnitude": sizes.mean(),
+            "initial": proposal(starts, solution.states.detach(), scene.agent_mask & taught[:, None]),
             "probability": losses.scene_probability(forecast.probabilities, mode, mask),
         }
-        followed = mask.any(-1)
         return {
             **{name: (self.weights[name], value) for name, value in values.items()},
             **goal_term(scene, forecast, self.weights["goal"]),

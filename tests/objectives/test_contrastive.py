@@ -190,6 +190,42 @@ def test_what_was_not_observed_is_taken_from_the_sample():
     assert (parameters.own_weights["acc"].grad[0] == 0).all()
 
 
+def test_a_scene_of_which_nothing_was_observed_teaches_nothing():
+    scene, parameters = setting()
+    mask = torch.ones(3, 2, 7, dtype=torch.bool)
+    mask[1] = False
+    seen = dataclasses.replace(
+        scene,
+        future=torch.where(mask[..., None], scene.future, torch.nan),
+        future_mask=mask,
+        goal_candidates=torch.randn(3, 2, 4, 2, dtype=torch.float64),
+        goal_mask=None,
+    )
+    logits, choice = (
+        torch.randn(3, 3, requires_grad=True),
+        torch.randn(3, 2, 4, dtype=torch.float64, requires_grad=True),
+    )
+    forecast = forecast_of(GAME, seen, parameters, Langevin(3, 0.01), logits.softmax(-1))
+    forecast = dataclasses.replace(
+        forecast,
+        initial_states=forecast.initial_states.detach().requires_grad_(),
+        goal_probabilities=choice.softmax(-1),
+    )
+    terms = Contrastive(WEIGHTS)(seen, forecast, GAME)
+    sum(weight * value for weight, value in terms.values()).backward()
+    leaves = (*parameters.own_weights.values(), parameters.goals)
+    assert (parameters.pair_weights["proximity"].grad[1] == 0).all()
+    for tensor in (*leaves, logits, choice, forecast.initial_states):
+        assert (tensor.grad[1] == 0).all()
+        assert (tensor.grad[[0, 2]] != 0).any()
+    # The others count as before.
+    alone = dataclasses.replace(seen[[0, 2]], goal_candidates=None, goal_mask=None)
+    rest = dataclasses.replace(forecast, goal_probabilities=None)[[0, 2]]
+    for name, (_, value) in Contrastive(WEIGHTS)(alone, rest, GAME).items():
+        share = 1.0 if name == "tracking" else 2.0 / 3.0
+        assert_close(terms[name][1], share * value, msg=name)
+
+
 def test_padding_does_not_matter():
     scene, parameters = setting()
     narrow = Contrastive(WEIGHTS)(scene, forecast_of(GAME, scene, parameters), GAME)
