@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
@@ -9,6 +10,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from epo_lightning.game.energy import Energy
+from epo_lightning.registry import ConfigError
 from epo_lightning.scene import JointForecast, Scene
 
 Terms = dict[str, tuple[float, Tensor]]
@@ -46,12 +48,23 @@ class Objective(ABC):
         """
 
 
-def checked_weights(weights: Mapping[str, float], names: tuple[str, ...]) -> dict[str, float]:
-    """The weights lambda: all of them and no others.
+def checked_weights(
+    weights: Mapping[str, float], names: tuple[str, ...], key: str = "objective.weights"
+) -> dict[str, float]:
+    """The weights lambda: all of them and no others, each a finite number of 0 or more.
+
+    Args:
+        weights: as configured.
+        names: of the terms.
+        key: where the configuration has them, for messages.
 
     Raises:
-        ValueError: a missing or an unknown name.
+        ConfigError: a missing or an unknown name, or a value that is no weight.
     """
     if set(weights) != set(names):
-        raise ValueError(f"weights must name {list(names)}, not {sorted(weights)}")
+        raise ConfigError(f"{key} must name {list(names)}, not {sorted(weights)}")
+    for name, value in weights.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not 0 <= value < math.inf:
+            raise ConfigError(f"{key}.{name} must be a number, 0 or more, not {value!r}")
     return dict(weights)

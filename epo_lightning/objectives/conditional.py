@@ -10,7 +10,7 @@ from torch import Tensor
 from epo_lightning import losses
 from epo_lightning.game.energy import Energy
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
-from epo_lightning.objectives.terms import observed_future
+from epo_lightning.objectives.terms import goal_term, observed_future
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import JointForecast, Scene
 from epo_lightning.solvers import assignments
@@ -31,14 +31,20 @@ class Conditional(Objective):
     allows. Where it allows each k*_i but not all of them together, or where energies are no numbers, the scene costs as much
     as the smallest probability of its precision, and teaches nothing: an infinite energy has no derivative.
 
+    In the joint density, log Z is a sum over more assignments than that of the observed ones, both exact where all can be
+    looked at (:func:`~.assignments.partition`), whichever solver chose the modes: a probability is 1 at most, and the loss
+    0 at least. Where there are too many, ten rounds of messages give both. Bethe's log Z is no bound on the true one, so
+    hard pair energies can make the loss negative there.
+
     Args:
         weights: lambda of ``density``; of ``marginal``, the cross entropy of every agent's candidates by their own energies
             alone, exp(-E_i) (JFP's auxiliary loss); and of ``regression``, the distance of the closest candidate, which
-            moves it where candidates are learned, and elsewhere tells how well they cover what happened.
+            moves it where candidates are learned, and elsewhere tells how well they cover what happened; and of ``goal``,
+            which teaches goals where they are decoded, and is idle elsewhere.
         density: ``joint`` or ``marginal``.
     """
 
-    terms = ("density", "marginal", "regression")
+    terms = ("density", "marginal", "regression", "goal")
     through_solution = True
     needs = frozenset({TABLES})
 
@@ -67,8 +73,9 @@ class Conditional(Objective):
         allowed = unary.transpose(1, 2).isfinite()
         closest = torch.where(allowed, distance, torch.inf).argmin(1)
         if self.density == "joint":
-            log_density = _joint(unary, pair, scene.agent_mask, closest, mask.any(-1)) - tables.log_partition
-            density = losses.joint_density(log_density, mask)
+            _, log_partition = assignments.partition(unary, pair, scene.agent_mask)
+            log_density = _joint(unary, pair, scene.agent_mask, closest, mask.any(-1)) - log_partition
+            density = losses.joint_density(torch.where(known, log_density, torch.nan), mask)
         else:
             density = losses.marginal_density(tables.log_marginals.transpose(1, 2), closest, mask)
         alone = torch.where(known[:, None, None], (-unary).log_softmax(-1), torch.nan).transpose(1, 2)
@@ -77,6 +84,7 @@ class Conditional(Objective):
             "density": (self.weights["density"], density),
             "marginal": (self.weights["marginal"], losses.marginal_density(alone, closest, mask)),
             "regression": (self.weights["regression"], regression),
+            **goal_term(scene, forecast, self.weights["goal"]),
         }
 
 

@@ -21,7 +21,7 @@ from epo_lightning.scene import JointForecast, Scene, Solution, Tables
 from epo_lightning.solvers import assignments
 
 NAN, INF = float("nan"), float("inf")
-WEIGHTS = {"density": 1.0, "marginal": 0.5, "regression": 0.25}
+WEIGHTS = {"density": 1.0, "marginal": 0.5, "regression": 0.25, "goal": 2.0}
 ENERGY = FeatureEnergy(["acc"], [])
 SCENES, AGENTS, COUNT, STEPS = 3, 3, 4, 5
 
@@ -57,7 +57,9 @@ def forecast_of(tables: Tables | None) -> JointForecast:
 
 def losses_of(scene: Scene, tables: Tables, density: str = "joint") -> dict[str, Tensor]:
     terms = Conditional(WEIGHTS, density)(scene, forecast_of(tables), ENERGY)
-    assert {name: weight for name, (weight, _) in terms.items()} == WEIGHTS
+    assert {name: weight for name, (weight, _) in terms.items()} == {
+        name: WEIGHTS[name] for name in WEIGHTS if name != "goal"
+    }
     return {name: value for name, (_, value) in terms.items()}
 
 
@@ -187,6 +189,44 @@ def test_impossible_scenes_cost_something_finite_and_teach_nothing(density, brok
     if broken == "no number" or density == "joint":
         assert (unary.grad[0] == 0).all()
     assert (unary.grad[1:] != 0).all()
+
+
+def test_no_probability_is_above_one_whichever_solver_gave_the_tables():
+    """Hard pair energies, for which Bethe's log Z is below the true one, and agents of whom nothing was observed."""
+    scene = partly_observed()
+    unary, pair, states = drawn(scene)
+    below = 0
+    for _ in range(20):
+        unary, pair = torch.randn_like(unary), 30.0 * torch.rand_like(pair).round()
+        unary, pair = assignments.settle(unary, pair, scene.agent_mask)
+        exact = assignments.partition(unary, pair, scene.agent_mask)
+        messages = assignments.sum_product(unary, pair, scene.agent_mask)
+        loss, approximate = (
+            losses_of(scene, Tables(states, unary, pair, *found))["density"].item() for found in (exact, messages)
+        )
+        assert loss >= -1e-12
+        assert approximate == pytest.approx(loss, abs=1e-12)
+        below += int((messages[1] < exact[1] - 0.1).any())
+    assert below, "no table was hard enough"
+
+
+def test_goals_are_taught_where_they_are_decoded():
+    scene = scene_of()
+    scene = dataclasses.replace(scene, goal_candidates=torch.randn(SCENES, AGENTS, 3, 2).double(), goal_mask=None)
+    logits = torch.zeros(SCENES, AGENTS, 3, dtype=torch.float64, requires_grad=True)
+    forecast = forecast_of(tables_of(scene, *drawn(scene)))
+    terms = Conditional(WEIGHTS)(scene, dataclasses.replace(forecast, goal_probabilities=logits.softmax(-1)), ENERGY)
+    weight, value = terms["goal"]
+    assert weight == WEIGHTS["goal"]
+    assert value.item() == pytest.approx(math.log(3))
+    value.backward()
+    assert (logits.grad != 0).all()
+
+
+@pytest.mark.parametrize("wrong", ["much", None, True, -0.1, INF, NAN])
+def test_weights_that_are_none_are_named(wrong):
+    with pytest.raises(ConfigError, match=r"objective\.weights\.marginal must be a number, 0 or more, not"):
+        Conditional({**WEIGHTS, "marginal": wrong})
 
 
 def test_unlikely_closest_candidates_are_still_learned_from():
