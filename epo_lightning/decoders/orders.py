@@ -6,12 +6,12 @@ A game that is convex given the order has one solution for each order, so joint 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from epo_lightning.decoders.mlp import MLP
-from epo_lightning.game.convex_energy import ConvexEnergy
+from epo_lightning.game.convex_energy import ACROSS, ConvexEnergy
 from epo_lightning.game.energy import pairs
 from epo_lightning.scene import Scene
 
@@ -37,33 +37,53 @@ class Orders(nn.Module):
         self.mlp = MLP(2 * width, 64, 1, norm="layer", bias=symmetric)  # a difference takes a bias away
 
     def forward(
-        self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]
+        self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"], matter: Bool[Tensor, "B P"]
     ) -> tuple[Float[Tensor, "B M P"], Float[Tensor, "B M"], Float[Tensor, "B P"]]:
-        """The M most likely orders, their log-probabilities among each other, and the logits, zero for absent pairs."""
+        """The M most likely orders, their log-probabilities, and the logits of pairs, zero for pairs that have no order.
+
+        Args:
+            z: features of the agents.
+            mask: agents that are present.
+            matter: pairs whose order matters (:func:`ordered`); others keep +1, and do not count in the probability.
+        """
         first, second = pairs(z.shape[1], z.device)
         z = torch.where(mask[..., None], z, 0.0)
         forth = self.mlp(torch.cat((z[:, first], z[:, second]), -1))[..., 0]
         back = self.mlp(torch.cat((z[:, second], z[:, first]), -1))[..., 0]
-        present = mask[:, first] & mask[:, second]
-        logits = torch.where(present, forth + back if self.symmetric else forth - back, 0.0)
-        order = most_likely(logits, present, self.modes)
-        score = torch.where(present[:, None], F.logsigmoid(order * logits[:, None]), 0.0).sum(-1)
-        return order, score.log_softmax(-1), logits
+        matter = matter & mask[:, first] & mask[:, second]
+        logits = torch.where(matter, forth + back if self.symmetric else forth - back, 0.0)
+        order = most_likely(logits, matter, self.modes)
+        score = torch.where(matter[:, None], F.logsigmoid(order * logits[:, None]), 0.0).sum(-1)
+        return order, score, logits
+
+
+def ordered(energy: ConvexEnergy, scene: Scene, steps: int) -> Bool[Tensor, "B P"]:
+    """Pairs whose order matters: the energy holds both, present, to it at one of the steps 1 .. K at least."""
+    return energy.pair_mask(scene) & energy.near(scene, steps).any(-1)
+
+
+def repeated(modes: Shaped[Tensor, "B M D"]) -> Bool[Tensor, "B M"]:
+    """Which modes are an earlier one again, by the choices that make a mode: where there are fewer than M, they begin anew.
+
+    Nothing is more likely for being named twice, so repeats have a probability of zero.
+    """
+    same = (modes[:, :, None] == modes[:, None]).all(-1)
+    return same.tril(-1).any(-1)
 
 
 @torch.no_grad()
-def most_likely(logits: Float[Tensor, "B P"], present: Bool[Tensor, "B P"], modes: int) -> Float[Tensor, "B M P"]:
+def most_likely(logits: Float[Tensor, "B P"], matter: Bool[Tensor, "B P"], modes: int) -> Float[Tensor, "B M P"]:
     """The M most likely orders of independent pairs, in that order; where there are fewer, they begin anew.
 
     The likeliest order has the sign of every logit, and to turn the sign of a pair costs |l| of log-probability. The M
     cheapest sets of signs to turn are found pair by pair: those of some pairs are among the M cheapest of the pairs before,
-    with and without the next one. Absent pairs keep +1.
+    with and without the next one. Pairs that do not matter keep +1.
     """
     batch, count = logits.shape
     cost = logits.new_full((batch, modes), torch.inf)
     cost[:, 0] = 0.0
     turned = torch.zeros(batch, modes, count, dtype=torch.bool, device=logits.device)
-    price = torch.where(present, logits.abs(), torch.inf)
+    price = torch.where(matter, logits.abs(), torch.inf)
     for pair in range(count):
         both = torch.cat((cost, cost + price[:, pair, None]), 1)
         cost, kept = both.sort(dim=1, stable=True)
@@ -72,14 +92,17 @@ def most_likely(logits: Float[Tensor, "B P"], present: Bool[Tensor, "B P"], mode
         turned[:, :, pair] = kept >= modes
     rank = torch.arange(modes, device=logits.device) % (cost < torch.inf).sum(1, keepdim=True).clamp_min(1)
     turned = turned.gather(1, rank[..., None].expand_as(turned))
-    likeliest = torch.where(present & (logits < 0), -1.0, 1.0).to(logits.dtype)[:, None]
+    likeliest = torch.where(matter & (logits < 0), -1.0, 1.0).to(logits.dtype)[:, None]
     return torch.where(turned, -likeliest, likeliest)
 
 
 def observed_order(energy: ConvexEnergy, scene: Scene) -> tuple[Float[Tensor, "B P"], Bool[Tensor, "B P"]]:
-    """The orders that agents took: the side on which i was of j where they came closest; and of which pairs it is known.
+    """The orders that agents took, and of which pairs they are known; others have +1.
 
-    Known is the order of pairs that were observed at some step together. Others have +1.
+    Who goes first (``along``) is who is ahead at the last step at which both were observed: where one overtakes the other,
+    they are closest while side by side, and neither is ahead. On which side they pass (``across``) is seen at the closest
+    such step. Known is the order of pairs that were observed at some step together, if their order matters
+    (:func:`ordered`).
 
     Raises:
         ValueError: the scene has no future.
@@ -91,9 +114,13 @@ def observed_order(energy: ConvexEnergy, scene: Scene) -> tuple[Float[Tensor, "B
     together = observed[:, first] & observed[:, second]
     position = torch.where(observed[..., None], scene.future[..., :2], 0.0)
     apart = position[:, first] - position[:, second]
-    closest = torch.where(together, apart.square().sum(-1), torch.inf).argmin(-1)[..., None, None]
-    way = apart.gather(2, closest.expand(-1, -1, 1, 2))[:, :, 0]
-    known = together.any(-1)
+    if energy.direction == ACROSS:
+        decisive = torch.where(together, apart.square().sum(-1), torch.inf).argmin(-1)
+    else:
+        step = torch.arange(together.shape[-1], device=together.device)
+        decisive = torch.where(together, step, -1).argmax(-1)
+    way = apart.gather(2, decisive[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
+    known = together.any(-1) & ordered(energy, scene, together.shape[-1])
     behind = known & ((energy.directions(scene) * way).sum(-1) < 0)
     return torch.where(behind, -1.0, 1.0).to(position.dtype), known
 

@@ -7,6 +7,7 @@ Table 1, and the cells that the literature left empty, are other choices of the 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -15,13 +16,14 @@ from torch import Tensor
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.goals import NO_CANDIDATE, GoalDecoder, choose, given_goals, most_likely
 from epo_lightning.decoders.motions import Motions
-from epo_lightning.decoders.orders import Orders
+from epo_lightning.decoders.orders import Orders, ordered, repeated
 from epo_lightning.decoders.probabilities import SceneProbabilities
 from epo_lightning.decoders.strategies import InitialStrategies
 from epo_lightning.decoders.weights import OwnWeights, PairWeights
 from epo_lightning.forecasters.base import Forecaster, Task
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.game.convex_energy import ConvexEnergy
+from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
 from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.objectives.base import Objective, Terms
@@ -85,6 +87,8 @@ class EPO(Forecaster):
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         _check_needs(energy, task)
         chooses = TABLES in solver.provides
+        if modes < 1:
+            raise ConfigError(f"forecaster.modes must be 1 or more, not {modes}")
         if initial not in INITIAL:
             raise ConfigError(f"unknown forecaster.initial {initial!r}: {nearest(str(initial), INITIAL)}")
         if chooses and initial == "zero":
@@ -92,17 +96,25 @@ class EPO(Forecaster):
                 "the solver chooses among candidates, and with forecaster.initial=zero they are all the same: decoded "
                 "learns them, motions samples them"
             )
+        if initial == "motions" and not isinstance(energy.dynamics, Unicycle):
+            raise ConfigError(
+                f"forecaster.initial=motions goes with dynamics=unicycle, not with {type(energy.dynamics).__name__}: "
+                "motions are those of a unicycle; choose decoded or zero"
+            )
+        if not 0 < control_scale < math.inf:
+            raise ConfigError(f"forecaster.control_scale must be positive, and finite, not {control_scale}")
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
         self.differentiate, self.objective = backward, objective  # Lightning calls something else `backward`
         games, starts = solver.games(modes), solver.starts(modes)
         width, scale, horizon = backbone.width, task.scale, task.horizon
         own, pair = energy.weighted
-        start = _checked(own_start, own)
+        start = _checked(own_start, own, energy.own)
         self.own_weights = OwnWeights(width, games, own, start) if own else None
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs) if pair else None
         self.strategies = InitialStrategies(width, starts, horizon, control_scale) if initial == "decoded" else None
-        self.motions = Motions(horizon, starts, **(motions or {})) if initial == "motions" else None
+        ranges = {} if motions is None and initial != "motions" else _ranges(motions)
+        self.motions = Motions(horizon, starts, **ranges) if initial == "motions" else None
         self.goals = (
             GoalDecoder(width, scale) if task.candidates > 1 and energy.needs & {"goals", "reference"} else None
         )
@@ -117,20 +129,22 @@ class EPO(Forecaster):
     def forward(self, scene: Scene) -> JointForecast:
         z = self.backbone(scene)
         logits = None if self.goals is None else self.goals(z, scene)
-        orders = None if self.orders is None else self.orders(z, scene.agent_mask)
+        orders = self._orders(z, scene)
         parameters = self.infer(scene, z, logits, None if orders is None else orders[0])
         solver = self.solver if self.training else self.solver.for_test()
         solution = self.differentiate(solver, self.energy, scene, parameters)
         if solution.tables is not None:
             stopped = (solution.status == Status.STOPPED).any(1, keepdim=True)
-            probabilities, initial = (-torch.where(stopped, 0.0, solution.energy)).softmax(1), None
+            assert solution.assignment is not None
+            probabilities = _once(-torch.where(stopped, 0.0, solution.energy), solution.assignment)
+            initial = None
         else:
             starts = parameters.initial_controls
             # Initial strategies that learn through the solution do not learn from their own states as well.
             starts = starts.detach() if self.differentiate.teaches_start else starts
             initial = self.energy.dynamics.rollout(self.energy.initial(scene), starts, scene.dt)
             if orders is not None:
-                probabilities = orders[1].softmax(1)
+                probabilities = self._probabilities_of(orders, logits)
             else:
                 assert self.probabilities is not None
                 current = scene.current.where(scene.agent_mask[..., None], 0.0)
@@ -177,6 +191,27 @@ class EPO(Forecaster):
             context=z if "context" in self.energy.needs else None,
             order=order,
         )
+
+    def _orders(self, z: Tensor, scene: Scene) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Orders of the pairs that the energy holds to one, with their log-probabilities and logits."""
+        if self.orders is None:
+            return None
+        assert isinstance(self.energy, ConvexEnergy)
+        return self.orders(z, scene.agent_mask, ordered(self.energy, scene, self.task.horizon))
+
+    def _probabilities_of(self, orders: tuple[Tensor, Tensor, Tensor], logits: Tensor | None) -> Tensor:
+        """How likely the order of every mode is, and that everybody heads where they do in it, [B, M].
+
+        Goals are taught by where agents ended up, not by which mode came closest, so no gradient goes to their ``logits``.
+        """
+        order, score, _ = orders
+        if logits is None:
+            return _once(score, order)
+        chosen = most_likely(logits, order.shape[1])
+        choices = logits.detach().log_softmax(-1).gather(-1, chosen.transpose(1, 2))  # zero where there is a single one
+        heads = (logits > NO_CANDIDATE).any(-1)[..., None]
+        score = score + torch.where(heads, choices, 0.0).sum(1)
+        return _once(score, torch.cat((order.long(), chosen), -1))
 
     def _starts(self, scene: Scene, z: Tensor) -> Tensor:
         """Initial strategies."""
@@ -238,14 +273,46 @@ def _check_needs(energy: Energy, task: Task) -> None:
         )
 
 
-def _checked(start: float | Mapping[str, float], features: Sequence[str]) -> float | Mapping[str, float]:
-    """The weights that own features start from. Names of features that other energies have are idle.
+def _once(score: Tensor, modes: Tensor) -> Tensor:
+    """Probabilities [B, M] of modes from their logarithms, up to a factor: a mode that repeats another has none."""
+    return torch.where(repeated(modes), -torch.inf, score).softmax(1)
+
+
+def _ranges(motions: Mapping[str, float] | None) -> dict[str, float]:
+    """What limits initial motions.
 
     Raises:
-        ConfigError: the name of no feature, or a weight that is not positive.
+        ConfigError: a name that is missing or unknown.
+    """
+    known, given = ("acceleration", "curvature"), dict(motions or {})
+    if set(given) != set(known):
+        raise ConfigError(
+            "forecaster.motions must name acceleration [m/s^2] and curvature [1/m], which initial=motions takes, not "
+            f"{', '.join(sorted(map(str, given))) or 'nothing'}"
+        )
+    return given
+
+
+def _checked(
+    start: float | Mapping[str, float], features: Sequence[str], all_features: Sequence[str]
+) -> float | Mapping[str, float]:
+    """The weights that own features start from. Names of features that other energies have are idle.
+
+    Args:
+        start: as configured.
+        features: own terms whose weight is decoded.
+        all_features: all own terms of the energy.
+
+    Raises:
+        ConfigError: the name of no feature, or of one whose weight is fixed, or a weight that is not positive.
     """
     named, known = start if isinstance(start, Mapping) else {"all": start}, {"all", *features, *OWN_FEATURES}
     for name, value in named.items():
+        if name in all_features and name not in features:
+            raise ConfigError(
+                f"forecaster.own_start.{name} starts nothing: this energy holds {name} fixed; it decodes weights of "
+                f"{', '.join(features) or 'nothing'}"
+            )
         if name not in known:
             raise ConfigError(f"unknown feature forecaster.own_start.{name}: {nearest(name, known)}")
         if not value > 0:

@@ -11,7 +11,7 @@ from games import pad, random_scene, reordered
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from epo_lightning.decoders.orders import Orders, most_likely, observed_order, order_loss
+from epo_lightning.decoders.orders import Orders, most_likely, observed_order, order_loss, ordered, repeated
 from epo_lightning.game.convex_energy import ConvexEnergy
 from epo_lightning.scene import Scene
 
@@ -40,6 +40,11 @@ def test_the_most_likely_orders_are_those_of_all(count, modes, ties, seed):
         assert found == [distinct[m % len(distinct)] for m in range(modes)]
 
 
+def all_pairs(mask: torch.Tensor) -> torch.Tensor:
+    agents = mask.shape[1]
+    return torch.ones(len(mask), agents * (agents - 1) // 2, dtype=torch.bool)
+
+
 def decoder(symmetric: bool, modes: int = 3) -> Orders:
     made = Orders(8, modes, symmetric).double()
     with torch.no_grad():
@@ -52,8 +57,8 @@ def decoder(symmetric: bool, modes: int = 3) -> Orders:
 def test_names_of_agents_do_not_matter(symmetric):
     orders, z, mask = decoder(symmetric), torch.randn(2, 4, 8, dtype=torch.float64), torch.ones(2, 4, dtype=torch.bool)
     names = [2, 0, 3, 1]
-    _, scores, logits = orders(z, mask)
-    _, again, renamed = orders(z[:, names], mask)
+    _, scores, logits = orders(z, mask, all_pairs(mask))
+    _, again, renamed = orders(z[:, names], mask, all_pairs(mask))
     matrix = torch.zeros(2, 4, 4, dtype=torch.float64)
     first, second = torch.triu_indices(4, 4, 1)
     matrix[:, first, second] = logits
@@ -66,9 +71,10 @@ def test_names_of_agents_do_not_matter(symmetric):
 def test_absent_agents_do_not_matter():
     orders, z = decoder(False), torch.randn(2, 3, 8, dtype=torch.float64)
     mask = torch.ones(2, 3, dtype=torch.bool)
-    order, scores, logits = orders(z, mask)
+    order, scores, logits = orders(z, mask, all_pairs(mask))
     wide = torch.cat((z, torch.full_like(z[:, :1], torch.nan)), 1).requires_grad_()
-    padded, again, more = orders(wide, torch.cat((mask, torch.zeros_like(mask[:, :1])), 1))
+    absent = torch.cat((mask, torch.zeros_like(mask[:, :1])), 1)
+    padded, again, more = orders(wide, absent, all_pairs(absent))
     _, second = torch.triu_indices(4, 4, 1)
     real = second < 3
     assert torch.equal(padded[:, :, real], order)
@@ -81,20 +87,44 @@ def test_absent_agents_do_not_matter():
     assert (wide.grad[:, :3] != 0).any()
 
 
-def test_log_probabilities_are_those_of_the_modes_among_each_other():
+def test_log_probabilities_are_those_of_independent_pairs():
     orders = decoder(False, modes=4)
     z, mask = torch.randn(2, 3, 8, dtype=torch.float64), torch.ones(2, 3, dtype=torch.bool)
-    order, scores, logits = orders(z, mask)
+    order, scores, logits = orders(z, mask, all_pairs(mask))
     joint = (order * logits[:, None]).sigmoid().prod(-1)
-    torch.testing.assert_close(scores.exp(), joint / joint.sum(-1, keepdim=True), rtol=1e-12, atol=0)
+    torch.testing.assert_close(scores.exp(), joint, rtol=1e-12, atol=0)
     assert (scores.diff(dim=-1) <= 0).all()
 
 
+def test_pairs_whose_order_does_not_matter_are_not_turned_scored_or_learned():
+    orders, z = decoder(False, modes=4), torch.randn(1, 3, 8, dtype=torch.float64, requires_grad=True)
+    mask, matter = torch.ones(1, 3, dtype=torch.bool), torch.tensor([[True, False, False]])
+    order, scores, logits = orders(z, mask, matter)
+    assert order[0, :, 0].tolist() in ([1.0, -1.0, 1.0, -1.0], [-1.0, 1.0, -1.0, 1.0])
+    assert (order[..., 1:] == 1).all()
+    assert (logits[:, 1:] == 0).all()
+    torch.testing.assert_close(scores[:, :2].exp().sum(), torch.ones((), dtype=torch.float64))
+    (scores[:, 0].sum() + logits.sum()).backward()
+    assert (z.grad[0, :2] != 0).any(1).all()
+    assert (z.grad[0, 2] == 0).all()
+
+
 def test_a_lone_agent_has_nobody_to_go_before():
-    order, scores, logits = Orders(8, 3)(torch.randn(2, 1, 8), torch.ones(2, 1, dtype=torch.bool))
+    mask = torch.ones(2, 1, dtype=torch.bool)
+    order, scores, logits = Orders(8, 3)(torch.randn(2, 1, 8), mask, all_pairs(mask))
     assert order.shape == (2, 3, 0)
     assert logits.shape == (2, 0)
-    torch.testing.assert_close(scores.exp(), torch.full((2, 3), 1 / 3))
+    assert (scores == 0).all()
+    assert repeated(order).tolist() == [[False, True, True]] * 2
+
+
+@settings(max_examples=40, deadline=None)
+@given(modes=st.integers(1, 6), width=st.integers(0, 3), seed=st.integers(0, 1000))
+def test_repeats_are_what_was_there_before(modes, width, seed):
+    torch.manual_seed(seed)
+    rows = torch.randint(2, (3, modes, width))
+    for found, row in zip(repeated(rows).tolist(), rows.tolist(), strict=True):
+        assert found == [mode in row[:number] for number, mode in enumerate(row)]
 
 
 def crossing(future: list[list[tuple[float, float]]], speeds=(1.0, 1.0), headings=(0.0, 0.0)) -> Scene:
@@ -110,19 +140,40 @@ def crossing(future: list[list[tuple[float, float]]], speeds=(1.0, 1.0), heading
     )
 
 
-def test_who_goes_first_is_seen_where_they_are_closest():
+def test_who_goes_first_is_who_is_ahead_in_the_end():
     energy = ConvexEnergy(["acc", "lat_acc"], direction="along")
-    # The second one is ahead at the end, but behind where they meet.
-    scene = crossing([[(1.0, 0.0), (2.0, 0.0), (3.0, 0.0)], [(0.5, 3.0), (1.5, 1.0), (6.0, 0.0)]])
+    # The second one overtakes: behind at first, and in the end too where only then both are seen.
+    scene = crossing([[(1.0, 0.0), (2.0, 0.0), (3.0, 0.0)], [(0.5, 3.0), (1.9, 1.0), (6.0, 1.0)]])
     order, known = observed_order(energy, scene)
-    assert order.tolist() == [[1.0]]
+    assert order.tolist() == [[-1.0]]
     assert known.all()
-    unseen = dataclasses.replace(scene, future_mask=torch.tensor([[[True, False, True], [True, True, True]]]))
-    assert observed_order(energy, unseen)[0].tolist() == [[-1.0]]  # the last step is the closest one that was seen
+    unseen = dataclasses.replace(scene, future_mask=torch.tensor([[[True, True, True], [True, True, False]]]))
+    assert observed_order(energy, unseen)[0].tolist() == [[1.0]]
     apart = dataclasses.replace(scene, future_mask=torch.tensor([[[True, False, False], [False, True, True]]]))
     assert not observed_order(energy, apart)[1].any()
     with pytest.raises(ValueError, match=r"scene\.future"):
         observed_order(energy, dataclasses.replace(scene, future=None, future_mask=None))
+
+
+@pytest.mark.parametrize("slip", [-0.2, 0.2])
+def test_overtaking_is_no_matter_of_who_is_ahead_while_side_by_side(slip):
+    energy = ConvexEnergy(["acc", "lat_acc"], direction="along")
+    scene = crossing([[(1.0, 0.0), (2.0, 0.0), (3.0, 0.0)], [(-3.0, 3.0), (2.0 + slip, 3.0), (8.0, 3.0)]])
+    assert observed_order(energy, scene)[0].tolist() == [[-1.0]]
+
+
+def test_pairs_that_are_never_near_have_no_order():
+    scene = crossing([[(1.0, 0.0), (2.0, 0.0)], [(1.0, 3.0), (2.0, 3.0)]])
+    for within, matters in ((2.9, False), (3.1, True)):
+        energy = ConvexEnergy(["acc", "lat_acc"], within=within)
+        assert ordered(energy, scene, 2).tolist() == [[matters]]
+        order, known = observed_order(energy, scene)
+        assert known.tolist() == [[matters]]
+        assert order_loss(torch.full_like(order, 2.0), order, known).item() == pytest.approx(
+            matters * 0.126928, abs=1e-6
+        )
+        padded = ordered(energy, pad(scene, 1), 2)
+        assert padded.tolist() == [[matters, False, False]]
 
 
 def test_on_which_side_they_pass():
@@ -133,6 +184,11 @@ def test_on_which_side_they_pass():
     assert observed_order(energy, reordered(scene, [1, 0]))[0].tolist() == [[1.0]]
     mirrored = crossing([[(1.0, -0.5), (2.0, -0.5)], [(3.0, 0.5), (2.0, 0.5)]], headings=(0.0, torch.pi))
     assert observed_order(energy, mirrored)[0].tolist() == [[-1.0]]
+    # What counts is where they are closest: later the first one is on the other side.
+    later = crossing(
+        [[(1.0, 0.5), (2.0, 0.5), (9.0, -5.0)], [(3.0, -0.5), (2.0, -0.5), (-9.0, 5.0)]], headings=(0.0, torch.pi)
+    )
+    assert observed_order(energy, later)[0].tolist() == [[1.0]]
 
 
 @pytest.mark.parametrize("direction", ["along", "across"])

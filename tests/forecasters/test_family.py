@@ -211,7 +211,7 @@ class TestHighwayDSDNet(DSDNet, HighwayRow):
 
 
 class TestHighwayTGL(TGL, HighwayRow):
-    pass
+    lessons = 60  # who goes first is hard to see of agents that are near each other, and only those count
 
 
 class TestHighwayEBIOC(EBIOC, HighwayRow):
