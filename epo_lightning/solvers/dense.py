@@ -16,6 +16,7 @@ from torch import Tensor
 
 from epo_lightning.game.energy import RESIDUALS, Energy
 from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.solvers import descent
 
 _PRODUCTS = 64
 """Products of matrices and vectors that are computed together: a bound on memory."""
@@ -135,7 +136,9 @@ def attach(
         factor, sound = factorise(matrix)
     scene, parameters = _silenced(scene, parameters, sound)
     with torch.enable_grad():
-        _, slope = gradient(energy, scene, parameters, torch.where(_wide(sound, controls), controls, 0.0))
+        value, slope = gradient(energy, scene, parameters, torch.where(_wide(sound, controls), controls, 0.0))
+        flat = slope.detach().flatten(2)
+        descent.say_if_far(value, flat, torch.cholesky_solve(flat[..., None], factor)[..., 0], sound)
         move = torch.cholesky_solve((slope - slope.detach()).flatten(2)[..., None], factor).view_as(controls)
         return controls - torch.where(_wide(sound, move), move, 0.0), torch.where(
             sound, Status.SOLVED, Status.STOPPED

@@ -6,6 +6,8 @@ stay bit for bit as they are. On CPUs the loop ends with the last of them; elsew
 
 from __future__ import annotations
 
+import warnings
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -13,6 +15,9 @@ from torch import Tensor
 from epo_lightning.game.energy import Energy
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 
+_FAR, _TINY = 1e-3, 1e-6
+"""Share of the energy, and energy, that a minimum's Newton decrement stays below."""
+_said = False
 _ROUNDING = 8.0
 """Roundings by which an energy may seem to rise over a step that lowers its gradient."""
 
@@ -96,3 +101,37 @@ def solution(
 def first_status(sound: Bool[Tensor, "B M"]) -> Tensor:
     """STOPPED where there is no number to begin with."""
     return torch.where(sound, int(Status.SOLVED), int(Status.STOPPED))
+
+
+def say_if_far(
+    value: Float[Tensor, "*batch"],
+    slope: Float[Tensor, "*batch n"],
+    step: Float[Tensor, "*batch n"],
+    sound: Bool[Tensor, "*batch"],
+) -> None:
+    """Warn, once per process, if more than half of the solutions that are differentiated as minima are none.
+
+    The Newton decrement 1/2 g . H^-1 g is what a quadratic model says is left to gain. Looked at on CPUs only: elsewhere the
+    host would have to wait.
+
+    Args:
+        value: E at the solutions.
+        slope: its gradient g.
+        step: H^-1 g.
+        sound: whether H is positive definite.
+    """
+    global _said
+    if _said or not sound.numel() or sound.device.type != "cpu":
+        return
+    with torch.no_grad():
+        left = 0.5 * (slope * step).sum(-1)
+        far = ~(sound & (left <= _FAR * value.abs() + _TINY))
+        share = far.double().mean().item()
+    if share > 0.5:
+        _said = True
+        warnings.warn(
+            f"backward=implicit: {100 * share:.0f} % of the solutions of a batch are no minima (a Newton decrement of more "
+            f"than {100 * _FAR:g} % of the energy, or a Hessian that is not positive definite). What is learned through "
+            "them is not right: take more solver.steps, solver.adaptive=true where the solver has it, or backward=unrolled",
+            stacklevel=2,
+        )

@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.solvers import descent
 from epo_lightning.solvers.structured import Game, factorise, planar
 
 
@@ -44,6 +45,9 @@ class _Attach(torch.autograd.Function):
     def forward(ctx: Any, game: Game, exact: bool, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         model = QuadraticModel(game.energy, game.scene, game.with_tensors(tensors), controls, not game.split, exact)
         ctx.factors = factorise(model, game.damping, game.split, retry=False)
+        slope = model.gradient
+        left = ctx.factors.solve(slope).flatten(1)
+        descent.say_if_far(model.value, slope.flatten(1), left, ctx.factors.status != Status.STOPPED)
         ctx.game = game
         ctx.save_for_backward(*tensors)
         status = ctx.factors.status.view(controls.shape[:2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Status
-from epo_lightning.solvers import implicit
+from epo_lightning.solvers import descent, implicit
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.dense import attach, factorise, gauss_newton, gradient, hessian
 from epo_lightning.solvers.newton import Newton
@@ -333,3 +334,34 @@ def test_padding_and_batches_do_not_change_gradients():
         torch.testing.assert_close(whole[1:2], one, rtol=1e-11, atol=1e-12)
         torch.testing.assert_close(wide[:, :, :3], whole, rtol=1e-11, atol=1e-12)
         assert (wide[:, :, 3:] == 0).all()
+
+
+@pytest.mark.parametrize("kind", ["features", "convex", "gauss_newton"])
+def test_solutions_that_are_no_minima_are_told_of_once(kind, monkeypatch):
+    energy, (scene, game) = (convex_energy(), convex_game()) if kind == "convex" else (FEATURES, feature_game())
+    teach = Implicit("gauss_newton" if kind == "gauss_newton" else "exact")
+    monkeypatch.setattr(descent, "_said", False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        teach(NEWTON, energy, scene, leaves_of(game))
+        with torch.no_grad():
+            teach(Newton(steps=0), energy, scene, game)  # nothing is differentiated
+    far = leaves_of(game)
+    with pytest.warns(UserWarning, match=r"backward=implicit: \d+ % of the solutions .* no minima .*solver.steps"):
+        teach(Newton(steps=0), energy, scene, far)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        teach(Newton(steps=0), energy, scene, far)
+
+
+@pytest.mark.parametrize(
+    ("shares", "told"), [((2e-3, 2e-3, 5e-4), "67 %"), ((2e-3, 5e-4, 5e-4), None), ((0.0, 0.0, 0.0), None)]
+)
+def test_only_most_of_a_batch_makes_a_warning(shares, told, monkeypatch):
+    monkeypatch.setattr(descent, "_said", False)
+    left = torch.tensor(shares, dtype=torch.float64)[:, None]
+    slope, value = (2.0 * left).sqrt()[..., None], torch.ones_like(left)  # with a Hessian of 1
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        descent.say_if_far(value, slope, slope, left.isfinite())
+    assert [told in str(warning.message) for warning in caught] == ([True] if told else [])
