@@ -327,8 +327,11 @@ class Equilibrium(_Batch):
     Attributes:
         initial, energy: E at the strategies from which the solver started, and at the forecast.
         optimum: E at the local minimum that a tightly converged descent from the forecast leads to; never above ``energy``.
+            NaN where the energy, or the objective of one agent, was given up while it was still falling: energies that are
+            networks need not have a minimum.
         gradient_norm: Euclidean norm of dE/du at the forecast; NaN where strategies are chosen among candidates.
-        nash_gap: what each agent could gain by changing its strategy alone, to a local best response; zero where absent.
+        nash_gap: what each agent could gain by changing its strategy alone, to a local best response; zero where absent,
+            NaN where ``optimum`` is.
         objective: J_i, what each agent minimises, at the forecast; zero where absent, NaN where it has no natural zero.
     """
 

@@ -12,6 +12,9 @@ strategies are chosen among candidates the minimum is one over a row of a table,
 Only the most likely joint mode is looked at, the one that overlap rates look at too: every scene is one game, and its best
 responses are *worlds* in which one agent moves and the others are held. All worlds of a batch are solved side by side,
 and those that have arrived are left out.
+
+Networks need not be bounded from below: where a descent is given up while the energy is still falling fast, there is no
+minimum to compare with, and the optimum and the gaps of that scene are NaN.
 """
 
 from __future__ import annotations
@@ -51,6 +54,9 @@ def equilibrium(energy: Energy, scene: Scene, forecast: JointForecast) -> Equili
       lowest of what choosing anew, agent after agent, leads to from any of the joint modes.
     - Any other energy with a gradient: quasi-Newton steps (:mod:`~epo_lightning.solvers.quasi_newton`).
 
+    Features are sums of squares and always have a minimum. With other energies a descent may find none in its 300
+    evaluations: ``optimum`` and the gaps of such a scene are NaN, and its other values are reported.
+
     A scene that holds no finite numbers has no finite report, and leaves those of the others as they are.
 
     Args:
@@ -81,12 +87,14 @@ def equilibrium(energy: Energy, scene: Scene, forecast: JointForecast) -> Equili
 
 @dataclass(frozen=True)
 class Descent:
-    """From where to where: what is minimised before and after, the controls after, and the slope before."""
+    """From where to where: what is minimised before and after, the controls after, the slope before, and whether a minimum
+    was found."""
 
     before: Float[Tensor, " W"]
     after: Float[Tensor, " W"]
     controls: Float[Tensor, "W 1 N K 2"]
     slope: Float[Tensor, " W"]
+    found: Bool[Tensor, " W"]
 
 
 Descend = Callable[[Energy, Scene, GameParameters, Tensor | None], Descent]
@@ -106,12 +114,14 @@ def _smooth(
     moved = descend(energy, worlds, dataclasses.replace(games, initial_controls=tried), agent)
     gap = (stayed.before - stayed.after.fmin(moved.after)).clamp_min(0.0)
     none = initial.new_zeros(scene.agent_mask.shape)
+    lost = torch.zeros_like(scene.agent_mask).index_put((origin, agent), ~(stayed.found & moved.found))
+    lost = lost.any(1) | ~optimum.found
     return Equilibrium(
         initial=initial,
         energy=optimum.before,
-        optimum=optimum.after,
+        optimum=torch.where(lost, torch.nan, optimum.after),
         gradient_norm=optimum.slope,
-        nash_gap=none.index_put((origin, agent), gap),
+        nash_gap=torch.where(lost[:, None] & scene.agent_mask, torch.nan, none.index_put((origin, agent), gap)),
         objective=none.index_put((origin, agent), stayed.before),
     )
 
@@ -157,7 +167,7 @@ def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent:
             if arrived.any():
                 on = (~arrived).nonzero()[:, 0]
                 left, some, these = left[on], some[on], these[on]
-    return Descent(here.energy[:, 0], value[:, 0], controls, here.gradient_norm[:, 0])
+    return Descent(here.energy[:, 0], value[:, 0], controls, here.gradient_norm[:, 0], value[:, 0].isfinite())
 
 
 def _gauss_newton(
@@ -213,7 +223,7 @@ def _descend_any(energy: Energy, scene: Scene, game: GameParameters, agent: Int[
     else:
         controls = start.clone()
         controls[chosen, 0, agent] = found.point.view(-1, *start.shape[3:])
-    return Descent(found.before, found.after, controls, found.slope)
+    return Descent(found.before, found.after, controls, found.slope, found.found)
 
 
 def _finite(
@@ -323,4 +333,4 @@ def _only(agent: Int[Tensor, " W"], agents: int) -> Bool[Tensor, "W N"]:
 def _nowhere(controls: Float[Tensor, "W 1 N K 2"]) -> Descent:
     """The descent of no world at all."""
     none = controls.new_zeros(len(controls))
-    return Descent(none, none, controls, none)
+    return Descent(none, none, controls, none, none == 0)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 _EVALUATIONS = 300
@@ -22,6 +22,8 @@ _CURVED = 1e-10
 """Cosine of step and change of slope from which on the curvature is positive beyond rounding."""
 _TOLERANCE = 1e-10
 """Of the value: where less is promised, a function is at its minimum."""
+_LATELY, _FALLING = 30, 1e-2
+"""Who still loses more than this share of its whole decrease in its last 30 evaluations has not come near a minimum."""
 _UPDATES = 3
 """At least, before a promise counts: the first ones know nothing of the curvature."""
 _ENTRIES = 2**24
@@ -33,27 +35,38 @@ Evaluate = Callable[[Int[Tensor, " w"], Float[Tensor, "w n"]], tuple[Float[Tenso
 
 @dataclass(frozen=True)
 class Minimum:
-    """What W functions were and have become, where, and how steep they were."""
+    """What W functions were and have become, where, and how steep they were.
+
+    Attributes:
+        before, after: values at the start and at ``point``.
+        point: the lowest that was found.
+        slope: Euclidean norm of the gradient at the start.
+        found: whether ``point`` is next to a minimum: a step promised nothing, or none helped any more, or the evaluations
+            ran out when there was little left to gain. Otherwise the function was given up while it was still falling; it
+            may have no minimum at all.
+    """
 
     before: Float[Tensor, " W"]
     after: Float[Tensor, " W"]
     point: Float[Tensor, "W n"]
     slope: Float[Tensor, " W"]
+    found: Bool[Tensor, " W"]
 
 
 def minimise(evaluate: Evaluate, start: Float[Tensor, "W n"]) -> Minimum:
     """Descend from ``start`` until a step promises less than 1e-10 of the value, in at most 300 evaluations.
 
     Steps are halved, or shortened to where a parabola has its minimum, until they lower the value; what was found is never
-    above the start. A function without a finite value stays where it is.
+    above the start. A function without a finite value stays where it is, and is not found. Those that run out of
+    evaluations are, unless they lost more than 1 % of their whole decrease in the last 30.
     """
     many = max(1, _ENTRIES // max(1, start.shape[1] ** 2))
     numbers = torch.arange(len(start), device=start.device)
     parts = [_minimise(evaluate, start[some], some) for some in numbers.split(many)]
     if not parts:
         none = start.new_zeros(0)
-        return Minimum(none, none, start, none)
-    return Minimum(*(torch.cat([getattr(p, name) for p in parts]) for name in ("before", "after", "point", "slope")))
+        return Minimum(none, none, start, none, none.bool())
+    return Minimum(*(torch.cat(tensors) for tensors in zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 def _minimise(evaluate: Evaluate, start: Tensor, numbers: Tensor) -> Minimum:
@@ -65,9 +78,12 @@ def _minimise(evaluate: Evaluate, start: Tensor, numbers: Tensor) -> Minimum:
     # The first step is one unit of the controls long at most.
     inverse = unit / g.norm(dim=1).clamp_min(1.0)[:, None, None]
     updates, stride = torch.zeros_like(left), torch.ones_like(f)
-    for _ in range(_EVALUATIONS):
+    lately = before.clone()
+    for count in range(_EVALUATIONS):
         if not len(left):
             break
+        if count == _EVALUATIONS - _LATELY:
+            lately[left] = f
         direction = -(inverse * g[:, None]).sum(2)
         promised = (g * direction).sum(1)
         trial = x + stride[:, None] * direction
@@ -94,7 +110,9 @@ def _minimise(evaluate: Evaluate, start: Tensor, numbers: Tensor) -> Minimum:
         if arrived.any():
             on = (~arrived).nonzero()[:, 0]
             left, x, f, g, inverse, updates, stride = (t[on] for t in (left, x, f, g, inverse, updates, stride))
-    return Minimum(before, after, point, steep.norm(dim=1))
+    settled = after.isfinite() & steep.isfinite().all(1)
+    settled[left] &= (lately - after <= _FALLING * (before - after))[left]
+    return Minimum(before, after, point, steep.norm(dim=1), settled)
 
 
 def _update_(

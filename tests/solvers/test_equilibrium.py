@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 
 from epo_lightning.game.energy import GRADIENT, Energy, pairs
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS, equilibrium_values
 from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status, Tables
 from epo_lightning.solvers import compiled, quasi_newton, structured
 from epo_lightning.solvers.equilibrium import equilibrium
@@ -490,3 +491,55 @@ def test_rosenbrocks_valleys_are_followed_to_their_ends():
     first, _ = evaluate(torch.arange(4), starts)
     assert torch.equal(found.before[:3], first[:3])
     assert quasi_newton.minimise(evaluate, starts[:0]).after.shape == (0,)
+
+
+def test_who_falls_without_end_is_given_up_and_who_creeps_is_not():
+    # Down a slope for ever, towards a bound that is never reached, along a parabola, and a quartic with a flat ground.
+    def evaluate(index, point):
+        with torch.enable_grad():
+            x = point.clone().requires_grad_()
+            every = torch.stack(
+                (-torch.nn.functional.softplus(x).sum(1), torch.exp(-x).sum(1), x.square().sum(1), (x**4).sum(1))
+            )
+            value = every[index, torch.arange(len(index))]
+            (slope,) = torch.autograd.grad(value.sum(), x)
+        return value.detach(), slope
+
+    found = quasi_newton.minimise(evaluate, torch.full((4, 3), 2.0).double())
+    assert found.found.tolist() == [False, True, True, True]
+    assert found.after[0] < -100.0
+    assert found.after[1:].max() < 1e-6
+    alone = quasi_newton.minimise(lambda index, point: evaluate(index * 0, point), torch.full((1, 3), 2.0).double())
+    assert not alone.found.item()
+
+
+class Downhill(Opaque):
+    """An energy that falls without end with the accelerations of whoever starts to the right of the origin."""
+
+    def own_terms(self, scene, parameters, states, controls):
+        terms = self.features.own_terms(scene, parameters, states, controls)
+        right = self.initial(scene)[..., 0] > 0
+        return {**terms, "acc": torch.where(right, -controls[..., 0].sum(-1), terms["acc"])}
+
+
+def test_energies_without_a_minimum_have_no_optimum_and_no_gap(monkeypatch):
+    monkeypatch.setattr(quasi_newton, "_EVALUATIONS", 80)  # so that it does not take long
+    scene = random_scene(3, 2, history=2, size=1.5, dtype=torch.float64)
+    history = scene.history.clone()
+    history[..., 0] = -history[..., 0].abs() - 1.0
+    history[1, 1, :, 0] = 3.0
+    scene = pad(dataclasses.replace(scene, history=history))
+    parameters = widen(random_game(random_scene(3, 2, history=2, dtype=torch.float64), 1, STEPS, own=("acc", "turnr")))
+    features = FeatureEnergy(("acc", "turnr"), ["proximity"])
+    energy = Downhill(features)
+    forecast = forecast_of(energy, scene, parameters, parameters.initial_controls)
+    found = equilibrium(energy, scene, forecast)
+    assert found.optimum.isnan().tolist() == [False, True, False]
+    assert found.nash_gap.isnan()[:, :2].all(1).tolist() == [False, True, False]
+    assert not found.nash_gap[[0, 2]].isnan().any()
+    assert (found.nash_gap[:, 2:] == 0).all()
+    assert found.energy.isfinite().all()
+    assert found.gradient_norm.isfinite().all()
+    metrics = equilibrium_values(dataclasses.replace(forecast, equilibrium=found))
+    names = [name for name, value in zip(EQUILIBRIUM_METRICS, metrics, strict=True) if value[1].isnan()]
+    assert names == ["energy_optimum", "nash_gap", "nash_gap_relative"]
