@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from epo_lightning.game.circles import disc, length_of, row_extent, row_overlap
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.energy import pairs
-from epo_lightning.game.network_energy import NetworkEnergy
+from epo_lightning.game.network_energy import NetworkEnergy, check_hidden
 from epo_lightning.game.networks import MOTION, Layers, motion, squared_distances
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import SPEED, GameParameters, Scene
@@ -45,7 +45,7 @@ class CollisionEnergy(NetworkEnergy):
         hidden: size of the hidden features.
 
     Raises:
-        ConfigError: an unknown shape, a gamma that is not positive, or no waypoint.
+        ConfigError: an unknown shape, a gamma that is not positive, no waypoint, or no hidden feature.
     """
 
     offers = frozenset()
@@ -67,6 +67,7 @@ class CollisionEnergy(NetworkEnergy):
         hidden: int = 64,
     ) -> None:
         super().__init__(dynamics, width, horizon, scale, own, pair, bounds, pair_stride)
+        check_hidden(hidden)
         if shape not in SHAPES:
             raise ConfigError(f"unknown shape {shape!r} of agents: {nearest(str(shape), SHAPES)}")
         if not gamma > 0:

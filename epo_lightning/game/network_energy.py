@@ -164,3 +164,13 @@ class NetworkEnergy(nn.Module, Energy):
             raise ValueError(f"parameters.context has shape {shape}; this scene and energy take {expected}")
         if self.features is not None:
             self.features.validate(scene, parameters, controls)
+
+
+def check_hidden(hidden: int) -> None:
+    """Refuse networks without hidden features.
+
+    Raises:
+        ConfigError: as said.
+    """
+    if hidden < 1:
+        raise ConfigError(f"energy.hidden must be 1 or more, not {hidden}")

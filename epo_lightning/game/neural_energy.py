@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.energy import GRADIENT, pairs
-from epo_lightning.game.network_energy import NetworkEnergy
+from epo_lightning.game.network_energy import NetworkEnergy, check_hidden
 from epo_lightning.game.networks import ENCOUNTER, MOTION, Layers, encounter, motion
 from epo_lightning.registry import register
 from epo_lightning.scene import GameParameters, Scene
@@ -40,6 +40,9 @@ class NeuralEnergy(NetworkEnergy):
         dynamics, width, horizon, scale, own, pair, bounds, pair_stride: see
             :class:`~epo_lightning.game.network_energy.NetworkEnergy`.
         hidden: size of the hidden features.
+
+    Raises:
+        ConfigError: no hidden feature.
     """
 
     offers = frozenset({GRADIENT})
@@ -58,6 +61,7 @@ class NeuralEnergy(NetworkEnergy):
         hidden: int = 64,
     ) -> None:
         super().__init__(dynamics, width, horizon, scale, own, pair, bounds, pair_stride)
+        check_hidden(hidden)
         self.embedding = Layers((width, MOTION * horizon), hidden)
         self.own_value = nn.Linear(hidden, 1, bias=False)
         self.interaction = Layers((hidden, hidden, ENCOUNTER), hidden)

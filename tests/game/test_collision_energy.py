@@ -145,6 +145,7 @@ def test_bad_settings_are_refused():
         ({"shape": "bxo"}, "unknown shape 'bxo' of agents: did you mean 'box'"),
         ({"shape": "box", "gamma": 0.0}, "must be positive, not 0.0"),
         ({"shape": "box", "waypoints": 0}, "waypoints must be 1 or more, not 0"),
+        ({"shape": "box", "hidden": 0}, "energy.hidden must be 1 or more, not 0"),
     ):
         with pytest.raises(ConfigError, match=message):
             CollisionEnergy(Unicycle(), WIDTH, HORIZON, 1.0, **settings_)

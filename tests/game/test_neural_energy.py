@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.networks import encounter
 from epo_lightning.game.neural_energy import NeuralEnergy
+from epo_lightning.registry import ConfigError
 
 WIDTH, HORIZON, SCALE = 3, 4, 2.0
 
@@ -172,3 +173,9 @@ def test_the_first_of_equally_near_steps_counts():
     met = encounter(states[0], states[1], SCALE)
     expected = torch.tensor([0.0, 3.0 / SCALE, 3.0 / SCALE, 1 / HORIZON, 1.0, 0.0], dtype=torch.float64)
     torch.testing.assert_close(met, expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("hidden", [0, -3])
+def test_networks_without_hidden_features_are_refused(hidden):
+    with pytest.raises(ConfigError, match=f"energy.hidden must be 1 or more, not {hidden}"):
+        NeuralEnergy(Unicycle(), WIDTH, HORIZON, SCALE, hidden=hidden)
