@@ -1,4 +1,4 @@
-"""Samples from near p(u | o) = exp(-E(u; o)) / Z by noisy steps against the gradient: the synthesis of EBIOC (arXiv 1904.05453).
+"""Samples near p(u | o) = exp(-E(u; o)) / Z by noisy steps against the gradient: the synthesis of EBIOC (arXiv 1904.05453).
 
     u <- u - (delta^2 / 2) S^2 dE/du + delta S z,   z ~ N(0, I)
 
