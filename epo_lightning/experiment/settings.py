@@ -18,6 +18,8 @@ from epo_lightning.registry import ConfigError, check, lookup, nearest
 Measured = Literal["test", "val", "time"]
 """What may be measured of a run: its scores on a split, or the time of a forecast."""
 PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective", "optimizer")
+PRECISIONS = ("32-true", "64-true")
+"""Lightning's names of those that solvers take."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,11 @@ class TrainerSettings:
     def __post_init__(self) -> None:
         if (self.max_epochs is None or self.max_epochs < 0) and self.max_steps < 0:
             raise ConfigError("trainer.max_epochs and trainer.max_steps are both open: the run would never end")
+        if self.precision not in PRECISIONS:
+            raise ConfigError(
+                f"trainer.precision must be one of {', '.join(PRECISIONS)}, not {self.precision!r}: games are solved by "
+                "factorisations, which have too few digits in 16 bits"
+            )
         for name in ("threads", "devices", "share", "validate_every", "log_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"trainer.{name} must be 1 or more, not {getattr(self, name)}")
