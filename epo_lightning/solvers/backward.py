@@ -4,9 +4,9 @@
 - ``truncated``: that of the last few steps, the iterate before them taken as given.
 - ``implicit``: that of the minimum which the steps approach (implicit function theorem), whatever led there. It is right
   only where the solution is a minimum, so take many steps: a warning is given, once, where most of a batch are none. A
-  sample whose Hessian is not positive definite is no minimum and gets a gradient of zero and the status STOPPED. A minimum does not
-  move when all weights of a game are scaled together, so the gradient has no component along them, w . dL/dw = 0: their
-  overall scale is not learned and drifts. Fix one weight, or normalise.
+  sample whose Hessian is not positive definite is no minimum and gets a gradient of zero and the status STOPPED. A minimum
+  does not move when all weights of a game are scaled together, so the gradient has no component along them, w . dL/dw = 0:
+  their overall scale is not learned and drifts. Fix one weight, or normalise.
 - ``detached``: none, for objectives that compare energies instead of solutions.
 """
 
