@@ -19,6 +19,10 @@ from epo_lightning.solvers.base import TABLES
 DENSITIES = ("joint", "marginal")
 
 
+GOAL = 0.1
+"""Weight of the cross entropy of goals; energies over candidates seldom have any."""
+
+
 @register("objective", "conditional")
 class Conditional(Objective):
     """-log p(k*) with p(k) = exp(-E(k)) / Z, and k*_i agent i's candidate that is closest to what it did.
@@ -40,7 +44,7 @@ class Conditional(Objective):
         weights: lambda of ``density``; of ``marginal``, the cross entropy of every agent's candidates by their own energies
             alone, exp(-E_i) (JFP's auxiliary loss); and of ``regression``, the distance of the closest candidate, which
             moves it where candidates are learned, and elsewhere tells how well they cover what happened; and of ``goal``,
-            which teaches goals where they are decoded, and is idle elsewhere.
+            which teaches goals where they are decoded, and is idle elsewhere (0.1 where it is not named).
         density: ``joint`` or ``marginal``.
     """
 
@@ -51,7 +55,7 @@ class Conditional(Objective):
     def __init__(self, weights: Mapping[str, float], density: str = "joint") -> None:
         if density not in DENSITIES:
             raise ConfigError(f"unknown objective.density {density!r}: {nearest(str(density), DENSITIES)}")
-        self.weights = checked_weights(weights, self.terms)
+        self.weights = checked_weights({"goal": GOAL, **weights}, self.terms)
         self.density = density
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
