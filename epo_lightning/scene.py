@@ -349,7 +349,7 @@ class JointForecast(_Batch):
 
     Attributes:
         states: futures; agents of one mode belong together.
-        probabilities: of the joint modes; sum to one.
+        probabilities: of the joint modes; sum to one, zero for modes that repeat an earlier one.
         agent_probabilities: of each agent's own modes, for forecasters that are marginal (per agent); the joint modes
             are then ordered so that mode m is everyone's m-th most likely one.
         controls: the strategies behind ``states``, where the forecaster has any.
@@ -357,7 +357,7 @@ class JointForecast(_Batch):
         parameters: the inferred game.
         solution: how the game was solved.
         goal_probabilities: of each agent's goal candidates, for forecasters that choose among them.
-        order_logits: of every pair's order being +1, for forecasters whose modes are orders.
+        order_logits: of every pair's order being +1, zero where it does not matter; for forecasters whose modes are orders.
         own_energy: energy by feature and agent at the solution.
         pair_energy: energy by feature and pair at the solution.
         equilibrium: how close the most likely mode is to an equilibrium, where that was asked for.

@@ -12,14 +12,15 @@ from typing import Any
 
 from epo_lightning.game.energy import CONVEX, FEATURES, GRADIENT, RESIDUALS
 from epo_lightning.registry import ConfigError, parts
-from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, TABLES
+from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, STEPS, TABLES
 
 WORDS = {
     GRADIENT: "a gradient",
     RESIDUALS: "residuals, of which it is half the sum of squares",
     FEATURES: "named features whose structure the solver knows",
     CONVEX: "convexity",
-    PATH: "steps that can be differentiated",
+    PATH: "a path that can be differentiated",
+    STEPS: "steps of which it can take some and go on",
     STATIONARY: "strategies at which the gradient vanishes",
     SAMPLES: "samples",
     TABLES: "energies of candidates",

@@ -44,7 +44,7 @@ class Marginal(Forecaster):
     ) -> None:
         super().__init__(task, optimizer)
         self.backbone = backbone
-        self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"))
+        self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.decoder = Trajectories(backbone.width, modes, task.horizon, task.scale)
 

@@ -45,7 +45,7 @@ class SceneConsistent(Forecaster):
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.dynamics = dynamics
-        self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"))
+        self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
         self.probabilities = SceneProbabilities(backbone.width, modes, task.horizon, task.scale)

@@ -159,7 +159,7 @@ def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, 
         path=run.path,
         name=setting("title"),
         seed=int(seed),
-        data=str(config["data"].get("dataset") or config["data"]["name"]),
+        data=_data(config["data"]),
         backbone=setting("backbone", "name"),
         forecaster=setting("forecaster", "name"),
         experiment=str(config.get("experiment") or ""),
@@ -177,6 +177,12 @@ def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, 
         row=row_identity(config, trained),
         config=config,
     )
+
+
+def _data(section: Mapping[str, Any]) -> str:
+    """What a data set is called; scenes drawn in the shapes of two tasks are two."""
+    name = str(section.get("dataset") or section["name"])
+    return f"{name} ({section['like']})" if name == "drawn" and "like" in section else name
 
 
 def _version(record: Mapping[str, Any]) -> str:

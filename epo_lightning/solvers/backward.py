@@ -24,7 +24,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers import dense, implicit
-from epo_lightning.solvers.base import PATH, STATIONARY, TABLES, Minimiser, Stepwise
+from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, TABLES, Minimiser, Stepwise
 
 HESSIANS = ("exact", "gauss_newton")
 
@@ -73,7 +73,7 @@ class Truncated(Backward):
         steps: how many.
     """
 
-    needs = frozenset({PATH})
+    needs = frozenset({STEPS})
 
     steps: int = 1
 

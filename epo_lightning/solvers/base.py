@@ -13,9 +13,9 @@ from typing import Any, ClassVar
 from epo_lightning.game.energy import Energy
 from epo_lightning.scene import GameParameters, Scene, Solution
 
-PATH, STATIONARY, SAMPLES, TABLES = "path", "stationary", "samples", "tables"
-"""What a minimiser may provide: steps that can be differentiated, strategies at which the gradient vanishes, draws from
-exp(-E), or energies of candidates, with their normalised log-probabilities."""
+PATH, STEPS, STATIONARY, SAMPLES, TABLES = "path", "steps", "stationary", "samples", "tables"
+"""What a minimiser may provide: a path that can be differentiated; steps of which it can take some and go on; strategies
+at which the gradient vanishes; draws from exp(-E); or energies of candidates, with their normalised log-probabilities."""
 
 
 class Minimiser(ABC):
@@ -26,7 +26,7 @@ class Minimiser(ABC):
 
     Attributes:
         needs: what an energy has to offer (:mod:`epo_lightning.game.energy`).
-        provides: some of :data:`PATH`, :data:`STATIONARY`, :data:`SAMPLES` and :data:`TABLES`.
+        provides: some of :data:`PATH`, :data:`STEPS`, :data:`STATIONARY`, :data:`SAMPLES` and :data:`TABLES`.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset()
@@ -58,7 +58,7 @@ class Minimiser(ABC):
 
 
 class Stepwise(Minimiser):
-    """A minimiser that takes S differentiable steps, and can go on where it stopped."""
+    """A minimiser that takes S differentiable steps, and can go on where it stopped: it provides PATH and STEPS."""
 
     steps: int
 

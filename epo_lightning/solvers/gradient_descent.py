@@ -25,7 +25,7 @@ from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.selection import evaluated
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
-from epo_lightning.solvers.base import PATH, STATIONARY, Stepwise
+from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
 from epo_lightning.solvers.dense import gradient
 
 
@@ -64,7 +64,7 @@ class GradientDescent(Stepwise):
     """
 
     needs = frozenset({GRADIENT})
-    provides = frozenset({PATH, STATIONARY})
+    provides = frozenset({PATH, STEPS, STATIONARY})
 
     steps: int = 16
     step_size: float = 0.005

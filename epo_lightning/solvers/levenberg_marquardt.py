@@ -20,7 +20,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers import compiled, structured
-from epo_lightning.solvers.base import PATH, STATIONARY, Stepwise
+from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
 
 Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool], Solution]
 """(energy, scene, parameters, steps, step size, damping [B, M] or [B, M, N], keep iterates) -> solution.
@@ -58,7 +58,7 @@ class LevenbergMarquardt(Stepwise):
     """
 
     needs = frozenset({FEATURES})
-    provides = frozenset({PATH, STATIONARY})
+    provides = frozenset({PATH, STEPS, STATIONARY})
 
     steps: int = 2
     step_size: float = 0.3

@@ -38,11 +38,11 @@ def documented():
 
 
 def test_documented_features_work_in_the_layer(documented):
-    assert documented == {"lateral", "hurry"}
+    assert documented == {"latacc", "hurry"}
     scene = random_scene(3, 2, history=2, dtype=torch.float64)
     scene.history[..., 3] += 29.5
     scene.history[..., 2] = 0.0  # side by side
-    own = ("goal", "acc", "turnr", "lateral", "hurry")
+    own = ("goal", "acc", "turnr", "latacc", "hurry")
     parameters = random_game(scene, own=own)
     parameters.pair_weights["comfort"] = parameters.pair_weights["proximity"]
     leaves = leaves_of(parameters)
@@ -57,14 +57,14 @@ def test_documented_features_work_in_the_layer(documented):
 
 def test_documented_features_work_beside_networks(documented):
     scene = random_scene(3, 2, history=2, horizon=7, dtype=torch.float64)
-    parameters = random_game(scene, own=("lateral",))
+    parameters = random_game(scene, own=("latacc",))
     context = torch.randn(3, 2, 8, dtype=torch.float64)
     parameters = dataclasses.replace(
         parameters, pair_weights={"comfort": parameters.pair_weights["proximity"]}, context=context
     )
-    energy = NeuralEnergy(Unicycle(), 8, 7, 1.0, own=["lateral"], pair=["comfort"]).double()
+    energy = NeuralEnergy(Unicycle(), 8, 7, 1.0, own=["latacc"], pair=["comfort"]).double()
     leaves = leaves_of(parameters)
     solution = GradientDescent(steps=3, step_size=1e-3)(energy, scene, leaves)
     assert (solution.energy < solution.initial_energy).all()
     solution.controls.square().sum().backward()
-    assert leaves.own_weights["lateral"].grad.abs().max() > 0
+    assert leaves.own_weights["latacc"].grad.abs().max() > 0
