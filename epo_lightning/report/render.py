@@ -28,12 +28,12 @@ COMPARISON_LEGEND = (
 )
 
 GAMES = (
-    "Energies are those of the most likely joint mode: at the initial strategies (of candidates: everybody's cheapest by itself), "
-    "as forecast (solved), and at a tightly solved optimum near the forecast. The Nash gap is the most that an agent could gain "
-    "by changing its strategy alone, by local search: a lower bound; for methods that choose among candidates, by taking another "
-    "of its own candidates, where choosing the best joint one leaves nothing to gain. Relative: as a share of its own objective, "
-    "where that has a natural zero. Energies of different methods, their gradients and gaps are in different units; relative "
-    "gaps compare, and lower is better."
+    "Energies are those of the most likely joint mode: at the initial strategies (of candidates: everybody's cheapest "
+    "by itself), as forecast (solved), and at a tightly solved optimum near the forecast. The Nash gap is the most "
+    "that an agent could gain by changing its strategy alone, by local search: a lower bound; for methods that choose "
+    "among candidates, by taking another of its own candidates, where choosing the best joint one leaves nothing to "
+    "gain. Relative: as a share of its own objective, where that has a natural zero. Energies of different methods, "
+    "their gradients and gaps are in different units; relative gaps compare, and lower is better."
 )
 
 CSV_HEADER = (
