@@ -23,6 +23,7 @@ MEANING = {
     "probabilities": "[B, M] of the joint modes",
     "agent_probabilities": "[B, M, N] of each agent's own modes",
     "goal_probabilities": "[B, N, G] of each agent's goal candidates",
+    "order_logits": "[B, P] of every pair's order being +1, for forecasters whose modes are orders",
     "controls": "[B, M, N, K, 2] acceleration [m/s^2], turn rate [rad/s]",
     "initial_states": "[B, M, N, K, 4] where the solver started",
     "goals": "[B, M, N, 2] goals of the inferred game [m]",

@@ -70,4 +70,5 @@ def test_fixed_forecasts_move_with_the_world(name, x, y):
     still, likely = forecasts(name, "v_lstm", curve(900.0), "fixed")
     moved, as_likely = forecasts(name, "v_lstm", curve(900.0, 0.0, (x, y)), "fixed")
     close(moved, still + np.array([x, y]))
-    torch.testing.assert_close(as_likely, likely, rtol=0, atol=1e-3)
+    # Single precision, kilometres from the origin, through batch normalisation.
+    torch.testing.assert_close(as_likely, likely, rtol=0, atol=5e-3)
