@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from epo_lightning.game.energy import CONVEX, FEATURES, GRADIENT, RESIDUALS
+from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS
 from epo_lightning.registry import ConfigError, parts
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, STEPS, TABLES
 
@@ -18,7 +18,6 @@ WORDS = {
     GRADIENT: "a gradient",
     RESIDUALS: "residuals, of which it is half the sum of squares",
     FEATURES: "named features whose structure the solver knows",
-    CONVEX: "convexity",
     PATH: "a path that can be differentiated",
     STEPS: "steps of which it can take some and go on",
     STATIONARY: "strategies at which the gradient vanishes",

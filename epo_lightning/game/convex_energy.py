@@ -27,7 +27,7 @@ from torch import Tensor
 
 from epo_lightning.game.circles import disc
 from epo_lightning.game.double_integrator import DoubleIntegrator, rotate
-from epo_lightning.game.energy import CONVEX, GRADIENT, RESIDUALS, Energy, check_names, pairs
+from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy, check_names, pairs
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import HEADING, SPEED, GameParameters, Scene
 
@@ -158,7 +158,7 @@ class ConvexEnergy(Energy):
         dynamics: a :class:`~epo_lightning.game.double_integrator.DoubleIntegrator`.
     """
 
-    offers = frozenset({GRADIENT, RESIDUALS, CONVEX})
+    offers = frozenset({GRADIENT, RESIDUALS})
 
     own: Sequence[str]
     pair: Sequence[str] = ("order",)

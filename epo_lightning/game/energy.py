@@ -21,9 +21,9 @@ from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import GameParameters, Scene
 
-GRADIENT, RESIDUALS, FEATURES, CONVEX = "gradient", "residuals", "features", "convex"
+GRADIENT, RESIDUALS, FEATURES = "gradient", "residuals", "features"
 """What an energy may offer besides values: a gradient by the controls, residuals of which it is half the sum of squares,
-named features whose structure a solver knows, convexity in the controls."""
+named features whose structure a solver knows."""
 
 _TABLE_ENTRIES = 2_000_000
 """Steps of pairs of candidates that are looked at together: a bound on memory."""
@@ -54,7 +54,7 @@ class Energy(ABC):
     """The interface of all energies. A subclass says what its terms are; how they add up stands here.
 
     Attributes:
-        offers: some of :data:`GRADIENT`, :data:`RESIDUALS`, :data:`FEATURES` and :data:`CONVEX`.
+        offers: some of :data:`GRADIENT`, :data:`RESIDUALS` and :data:`FEATURES`.
         own, pair: names of the terms of agents and of pairs.
         dynamics: what turns controls into states.
     """
