@@ -18,7 +18,7 @@ STAMP := $(VENV)/.installed
 
 install: $(STAMP)
 
-KERNEL := $(wildcard epo_lightning/solvers/kernel/*.?pp)
+KERNEL := $(wildcard epo_lightning/solvers/gauss_newton/kernel/*.?pp)
 
 $(STAMP): pyproject.toml constraints.txt $(KERNEL)
 	$(PYTHON) -m venv $(VENV)
@@ -57,4 +57,4 @@ wheel: $(STAMP)
 	$(BIN)/pip wheel -q --no-deps -w dist .
 
 clean:
-	rm -rf epo_lightning/solvers/kernel/epo_kernel.* runs/reduced figures results.md results.csv results.tex comparisons.csv index.html build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf epo_lightning/solvers/gauss_newton/kernel/epo_kernel.* runs/reduced figures results.md results.csv results.tex comparisons.csv index.html build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

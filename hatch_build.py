@@ -17,7 +17,7 @@ class KernelHook(BuildHookInterface):
     """Compiles the kernel into the source tree, from where the wheel takes it."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        path = Path(self.root) / "epo_lightning" / "solvers" / "kernel" / "build.py"
+        path = Path(self.root) / "epo_lightning" / "solvers" / "gauss_newton" / "kernel" / "build.py"
         spec = importlib.util.spec_from_file_location("kernel_build", path)
         assert spec is not None
         assert spec.loader is not None

@@ -17,8 +17,8 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from epo_lightning.data.scenes import RecordedScenes
-from epo_lightning.data.windows import Extract, Recipe, extract, joined
+from epo_lightning.data.recorded.scenes import RecordedScenes
+from epo_lightning.data.recorded.windows import Extract, Recipe, extract, joined
 from epo_lightning.registry import lookup
 
 Result = TypeVar("Result")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from epo_lightning.experiment.compose import compose
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from benchmarks import peer, reference
 from benchmarks.games import Game
 from epo_lightning.scene import GameParameters
-from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 NAMES = ("peer", "reference", "pytorch", "compiled", "cuda")
 """Theseus; plain autograd; this project's layer in plain PyTorch, as compiled code, and in PyTorch on a GPU."""

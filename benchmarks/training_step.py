@@ -19,8 +19,8 @@ from rich.table import Table
 from torch import Tensor, nn
 
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.compose import compose
-from epo_lightning.experiment.settings import Settings, read
+from epo_lightning.experiment.config.compose import compose
+from epo_lightning.experiment.config.settings import Settings, read
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError

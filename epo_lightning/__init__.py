@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from epo_lightning.game.energy import Energy
     from epo_lightning.game.feature_energy import FeatureEnergy
     from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
-    from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
+    from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 _HOMES = {
     "load": "forecasters",
@@ -33,7 +33,7 @@ _HOMES = {
     "Scene": "scene",
     "Solution": "scene",
     "Status": "scene",
-    "LevenbergMarquardt": "solvers.levenberg_marquardt",
+    "LevenbergMarquardt": "solvers.gauss_newton.levenberg_marquardt",
 }
 
 __all__ = [

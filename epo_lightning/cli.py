@@ -162,7 +162,7 @@ def _help(arguments: Arguments) -> None:
     """The verb's own configuration file is its help: every line of it is commented."""
     from textwrap import fill
 
-    from epo_lightning.experiment.compose import hydra, options_of, tree
+    from epo_lightning.experiment.config.compose import hydra, options_of, tree
 
     if arguments.verb == "sweep":
         print(SWEEP_USAGE)
@@ -206,7 +206,7 @@ def _config(arguments: Arguments) -> None:
     verb = words.pop(0) if words and words[0] in VERBS and words[0] != "config" else "train"
     if words and "=" not in words[0] and not words[0].startswith("~"):
         raise ConfigError(f"epo config knows no {words[0]!r}: {nearest(words[0], ['check', *VERBS])}")
-    from epo_lightning.experiment.compose import compose
+    from epo_lightning.experiment.config.compose import compose
 
     config = compose(verb, words, arguments.extra)
     if not checking:
@@ -221,7 +221,7 @@ def _config(arguments: Arguments) -> None:
         print(f"{verb}: the configuration is sound")
         return
     from epo_lightning.experiment import assembly, train
-    from epo_lightning.experiment.settings import Settings, read
+    from epo_lightning.experiment.config.settings import Settings, read
 
     settings = read(Settings, config)
     data, model = assembly.check(settings)
@@ -240,7 +240,7 @@ def _single(arguments: Arguments) -> None:
     words = list(arguments.overrides)
     if arguments.verb == "report" and words and "=" not in words[0]:
         words[0] = f"sweep={words[0]}"
-    from epo_lightning.experiment.compose import compose
+    from epo_lightning.experiment.config.compose import compose
 
     config = compose(arguments.verb, words, arguments.extra)
     from epo_lightning.experiment import verbs
@@ -264,12 +264,12 @@ def _multirun(arguments: Arguments) -> None:
     """Check every job, then let Hydra launch them."""
     if arguments.verb != "train":
         raise ConfigError(f"epo {arguments.verb} takes no -m: give it runs=<folder> to work on several runs")
-    from epo_lightning.experiment import compose
+    from epo_lightning.experiment.config import compose
 
     listed = compose.jobs("train", arguments.overrides, arguments.extra)
     if listed:
         from epo_lightning.experiment import assembly, train
-        from epo_lightning.experiment.settings import Settings, read
+        from epo_lightning.experiment.config.settings import Settings, read
 
         for job in listed:
             settings = read(Settings, compose.compose("train", job, arguments.extra))
@@ -281,7 +281,7 @@ def _multirun(arguments: Arguments) -> None:
 
 def _sweep(arguments: Arguments) -> None:
     """See ``SWEEP_USAGE``."""
-    from epo_lightning.experiment import sweeping
+    from epo_lightning.experiment.sweeps import sweeping
 
     words = list(arguments.overrides)
     looking = words[:1] == ["status"]
@@ -313,13 +313,13 @@ def job_of_sweep(config: DictConfig) -> float | None:
     from omegaconf import OmegaConf
 
     from epo_lightning.experiment import verbs
-    from epo_lightning.experiment.compose import resolve
+    from epo_lightning.experiment.config.compose import resolve
 
     whole = OmegaConf.merge({"hydra": HydraConfig.get()}, config)
     OmegaConf.set_struct(whole, False)
     values, overrides = resolve(whole), list(HydraConfig.get().overrides.task)  # type: ignore[arg-type]
     if values.get("sweep"):
-        from epo_lightning.experiment.sweep import Sweep
+        from epo_lightning.experiment.sweeps.sweep import Sweep
 
         return Sweep(Path(values["sweep"])).work(values, overrides)
     return verbs.train(values, overrides)

@@ -10,8 +10,8 @@ import torch
 from epo_lightning.game import features
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES
-from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
 BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}
 """Narrow enough for random controls to leave them."""

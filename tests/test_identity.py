@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from epo_lightning.experiment.compose import compose
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.identity import differences, essence, identity, row_identity
 
 CONFIG = compose("train", ["experiment=rpi/v_lstm_epo"])

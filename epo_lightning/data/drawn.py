@@ -1,7 +1,8 @@
 """Scenes drawn at random in memory: for measuring time, smoke tests and checks where there is no data set.
 
 They have the shapes of real ones exactly, because the classes that read real records read these: what is drawn here are the
-tables, and :class:`~epo_lightning.data.rpi.scenes.RPIDataset` and :class:`~epo_lightning.data.scenes.RecordedScenes` make
+tables, and :class:`~epo_lightning.data.rpi.scenes.RPIDataset` and
+:class:`~epo_lightning.data.recorded.scenes.RecordedScenes` make
 scenes of them. There is nothing worth learning in them.
 """
 
@@ -16,10 +17,10 @@ from torch import Tensor
 
 from epo_lightning.data import cache
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
-from epo_lightning.data.routes import ACCELERATING, BEHIND, BEYOND, BRAKING, LINES, PER_LINE, POINTS
+from epo_lightning.data.recorded.routes import ACCELERATING, BEHIND, BEYOND, BRAKING, LINES, PER_LINE, POINTS
+from epo_lightning.data.recorded.scenes import RecordedScenes
+from epo_lightning.data.recorded.windows import MOST_AGENTS, SPACING, VECTORS, Recipe
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
-from epo_lightning.data.scenes import RecordedScenes
-from epo_lightning.data.windows import MOST_AGENTS, SPACING, VECTORS, Recipe
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import KINDS
 

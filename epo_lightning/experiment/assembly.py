@@ -22,7 +22,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from epo_lightning.data.datamodule import check_share
 from epo_lightning.experiment import debugging, gpus, logs
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
-from epo_lightning.experiment.settings import PARTS, Settings, TrainerSettings, check_part, check_types
+from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings, check_part, check_types
 from epo_lightning.forecasters import build_forecaster, check_model
 from epo_lightning.registry import ConfigError, build
 from epo_lightning.run_folder import RunFolder

@@ -18,7 +18,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch import callbacks as of_lightning
 from lightning.pytorch.callbacks import TQDMProgressBar
 
-from epo_lightning.experiment.settings import CallbackSettings
+from epo_lightning.experiment.config.settings import CallbackSettings
 from epo_lightning.run_folder import RunFolder, write_json
 
 

@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader
 from torch.utils.hooks import RemovableHandle
 from torchmetrics import Metric
 
-from epo_lightning.experiment.settings import TrainerSettings
+from epo_lightning.experiment.config.settings import TrainerSettings
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_text
 from epo_lightning.scene import Scene

@@ -117,7 +117,7 @@ def follow(place: Place, run: RunFolder | None = None) -> None:
     if store is None:
         return
     from epo_lightning.experiment import assembly, callbacks, train
-    from epo_lightning.experiment.settings import Settings, read
+    from epo_lightning.experiment.config.settings import Settings, read
 
     task = json.loads(store.get("task"))
     settings, run = read(Settings, task["config"]), RunFolder(Path(task["run"]))

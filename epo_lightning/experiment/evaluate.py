@@ -10,7 +10,7 @@ from lightning.pytorch import Trainer, seed_everything
 
 import epo_lightning
 from epo_lightning.experiment import assembly, gpus, logs
-from epo_lightning.experiment.settings import EvaluateSettings, Settings, TrainerSettings, read
+from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings, read
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, write_json
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from epo_lightning.experiment.settings import TrainerSettings
+from epo_lightning.experiment.config.settings import TrainerSettings
 
 _chosen: int | None = None
 

@@ -16,13 +16,13 @@ from typing import Any
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.utilities import rank_zero_only
 
+from epo_lightning.experiment.config.settings import DashboardSettings, LoggerSettings, Settings, read
 from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.experiment.dashboards.aside import Aside
 from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
 from epo_lightning.experiment.dashboards.mlflow import MLflow
 from epo_lightning.experiment.dashboards.tensorboard import TensorBoard
 from epo_lightning.experiment.dashboards.wandb import WandB
-from epo_lightning.experiment.settings import DashboardSettings, LoggerSettings, Settings, read
 from epo_lightning.identity import SECTIONS, identity
 from epo_lightning.run_folder import RunFolder, read_json
 
@@ -166,9 +166,9 @@ def _close(dashboards: Sequence[Aside], settings: Settings, run: RunFolder, fail
 def _pictures(settings: Settings, run: RunFolder, count: int) -> list[Path]:
     """Forecasts of the best checkpoint on the validation split, in ``logs/figures``; drawn once."""
     from epo_lightning.experiment import assembly
+    from epo_lightning.experiment.config.settings import PredictSettings
     from epo_lightning.experiment.evaluate import open_checkpoint
     from epo_lightning.experiment.predict import choose, draw, forecast_of
-    from epo_lightning.experiment.settings import PredictSettings
 
     if drawn := sorted((run.logs / "figures").glob("*.png")):
         return drawn

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.settings import PredictSettings, Settings, read
 from epo_lightning.experiment.evaluate import open_checkpoint, open_data, split_of
-from epo_lightning.experiment.settings import PredictSettings, Settings, read
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json
 from epo_lightning.scene import HEADING, KINDS, JointForecast, Scene, X, Y

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.settings import ReportSettings, Settings, read
 from epo_lightning.experiment.evaluate import open_checkpoint, open_data
 from epo_lightning.experiment.predict import choose, eventful, forecast_of, is_traffic, pairs, spread
-from epo_lightning.experiment.settings import ReportSettings, Settings, read
-from epo_lightning.experiment.sweep import Sweep
+from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import EvaluatedRun, Report, build_tables, collect, write_report

@@ -19,9 +19,9 @@ from lightning.pytorch import LightningModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import Timer
 
 from epo_lightning.experiment import assembly, callbacks, distributed, gpus, logs
-from epo_lightning.experiment.compose import PACKAGE
+from epo_lightning.experiment.config.compose import PACKAGE
+from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, read
 from epo_lightning.experiment.evaluate import score
-from epo_lightning.experiment.settings import EvaluateSettings, Settings, read
 from epo_lightning.identity import differences, identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder

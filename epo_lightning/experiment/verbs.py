@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from epo_lightning.experiment.settings import (
+from epo_lightning.experiment.config.settings import (
     EvaluateSettings,
     GenerateSettings,
     PredictSettings,
@@ -41,7 +41,7 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Make the data set, unless it is there already, and print its report."""
     settings = check("generate", config)
     from epo_lightning.experiment import assembly
-    from epo_lightning.experiment.compose import tree
+    from epo_lightning.experiment.config.compose import tree
 
     data = assembly.build_data(settings.data)
     folder = data.generate(workers=settings.workers, progress=settings.progress)

@@ -32,7 +32,7 @@ from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, JointForecast, Scene, Status
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import TABLES, Minimiser
-from epo_lightning.solvers.equilibrium import equilibrium
+from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 
 INITIAL = ("decoded", "zero", "motions")
 """Where solutions start, or between what they choose: strategies of the network's, (the paper's ablation "no init") controls

@@ -13,8 +13,8 @@ from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term, observed_future
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import JointForecast, Scene
-from epo_lightning.solvers import assignments
 from epo_lightning.solvers.base import TABLES
+from epo_lightning.solvers.discrete import assignments
 
 DENSITIES = ("joint", "marginal")
 

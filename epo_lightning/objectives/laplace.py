@@ -35,8 +35,8 @@ from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term, observed_future
 from epo_lightning.registry import register
 from epo_lightning.scene import ACCELERATION, GameParameters, JointForecast, Scene
-from epo_lightning.solvers import dense
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
+from epo_lightning.solvers.general import dense
 
 _LINEAR = (Source.CONTROL, Source.RATE, Source.SPEED)
 """What features read that is linear in the controls of one channel."""

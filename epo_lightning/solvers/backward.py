@@ -23,8 +23,9 @@ from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
-from epo_lightning.solvers import dense, implicit
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, TABLES, Minimiser, Stepwise
+from epo_lightning.solvers.gauss_newton import implicit
+from epo_lightning.solvers.general import dense
 
 HESSIANS = ("exact", "gauss_newton")
 

@@ -13,8 +13,8 @@ from hydra.types import RunMode
 
 from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.compose import compose, hydra, jobs, options_of, tree
-from epo_lightning.experiment.settings import Settings, read
+from epo_lightning.experiment.config.compose import compose, hydra, jobs, options_of, tree
+from epo_lightning.experiment.config.settings import Settings, read
 from epo_lightning.forecasters import build_forecaster
 
 CONF = tree() / "conf"

@@ -15,7 +15,7 @@ _SOLVE = """
 import sys
 sys.path.insert(0, {site!r})
 from pathlib import Path
-from epo_lightning.solvers import compiled
+from epo_lightning.solvers.gauss_newton import compiled
 print(Path(compiled.__file__).parents[2], compiled._library().epo_levels() > 0)
 """
 

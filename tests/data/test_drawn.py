@@ -9,7 +9,7 @@ import torch
 
 from epo_lightning.data.drawn import DrawnData
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.compose import compose
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.metrics.functional.overlap import overlapping_pairs
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene

@@ -12,8 +12,8 @@ import yaml
 
 from epo_lightning import registry
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recordings import RecordedData
-from epo_lightning.experiment.compose import tree
+from epo_lightning.data.recorded.recordings import RecordedData
+from epo_lightning.experiment.config.compose import tree
 
 PAGE = Path(__file__).parents[2] / "docs" / "extend.md"
 

@@ -16,9 +16,9 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from epo_lightning.data.drawn import DrawnData
-from epo_lightning.experiment.compose import compose, tree
+from epo_lightning.experiment.config.compose import compose, tree
+from epo_lightning.experiment.config.settings import Settings, read
 from epo_lightning.experiment.debugging import PROFILED, FewBatches, NonFinite
-from epo_lightning.experiment.settings import Settings, read
 from epo_lightning.experiment.train import folder_for
 from epo_lightning.forecasters import Forecaster, build_forecaster
 from epo_lightning.registry import ConfigError

@@ -6,8 +6,8 @@ import threading
 from contextlib import ExitStack
 from pathlib import Path
 
+from epo_lightning.experiment.config.settings import TrainerSettings
 from epo_lightning.experiment.gpus import devices, place, placed
-from epo_lightning.experiment.settings import TrainerSettings
 
 
 def test_empty_gpus_come_first_and_then_those_with_company(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from experiment.conftest import Epo
 
-from epo_lightning.experiment.compose import tree
+from epo_lightning.experiment.config.compose import tree
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "exid_sim"
 DATA = (f"data.folder={FIXTURE}", "data.batch_size=4")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from epo_lightning.experiment.settings import TrainerSettings
+from epo_lightning.experiment.config.settings import TrainerSettings
 from epo_lightning.registry import ConfigError
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from epo_lightning.experiment import train
-from epo_lightning.experiment.compose import compose, tree
+from epo_lightning.experiment.config.compose import compose, tree
 from epo_lightning.experiment.evaluate import evaluate
 from epo_lightning.run_folder import read_json
 

@@ -10,9 +10,9 @@ from report.methods import of_methods
 from report.page_runs import timed
 from report.run_folders import make_run, scores
 
+from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import of_sweep, report
-from epo_lightning.experiment.settings import ReportSettings
-from epo_lightning.experiment.sweep import Sweep
+from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json, write_text
 

@@ -14,7 +14,7 @@ from experiment.conftest import TINY, Epo
 import epo_lightning
 from epo_lightning.experiment import assembly, verbs
 from epo_lightning.experiment.callbacks import RandomStates
-from epo_lightning.experiment.settings import Settings, measures, read
+from epo_lightning.experiment.config.settings import Settings, measures, read
 from epo_lightning.experiment.timing import SAMPLES, measure
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError

@@ -9,7 +9,7 @@ import torch
 from games import random_scene
 from suites import model
 
-from epo_lightning.experiment.compose import compose
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.registry import ConfigError
 

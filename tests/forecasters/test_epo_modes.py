@@ -9,7 +9,7 @@ import torch
 from games import highway_scene, random_scene
 from suites import highway_model, model
 
-from epo_lightning.experiment.compose import compose
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.convex_energy import ConvexEnergy

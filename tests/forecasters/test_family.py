@@ -16,7 +16,7 @@ from games import random_scene
 from suites import ForecasterSuite, HighwaySuite, highway_model, model
 
 from epo_lightning import losses
-from epo_lightning.experiment.compose import compose
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.scene import Scene

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from data.roads import FOUR, curve, recording
-from data.test_windows import scenes_of
+from data.recorded.roads import FOUR, curve, recording
+from data.recorded.test_windows import scenes_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from suites import highway_model
 
-from epo_lightning.data.windows import Recipe
+from epo_lightning.data.recorded.windows import Recipe
 from epo_lightning.forecasters import build_forecaster
 
 CONFIGS = {

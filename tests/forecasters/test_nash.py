@@ -18,13 +18,13 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from epo_lightning.experiment.compose import compose
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.game.convex_energy import FLOOR
 from epo_lightning.game.energy import Energy, pairs
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import build
 from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scene, Solution
-from epo_lightning.solvers.equilibrium import equilibrium
+from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 
 STEPS, DT, KEPT = 6, 0.4, 6.0
 START, SPEED = np.array([6.6, 0.0, 12.0]), np.array([1.0, 2.0, 1.5])

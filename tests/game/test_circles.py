@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 from shapely import LineString, MultiPoint, Point, Polygon
 from shapely.affinity import rotate, translate
 
-from epo_lightning.experiment.compose import compose
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.game.circles import places, row_extent, row_overlap
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import PAIR_FEATURES, Source, pair_feature
-from epo_lightning.game.quadratic_model import QuadraticModel
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Status
-from epo_lightning.solvers import compiled, structured
 from epo_lightning.solvers.backward import Implicit, Unrolled
-from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
+from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
 OWN = ("goal", "velref", "acc", "turnr", "jerk")
 SIZES = ((1.8, 0.6), (0.5, 0.5), (3.9, 1.7), (4.0, 1.8), (4.7, 1.9), (7.9, 2.2), (8.0, 2.3), (16.0, 2.5), (0.4, 0.7))

@@ -13,14 +13,14 @@ from games import pad, reordered
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from epo_lightning.experiment.compose import tree
+from epo_lightning.experiment.config.compose import tree
 from epo_lightning.game.convex_energy import FLOOR, ConvexEnergy
 from epo_lightning.game.double_integrator import DoubleIntegrator
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.registry import ConfigError, build
 from epo_lightning.scene import Scene
-from epo_lightning.solvers import dense
-from epo_lightning.solvers.dense import gradient, hessian
+from epo_lightning.solvers.general import dense
+from epo_lightning.solvers.general.dense import gradient, hessian
 
 DIRECTIONS = ("along", "across")
 

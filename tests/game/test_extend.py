@@ -15,8 +15,8 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.neural_energy import NeuralEnergy
 from epo_lightning.scene import Status
-from epo_lightning.solvers.gradient_descent import GradientDescent
-from epo_lightning.solvers.levenberg_marquardt import LevenbergMarquardt
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+from epo_lightning.solvers.general.gradient_descent import GradientDescent
 
 PAGE = Path(__file__).parents[2] / "docs" / "extend.md"
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from games import BOUNDS, pad, random_game, random_scene, reordered, widen
 
-from epo_lightning.experiment.compose import compose
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.game.collision_energy import CollisionEnergy
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import Energy

@@ -18,7 +18,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.objectives.conditional import Conditional
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import JointForecast, Scene, Solution, Tables
-from epo_lightning.solvers import assignments
+from epo_lightning.solvers.discrete import assignments
 
 NAN, INF = float("nan"), float("inf")
 WEIGHTS = {"density": 1.0, "marginal": 0.5, "regression": 0.25, "goal": 2.0}

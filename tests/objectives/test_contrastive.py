@@ -15,8 +15,8 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.selection import games
 from epo_lightning.objectives.contrastive import Contrastive
 from epo_lightning.scene import JointForecast
-from epo_lightning.solvers.gradient_descent import GradientDescent
-from epo_lightning.solvers.langevin import Langevin
+from epo_lightning.solvers.general.gradient_descent import GradientDescent
+from epo_lightning.solvers.general.langevin import Langevin
 
 CONF = Path(__file__).parents[2] / "conf" / "objective" / "contrastive.yaml"
 WEIGHTS = {"contrastive": 1.0, "magnitude": 0.5, "initial": 1.0, "goal": 0.1, "probability": 0.1}

@@ -18,7 +18,7 @@ from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.objectives.laplace import Laplace, log_densities
 from epo_lightning.scene import JointForecast
-from epo_lightning.solvers import dense
+from epo_lightning.solvers.general import dense
 
 CONF = Path(__file__).parents[2] / "conf" / "objective" / "laplace.yaml"
 WEIGHTS = {"density": 1.0, "initial": 0.5, "goal": 0.1}

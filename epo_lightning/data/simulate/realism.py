@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from epo_lightning.data.clock import Stretches, stretches
-from epo_lightning.data.lanes import lane_changes
-from epo_lightning.data.tracks import Recording, TrackTable
-from epo_lightning.data.traffic import leaders
+from epo_lightning.data.recorded.clock import Stretches, stretches
+from epo_lightning.data.recorded.lanes import lane_changes
+from epo_lightning.data.recorded.tracks import Recording, TrackTable
+from epo_lightning.data.simulate.leaders import leaders
 from epo_lightning.scene import KINDS
 
 DT, SMOOTHING = 0.2, 1.0

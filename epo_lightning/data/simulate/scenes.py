@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from epo_lightning.data import cache, simulate
-from epo_lightning.data.recordings import RecordedData
-from epo_lightning.data.tracks import Recording, Source
+from epo_lightning.data.recorded.recordings import RecordedData
+from epo_lightning.data.recorded.tracks import Recording, Source
 from epo_lightning.registry import ConfigError, register
 
 
@@ -21,7 +21,7 @@ class SimulatedHighway(RecordedData):
         minutes: that each of them lasts.
         layouts: their ids; null for all.
         dataset, windows, test, val_share, val_by, frame, scale, root, batch_size, share: as of
-            :class:`~epo_lightning.data.recordings.RecordedData`.
+            :class:`~epo_lightning.data.recorded.recordings.RecordedData`.
         seed: of the traffic and of the splits, and of the batches' order where a run sets no other.
     """
 

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
+from epo_lightning.experiment.config.settings import MLflowSettings
 from epo_lightning.experiment.dashboards.base import ARTIFACTS, Dashboard, Ending, Facts, Row
-from epo_lightning.experiment.settings import MLflowSettings
 from epo_lightning.registry import ConfigError
 
 SQLITE = "sqlite:///"

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from epo_lightning.experiment.config.settings import TensorBoardSettings
 from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
-from epo_lightning.experiment.settings import TensorBoardSettings
 
 
 class TensorBoard(Dashboard):

@@ -13,8 +13,8 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
+from epo_lightning.experiment.config.settings import WandbSettings
 from epo_lightning.experiment.dashboards.base import ARTIFACTS, Dashboard, Ending, Facts, Row
-from epo_lightning.experiment.settings import WandbSettings
 
 STEP = "trainer/global_step"
 """The axis of all curves. W&B's own step only counts rows: joined after a `wandb sync`, it says nothing."""

@@ -10,16 +10,16 @@ import polars as pl
 import pytest
 import shapely
 
-from epo_lightning.data.formats.exid import TRACKS, read_tracks, read_tracks_meta
-from epo_lightning.data.lanes import lane_changes
+from epo_lightning.data.recorded.formats.exid import TRACKS, read_tracks, read_tracks_meta
+from epo_lightning.data.recorded.lanes import lane_changes
+from epo_lightning.data.recorded.tracks import Recording
 from epo_lightning.data.simulate import realism, recording
 from epo_lightning.data.simulate.generate import map_path
 from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS
+from epo_lightning.data.simulate.leaders import FURTHEST_LEADER, leaders
 from epo_lightning.data.simulate.motion import Motion, move, savitzky_golay
 from epo_lightning.data.simulate.traffic import RATE, Traffic, simulate, simulator
-from epo_lightning.data.tracks import Recording
-from epo_lightning.data.traffic import FURTHEST_LEADER, leaders
 from epo_lightning.registry import ConfigError, lookup
 
 LAYOUT, SEED, SECONDS = LAYOUTS[4], [5, 4], 40.0

@@ -1,0 +1,1 @@
+"""Recordings of traffic and pedestrians: their formats, and the way from tracks to scenes."""

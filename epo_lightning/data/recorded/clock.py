@@ -1,0 +1,189 @@
+"""One clock for all agents of a recording: uninterrupted stretches of states at multiples of dt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from epo_lightning.data.recorded.tracks import TrackTable
+from epo_lightning.registry import ConfigError
+
+
+@dataclass(frozen=True)
+class Stretches:
+    """States of agents at steps of a common clock. Row ``start + s - first`` of a stretch is its state at step s.
+
+    Attributes:
+        dt: of the clock [s]; step s is at s dt, counted from the recording's frame 0.
+        agent: whose stretch it is.
+        first: its first step.
+        count: how many steps it lasts.
+        start: its first row.
+        state: x, y [m], heading [rad], speed [m/s] of every row; headings go on beyond half a turn.
+        ending: where tracks are smoothed, every row's state and those of the steps right before it as they are known at its
+            time: fitted to no later frame. Later smoothing knows better, but a forecaster must not.
+    """
+
+    dt: float
+    agent: Int[np.ndarray, " C"]
+    first: Int[np.ndarray, " C"]
+    count: Int[np.ndarray, " C"]
+    start: Int[np.ndarray, " C"]
+    state: Float[np.ndarray, "Z 4"]
+    ending: Float[np.ndarray, "Z J 4"] | None = None
+
+    @property
+    def now(self) -> Float[np.ndarray, "Z 4"]:
+        """Every row's state as it is known at its time."""
+        return self.state if self.ending is None else self.ending[:, 0]
+
+    @property
+    def owner(self) -> Int[np.ndarray, " Z"]:
+        """The stretch that each row belongs to."""
+        return np.repeat(np.arange(len(self.count)), self.count)
+
+
+def stretches(
+    tracks: TrackTable, dt: float, smoothing: float | None, shortest: int
+) -> tuple[Stretches, dict[str, int]]:
+    """Put a recording on a clock.
+
+    Args:
+        tracks: the recording.
+        dt: of the clock [s].
+        smoothing: length [s] of the window in which a parabola is fitted to positions and headings; None for data that
+            are smooth already.
+        shortest: steps that a stretch must last to be of use.
+
+    Returns:
+        the stretches, and how many stretches were interrupted or left out, by reason.
+
+    Raises:
+        ConfigError: a clock that is faster than the recording.
+    """
+    if dt * tracks.rate < 1 - 1e-6:
+        raise ConfigError(
+            f"data.windows.dt={dt} asks for more than the recording's {tracks.rate:g} frames per second: "
+            f"use {1 / tracks.rate:g} or more"
+        )
+    rows = len(tracks)
+    new = np.append(True, (np.diff(tracks.agent) != 0) | (np.diff(tracks.frame) != 1))[:rows]
+    begin = np.flatnonzero(new)
+    length = np.diff(np.append(begin, rows))
+    agents = len(np.unique(tracks.agent))
+    dropped = {"gaps in tracks": len(begin) - agents}
+
+    window = 0 if smoothing is None else max(3, 2 * round(smoothing * tracks.rate / 2) + 1)
+    first = np.ceil(tracks.frame[begin] / (tracks.rate * dt) - 1e-6).astype(int)
+    last = np.floor(tracks.frame[begin + length - 1] / (tracks.rate * dt) + 1e-6).astype(int)
+    count = last - first + 1
+    long = (count >= shortest) & (length >= window)
+    dropped["tracks shorter than a window"] = int((~long).sum())
+    begin, length, first, count = begin[long], length[long], first[long], count[long]
+
+    kept = np.repeat(begin - np.append(0, length.cumsum()[:-1]), length) + np.arange(length.sum())
+    within = length.cumsum() - length
+    heading = _unwrap(tracks.heading[kept], within)
+    values = np.column_stack([tracks.position[kept], heading, tracks.velocity[kept]])
+    raw = values
+    if window:
+        values = _smooth(values, within, length, window, tracks.rate)
+
+    start = count.cumsum() - count
+    step = np.arange(count.sum()) - np.repeat(start - first, count)
+    at = step * (dt * tracks.rate) - np.repeat(tracks.frame[begin], count)
+    lower = np.clip(np.floor(at + 1e-6).astype(int), 0, np.repeat(np.maximum(length - 2, 0), count))
+    share = np.clip(at - lower, 0.0, 1.0)[:, None]
+    row = np.repeat(within, count) + lower
+    after = np.minimum(row + 1, len(values) - 1)
+    values = np.where(share < 1e-6, values[row], (1 - share) * values[row] + share * values[after])
+    ending = None
+    if window:
+        ending = _ending(raw, row, lower, at - lower, window, tracks.rate, dt)
+    return Stretches(dt, tracks.agent[begin], first, count, start, _states(values), ending), dropped
+
+
+def _states(values: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "*n 4"]:
+    """Positions, headings and velocities as states: the speed is that along the heading."""
+    x, y, heading, right, up = np.moveaxis(values, -1, 0)
+    return np.stack([x, y, heading, right * np.cos(heading) + up * np.sin(heading)], -1)
+
+
+def _unwrap(heading: Float[np.ndarray, " n"], begin: Int[np.ndarray, " C"]) -> Float[np.ndarray, " n"]:
+    """Headings that go on beyond half a turn within a stretch."""
+    turn = np.diff(heading, prepend=heading[:1])
+    turns = np.round(turn / (2 * np.pi))
+    turns[begin] = 0.0
+    total = turns.cumsum()
+    offset = np.repeat(total[begin], np.diff(np.append(begin, len(heading))))
+    return heading - 2 * np.pi * (total - offset)
+
+
+def _smooth(
+    values: Float[np.ndarray, "n 5"],
+    begin: Int[np.ndarray, " C"],
+    length: Int[np.ndarray, " C"],
+    window: int,
+    rate: float,
+) -> Float[np.ndarray, "n 5"]:
+    """Fit a parabola to every window of positions and headings (Savitzky-Golay); velocities are the parabolas' slopes.
+
+    Near the ends of a stretch, the first or last whole window's parabola goes on.
+    """
+    half = window // 2
+    time, fit = _parabolas(window, rate)
+    smooth = np.empty_like(values)
+    if len(values) >= window:
+        middle = np.lib.stride_tricks.sliding_window_view(values[:, :3], window, axis=0)  # [n - window + 1, 3, window]
+        coefficients = np.einsum("cw,nvw->cnv", fit[:2], middle)
+        smooth[half : len(values) - half, :3] = coefficients[0]
+        smooth[half : len(values) - half, 3:] = coefficients[1][:, :2]
+    for offset, edge in ((begin, np.arange(half)), (begin + length - window, np.arange(half + 1, window))):
+        around = values[offset[:, None] + np.arange(window), :3]  # [C, window, 3]
+        smooth[offset[:, None] + edge] = _evaluate(fit, around[:, None], time[edge])
+    return smooth
+
+
+def _ending(
+    raw: Float[np.ndarray, "n 5"],
+    row: Int[np.ndarray, " Z"],
+    before: Int[np.ndarray, " Z"],
+    beyond: Float[np.ndarray, " Z"],
+    window: int,
+    rate: float,
+    dt: float,
+) -> Float[np.ndarray, "Z J 4"]:
+    """The states at every step, and at those before it that a centred window would smooth with later frames, by the parabola
+    through the window that ends there; as they were recorded where a stretch is too young for a whole window.
+
+    Args:
+        raw: positions, headings and velocities as recorded.
+        row: of ``raw``, the last one at or before each step.
+        before: how many rows of the stretch lie before that.
+        beyond: how far each step lies after its row [rows].
+    """
+    time, fit = _parabolas(window, rate)
+    steps = int(window // 2 / (dt * rate)) + 1
+    whole = before >= window - 1
+    around = raw[np.maximum(row[:, None] - window + 1 + np.arange(window), 0), :3]
+    at = time[-1] + np.minimum(beyond, 1.0)[:, None] / rate - dt * np.arange(steps)  # [Z, J]
+    fitted = _states(_evaluate(fit, around[:, None], at))
+    earlier = np.maximum(row[:, None] - np.round(np.arange(steps) * dt * rate).astype(int), (row - before)[:, None])
+    return np.where(whole[:, None, None], fitted, _states(raw[earlier]))
+
+
+def _parabolas(window: int, rate: float) -> tuple[Float[np.ndarray, " window"], Float[np.ndarray, "3 window"]]:
+    """The times of a window's frames around its middle [s], and the matrix from samples to a parabola's coefficients."""
+    time = (np.arange(window) - window // 2) / rate
+    return time, np.linalg.pinv(np.vander(time, 3, increasing=True))
+
+
+def _evaluate(
+    fit: Float[np.ndarray, "3 window"], around: Float[np.ndarray, "*n window 3"], at: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 5"]:
+    """Values and slopes of windows' parabolas: x, y, heading, and the speeds in x and y."""
+    constant, slope, bend = np.moveaxis(np.einsum("cw,...wv->...cv", fit, around), -2, 0)
+    t = at[..., None]
+    return np.concatenate([constant + slope * t + bend * t**2, (slope + 2 * bend * t)[..., :2]], -1)

@@ -1,0 +1,111 @@
+"""Extracted tables as scenes, put together a batch at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from epo_lightning.data.recorded.routes import LINES, PER_LINE
+from epo_lightning.scene import Scene
+
+FRAMES = ("fixed", "aligned")
+"""A scene's axes: those of the recording, or x where its agents head on average. The origin lies amid the agents."""
+
+
+class RecordedScenes:
+    """Scenes of one split, put together batch by batch.
+
+    Args:
+        tables: the columns of an :class:`~epo_lightning.data.recorded.windows.Extract`.
+        dt: time step [s].
+        frame: ``fixed`` (axes of the recording, origin amid the agents) or ``aligned`` (x where they head on average).
+        names: of the recordings.
+    """
+
+    def __init__(self, tables: Mapping[str, Tensor], dt: float, frame: str, names: Sequence[str]) -> None:
+        self.tables, self.dt, self.frame, self.names = tables, dt, frame, tuple(names)
+
+    def __len__(self) -> int:
+        return len(self.tables["agents"])
+
+    def set_epoch(self, epoch: int) -> None:
+        """Every epoch has the same scenes."""
+
+    def __getitem__(self, indices: Tensor) -> Scene:
+        of = {name: self.tables[name][indices] for name in ("agents", "lanes", "centre", "direction", "recording")}
+        present = of["agents"] >= 0
+        rows = of["agents"].clamp_min(0).long()
+        angle = of["direction"] if self.frame == "aligned" else torch.zeros_like(of["direction"])
+        cosine, sine = angle.cos(), angle.sin()
+
+        def move(points: Tensor) -> Tensor:
+            """Positions [B, .., 2] in the scenes' own frames."""
+            shape = (len(indices), *[1] * (points.dim() - 2))
+            x, y = (points[..., axis] - of["centre"][:, axis].to(points.dtype).view(shape) for axis in range(2))
+            if self.frame == "fixed":
+                return torch.stack((x, y), -1).float()
+            c, s = (value.to(points.dtype).view(shape) for value in (cosine, sine))
+            return torch.stack((c * x + s * y, c * y - s * x), -1).float()
+
+        def states(name: str) -> tuple[Tensor, Tensor]:
+            values, mask = self.tables[name][rows], self.tables[f"{name}_mask"][rows] & present[..., None]
+            heading = values[..., 2:3]
+            if self.frame == "aligned":
+                # The branch of the current heading decides for the whole scene.
+                now = self.tables["history"][rows, -1, 2].double() - angle[:, None]
+                turns = torch.round(now / (2 * torch.pi)) * 2 * torch.pi
+                heading = (heading.double() - (angle[:, None] + turns)[..., None, None]).float()
+            moved = torch.cat((move(values[..., :2]), heading, values[..., 3:]), -1)
+            return moved.where(mask[..., None], 0.0), mask
+
+        def known(values: Tensor) -> Tensor:
+            return values.where(present.view(*present.shape, *[1] * (values.dim() - 2)), 0)
+
+        history, history_mask = states("history")
+        future, future_mask = states("future")
+        origin = self.tables["origin"][of["recording"].long()] + of["centre"]
+        on_map: dict[str, Tensor] = {}
+        if len(self.tables["polylines"]):
+            points = move(self.tables["polylines"][of["lanes"].clamp_min(0).long()])
+            there = (of["lanes"] >= 0)[..., None].expand(*points.shape[:2], points.shape[2] - 1)
+            line = torch.arange(LINES).repeat_interleave(PER_LINE).expand(*present.shape, -1)
+            on_map = {
+                "lanes": torch.cat((points[:, :, :-1], points[:, :, 1:]), -1).where(there[..., None], 0.0),
+                "lane_mask": there,
+                "goal_candidates": known(move(self.tables["candidates"][rows])),
+                "goal_mask": present[..., None].expand(*present.shape, line.shape[-1]),
+                "goal_reference": line,
+                "references": known(move(self.tables["references"][rows])),
+                "reference_mask": present[..., None].expand(*present.shape, LINES),
+                "reference_speed": known(self.tables["reference_speed"][rows]),
+            }
+        return Scene(
+            history=history,
+            dt=self.dt,
+            history_mask=history_mask,
+            agent_mask=present,
+            future=future,
+            future_mask=future_mask,
+            size=known(self.tables["size"][rows]),
+            kind=known(self.tables["kind"][rows]),
+            frame=torch.cat((origin, angle[:, None]), -1),
+            id=indices,
+            **on_map,
+        )
+
+    def provenance(self, indices: Sequence[int]) -> list[dict[str, Any]]:
+        """Which recording, frame and tracks each of some scenes was extracted from."""
+        found = []
+        for index in indices:
+            agents = self.tables["agents"][index]
+            found.append(
+                {
+                    "recording": self.names[int(self.tables["recording"][index])],
+                    "frame": int(self.tables["frame"][index]),
+                    "tracks": self.tables["track"][agents[agents >= 0].long()].tolist(),
+                }
+            )
+        return found

@@ -1,0 +1,150 @@
+"""Recordings: what agents did and on which lanes, in one record type for every format.
+
+A format is one file in ``formats/``: a function from a folder to the :class:`Source` objects in it, registered by name::
+
+    @register("format", "exid")
+    def exid(folder: Path) -> list[Source]: ...
+
+Listing must be cheap; a source reads its files when it is asked to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.lanes import FARTHEST, LaneGraph
+
+__all__ = ["Recording", "RecordingError", "Source", "TrackTable"]
+
+FASTEST = 120.0
+"""Speeds [m/s] beyond this are a mistake of units."""
+LONGEST = 40.0
+"""Vehicles [m] longer than this are a mistake of units."""
+
+
+@dataclass(frozen=True)
+class TrackTable:
+    """Everything that moved in a recording. Rows are sorted by agent, and by frame within an agent; frames may be missing.
+
+    Attributes:
+        rate: frames per second [Hz].
+        agent: index of each row's agent, 0 .. A-1.
+        frame: number of each row's frame.
+        position: of the centre [m].
+        heading: where the front points, counter-clockwise from x [rad]; any number of turns.
+        velocity: in the directions of x and y [m/s].
+        ids: what the recording calls each agent.
+        size: length and width of each agent [m].
+        kind: what each agent is, an index into :data:`~epo_lightning.scene.KINDS`.
+    """
+
+    rate: float
+    agent: Int[np.ndarray, " T"]
+    frame: Int[np.ndarray, " T"]
+    position: Float[np.ndarray, "T 2"]
+    heading: Float[np.ndarray, " T"]
+    velocity: Float[np.ndarray, "T 2"]
+    ids: Int[np.ndarray, " A"]
+    size: Float[np.ndarray, "A 2"]
+    kind: Int[np.ndarray, " A"]
+
+    def __len__(self) -> int:
+        return len(self.agent)
+
+    @property
+    def speed(self) -> Float[np.ndarray, " T"]:
+        """Speed along the heading [m/s], negative when reversing."""
+        return self.velocity[:, 0] * np.cos(self.heading) + self.velocity[:, 1] * np.sin(self.heading)
+
+    def check(self, path: Path | str) -> TrackTable:
+        """This table, if its numbers can be what they claim to be.
+
+        Args:
+            path: of the file, for error messages.
+
+        Raises:
+            RecordingError: no rows, numbers that are not finite, units that cannot be right, an agent whose time goes
+                backwards or who is in two places in one frame.
+        """
+
+        def first(bad: Any) -> int:
+            return int(np.flatnonzero(bad)[0])
+
+        if not len(self.agent):
+            raise RecordingError(path, "there is no track in it")
+        if not (np.isfinite(self.rate) and 1.0 <= self.rate <= 1000.0):
+            raise RecordingError(path, f"a frame rate of {self.rate} Hz was expected to lie between 1 and 1000 Hz")
+        by_agent = np.diff(self.agent)
+        backwards = (by_agent < 0) | ((by_agent == 0) & (np.diff(self.frame) <= 0))
+        if backwards.any():
+            row = first(backwards) + 1
+            raise RecordingError(
+                path,
+                f"frame {self.frame[row]} of track {self.ids[self.agent[row]]} comes after its frame "
+                f"{self.frame[row - 1]}: time must go forward, and an id must belong to one agent",
+            )
+        for name, values, limit, unit in (
+            ("position", self.position, FARTHEST, "m"),
+            ("heading", self.heading[:, None], 1e4, "rad"),
+            ("velocity", self.velocity, FASTEST, "m/s"),
+        ):
+            bad = ~np.all(np.abs(values) <= limit, axis=1)
+            if bad.any():
+                row = first(bad)
+                raise RecordingError(
+                    path,
+                    f"{name} {values[row].tolist()} of track {self.ids[self.agent[row]]} in frame {self.frame[row]} was "
+                    f"expected to be finite and at most {limit:g} {unit}: is it in another unit?",
+                )
+        bad = ~np.all((self.size > 0) & (self.size <= LONGEST), axis=1)
+        if bad.any():
+            agent = first(bad)
+            raise RecordingError(
+                path,
+                f"length and width {self.size[agent].tolist()} of track {self.ids[agent]} were expected to be positive "
+                f"and at most {LONGEST:g} m: are they in another unit?",
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording, read.
+
+    Attributes:
+        name: unique within its data set.
+        group: what splits keep together: a map, a scene, a layout.
+        tracks: what agents did.
+        lanes: where they could drive; None where there are no lanes.
+        dropped: how many things the reader left out, by reason.
+    """
+
+    name: str
+    group: str
+    tracks: TrackTable
+    lanes: LaneGraph | None
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording that can be read.
+
+    Attributes:
+        name, group: as of the :class:`Recording`.
+        files: what it is read from; their contents identify a data set.
+        read: reads it, in another process maybe, so it is a function of a module or a partial of one. Raises
+            :class:`RecordingError`.
+    """
+
+    name: str
+    group: str
+    files: tuple[Path, ...]
+    read: Callable[[], Recording]

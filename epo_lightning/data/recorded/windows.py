@@ -1,0 +1,360 @@
+"""From recordings to scenes: which agents, when, and what is known of them (Appendix C.2, "exiD").
+
+Scenes share agents: a vehicle at one moment may be the centre of one scene and a neighbour in others. What is known of it is
+kept once, in a table of agents; a scene is a row of indices into that table. :class:`Extract` holds both, in coordinates of
+the recording's own.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.clock import Stretches, stretches
+from epo_lightning.data.recorded.lanes import Located, lane_changes
+from epo_lightning.data.recorded.routes import Routes, pieces
+from epo_lightning.data.recorded.tracks import Recording
+from epo_lightning.registry import ConfigError
+
+VECTORS, SPACING = 10, 6.0
+"""Vectors V of a lane polyline and their greatest length [m]."""
+MOST_BESIDE = 0.5
+"""Share of positions on no lane beyond which a map does not belong to its tracks."""
+AGREE = 0.2
+"""Length of the mean of the agents' directions below which they do not head anywhere together."""
+MOST_AGENTS, LONGEST_SMOOTHING = 32, 10.0
+"""Agents of a scene, and seconds of a smoothing window, that make sense."""
+CHUNK = 4_000_000
+"""Distances between agents that are held at a time."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Which windows of a recording become scenes. The defaults are the paper's for exiD.
+
+    Attributes:
+        dt: time step [s].
+        history: steps H until now, this one included (1.8 s).
+        horizon: steps K that are forecast (4 s).
+        agents: most agents N of a scene: a focal one and its nearest neighbours.
+        least_agents: windows with fewer are left out.
+        radius: neighbours are nearer than this to the focal agent [m]; null for no limit.
+        lane_change: whether at least one agent must change lane within the window.
+        every: steps between two windows.
+        complete: whether neighbours must be observed in the whole window, as the focal agent is, or only now.
+        smoothing: length [s] of the window in which tracks are smoothed; null for tracks that are smooth.
+        lanes: most lane polylines L of a scene, the nearest ones.
+        speed_limit: where lanes know none [m/s].
+    """
+
+    dt: float = 0.2
+    history: int = 10
+    horizon: int = 20
+    agents: int = 4
+    least_agents: int = 4
+    radius: float | None = 60.0
+    lane_change: bool = True
+    every: int = 1
+    complete: bool = True
+    smoothing: float | None = None
+    lanes: int = 32
+    speed_limit: float = 36.1
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("history", 2),
+            ("horizon", 2),
+            ("agents", 1),
+            ("least_agents", 1),
+            ("every", 1),
+            ("lanes", 1),
+        ):
+            if getattr(self, name) < least:
+                raise ConfigError(f"data.windows.{name} must be {least} or more, not {getattr(self, name)}")
+        for name in ("dt", "speed_limit"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ConfigError(f"data.windows.{name} must be positive, not {getattr(self, name)}")
+        for name in ("radius", "smoothing"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise ConfigError(f"data.windows.{name} must be positive, or null for none, not {value}")
+        if self.agents > MOST_AGENTS:
+            raise ConfigError(f"data.windows.agents must be {MOST_AGENTS} or less, not {self.agents}")
+        if self.smoothing is not None and self.smoothing > LONGEST_SMOOTHING:
+            raise ConfigError(
+                f"data.windows.smoothing must be {LONGEST_SMOOTHING:g} s or less, or null for none, not {self.smoothing}"
+            )
+        if self.least_agents > self.agents:
+            raise ConfigError(
+                f"data.windows.least_agents={self.least_agents} asks for more agents than data.windows.agents={self.agents} "
+                "lets in"
+            )
+
+
+@dataclass(frozen=True)
+class Extract:
+    """The scenes of a recording, or of several.
+
+    Attributes, by agent (A rows):
+        history, history_mask, future, future_mask: states x, y [m], heading [rad], speed [m/s].
+        size: length and width [m].
+        kind: an index into :data:`~epo_lightning.scene.KINDS`.
+        track: what the recording calls the agent.
+        candidates, references, reference_speed: where it may be going; empty without a map.
+    Attributes, by lane polyline (T rows):
+        polylines: points of the map's polylines.
+    Attributes, by scene (S rows):
+        agents: the scene's agents, -1 for none.
+        lanes: its polylines, -1 for none.
+        centre: where its frame has its origin.
+        direction: where its agents head on average [rad].
+        recording: index of its recording.
+        frame: the recording's frame number at t0.
+    Attributes, by recording:
+        origin: what was subtracted from all coordinates of the recording.
+    """
+
+    history: Float[np.ndarray, "A H 4"]
+    history_mask: Bool[np.ndarray, "A H"]
+    future: Float[np.ndarray, "A K 4"]
+    future_mask: Bool[np.ndarray, "A K"]
+    size: Float[np.ndarray, "A 2"]
+    kind: Int[np.ndarray, " A"]
+    track: Int[np.ndarray, " A"]
+    candidates: Float[np.ndarray, "A G 2"]
+    references: Float[np.ndarray, "A R Q 2"]
+    reference_speed: Float[np.ndarray, " A"]
+    polylines: Float[np.ndarray, "T V+1 2"]
+    agents: Int[np.ndarray, "S N"]
+    lanes: Int[np.ndarray, "S L"]
+    centre: Float[np.ndarray, "S 2"]
+    direction: Float[np.ndarray, " S"]
+    recording: Int[np.ndarray, " S"]
+    frame: Int[np.ndarray, " S"]
+    origin: Float[np.ndarray, "O 2"]
+
+    def __len__(self) -> int:
+        return len(self.agents)
+
+
+INDEX_OF = {"agents": "history", "lanes": "polylines", "recording": "origin"}
+"""Fields that are indices, and whose rows they count."""
+
+
+def joined(parts: list[Extract]) -> Extract:
+    """Several extracts as one: indices are moved to where the rows come to lie."""
+    columns: dict[str, np.ndarray] = {}
+    for field in fields(Extract):
+        values = [getattr(part, field.name) for part in parts]
+        if field.name in INDEX_OF:
+            before = np.cumsum([0, *(len(getattr(part, INDEX_OF[field.name])) for part in parts)])
+            values = [np.where(value < 0, -1, value + offset) for value, offset in zip(values, before, strict=False)]
+        columns[field.name] = np.concatenate(values)
+    return Extract(**columns)
+
+
+def extract(recording: Recording, recipe: Recipe) -> tuple[Extract | None, dict[str, int]]:
+    """The scenes of a recording.
+
+    Returns:
+        the scenes, None where there are none; and how many windows there were and where they went.
+
+    Raises:
+        ConfigError: a recipe that needs lanes for a recording without, or a clock faster than the recording.
+    """
+    if recipe.lane_change and recording.lanes is None:
+        raise ConfigError(
+            f"{recording.name} has no lanes, so nobody can change lane on them: use data.windows.lane_change=false"
+        )
+    counts: Counter[str] = Counter(recording.dropped)
+    shortest = recipe.history + recipe.horizon if recipe.complete else 2
+    clock, left_out = stretches(recording.tracks, recipe.dt, recipe.smoothing, shortest)
+    counts.update(left_out)
+    located, changes = _on_lanes(clock, recording)
+    moments, members = _choose(clock, changes, recipe, counts)
+    if recording.lanes is not None:
+        off = ((located.lane[_rows(clock, moments, members)] < 0) & (members >= 0)).any(1)
+        counts["an agent on no lane"] = int(off.sum())
+        moments, members = moments[~off], members[~off]
+    counts["scenes"] = len(moments)
+    if not len(moments):
+        return None, dict(counts)
+    return _assemble(recording, recipe, clock, located, moments, members), dict(counts)
+
+
+def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.ndarray, " Z"]]:
+    """Where every state is, and how many lane changes the rows have seen until then.
+
+    Raises:
+        RecordingError: a map that does not fit the tracks.
+    """
+    rows = len(clock.state)
+    if recording.lanes is None:
+        return Located(np.full(rows, -1), np.zeros(rows), np.zeros(rows)), np.zeros(rows, dtype=int)
+    located = recording.lanes.locate(clock.now[:, :2], clock.now[:, 2])
+    beside = float((located.lane < 0).mean()) if rows else 0.0
+    if beside > MOST_BESIDE:
+        raise RecordingError(
+            recording.name,
+            f"{beside:.0%} of all positions lie on no lane of its map: is it the map of another place, or in other "
+            "coordinates? Give it the right one, or set data.map=false",
+        )
+    smooth = located if clock.ending is None else recording.lanes.locate(clock.state[:, :2], clock.state[:, 2])
+    return located, lane_changes(clock.owner, smooth, recording.lanes).cumsum()
+
+
+def _rows(clock: Stretches, moments: Int[np.ndarray, " S"], members: Int[np.ndarray, "S N"]) -> Int[np.ndarray, "S N"]:
+    """The rows of windows' members at their moments; -1 for none."""
+    return np.where(members >= 0, clock.start[members] + moments[:, None] - clock.first[members], -1)
+
+
+def _choose(
+    clock: Stretches, changes: Int[np.ndarray, " Z"], recipe: Recipe, counts: Counter[str]
+) -> tuple[Int[np.ndarray, " S"], Int[np.ndarray, "S N"]]:
+    """Moments and members (stretches) of all windows that pass, the focal agent first, then by distance."""
+    found_moments, found_members = [np.empty(0, dtype=int)], [np.empty((0, recipe.agents), dtype=int)]
+    for moment, stretch, focal in _crowds(clock, recipe):
+        position = clock.now[_rows(clock, moment, stretch), :2]
+        distance = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
+        distance[np.broadcast_to((stretch < 0)[:, None], distance.shape)] = np.inf
+        everyone = np.arange(stretch.shape[1])
+        distance[:, everyone, everyone] = -1.0
+        nearest = np.argsort(distance, axis=-1, kind="stable")[..., : recipe.agents]
+        reach = np.take_along_axis(distance, nearest, -1)
+        members = np.take_along_axis(np.broadcast_to(stretch[:, None], distance.shape), nearest, -1)
+        members = np.where(reach <= (np.inf if recipe.radius is None else recipe.radius), members, -1)
+        members = np.pad(members, ((0, 0), (0, 0), (0, recipe.agents - members.shape[2])), constant_values=-1)
+        members, moments = members[focal], np.broadcast_to(moment[:, None], focal.shape)[focal]
+        counts["windows"] += len(moments)
+        enough = (members >= 0).sum(1) >= recipe.least_agents
+        counts["too few agents around"] += int((~enough).sum())
+        members, moments = members[enough], moments[enough]
+        _, once = np.unique(np.column_stack([moments, np.sort(members, 1)]), axis=0, return_index=True)
+        once.sort()
+        counts["the same agents twice"] += len(moments) - len(once)
+        found_moments.append(moments[once])
+        found_members.append(members[once])
+    moments, members = np.concatenate(found_moments), np.concatenate(found_members)
+    if recipe.lane_change:
+        first, last = clock.first[members], (clock.first + clock.count - 1)[members]
+        before = np.clip((moments - recipe.history + 1)[:, None], first, last)
+        after = np.clip((moments + recipe.horizon)[:, None], first, last)
+        offset = clock.start[members] - first
+        changed = ((changes[offset + after] > changes[offset + before]) & (members >= 0)).any(1)
+        counts["no lane change"] += int((~changed).sum())
+        moments, members = moments[changed], members[changed]
+    return moments, members
+
+
+def _crowds(clock: Stretches, recipe: Recipe) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Moments, the stretches that are there at each (padded with -1), and which of them may be focal."""
+    before, after = (recipe.history - 1, recipe.horizon) if recipe.complete else (1, 0)
+    count = np.maximum(clock.count - before - after, 0)
+    stretch = np.repeat(np.arange(len(count)), count)
+    within = np.arange(count.sum()) - np.repeat(count.cumsum() - count, count) + before
+    moment = clock.first[stretch] + within
+    focal = (within >= recipe.history - 1) & (within + recipe.horizon < clock.count[stretch])
+    kept = moment % recipe.every == 0
+    stretch, moment, focal = stretch[kept], moment[kept], focal[kept]
+    order = np.argsort(moment, kind="stable")
+    stretch, moment, focal = stretch[order], moment[order], focal[order]
+    moments, begin, present = np.unique(moment, return_index=True, return_counts=True)
+    most = int(present.max(initial=1))
+    size = max(1, CHUNK // most**2)
+    for chunk in range(0, len(moments), size):
+        rows = slice(chunk, chunk + size)
+        place = np.arange(int(present[rows].max()))
+        there = place < present[rows, None]
+        at = np.where(there, begin[rows, None] + place, 0)
+        yield moments[rows], np.where(there, stretch[at], -1), there & focal[at]
+
+
+def _assemble(
+    recording: Recording,
+    recipe: Recipe,
+    clock: Stretches,
+    located: Located,
+    moments: Int[np.ndarray, " S"],
+    members: Int[np.ndarray, "S N"],
+) -> Extract:
+    """Gather what is known of the chosen agents at their moments."""
+    rows = _rows(clock, moments, members)
+    used, place = np.unique(rows, return_inverse=True)
+    place = place.reshape(rows.shape)
+    if used[0] < 0:
+        used, place = used[1:], place - 1
+    origin = np.floor(clock.state[:, :2].mean(0))
+    owner = clock.owner[used]
+    begin, end = clock.start[owner], clock.start[owner] + clock.count[owner] - 1
+    turns = 2 * np.pi * np.round(clock.now[used, 2] / (2 * np.pi))
+
+    def states(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        at = used[:, None] + steps
+        real = (at >= begin[:, None]) & (at <= end[:, None])
+        found = clock.state[np.clip(at, begin[:, None], end[:, None])]
+        if clock.ending is not None and steps[-1] == 0:
+            recent = min(clock.ending.shape[1], len(steps))
+            found[:, len(steps) - recent :] = clock.ending[used, recent - 1 :: -1]
+        found[..., :2] -= origin
+        found[..., 2] -= turns[:, None]
+        return np.where(real[..., None], found, 0.0).astype(np.float32), real
+
+    history, history_mask = states(np.arange(1 - recipe.history, 1))
+    future, future_mask = states(np.arange(1, recipe.horizon + 1))
+    agent = clock.agent[owner]
+    now = clock.now[used]
+    at = now[place, :2]
+    there = (place >= 0)[..., None]
+    centre = (at * there).sum(1) / there.sum(1)
+    heading = now[place, 2]
+    ahead = np.stack([(f(heading) * there[..., 0]).sum(1) for f in (np.cos, np.sin)], 1)
+    # Agents that head against each other have no mean: the focal one decides then.
+    scattered = np.linalg.norm(ahead, axis=1) < AGREE * there[..., 0].sum(1)
+    direction = np.where(scattered, heading[:, 0], np.arctan2(ahead[:, 1], ahead[:, 0]))
+    candidates, references = np.empty((len(used), 0, 2)), np.empty((len(used), 0, 0, 2))
+    speed, polylines = np.empty((len(used), 0)), np.empty((0, VECTORS + 1, 2))
+    if recording.lanes is not None:
+        here = Located(located.lane[used], located.along[used], located.offset[used])
+        route = Routes(recording.lanes).of(now[:, :2], now[:, 3], here, recipe.horizon * recipe.dt)
+        candidates, references = route.candidates - origin, route.references - origin
+        limit = recording.lanes.speed_limit[here.lane]
+        speed = np.where(np.isnan(limit), recipe.speed_limit, limit)
+        polylines = pieces(recording.lanes, VECTORS, SPACING)
+    return Extract(
+        history=history,
+        history_mask=history_mask,
+        future=future,
+        future_mask=future_mask,
+        size=recording.tracks.size[agent].astype(np.float32),
+        kind=recording.tracks.kind[agent],
+        track=recording.tracks.ids[agent],
+        candidates=candidates.astype(np.float32),
+        references=references.astype(np.float32),
+        reference_speed=speed.astype(np.float32),
+        polylines=polylines - origin,
+        agents=place.astype(np.int32),
+        lanes=_nearest(polylines, centre, recipe.lanes),
+        centre=centre - origin,
+        direction=direction,
+        recording=np.zeros(len(moments), dtype=np.int32),
+        frame=np.round(moments * recipe.dt * recording.tracks.rate).astype(np.int64),
+        origin=origin[None],
+    )
+
+
+def _nearest(polylines: np.ndarray, centre: np.ndarray, most: int) -> Int[np.ndarray, "S L"]:
+    """The polylines whose middles are nearest to each centre, nearest first."""
+    found = np.full((len(centre), most), -1, dtype=np.int32)
+    if len(polylines):
+        middle = polylines[:, polylines.shape[1] // 2]
+        kept = min(most, len(middle))
+        for chunk in range(0, len(centre), 4096):
+            rows = slice(chunk, chunk + 4096)
+            distance = ((centre[rows, None] - middle) ** 2).sum(-1)
+            found[rows, :kept] = np.argsort(distance, axis=1, kind="stable")[:, :kept]
+    return found

@@ -1,0 +1,1 @@
+"""Configurations: how Hydra composes them, and the checked settings that code reads."""

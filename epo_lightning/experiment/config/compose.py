@@ -1,0 +1,295 @@
+"""Hydra, with its errors in one sentence each.
+
+The configuration tree lies beside the package in a checkout and inside it in an installed wheel. A configuration is
+composed here and checked before anything else happens, so that a misspelt word costs a second and leaves no folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from epo_lightning.identity import canonical, essence
+from epo_lightning.registry import ConfigError, nearest
+
+if TYPE_CHECKING:
+    from hydra._internal.hydra import Hydra
+    from omegaconf import DictConfig
+
+PACKAGE = Path(__file__).resolve().parents[2]
+PLUGINS = {
+    "hydra/launcher/joblib": "local",
+    "hydra/launcher/submitit_slurm": "slurm",
+    "hydra/launcher/submitit_local": "slurm",
+    "hydra/launcher/ray": "ray",
+    "hydra/sweeper/optuna": "search",
+}
+"""Options that come with another package, and the extra that installs it."""
+
+
+def tree() -> Path:
+    """The folder that holds ``conf/`` and ``sweeps/``: the package of a wheel, the root of a checkout."""
+    for folder in (PACKAGE, PACKAGE.parent):
+        if (folder / "conf" / "train.yaml").is_file():
+            return folder
+    raise ConfigError(
+        f"the configuration tree is missing: no conf/train.yaml in {PACKAGE} or {PACKAGE.parent}; reinstall"
+    )
+
+
+@contextmanager
+def hydra(extra: Sequence[str] = ()) -> Iterator[Hydra]:
+    """Hydra with this project's tree on its search path, and ``extra`` folders before it.
+
+    Raises:
+        ConfigError: one of the ``extra`` folders does not exist.
+    """
+    from hydra import version
+    from hydra._internal.hydra import Hydra
+    from hydra._internal.sources_registry import SourcesRegistry
+    from hydra._internal.utils import create_config_search_path
+    from hydra.core.config_search_path import SearchPathQuery
+    from hydra.core.global_hydra import GlobalHydra
+
+    from epo_lightning.experiment.config.sources import SweepsSource, TreeSource
+
+    version.setbase("1.3")
+    root = tree()
+    for source in (TreeSource, SweepsSource):
+        SourcesRegistry.instance().register(source)
+    path = create_config_search_path(f"{TreeSource.scheme()}://{root / 'conf'}")
+    # The group `sweeps` lies beside conf/, where somebody looks who wants a table of the paper.
+    path.append("sweeps", f"{SweepsSource.scheme()}://{root}", SearchPathQuery(provider="main"))
+    for folder in reversed(extra):
+        if not Path(folder).is_dir():
+            raise ConfigError(f"--config-dir {folder}: the folder does not exist")
+        address = f"{TreeSource.scheme()}://{Path(folder).resolve()}"
+        path.prepend("command-line", address, SearchPathQuery(provider="main"))
+    GlobalHydra.instance().clear()
+    try:
+        yield Hydra.create_main_hydra2("epo", path)
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def compose(name: str, overrides: Sequence[str] = (), extra: Sequence[str] = ()) -> dict[str, Any]:
+    """The configuration ``name`` with ``overrides``, resolved to plain Python values.
+
+    Raises:
+        ConfigError: an unknown key, an unknown option of a group, or an override that cannot be read.
+    """
+    with hydra(extra) as instance:
+        return resolve(_composed(instance, name, overrides))
+
+
+def resolve(config: DictConfig) -> dict[str, Any]:
+    """Plain Python values, with every interpolation replaced and without Hydra's own part.
+
+    Adds ``experiment``, and ``variant``: empty where nothing that matters differs from the experiment as it is written, at
+    its budget, and else six digits of a hash of what the run is without its seed.
+
+    Raises:
+        ConfigError: an interpolation that leads nowhere, or a value that is still missing.
+    """
+    choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
+    values = _plain_values(config)
+    if choices.get("experiment"):
+        values["experiment"] = choices["experiment"]
+    if "trainer" in values:
+        own = canonical(essence({**values, "seed": None}))
+        words = tuple(f"{group}={choices[group]}" for group in ("experiment", "budget") if choices.get(group))
+        same = own == _as_written(words, _search_path())
+        values["variant"] = "" if same else hashlib.sha256(own.encode()).hexdigest()[:6]
+    return values
+
+
+def _search_path() -> tuple[str, ...]:
+    from hydra.core.global_hydra import GlobalHydra
+
+    return tuple(entry.path for entry in GlobalHydra.instance().config_loader().get_search_path().get_path())
+
+
+@cache
+def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> str | None:
+    """The essence of an experiment at its budget, without a seed; None where it cannot stand alone."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.types import RunMode
+
+    loader = GlobalHydra.instance().config_loader()
+    try:
+        config = loader.load_configuration("train", list(words), run_mode=RunMode.RUN)
+        return canonical(essence({**_plain_values(config), "seed": None}))
+    except Exception:  # it needs a value that only the run at hand brings
+        return None
+
+
+def _plain_values(config: DictConfig) -> dict[str, Any]:
+    from omegaconf import OmegaConf
+    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+    plain = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    try:
+        values = OmegaConf.to_container(plain, resolve=True, throw_on_missing=True)
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"{error.full_key}=<value> is needed: it has no default") from error
+    except OmegaConfBaseException as error:
+        raise ConfigError(_sentence(error)) from error
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items()}
+
+
+def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list[list[str]]:
+    """The overrides of every job that Hydra's basic sweeper would launch; empty for sweepers that choose as they go."""
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    with hydra(extra) as instance:
+        config = _composed(instance, name, overrides, multirun=True)
+        sweeper = config.hydra.sweeper
+        if not str(sweeper.get("_target_", "")).endswith("BasicSweeper"):
+            return []
+        params = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
+        arguments = [*params, *config.hydra.overrides.task]
+        parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(arguments)
+        batches = BasicSweeper.split_arguments(parsed, None)
+        return [[str(text) for text in job] for batch in batches for job in batch]
+
+
+def trials(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> int | None:
+    """How many runs a searching sweeper is asked for; None where it does not say."""
+    with hydra(extra) as instance:
+        return _composed(instance, name, overrides, multirun=True).hydra.sweeper.get("n_trials")
+
+
+def launch(
+    name: str,
+    overrides: Sequence[str],
+    jobs: Sequence[list[str]],
+    task: Callable[[DictConfig], Any],
+    extra: Sequence[str],
+) -> None:
+    """Hand these jobs to the launcher that the configuration chooses; what becomes of them is for their task to say."""
+    from hydra._internal.callbacks import Callbacks
+    from hydra.core.plugins import Plugins
+    from hydra.types import HydraContext
+
+    with hydra(extra) as instance, _one_sentence(instance, name, overrides):
+        config = _composed(instance, name, overrides, multirun=True)
+        callbacks = Callbacks(config)
+        launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=HydraContext(config_loader=instance.config_loader, callbacks=callbacks),
+            task_function=task,
+            config=config,
+        )
+        callbacks.on_multirun_start(config=config, config_name=name)
+        launcher.launch(jobs, initial_job_idx=0)
+        callbacks.on_multirun_end(config=config, config_name=name)
+
+
+def multirun(name: str, overrides: Sequence[str], task: Callable[[DictConfig], Any], extra: Sequence[str] = ()) -> Any:
+    """Hand the sweep to Hydra's own sweeper and launcher."""
+    with hydra(extra) as instance, _one_sentence(instance, name, overrides):
+        return instance.multirun(config_name=name, task_function=task, overrides=list(overrides))
+
+
+def _composed(instance: Hydra, name: str, overrides: Sequence[str], multirun: bool = False) -> DictConfig:
+    from hydra.types import RunMode
+
+    with _one_sentence(instance, name, overrides):
+        return instance.compose_config(
+            config_name=name,
+            overrides=list(overrides),
+            run_mode=RunMode.MULTIRUN if multirun else RunMode.RUN,
+            with_log_configuration=False,
+        )
+
+
+@contextmanager
+def _one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterator[None]:
+    """Turn Hydra's and OmegaConf's exceptions into a :class:`ConfigError` that names the nearest valid word."""
+    from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        yield
+    except OverrideParseException as error:
+        raise ConfigError(
+            f"cannot read the override {error.override!r}: write key=value, for example seed=1"
+        ) from error
+    except MissingConfigException as error:
+        raise ConfigError(_missing_option(instance, error.missing_cfg_file or "", str(error))) from error
+    except (HydraException, OmegaConfBaseException) as error:
+        unknown = re.search(r"Could not (?:override|delete from config\.) +'([\w./@]+)'", str(error))
+        if unknown and "Multiple values" not in str(error):
+            raise ConfigError(_unknown_key(instance, name, unknown.group(1), overrides)) from error
+        raise ConfigError(_sentence(error)) from error
+    except ValueError as error:  # Hydra's own, for example debug=null
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(_sentence(error)) from error
+
+
+def _missing_option(instance: Hydra, missing: str, message: str) -> str:
+    """``experiment/rpi/v_lst`` is no file: name the files that are."""
+    if missing.removesuffix(".yaml") in PLUGINS:
+        package = PLUGINS[missing.removesuffix(".yaml")]
+        return (
+            f"{missing.removesuffix('.yaml')} is a plugin that is not installed: pip install 'epo_lightning[{package}]'"
+        )
+    group, _, option = missing.removesuffix(".yaml").partition("/")
+    options = options_of(instance, group) if option else []
+    if not options:
+        return f"unknown configuration {missing!r}: " + " ".join(message.split())
+    return f"unknown option {group}={option}: {nearest(option, options)}"
+
+
+def options_of(instance: Hydra, group: str) -> list[str]:
+    """The options of a group, also those in folders within it: ``rpi/v_lstm`` for ``experiment``."""
+    from hydra.core.object_type import ObjectType
+
+    return sorted(set(instance.config_loader.get_group_options(group, ObjectType.CONFIG)))
+
+
+def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str]) -> str:
+    """Find the level at which ``key`` leaves the configuration, and the names known there."""
+    from hydra.types import RunMode
+    from omegaconf import DictConfig
+
+    config: Any = None
+    for kept in (_groups(instance, overrides), []):
+        try:
+            config = instance.compose_config(
+                config_name=name, overrides=kept, run_mode=RunMode.RUN, with_log_configuration=False
+            )
+            break
+        except Exception:  # the other overrides are wrong as well; the plain tree still tells the names
+            continue
+    walked: list[str] = []
+    for word in key.replace("/", ".").split("."):
+        names = [str(known) for known in config if known != "hydra"] if isinstance(config, DictConfig) else []
+        if word not in names:
+            level = f" in {'.'.join(walked)}" if walked else ""
+            return f"unknown key {key!r}{level}: {nearest(word, names)}"
+        walked.append(word)
+        config = config[word]
+    return f"unknown key {key!r}"
+
+
+def _groups(instance: Hydra, overrides: Iterable[str]) -> list[str]:
+    """Only those overrides that choose an option of a group."""
+    groups = set(instance.config_loader.list_groups(""))
+    return [text for text in overrides if text.split("=", 1)[0].split("@")[0].split("/")[0] in groups]
+
+
+def _sentence(error: BaseException) -> str:
+    """An exception's message in one line, without OmegaConf's notes for programmers."""
+    texts = [str(error)] + ([str(error.__cause__)] if error.__cause__ else [])
+    lines = [line.strip() for text in texts for line in text.splitlines()]
+    notes = ("object_type=", "reference_type=")
+    kept = [line.replace("full_key:", "key:") for line in lines if line and not line.startswith(notes)]
+    return "; ".join(dict.fromkeys(kept))

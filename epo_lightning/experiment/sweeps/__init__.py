@@ -1,0 +1,1 @@
+"""Sweeps: their definition, their start, their state while they run."""

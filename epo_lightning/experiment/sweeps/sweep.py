@@ -1,0 +1,284 @@
+"""A sweep: many runs started by one command, of which each is trained once, however often the command is given.
+
+::
+
+    <runs>/sweeps/<label>/
+        sweep.json       the command, and every run: its overrides, its folder (relative to <runs>) and its identity
+        found/           the same of runs that a searching sweeper thought of, one file each
+        failures/        tracebacks of what went wrong in the last attempt, one file each
+        .lock            locked as long as the sweep runs
+        report/          written by ``epo report <name>``
+
+The label is the sweep's name, with a hash of further overrides where there are any. The runs themselves lie where they
+would lie without a sweep, so that two sweeps share what is the same run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import socket
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment import train as training
+from epo_lightning.experiment.config.settings import Measured, Settings, measures, read
+from epo_lightning.experiment.sweeps.orphans import end_with
+from epo_lightning.identity import identity
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_json, write_text
+
+State = Literal["waiting", "running", "interrupted", "failed", "done"]
+BESIDE = (
+    *("logger", "existing", "runs", "sweep", "sweeps"),
+    *("hydra/launcher", "hydra.launcher", "hydra/hydra_logging", "hydra.sweep", "hydra.job", "hydra.verbose"),
+    *("hydra.sweeper.n_trials", "hydra.sweeper.n_jobs"),
+    *("callbacks.progress", "callbacks.refresh"),
+    *("trainer.accelerator", "trainer.devices", "trainer.share", "trainer.threads"),
+)
+"""Overrides that do not make it another sweep: where and how visibly it runs."""
+
+
+class RunFailed(RuntimeError):
+    """A run of a sweep failed; all that is known of it is in the message, so that it can travel between processes."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep.
+
+    Attributes:
+        overrides: what it was started with.
+        run: where it lies.
+        identity: what makes it this run.
+        title, seed: how to call it.
+        measures: what is measured when it is trained.
+    """
+
+    overrides: tuple[str, ...]
+    run: RunFolder
+    identity: str
+    title: str
+    seed: int
+    measures: tuple[Measured, ...]
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any], overrides: Sequence[str]) -> Job:
+        """The job of a resolved configuration, which is checked; touches no file.
+
+        Raises:
+            ConfigError: as :func:`assembly.check`.
+        """
+        settings = read(Settings, config)
+        data, _ = assembly.check(settings)
+        run = training.folder_for(settings)
+        name = identity(config, data.digest)
+        return cls(tuple(overrides), run, name, settings.title, settings.seed, settings.measures)
+
+    @property
+    def measured(self) -> bool:
+        """Whether all that is measured lies in the run's folder."""
+        return all(self.run.metrics_file(which).is_file() for which in self.measures)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The record of a sweep, read from its folder."""
+
+    folder: Path
+
+    @classmethod
+    def of(cls, name: str, overrides: Sequence[str], runs: str | Path) -> Sweep:
+        """The sweep that a command line means; it may not have begun yet."""
+        return cls(Path(runs).expanduser().absolute() / "sweeps" / label(name, overrides))
+
+    @classmethod
+    def find(cls, name: str, overrides: Sequence[str], runs: str | Path) -> Sweep:
+        """A sweep that has begun: the one with these overrides; without any, the latest of that name or label.
+
+        Raises:
+            ConfigError: there is none; the message names those that there are.
+        """
+        home = Path(runs).expanduser().absolute() / "sweeps"
+        known = {sweep.label: sweep for sweep in cls.begun(runs)}
+        exact = label(name, overrides)
+        if exact in known and (exact != name or not any(found.startswith(f"{name}-") for found in known)):
+            return known[exact]
+        alike = [sweep for sweep in known.values() if sweep.record.get("name") == name or sweep.folder.name == name]
+        if not alike or exact != name:
+            what = f"{name} with these overrides" if exact != name else name
+            begun = "; ".join(f"{key} ({sweep.record.get('command')})" for key, sweep in known.items())
+            raise ConfigError(
+                f"no sweep {what} has begun below {home}: " + (f"known: {begun}" if begun else "none has")
+            )
+        return alike[0]
+
+    @classmethod
+    def begun(cls, runs: str | Path) -> list[Sweep]:
+        """All sweeps that have begun, the latest first."""
+        home = Path(runs).expanduser().absolute() / "sweeps"
+        found = [cls(path.parent) for path in home.glob("*/sweep.json")]
+        return sorted(found, key=lambda sweep: sweep.record.get("began", ""), reverse=True)
+
+    @property
+    def label(self) -> str:
+        return self.folder.name
+
+    @property
+    def root(self) -> Path:
+        """The folder that all runs lie below."""
+        return self.folder.parents[1]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The contents of sweep.json."""
+        return read_json(self.folder / "sweep.json")
+
+    @property
+    def jobs(self) -> list[Job]:
+        """All of its runs; of a sweep that searches, those that it has thought of so far."""
+        found = [read_json(path) for path in sorted((self.folder / "found").glob("*.json"))]
+        return [self._job(entry) for entry in [*self.record.get("jobs", []), *found]]
+
+    def _job(self, entry: Mapping[str, Any]) -> Job:
+        run = RunFolder(Path(os.path.relpath(self.root / entry["folder"])))
+        measured = measures(entry["score"])  # null or a word in records of older versions
+        return Job(tuple(entry["overrides"]), run, entry["identity"], entry["title"], entry["seed"], measured)
+
+    def _entry(self, job: Job) -> dict[str, Any]:
+        return {
+            "overrides": list(job.overrides),
+            "folder": self._place(job.run),
+            "identity": job.identity,
+            "title": job.title,
+            "seed": job.seed,
+            "score": list(job.measures),
+        }
+
+    def state(self, job: Job) -> State:
+        """What has become of a run, its scores included; a damaged folder has failed."""
+        try:
+            state = job.run.state
+        except ConfigError:
+            return "failed"
+        if state == "finished":
+            if job.measured:
+                return "done"
+            state = "running" if job.run.locked else "interrupted"
+        return "failed" if state in ("waiting", "interrupted") and self._failure(job.run).is_file() else state
+
+    def error(self, job: Job) -> str:
+        """Why a run failed, in one line; empty if it did not."""
+        try:
+            if self._failure(job.run).is_file():
+                return self._failure(job.run).read_text(encoding="utf-8").partition("\n")[0]
+            return str(job.run.record.get("error") or "") if job.run.record_file.is_file() else ""
+        except ConfigError as error:
+            return str(error)
+
+    def _failure(self, run: RunFolder) -> Path:
+        return self.folder / "failures" / f"{self._place(run).replace(os.sep, '__')}.txt"
+
+    def _place(self, run: RunFolder) -> str:
+        """A run's folder, relative to the folder of all runs, which may be moved."""
+        return os.path.relpath(run.path.absolute(), self.root)
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep a second start of the same sweep away.
+
+        Raises:
+            ConfigError: it runs already.
+        """
+        from filelock import FileLock, Timeout
+
+        self.folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.folder / LOCK)
+        try:
+            lock.acquire(timeout=0.5, poll_interval=0.1)
+        except Timeout:
+            record = self.record if (self.folder / "sweep.json").is_file() else {}
+            who = f" (process {record['process']} on {record['host']})" if "process" in record else ""
+            raise ConfigError(
+                f"the sweep {self.label} runs already{who}: see `epo sweep status {self.label}`, or give this one "
+                "another place with runs=<folder>"
+            ) from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def begin(
+        self, name: str, command: str, overrides: Sequence[str], jobs: Sequence[Job], stop_on_failure: bool
+    ) -> None:
+        """Write down what is about to run; failures of earlier attempts are forgotten."""
+        for failure in (self.folder / "failures").glob("*.txt"):
+            failure.unlink()
+        content = {
+            "name": name,
+            "label": self.label,
+            "command": command,
+            "overrides": list(overrides),
+            "directory": str(Path.cwd()),
+            "cache": os.environ.get("EPO_CACHE"),
+            "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "process": os.getpid(),
+            "host": socket.gethostname(),
+            "stop_on_failure": stop_on_failure,
+            "jobs": [self._entry(job) for job in jobs],
+        }
+        write_json(self.folder / "sweep.json", content)
+
+    def lost(self, job: Job) -> None:
+        """Note that a run's process has died without a word."""
+        write_text(self._failure(job.run), "its process died, again and again (out of memory?)\n")
+
+    def work(self, config: Mapping[str, Any], overrides: Sequence[str]) -> float | None:
+        """Train and score one of the runs, in whatever process a launcher chose.
+
+        Returns:
+            the best validation score; None for a run that was left alone because another one failed.
+
+        Raises:
+            RunFailed: the run failed; the sweep's folder holds the traceback.
+        """
+        record = self.record
+        # A worker on another machine may have started anywhere, and knows nothing of our environment.
+        with contextlib.suppress(OSError):
+            os.chdir(record["directory"])
+        if record["cache"]:
+            os.environ.setdefault("EPO_CACHE", record["cache"])
+        if record["stop_on_failure"] and any((self.folder / "failures").glob("*.txt")):
+            return None
+        end_with(record["process"])
+        settings = read(Settings, config)
+        run = training.folder_for(settings)
+        try:
+            if not record["jobs"]:
+                name = self._failure(run).with_suffix(".json").name
+                write_json(self.folder / "found" / name, self._entry(Job.of(config, overrides)))
+            training.train(dict(config), overrides)
+        except Exception as error:
+            message = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            message = message.replace(f"{self.root}{os.sep}", f"{os.path.relpath(self.root)}{os.sep}")
+            write_text(self._failure(run), f"{message}\n\n{traceback.format_exc()}")
+            raise RunFailed(f"{settings.title}, seed {settings.seed}: {message}") from None
+        return next(iter(run.record.get("best", {}).values()), None)
+
+
+def label(name: str, overrides: Sequence[str]) -> str:
+    """``name``, and six digits of a hash of the overrides that decide on results, where there are any."""
+    keys = {word: word.lstrip("+~").split("=")[0].split("@")[0] for word in overrides}
+    special = sorted(
+        word
+        for word, key in keys.items()
+        if not any(key == beside or key.startswith((f"{beside}.", f"{beside}/")) for beside in BESIDE)
+    )
+    return name + ("-" + hashlib.sha256("\n".join(special).encode()).hexdigest()[:6] if special else "")

@@ -1,0 +1,182 @@
+"""``epo sweep``: find out what is missing, have it done by a launcher, and say what became of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment import train as training
+from epo_lightning.experiment.config import compose
+from epo_lightning.experiment.config.settings import Settings, TrainerSettings, read
+from epo_lightning.experiment.sweeps.sweep import Job, Sweep
+from epo_lightning.experiment.sweeps.watch import news, status, summary
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.labels import value_text, word
+from epo_lightning.run_folder import RunFolder, read_json
+
+ATTEMPTS = 3
+"""How often a launcher may break down in a sweep."""
+
+
+def run(
+    name: str, overrides: Sequence[str], extra: Sequence[str], task: Callable[..., Any], stop_on_failure: bool
+) -> bool:
+    """Run what is missing of a sweep: new runs, and those that were interrupted or failed, from their last checkpoint.
+
+    Args:
+        name: of the file in ``sweeps/``.
+        overrides: of every run.
+        extra: folders that are searched for configurations first.
+        task: of the jobs; launchers send it to other processes, so it is a function at the level of a module.
+        stop_on_failure: begin no further run when one has failed.
+
+    Returns:
+        whether all runs are done.
+
+    Raises:
+        ConfigError: a mistake in the configuration of any run, before the first one begins; or the sweep runs already.
+    """
+    assembly.quiet()
+    for given in overrides:
+        if given.split("=")[0] in ("run_dir", "resume", "sweep", "sweeps"):
+            raise ConfigError(f"{given} makes no sense in a sweep, whose runs have folders of their own: leave it out")
+    runs = _runs(overrides)
+    sweep = Sweep.of(name, overrides, runs)
+    words = [f"sweeps={name}", *overrides]
+    # Absolute, because a worker on another machine may start in any folder.
+    places = {"sweep": sweep.folder, "runs": sweep.root, "hydra.sweep.dir": sweep.folder}
+    words += [f"{key}={value_text(str(place))}" for key, place in places.items()] + ["existing=continue"]
+    words += ["hydra/hydra_logging=none"]  # the news say it better
+    jobs = _listed(sweep, words, extra)
+    with sweep.lock():
+        states = [sweep.state(job) for job in jobs]
+        sweep.begin(name, shlex.join(["epo", "sweep", name, *overrides]), overrides, jobs, stop_on_failure)
+        if jobs:
+            print(f"{sweep.label}: {summary(Counter(states))}", flush=True)
+        with news(sweep):
+            if jobs:
+                missing = [job for job, state in zip(jobs, states, strict=True) if state != "done"]
+                _launch(sweep, missing, words, task, extra)
+            else:
+                _search(sweep, words, task, extra)
+        counts = status(sweep)
+    if counts["failed"]:
+        print(f"tracebacks: {os.path.relpath(sweep.folder / 'failures')}")
+    done = counts["done"] == counts.total()
+    if done:
+        print(f"next: epo report {sweep.label}" + (f" {word('runs', runs)}" if runs != "runs" else ""))
+    return done
+
+
+def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Job]:
+    """All runs of a sweep that says them beforehand, each once, with everything looked at that could stop one at its start.
+
+    Raises:
+        ConfigError: a mistake in a configuration, a folder that holds something else, or data that is missing.
+    """
+    jobs: dict[Path, Job] = {}
+    ready: set[str] = set()
+    for overrides in compose.jobs("train", words, extra):
+        config = compose.compose("train", overrides, extra)
+        job = Job.of(config, overrides)
+        if job.run.record_file.is_file():
+            training.refuse_other(job.run, config)
+        elif job.run.exists:
+            raise ConfigError(
+                f"{job.run.path} exists and is not a run folder: move it away, or choose another runs=<folder>"
+            )
+        if "time" in job.measures:
+            _set_aside(job.run, read(Settings, config).trainer)
+        data = json.dumps(config["data"], sort_keys=True)
+        if data not in ready and sweep.state(job) != "done":
+            training.ready(read(Settings, config))
+            ready.add(data)
+        jobs.setdefault(job.run.path, job)
+    return list(jobs.values())
+
+
+def _set_aside(run: RunFolder, settings: TrainerSettings) -> None:
+    """Keep a time that was measured on something else under another name, so that it is measured anew."""
+    file = run.metrics_file("time")
+    if not file.is_file():
+        return
+    found = read_json(file)
+    on_gpu = found["device"] != "cpu"
+    if found["threads"] != settings.threads or (
+        settings.accelerator != "auto" and on_gpu == (settings.accelerator == "cpu")
+    ):
+        kind = "gpu" if on_gpu else "cpu"
+        file.rename(file.with_name(f"runtime-{kind}-{found['threads']}.json"))
+
+
+def _launch(
+    sweep: Sweep, jobs: Sequence[Job], words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]
+) -> None:
+    """Have jobs done. A launcher that breaks down, because a worker was killed, say, is started again for what it left."""
+    left = list(jobs)
+    for _ in range(ATTEMPTS):
+        if not left:
+            return
+        try:
+            compose.launch("train", words, [list(job.overrides) for job in left], task, extra)
+            return
+        except ConfigError:
+            raise
+        except Exception as error:
+            left = [job for job in left if sweep.state(job) not in ("done", "failed")]
+            said = " ".join(str(error).split())
+            print(
+                f"the launcher broke down ({type(error).__name__}: {said[:200]}): {len(left)} runs are left", flush=True
+            )
+    for job in left:
+        if sweep.state(job) == "interrupted":
+            sweep.lost(job)
+
+
+def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]) -> None:
+    """Go on with a sweep whose sweeper chooses as it goes: finish what it has thought of, then let it think further."""
+    found = sweep.jobs
+    _launch(sweep, [job for job in found if sweep.state(job) != "done"], words, task, extra)
+    trials = compose.trials("train", words, extra)
+    if trials is None:
+        compose.multirun("train", words, task, extra)
+    elif trials > len(found):
+        compose.multirun("train", [*words, f"hydra.sweeper.n_trials={trials - len(found)}"], task, extra)
+
+
+def known(extra: Sequence[str] = ()) -> dict[str, str]:
+    """The names of all sweeps, and what the first line of each file says."""
+    says = {}
+    with compose.hydra(extra) as instance:
+        for option in compose.options_of(instance, "sweeps"):
+            files = (folder / "sweeps" / f"{option}.yaml" for folder in [*map(Path, extra), compose.tree()])
+            lines = next((file.read_text(encoding="utf-8").splitlines() for file in files if file.is_file()), [])
+            comments = [line.lstrip("# ") for line in lines if line.startswith("#") and "@package" not in line]
+            says[option] = comments[0].partition(":  ")[0].rstrip(":") if comments else ""
+    return says
+
+
+def show(name: str | None, overrides: Sequence[str]) -> None:
+    """Print the state of every run of a sweep that has begun; without a name, how far each sweep is.
+
+    Raises:
+        ConfigError: there is none of that name and overrides.
+    """
+    runs = _runs(overrides)
+    if name is not None:
+        status(Sweep.find(name, overrides, runs))
+        return
+    for sweep in Sweep.begun(runs):
+        counts = Counter(sweep.state(job) for job in sweep.jobs)
+        print(f"{sweep.label}: {summary(counts)}\n    {sweep.record['command']}")
+
+
+def _runs(overrides: Sequence[str]) -> str:
+    """The folder that runs are written below, as Hydra reads it."""
+    return str(compose.compose("train", [given for given in overrides if given.startswith("runs=")])["runs"])

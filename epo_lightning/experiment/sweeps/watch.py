@@ -1,0 +1,135 @@
+"""Looking at a sweep: the state of every run as a table, and news of them while it runs."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
+from epo_lightning.report.timings import duration
+from epo_lightning.run_folder import read_json
+
+STYLES: dict[State, str] = {
+    "running": "cyan",
+    "interrupted": "yellow",
+    "failed": "bold red",
+    "done": "green",
+    "waiting": "",
+}
+POLL = 2.0
+"""Seconds between two looks at the run folders."""
+
+
+def status(sweep: Sweep) -> Counter[State]:
+    """Print the state of every run; returns how many there are of each."""
+    jobs = sweep.jobs
+    states = [sweep.state(job) for job in jobs]
+    names = names_of(jobs)
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in ("run", "state", "how far"):
+        table.add_column(column, overflow="fold")
+    for job, state in zip(jobs, states, strict=True):
+        table.add_row(escape(names[job.run.path]), Text(state, STYLES[state]), escape(_details(sweep, job, state)))
+    console = Console()
+    console.print(sweep.record["command"], style="bold", highlight=False, markup=False)
+    console.print(table)
+    counts = Counter(states)
+    console.print(f"{summary(counts)}; they lie below {sweep.root}", highlight=False, markup=False, soft_wrap=True)
+    return counts
+
+
+def names_of(jobs: Sequence[Job]) -> dict[Path, str]:
+    """How to call each run among the others: title and seed, and the folder's name where those do not tell them apart."""
+    names = {job.run.path: f"{job.title}, seed {job.seed}" for job in jobs}
+    counts = Counter(names.values())
+    folders = Counter((names[job.run.path], job.run.path.name) for job in jobs)
+    for path, name in names.items():
+        if counts[name] > 1:
+            names[path] = f"{name} ({'/'.join(path.parts[-2 if folders[name, path.name] > 1 else -1 :])})"
+    return names
+
+
+def summary(counts: Counter[State]) -> str:
+    """``12 runs: 5 done, 1 running, 6 waiting``"""
+    parts = [
+        f"{counts[state]} {state}" for state in ("done", "running", "interrupted", "failed", "waiting") if counts[state]
+    ]
+    total = counts.total()
+    return f"{total} run{'' if total == 1 else 's'}: {', '.join(parts) or 'none'}"
+
+
+def _details(sweep: Sweep, job: Job, state: State) -> str:
+    if state == "running":
+        return how_far(job)
+    if state == "failed":
+        return sweep.error(job)
+    if state == "interrupted":
+        return how_far(job) if job.run.progress else ""
+    return result(job) if state == "done" else ""
+
+
+def how_far(job: Job) -> str:
+    """Steps, and minutes that are left at the present pace."""
+    progress = job.run.progress
+    step, steps, since = (progress.get(key) for key in ("step", "steps", "seconds"))
+    if step is None:
+        return "begins" if not job.run.finished else "is scored"
+    if not steps:
+        return f"step {step}"
+    done = step - progress.get("from_step", 0)
+    left = f", {duration((steps - step) * since / done)} left" if done and since else ""
+    return f"step {step} of {steps}{left}"
+
+
+def result(job: Job) -> str:
+    """What a finished run has come to: its best validation score and how long it took, and how long a forecast takes."""
+    told = []
+    if job.measures != ("time",):
+        record = job.run.record
+        best = next(((key, value) for key, value in record.get("best", {}).items() if value is not None), None)
+        told = [*([f"{best[0]} {best[1]:.4f}"] if best else []), duration(record.get("seconds", 0.0))]
+    if "time" in job.measures:
+        seconds = read_json(job.run.metrics_file("time"))["seconds"]["median"]
+        told.append(f"{1000 * seconds:.1f} ms per forecast")
+    return ", ".join(told)
+
+
+@contextmanager
+def news(sweep: Sweep) -> Iterator[None]:
+    """Print a line whenever a run is done or has failed, whoever runs it and wherever."""
+    names = names_of(sweep.jobs)
+    known = {job.run.path: sweep.state(job) for job in sweep.jobs}
+    over = threading.Event()
+
+    def look() -> None:
+        jobs = sweep.jobs
+        for job in jobs:
+            state = sweep.state(job)
+            if state != known.get(job.run.path) and state in ("done", "failed"):
+                done = sum(known.get(other.run.path) in ("done", "failed") for other in jobs) + 1
+                text = f"FAILED, {sweep.error(job)}" if state == "failed" else f"done, {result(job)}"
+                name = names.get(job.run.path) or names_of(jobs)[job.run.path]
+                print(f"[{done}/{len(jobs)}] {name}: {text}", flush=True)
+            known[job.run.path] = state
+
+    def watch() -> None:
+        while not over.wait(POLL):
+            look()
+
+    watcher = threading.Thread(target=watch, name="news of the sweep", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join(timeout=POLL)
+        look()

@@ -1,0 +1,1 @@
+"""How close a joint strategy is to an equilibrium of its game."""

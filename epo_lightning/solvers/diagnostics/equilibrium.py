@@ -1,0 +1,337 @@
+"""How close a forecast is to an open-loop Nash equilibrium of the game that was inferred for it, in numbers all rows share.
+
+In an equilibrium nobody gains by changing its strategy alone. Agent i's gain is the most that its J_i = E_i + sum_j E_ij can
+fall while the others stay, and because the game has the potential E, E falls by as much (Theorem 1):
+
+    gap_i(u) = J_i(u) - min over u_i' of J_i(u_i', u_-i) = E(u) - min over u_i' of E(u_i', u_-i).
+
+Where strategies are controls the minima are local ones, converged tightly: the *best response* of an agent is the better one
+of two descents, from its own strategy and from the one that it has in the optimum, and the gap is a lower bound. Where
+strategies are chosen among candidates the minimum is one over a row of a table, and exact.
+
+Only the most likely joint mode is looked at, the one that overlap rates look at too: every scene is one game, and its best
+responses are *worlds* in which one agent moves and the others are held. All worlds of a batch are solved side by side,
+and those that have arrived are left out.
+
+Networks need not be bounded from below: where a descent is given up while the energy is still falling fast, there is no
+minimum to compare with, and the optimum and the gaps of that scene are NaN.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from epo_lightning.game.energy import FEATURES, GRADIENT, Energy, pairs
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scene, Solution, Status, Tables
+from epo_lightning.solvers.diagnostics import quasi_newton
+from epo_lightning.solvers.gauss_newton import structured
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LEAST_DAMPING, MOST_DAMPING, Backend, backend
+from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
+
+_GAUSS_NEWTON, _NEWTON = 20, 60
+"""Steps at most. The first kind is cheap and never looks back; the second one arrives where residuals stay large."""
+_START, _SMALL = 1e-2, 1e-4
+"""Damping at the start, and up to which a step that changes nothing says that there is nothing to gain."""
+_TOLERANCE = 1e-13
+"""Of the energy: smaller changes are rounding."""
+_SWEEPS = 100
+"""At most, of coordinate descent over candidates: each lowers the energy, so there is an end, and it comes soon."""
+
+
+@torch.no_grad()
+def equilibrium(energy: Energy, scene: Scene, forecast: JointForecast) -> Equilibrium | None:
+    """The report on the most likely joint mode of every scene, in float64.
+
+    - Energies made of features: damped Gauss-Newton steps, one agent at a time by an infinite damping of the others.
+    - Solutions that are choices among candidates (``tables`` and ``assignment``): from the tables, exact. The optimum is the
+      lowest of what choosing anew, agent after agent, leads to from any of the joint modes.
+    - Any other energy with a gradient: quasi-Newton steps (:mod:`~epo_lightning.solvers.diagnostics.quasi_newton`).
+
+    Features are sums of squares and always have a minimum. With other energies a descent may find none in its 300
+    evaluations: ``optimum`` and the gaps of such a scene are NaN, and its other values are reported.
+
+    A scene that holds no finite numbers has no finite report, and leaves those of the others as they are.
+
+    Args:
+        energy: what was minimised.
+        scene: what was observed.
+        forecast: with the game (``parameters``) and how it was solved (``solution``).
+
+    Returns:
+        the report; None where the forecast has no game or no solution, and for energies that offer no gradient and whose
+        solution has no tables.
+    """
+    parameters, solution = forecast.parameters, forecast.solution
+    if parameters is None or solution is None:
+        return None
+    mode = forecast.probabilities.argmax(1)
+    initial = _of_mode(solution.initial_energy, mode)[:, 0].double()
+    if solution.tables is not None and solution.assignment is not None:
+        return _finite(scene.agent_mask, solution.tables, solution.assignment, mode, initial)
+    if GRADIENT not in energy.offers:
+        return None
+    descend: Descend = _descend_features if FEATURES in energy.offers else _descend_any
+    if isinstance(energy, torch.nn.Module):
+        energy = copy.deepcopy(energy).double()
+    return _smooth(
+        descend, energy, _relevant(scene).to(torch.float64), _game(scene, parameters, solution, mode), initial
+    )
+
+
+@dataclass(frozen=True)
+class Descent:
+    """From where to where: what is minimised before and after, the controls after, the slope before, and whether a minimum
+    was found."""
+
+    before: Float[Tensor, " W"]
+    after: Float[Tensor, " W"]
+    controls: Float[Tensor, "W 1 N K 2"]
+    slope: Float[Tensor, " W"]
+    found: Bool[Tensor, " W"]
+
+
+Descend = Callable[[Energy, Scene, GameParameters, Tensor | None], Descent]
+"""(energy, scene, game, agent [W]) -> the descent of E by all controls, or of J_i by those of one agent of every world."""
+
+
+def _smooth(
+    descend: Descend, energy: Energy, scene: Scene, game: GameParameters, initial: Float[Tensor, " B"]
+) -> Equilibrium:
+    """The report of strategies that are controls, given how to descend."""
+    optimum = descend(energy, scene, game, None)
+    origin, agent = scene.agent_mask.nonzero(as_tuple=True)
+    worlds, games = scene[origin], game[origin]
+    stayed = descend(energy, worlds, games, agent)
+    moves = _only(agent, scene.agent_mask.shape[1])[:, None, :, None, None]
+    tried = torch.where(moves, optimum.controls[origin], games.initial_controls)
+    moved = descend(energy, worlds, dataclasses.replace(games, initial_controls=tried), agent)
+    gap = (stayed.before - stayed.after.fmin(moved.after)).clamp_min(0.0)
+    none = initial.new_zeros(scene.agent_mask.shape)
+    lost = torch.zeros_like(scene.agent_mask).index_put((origin, agent), ~(stayed.found & moved.found))
+    lost = lost.any(1) | ~optimum.found
+    return Equilibrium(
+        initial=initial,
+        energy=optimum.before,
+        optimum=torch.where(lost, torch.nan, optimum.after),
+        gradient_norm=optimum.slope,
+        nash_gap=torch.where(lost[:, None] & scene.agent_mask, torch.nan, none.index_put((origin, agent), gap)),
+        objective=none.index_put((origin, agent), stayed.before),
+    )
+
+
+def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent: Int[Tensor, " W"] | None) -> Descent:
+    """Damped Gauss-Newton steps; J_i is the energy of a game in which only i and its pairs have weights."""
+    assert isinstance(energy, FeatureEnergy)
+    start = game.initial_controls
+    held = None
+    if agent is not None:
+        agents = start.shape[2]
+        mine = _only(agent, agents)[:, None]
+        first, second = pairs(agents, start.device)
+        own = {name: torch.where(mine, weight, 0.0) for name, weight in game.own_weights.items()}
+        pair = {
+            name: torch.where(mine[..., first] | mine[..., second], weight, 0.0)
+            for name, weight in game.pair_weights.items()
+        }
+        game, held = dataclasses.replace(game, own_weights=own, pair_weights=pair), ~mine
+    if start.numel() == 0:
+        return _nowhere(start)
+    energy.validate(scene, game, start)
+    solve = backend("auto", energy, scene, game)
+    damping = start.new_full((len(start), 1), _START)
+    here = solve(energy, scene, game, 0, 1.0, damping, False)
+    controls, value = here.controls.clone(), here.energy.clone()
+    left = value[:, 0].isfinite().nonzero()[:, 0]
+    for step, count in ((_gauss_newton, _GAUSS_NEWTON), (_newton, _NEWTON)):
+        some, these = scene[left], game[left]
+        for _ in range(count):
+            if not len(left):
+                break
+            now, before = damping[left], value[left]
+            these = dataclasses.replace(these, initial_controls=controls[left])
+            of_agents = now if held is None else torch.where(held[left], torch.inf, now[..., None])
+            trial, after = step(solve, energy, some, these, of_agents)
+            better, tiny = after < before, (after - before).abs() <= _TOLERANCE * before
+            controls[left] = torch.where(better[..., None, None, None], trial, these.initial_controls)
+            value[left] = torch.where(better, after, before)
+            arrived = torch.where(better | tiny, tiny & (now <= _SMALL), now >= MOST_DAMPING)[:, 0]
+            now = torch.where(better | tiny, now / 10.0, now * 10.0)
+            damping[left] = now.clamp(LEAST_DAMPING, MOST_DAMPING)
+            if arrived.any():
+                on = (~arrived).nonzero()[:, 0]
+                left, some, these = left[on], some[on], these[on]
+    return Descent(here.energy[:, 0], value[:, 0], controls, here.gradient_norm[:, 0], value[:, 0].isfinite())
+
+
+def _gauss_newton(
+    solve: Backend, energy: FeatureEnergy, scene: Scene, game: GameParameters, damping: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Where a damped Gauss-Newton step leads, and the energy there."""
+    there = solve(energy, scene, game, 1, 1.0, damping, False)
+    return there.controls, there.energy
+
+
+def _newton(
+    solve: Backend, energy: FeatureEnergy, scene: Scene, game: GameParameters, damping: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The same with the exact Hessian. Where that has no factor, nothing has become better: more damping will be tried."""
+    controls = game.initial_controls
+    split = controls.device.type == "cpu"
+    model = QuadraticModel(energy, scene, game, controls, not split, exact=True)
+    factors = structured.factorise(model, damping.flatten(0, 1), split, retry=False)
+    moved = controls + factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
+    there = solve(energy, scene, dataclasses.replace(game, initial_controls=moved), 0, 1.0, damping, False)
+    failed = (factors.status == Status.STOPPED).view(there.energy.shape)
+    return there.controls, torch.where(failed, torch.inf, there.energy)
+
+
+def _descend_any(energy: Energy, scene: Scene, game: GameParameters, agent: Int[Tensor, " W"] | None) -> Descent:
+    """Quasi-Newton steps with derivatives by automatic differentiation."""
+    start = game.initial_controls
+    if start.numel() == 0:
+        return _nowhere(start)
+    chosen = torch.arange(len(start), device=start.device)
+
+    def evaluate(index: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+        some, these = scene[index], game[index]
+        with torch.enable_grad():
+            leaf = free.detach().requires_grad_()
+            if agent is None:
+                controls = leaf.view(len(index), *start.shape[1:])
+                value = energy(some, these, controls)[:, 0]
+            else:
+                whose = agent[index]
+                rest = these.initial_controls
+                mine = leaf.view(len(index), 1, 1, *start.shape[3:])
+                moves = _only(whose, start.shape[2])[:, None, :, None, None]
+                controls = torch.where(moves, mine, rest)
+                value = energy.objectives(some, these, controls)[chosen[: len(index)], 0, whose]
+            (slope,) = torch.autograd.grad(value.sum(), leaf)
+        return value.detach(), slope
+
+    free = start[:, 0].flatten(1) if agent is None else start[chosen, 0, agent].flatten(1)
+    found = quasi_newton.minimise(evaluate, free)
+    if agent is None:
+        controls = found.point.view(start.shape)
+    else:
+        controls = start.clone()
+        controls[chosen, 0, agent] = found.point.view(-1, *start.shape[3:])
+    return Descent(found.before, found.after, controls, found.slope, found.found)
+
+
+def _finite(
+    mask: Bool[Tensor, "B N"],
+    tables: Tables,
+    assignment: Int[Tensor, "B M N"],
+    mode: Int[Tensor, " B"],
+    initial: Float[Tensor, " B"],
+) -> Equilibrium:
+    """The report of choices among candidates."""
+    options = _options(mask, tables, assignment)  # of all modes
+    energy = _chosen_energy(mask, tables, assignment, options)
+    by_mode = [_of_mode(each, mode)[:, 0] for each in (energy, options, assignment)]
+    solved, mine, choice = by_mode
+    objective = mine.gather(2, _valid(mask, choice)[..., None])[..., 0]
+    lowest = mine.amin(2)
+    gap = torch.where(objective == lowest, 0.0, objective - lowest)  # infinite energies are equal, too
+    # Choosing anew, agent after agent, from every mode.
+    assignment = _valid(mask[:, None], assignment)
+    for _ in range(_SWEEPS):
+        before = assignment
+        for agent in range(mask.shape[1]):
+            options = _options(mask, tables, assignment)[:, :, agent]
+            current = options.gather(2, assignment[:, :, agent, None])[..., 0]
+            lower, best = options.min(2)
+            better = torch.where(lower < current, best, assignment[:, :, agent])
+            assignment = torch.cat((assignment[:, :, :agent], better[..., None], assignment[:, :, agent + 1 :]), 2)
+        if torch.equal(before, assignment):
+            break
+    settled = _chosen_energy(mask, tables, assignment, _options(mask, tables, assignment)).amin(1)
+    return Equilibrium(
+        initial=initial,
+        energy=solved,
+        optimum=torch.minimum(solved, settled),  # equal, but for the order of additions
+        gradient_norm=torch.full_like(solved, torch.nan),
+        nash_gap=torch.where(mask, gap, 0.0),
+        objective=torch.where(mask, objective, 0.0),
+    )
+
+
+def _options(mask: Bool[Tensor, "B N"], tables: Tables, assignment: Int[Tensor, "B M N"]) -> Float[Tensor, "B M N C"]:
+    """J_i of every candidate of every agent while the others keep theirs."""
+    batch, modes, agents = assignment.shape
+    choice = _valid(mask[:, None], assignment)
+    first, second = pairs(agents, mask.device)
+    scenes = torch.arange(batch, device=mask.device)[:, None, None]
+    which = torch.arange(len(first), device=mask.device)
+    both = (mask[:, first] & mask[:, second])[:, None, :, None]
+    of_first = tables.pair[scenes, which, :, choice[..., second]].double()  # [B, M, P, C]
+    of_second = tables.pair.transpose(2, 3)[scenes, which, :, choice[..., first]].double()
+    own = torch.where(mask[..., None], tables.unary, 0.0).double()[:, None].expand(-1, modes, -1, -1)
+    options = own.index_add(2, first, torch.where(both, of_first, 0.0))
+    return options.index_add(2, second, torch.where(both, of_second, 0.0))
+
+
+def _chosen_energy(
+    mask: Bool[Tensor, "B N"],
+    tables: Tables,
+    assignment: Int[Tensor, "B M N"],
+    options: Float[Tensor, "B M N C"],
+) -> Float[Tensor, "B M"]:
+    """E of an assignment: every pair is in the objectives of both its agents, so half of them and half of the own terms."""
+    choice = _valid(mask[:, None], assignment)[..., None]
+    objective = options.gather(3, choice)[..., 0]
+    own = torch.where(mask[..., None], tables.unary, 0.0).double()[:, None]
+    return 0.5 * (objective + own.expand(options.shape).gather(3, choice)[..., 0]).sum(2)
+
+
+def _valid(mask: Bool[Tensor, "*#batch N"], assignment: Int[Tensor, "*batch N"]) -> Int[Tensor, "*batch N"]:
+    """Whatever stands for absent agents is not an index."""
+    return torch.where(mask, assignment, 0)
+
+
+def _relevant(scene: Scene) -> Scene:
+    """What an energy may refer to, which is little: worlds hold it once for every agent."""
+    return Scene(
+        history=scene.history[:, :, -1:],
+        dt=scene.dt,
+        agent_mask=scene.agent_mask,
+        size=scene.size,
+        kind=scene.kind,
+        references=scene.references,
+        reference_mask=scene.reference_mask,
+        reference_speed=scene.reference_speed,
+    )
+
+
+def _game(scene: Scene, parameters: GameParameters, solution: Solution, mode: Int[Tensor, " B"]) -> GameParameters:
+    """The game of one mode in every scene, starting from its solution."""
+    game = dataclasses.replace(parameters, context=None).map(lambda tensor: _of_mode(tensor, mode))
+    controls = _of_mode(solution.controls, mode)
+    controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
+    return dataclasses.replace(game, context=parameters.context, initial_controls=controls).to(torch.float64)
+
+
+def _of_mode(values: Tensor, mode: Int[Tensor, " B"]) -> Tensor:
+    """One mode of every scene, [B, 1, ..]; one game for all modes is that of each of them."""
+    scenes = torch.arange(len(mode), device=mode.device)
+    return values[scenes, mode.clamp_max(values.shape[1] - 1)][:, None]
+
+
+def _only(agent: Int[Tensor, " W"], agents: int) -> Bool[Tensor, "W N"]:
+    """Which of N agents is the one of each world."""
+    return agent[:, None] == torch.arange(agents, device=agent.device)
+
+
+def _nowhere(controls: Float[Tensor, "W 1 N K 2"]) -> Descent:
+    """The descent of no world at all."""
+    none = controls.new_zeros(len(controls))
+    return Descent(none, none, controls, none, none == 0)

@@ -1,0 +1,1 @@
+"""Minimisers that choose among finitely many candidates."""

@@ -1,0 +1,286 @@
+"""The damped Gauss-Newton matrix, factorised a few nodes at a time: dynamic programming in blocks.
+
+Seen from node s, all that earlier nodes do to later costs goes through three things: how far the next position was moved,
+and where nodes s and s - 1 were moved to (differences of nodes are controls, and differences of those their rates). With
+that state x = (dp_{s+1}, dz_{s-1}, dz_s) and the nodes Z = (dz_{s+1} .. dz_e) of a block, the block is eliminated by
+
+    L L^T = H_ZZ,   G = L^-1 H_Zx,   P = H_xx - G^T G,
+
+P being what the block before sees of everything that follows. Blocks of some forty unknowns keep the operations few and
+large; the whole costs O(K N^3), and nothing is divided by more than what the block itself needs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from epo_lightning.solvers.gauss_newton.edges import Group
+from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
+
+_UNKNOWNS = 32
+"""Aimed at in every block: fewer are more operations, more are more arithmetic."""
+_ALIGNED = 16
+"""Unknowns are filled up to a multiple of this. Libraries round differently where a matrix starts in the middle of a cache
+line, and a sample must not depend on its place in a batch."""
+
+
+def bounds(steps: int, agents: int) -> list[tuple[int, int]]:
+    """First node (exclusive) and last node (inclusive) of every block; each has two nodes at least."""
+    count = max(1, steps // max(2, _UNKNOWNS // (2 * agents)))
+    edges = [steps * block // count for block in range(count + 1)]
+    return list(pairwise(edges))
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block's part of the factors, for C sets of m agents, F = 2 m unknowns at each of its nodes.
+
+    Attributes:
+        unknowns: how many there are; what is beyond them, up to n, fills up the arrays.
+        moves: how the nodes move later positions, dt M, component and agent by axis and agent.
+        factor: L.
+        gain: G^T; None for the first block, whose state is given.
+    """
+
+    unknowns: int
+    moves: Float[Tensor, "C n F"]
+    factor: Float[Tensor, "C n n"]
+    gain: Float[Tensor, "C X n"] | None
+
+
+@dataclass(frozen=True)
+class Factors:
+    """J^T J + lambda I of a group of agents, factorised block by block."""
+
+    blocks: list[Block]
+
+    def put(self, where: Int[Tensor, " D"], others: Factors, chosen: Bool[Tensor, " D"]) -> None:
+        """Take over, at ``where``, the chosen ones of other factors."""
+        for mine, theirs in zip(self.blocks, others.blocks, strict=True):
+            mine.factor[where[chosen]] = theirs.factor[chosen]
+            if mine.gain is not None and theirs.gain is not None:
+                mine.gain[where[chosen]] = theirs.gain[chosen]
+
+    def solve(self, right: Float[Tensor, "C N"]) -> Float[Tensor, "C N"]:
+        """(J^T J + lambda I)^-1 times a covector of all nodes, in the order node, component, agent."""
+        width = self.blocks[0].moves.shape[-1]
+        parts = list(right[..., None].split([block.unknowns for block in self.blocks], 1))
+        carried: Tensor | None = None
+        for index in range(len(self.blocks) - 1, -1, -1):
+            block = self.blocks[index]
+            part = parts[index].new_zeros(len(right), block.factor.shape[-1], 1)
+            part[:, : block.unknowns] = parts[index]
+            if carried is not None:
+                part += _times(block.moves, carried[:, :width])
+                part[:, block.unknowns - 2 * width : block.unknowns] += carried[:, width:]
+            parts[index] = torch.linalg.solve_triangular(block.factor, part, upper=False)
+            if block.gain is not None:
+                spread = -_times(block.gain, parts[index])
+                if carried is not None:
+                    spread[:, :width] += carried[:, :width]
+                carried = spread
+        state: Tensor | None = None
+        for index, block in enumerate(self.blocks):
+            part = parts[index]
+            if state is not None:
+                assert block.gain is not None
+                part = torch.baddbmm(part, block.gain.mT, state, alpha=-1)
+            nodes = torch.linalg.solve_triangular(block.factor.mT, part, upper=True)
+            moved = block.moves.mT @ nodes
+            parts[index] = nodes = nodes[:, : block.unknowns]
+            state = torch.cat((moved if state is None else state[:, :width] + moved, nodes[:, -2 * width :]), 1)
+        return torch.cat(parts, 1)[..., 0]
+
+
+def _times(matrix: Float[Tensor, "C a b"], vector: Float[Tensor, "C b 1"]) -> Float[Tensor, "C a 1"]:
+    # Products of rows with vectors round differently in a batch of one: libraries have a routine of its own for it.
+    return (matrix * vector.mT).sum(-1, keepdim=True)
+
+
+def factorise(
+    model: QuadraticModel, damping: Float[Tensor, "S *agents"], group: Group
+) -> tuple[Factors, Bool[Tensor, " C"]]:
+    """Factors of a group's matrices, and which of them have none.
+
+    Args:
+        model: the energy around an iterate.
+        damping: lambda of every sample or of every agent, a multiple of the identity in their controls.
+    """
+    parts = _Parts(model, damping, group)
+    failed = torch.zeros(group.count, dtype=torch.bool, device=damping.device)
+    blocks: list[Block] = []
+    cost: Tensor | None = None
+    # Undeclared features may couple any two steps: then there is one block of all.
+    whole = model.blocks is not None or model.pair_blocks is not None
+    for start, end in reversed([(0, model.steps)] if whole else bounds(model.steps, group.size)):
+        block, cost, info = parts.eliminate(start, end, cost)
+        blocks.insert(0, block)
+        failed |= info != 0
+    return Factors(blocks), failed
+
+
+class _Parts:
+    """A model's stiffnesses for one group, laid out [C, .., nodes, .., m]."""
+
+    def __init__(self, model: QuadraticModel, damping: Float[Tensor, "S *agents"], group: Group) -> None:
+        self.model, self.group, self.size = model, group, group.size
+
+        # In double precision: nodes see rates of controls divided by dt^4, for which single precision has no digits.
+        def exact(values: Tensor) -> Tensor:
+            return values.to(torch.float64)
+
+        # Absent agents get unit matrices of their own, so that they are regular even without damping.
+        control = exact(model.control_stiffness) + damping.reshape(len(damping), -1, 1, 1)
+        control = torch.where(model.present[..., None, None], control, 1.0)
+        moves, node, pull = exact(model.moves), exact(model.node_stiffness), exact(model.pull[:, :, 2:])
+        rows = [model.dt * moves.flatten(2, 3), control / model.dt**2, node, pull]
+        sizes = [4, 2, 2, 3]
+        for optional, scale in ((model.rate_stiffness, model.dt**-4), (model.cross, 1.0)):
+            if optional is not None:
+                rows.append(exact(optional) * scale)
+            sizes.append(2 * (optional is not None))
+        packed = torch.cat(rows, 2).flatten(0, 1)
+        if group.agents is not None:
+            packed = packed.index_select(0, group.agents.flatten())
+        packed = packed.view(group.count, group.size, -1, model.steps).permute(0, 3, 2, 1).contiguous()  # [C, K, f, m]
+        moves, self.control, self.node, pull, self.rate, self.cross = packed.split(sizes, 2)
+        self.moves = moves.unflatten(2, (2, 2))  # [C, K, component, axis, m]
+        # All curvatures in positions, [C, K, axis m, axis m].
+        shared = None if model.pair_curvature is None else exact(model.pair_curvature)
+        xx, xy, yy = group.coupled(pull.transpose(1, 2), shared).movedim(3, 1).unbind(2)  # [C, K, m, m]
+        self.curvature = torch.stack((torch.stack((xx, xy), -2), torch.stack((xy, yy), -2)), 2).view(
+            group.count, model.steps, 2 * group.size, 2 * group.size
+        )
+
+    def eliminate(self, start: int, end: int, cost: Tensor | None) -> tuple[Block, Tensor | None, Tensor]:
+        """The block of nodes start + 1 .. end, given what follows costs; and what it costs itself, seen from before."""
+        width, count = 2 * self.size, end - start
+        batch = len(self.moves)
+        moves = self.moves[:, start:end]
+        # The state moves all positions of the block, start + 1 .. end, and node l those after l, and all that follow.
+        ahead = self.curvature.new_zeros(batch, count + 1, width, width)
+        ahead[:, :-1] = self.curvature[:, start:end].flip(1).cumsum(1).flip(1)
+        if cost is not None:
+            ahead += cost[:, None, :width, :width]
+        beta = self.model.beta
+        later = ahead[:, 1:]
+        if beta != 1.0:
+            # Position l itself moves with 1 - beta of node l, which counts twice on the diagonal.
+            later = later + (1.0 - beta) * self.curvature[:, start:end]
+        by_axis = later.view(batch, count, 2, self.size, width)
+        unknowns = count * width
+        filled = -(-unknowns // _ALIGNED) * _ALIGNED
+        left, right = moves.new_zeros(2, batch, filled, width).unbind(0)
+        product = left[:, :unknowns].view(batch, count, 2, self.size, width)
+        torch.mul(moves[:, :, :, 0, :, None], by_axis[:, :, None, 0], out=product)
+        product.addcmul_(moves[:, :, :, 1, :, None], by_axis[:, :, None, 1])
+        apart = right[:, :unknowns].view(batch, count, 2, self.size, 2, self.size)
+        apart.diagonal(dim1=3, dim2=5).copy_(moves)
+        # Column by column, as factorisations and triangular solves in place take them.
+        matrix = torch.bmm(right, left.mT).mT
+        if cost is not None:
+            tail = slice(unknowns - 2 * width, unknowns)
+            across = torch.bmm(cost[:, width:, :width], right.mT)
+            matrix[:, tail] += across
+            matrix[:, tail, tail] += across[:, :, tail].mT
+            matrix[:, tail, tail] += cost[:, width:, width:]
+        state = None
+        if start > 0:
+            # Against the state (position, node start - 1, node start).
+            state = left.new_zeros(batch, 3 * width, matrix.shape[1]).mT
+            state[:, :, :width] = left
+            if cost is not None:
+                state[:, tail, :width] += cost[:, width:, :width]
+        nodes = matrix[:, :unknowns, :unknowns]
+        own = self._bands(nodes, state, start, end)
+        matrix.diagonal(0, 1, 2)[:, unknowns:] = 1.0
+        if beta not in (0.0, 1.0):
+            diagonal = nodes.unflatten(1, (count, width)).unflatten(3, (count, width)).diagonal(0, 1, 3)
+            by_node = apart.view(batch, count, width, width)
+            at_node = by_node @ (self.curvature[:, start:end] @ by_node.mT)
+            diagonal -= beta * (1.0 - beta) * at_node.permute(0, 2, 3, 1)
+        if start == 0 and end == self.model.steps:
+            self._add_undeclared(nodes)
+        info = torch.empty(batch, dtype=torch.int32, device=matrix.device)
+        torch.linalg.cholesky_ex(matrix, out=(matrix, info))
+        if state is None:
+            return Block(unknowns, right, matrix, None), None, info
+        gain = torch.linalg.solve_triangular(matrix, state, upper=False, out=state)
+        own[:, :width, :width] += ahead[:, 0]
+        own = torch.baddbmm(own, gain.mT, gain, alpha=-1)
+        return Block(unknowns, right, matrix, gain.mT), own, info
+
+    def _bands(self, matrix: Tensor, state: Tensor | None, start: int, end: int) -> Tensor:
+        """Add what differences of nodes cost, to the block's own matrix and to its rows against the state.
+
+        Every difference belongs to the block that holds its last node. Returns what falls to the state alone.
+        """
+        width, count = 2 * self.size, end - start
+        batch = len(matrix)
+        # Over nodes start - 1 .. end: diagonals 0, 1 and 2 of a banded matrix [C, T + 2, F].
+        diagonal = matrix.new_zeros(batch, count + 2, 2, self.size)
+        first, second = torch.zeros_like(diagonal), torch.zeros_like(diagonal)
+        control = self.control[:, start:end]
+        diagonal[:, 1:-1] += control
+        diagonal[:, 2:] += control
+        first[:, 2:] -= control
+        diagonal[:, 2:] += self.node[:, start:end]
+        if self.rate.shape[2]:
+            # Of controls l and l + 1, for l = start - 1 .. end - 2: the first one of all has none before it.
+            low = max(start - 1, 0)
+            rate, shift = self.rate[:, low : end - 1], low - (start - 1)
+            diagonal[:, shift:-2] += rate
+            diagonal[:, shift + 1 : -1] += 4.0 * rate
+            diagonal[:, shift + 2 :] += rate
+            first[:, shift + 1 : -1] -= 2.0 * rate
+            first[:, shift + 2 :] -= 2.0 * rate
+            second[:, shift + 2 :] += rate
+        bands = [band.view(batch, count + 2, width) for band in (diagonal, first, second)]
+        for offset, band in enumerate(bands):
+            # Entry a of band o couples node a with node a - o; nodes 2 and after are the block's.
+            inner = band[:, 2 + offset :].flatten(1)
+            if inner.shape[1]:
+                matrix.diagonal(-offset * width, 1, 2).add_(inner)
+        if self.cross.shape[2]:
+            # The speed of a node with its heading (rows of headings, columns of speeds), and with the next heading.
+            nodes = matrix.mT.unflatten(1, (count, 2, self.size)).unflatten(4, (count, 2, self.size))
+            here, following = self.cross[:, start:end].unbind(2)
+            heading_by_speed = nodes[:, :, 0, :, :, 1].diagonal(0, 2, 4).transpose(1, 2)  # [C, T, T, m]
+            heading_by_speed.diagonal(0, 1, 2).add_(here.transpose(1, 2))
+            if count > 1:
+                heading_by_speed.diagonal(-1, 1, 2).add_(following[:, :-1].transpose(1, 2))
+        own = matrix.new_zeros(batch, 3 * width, 3 * width)
+        if state is None:
+            return own
+        before, at = slice(width, 2 * width), slice(2 * width, 3 * width)
+        own[:, before, before].diagonal(0, 1, 2).add_(bands[0][:, 0])
+        own[:, at, at].diagonal(0, 1, 2).add_(bands[0][:, 1])
+        own[:, at, before].diagonal(0, 1, 2).add_(bands[1][:, 1])
+        own[:, before, at].diagonal(0, 1, 2).add_(bands[1][:, 1])
+        state[:, :width, at].diagonal(0, 1, 2).add_(bands[1][:, 2])
+        state[:, :width, before].diagonal(0, 1, 2).add_(bands[2][:, 2])
+        state[:, width : 2 * width, at].diagonal(0, 1, 2).add_(bands[2][:, 3])
+        if self.cross.shape[2]:
+            following = self.cross[:, start - 1, 1]
+            state[:, self.size : width, 2 * width : 2 * width + self.size].diagonal(0, 1, 2).add_(following)
+        return own
+
+    def _add_undeclared(self, matrix: Tensor) -> None:
+        """Add the dense curvatures of undeclared features to the matrix of all nodes."""
+        steps, size = self.model.steps, self.size
+        nodes = matrix.unflatten(1, (steps, 2, size)).unflatten(4, (steps, 2, size))
+        if self.model.blocks is not None:
+            blocks = self.model.blocks
+            blocks = blocks if self.group.agents is None else blocks.flatten(0, 1)[self.group.agents]
+            blocks = blocks.view(-1, size, 2, steps, 2, steps)
+            nodes.diagonal(dim1=3, dim2=6).add_(blocks.permute(0, 3, 2, 5, 4, 1))
+        if self.model.pair_blocks is not None:
+            shared = self.group.of_edges(self.model.pair_blocks).to(matrix.dtype).view(-1, 2, steps, 2, steps)
+            of = self.group
+            nodes[of.component, :, :, of.second, :, :, of.first] += shared.permute(0, 4, 3, 2, 1)
+            nodes[of.component, :, :, of.first, :, :, of.second] += shared.permute(0, 2, 1, 4, 3)

@@ -1,0 +1,65 @@
+"""Differentiation of a minimiser by the implicit function theorem: what a change of the game does to the solution.
+
+At a minimum, grad E(u, p) = 0 for every p near by, so du/dp = -H^-1 d(grad E)/dp with the Hessian H of E. For a cotangent v
+of the solution, H mu = v, and the gradient is that of -<mu, grad E(u, p)> by p with u and mu held constant. No step of the
+minimisation counts, and none of what it started from: initial controls have no gradient.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
+from epo_lightning.solvers.gauss_newton.structured import Game, factorise, planar
+from epo_lightning.solvers.general import descent
+
+
+def attach(
+    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
+) -> tuple[Tensor, Tensor]:
+    """The controls of a solution with the gradient that the implicit function theorem gives them, and a status.
+
+    Args:
+        energy, scene, parameters: the game.
+        controls: its solution.
+        exact: whether H is the Hessian or its Gauss-Newton approximation.
+
+    Returns:
+        controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H has no Cholesky factor, that is, where the
+        controls are no minimum; such a sample has a gradient of zero.
+    """
+    none = controls.new_zeros(controls.shape[:2]).flatten()
+    game = Game(energy, scene, parameters, 1.0, none, controls.device.type == "cpu")
+    found, status = _Attach.apply(game, exact, controls, *game.tensors(parameters))
+    return found, status
+
+
+class _Attach(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, game: Game, exact: bool, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        model = QuadraticModel(game.energy, game.scene, game.with_tensors(tensors), controls, not game.split, exact)
+        ctx.factors = factorise(model, game.damping, game.split, retry=False)
+        slope = model.gradient
+        left = ctx.factors.solve(slope).flatten(1)
+        descent.say_if_far(model.value, slope.flatten(1), left, ctx.factors.status != Status.STOPPED)
+        ctx.game = game
+        ctx.save_for_backward(*tensors)
+        status = ctx.factors.status.view(controls.shape[:2])
+        ctx.mark_non_differentiable(status)
+        return controls.view_as(controls), status
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        factors, tensors = ctx.factors, ctx.saved_tensors
+        sound = factors.status != Status.STOPPED
+        adjoint = torch.where(sound[:, None, None, None], factors.solve(planar(cotangent)), 0.0)
+        _, by = ctx.game.pullback(factors.model, tensors, adjoint, torch.zeros_like(adjoint))
+        by = [torch.where(sound.view(*g.shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
+        return None, None, None, *by

@@ -1,0 +1,368 @@
+"""Damped Gauss-Newton steps in PyTorch, on any device: the quadratic model of all samples, factorised in blocks.
+
+One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Two things happen around it.
+
+*Splitting.* Agents that no active pair connects do not know of each other: on a CPU every sample falls apart into the
+connected components of its active pairs, and components of one size are factorised together. What is solved for an agent
+then depends on nothing but its component, to the last bit, and a scene with few active pairs costs little more than its
+agents alone. Other devices would have to wait for the host to learn the components; there every sample is one matrix, and
+no operation asks the device for a number.
+
+*Differentiation* does not tape the factorisation. For a cotangent v of u + alpha d, one more solve with the same factor
+gives mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
+
+    phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
+
+in closed form (:meth:`~epo_lightning.solvers.gauss_newton.quadratic_model.QuadraticModel.pullback`), to which v itself is
+added for u.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.features import Source
+from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.solvers.gauss_newton import blocks
+from epo_lightning.solvers.gauss_newton.edges import Group
+from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
+
+_RETRIES = 4
+"""How often the damping of a sample that cannot be factorised is raised tenfold."""
+_LEAST_RAISED_DAMPING = 1e-3
+"""Where raising starts from when the damping is smaller."""
+_HOLDING = 1e30
+"""Stands for an infinite damping in the matrices: beside it no curvature is seen, and nobody else is disturbed by it."""
+
+
+def solve(
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    steps: int,
+    step_size: float,
+    damping: Float[Tensor, "B M *agents"],
+    keep_iterates: bool = False,
+    split: bool | None = None,
+) -> Solution:
+    """Take ``steps`` steps from ``parameters.initial_controls``.
+
+    The controls and states of the solution are differentiable with respect to weights, goals and initial controls, by
+    unrolling.
+
+    Args:
+        energy, scene, parameters: what to minimise; they fit together.
+        steps: number S of steps.
+        step_size: alpha.
+        damping: lambda of every sample, or of every agent; an infinite one holds the agent exactly where it is.
+        keep_iterates: whether the solution carries u_0 .. u_S.
+        split: whether samples fall apart into components; by default, on a CPU.
+    """
+    controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
+    split = controls.device.type == "cpu" if split is None else split
+    game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(0, 1), split)
+    tensors = game.tensors(parameters)
+    status = torch.where(game.known, Status.SOLVED, Status.STOPPED)
+    iterates = [controls]
+    initial_energy = None
+    for _ in range(steps):
+        controls, outcome, value = _Step.apply(game, controls, *tensors)
+        initial_energy = value if initial_energy is None else initial_energy
+        status = torch.maximum(status, outcome)
+        iterates.append(controls)
+    with torch.no_grad():
+        last = QuadraticModel(energy, scene, parameters, controls, not split)
+        gradient_norm = last.gradient.square().flatten(2).sum(-1).cumsum(1)[:, -1].sqrt().view_as(status)
+        final_energy = last.value.view_as(status)
+    return Solution(
+        controls=controls,
+        states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
+        if controls.requires_grad
+        else last.states,
+        initial_energy=final_energy if initial_energy is None else initial_energy,
+        energy=final_energy,
+        gradient_norm=gradient_norm,
+        status=status,
+        iterates=tuple(iterates) if keep_iterates else None,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Game:
+    """What stays the same from step to step."""
+
+    energy: FeatureEnergy
+    scene: Scene
+    parameters: GameParameters
+    step_size: float
+    damping: Float[Tensor, "S *agents"]
+    split: bool
+
+    @cached_property
+    def known(self) -> Bool[Tensor, "B M"]:
+        """See :meth:`~epo_lightning.game.energy.Energy.known`."""
+        return self.energy.known(self.scene, self.parameters)
+
+    def tensors(self, parameters: GameParameters) -> list[Tensor]:
+        """The tensors of a game that an iterate is differentiated by."""
+        tensors = [parameters.own_weights[name] for name in self.energy.own]
+        tensors += [parameters.pair_weights[name] for name in self.energy.pair]
+        if self.energy.needs_goals:
+            assert parameters.goals is not None
+            tensors.append(parameters.goals)
+        return tensors
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> GameParameters:
+        """The game with these tensors instead."""
+        own, pair = list(self.energy.own), list(self.energy.pair)
+        goals = tensors[len(own) + len(pair) :]
+        return dataclasses.replace(
+            self.parameters,
+            own_weights=dict(zip(own, tensors[: len(own)], strict=True)),
+            pair_weights=dict(zip(pair, tensors[len(own) : len(own) + len(pair)], strict=True)),
+            goals=goals[0] if goals else self.parameters.goals,
+        )
+
+    def pullback(
+        self, model: QuadraticModel, tensors: Sequence[Tensor], adjoint: Tensor, step: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
+        """phi's gradient by the controls and by the game's tensors."""
+        shape = model.controls.shape
+        by_controls, own, pair, goals = model.pullback(adjoint, step)
+        by_controls = by_controls.transpose(-1, -2).reshape(shape)
+        gradients = [own.get(name) for name in self.energy.own] + [pair.get(name) for name in self.energy.pair]
+        if self.energy.needs_goals:
+            gradients.append(goals)
+        by = [
+            torch.zeros_like(tensor) if gradient is None else gradient.reshape(tensor.shape)
+            for tensor, gradient in zip(tensors, gradients, strict=True)
+        ]
+        if self.undeclared is not None:
+            directions = torch.stack([change.transpose(-1, -2).reshape(shape) for change in (adjoint, step)])
+            extra, rest = _undeclared(self, model.controls, tensors, directions)
+            by_controls = by_controls + extra
+            by = [one + other for one, other in zip(by, rest, strict=True)]
+        return by_controls, by
+
+    @property
+    def undeclared(self) -> FeatureEnergy | None:
+        """The features that only automatic differentiation knows about."""
+        own = [name for name, feature in self.energy.own_features.items() if feature.source is Source.TRAJECTORY]
+        pair = [name for name, feature in self.energy.pair_features.items() if feature.source is Source.TRAJECTORY]
+        return dataclasses.replace(self.energy, own=own, pair=pair) if own or pair else None
+
+
+def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) -> list[Group]:
+    """The agents of every sample, grouped by the active pairs that connect them; the absent and the held are in no group."""
+    edges, mask = model.edges, model.scene.agent_mask
+    samples, agents = edges.samples, edges.agents
+    moving = mask[:, None].expand(-1, samples // len(mask), -1).flatten()
+    links = model.linked
+    if held is not None:  # a pair of which one is held pulls at the other, and that is all
+        moving = moving & ~held.flatten()
+        links = links & moving[edges.first] & moving[edges.second]
+    linked = bool(links.all())
+    if edges.every and linked and bool(moving.all()) and agents > 0:
+        return [Group.whole(edges)]
+    chosen = None if linked else links.nonzero()[:, 0]
+    first, second = edges.first, edges.second
+    if chosen is not None:
+        first, second = first[chosen], second[chosen]
+    # Every agent takes the lowest number among those that it is connected with.
+    label = torch.arange(samples * agents)
+    while True:
+        lowest = torch.minimum(label[first], label[second])
+        lower = label.scatter_reduce(0, first, lowest, "amin").scatter_reduce(0, second, lowest, "amin")
+        lower = lower[lower]
+        if torch.equal(lower, label):
+            break
+        label = lower
+    size_of = torch.bincount(label, minlength=len(label))[label] * moving
+    order = label.argsort(stable=True)
+    sizes = size_of[order]
+    groups = []
+    component, place = torch.empty_like(label), torch.empty_like(label)
+    for size in sizes.unique().tolist():
+        if size == 0:
+            continue
+        members = order[sizes == size].view(-1, size)
+        count = len(members)
+        component[members] = torch.arange(count)[:, None]
+        place[members] = torch.arange(size)
+        within = (size_of[first] == size).nonzero()[:, 0]
+        one, other = first[within], second[within]
+        whole = size == agents and count == samples
+        groups.append(
+            Group(
+                None if whole else members,
+                count,
+                size,
+                within if chosen is None else chosen[within],
+                component[one],
+                place[one],
+                place[other],
+            )
+        )
+    return groups
+
+
+@dataclasses.dataclass(frozen=True)
+class Factors:
+    """J^T J + lambda I of every sample, factorised.
+
+    Attributes:
+        model: whose matrices these are.
+        groups: the agents that were factorised together.
+        factors: of each group.
+        status: a :class:`Status` per sample.
+        held: the agents that stay where they are, where agents have a damping each.
+    """
+
+    model: QuadraticModel
+    groups: list[Group]
+    factors: list[blocks.Factors]
+    status: Int[Tensor, " S"]
+    held: Bool[Tensor, "S N"] | None = None
+
+    def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
+        """(J^T J + lambda I)^-1 times a covector of the controls."""
+        exact = self.model.to_nodes(right.to(torch.float64))
+        parts = [f.solve(_gather(group, exact)) for f, group in zip(self.factors, self.groups, strict=True)]
+        solved = self.model.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
+        return solved if self.held is None else torch.where(self.held[..., None, None], 0.0, solved)
+
+
+def factorise(
+    model: QuadraticModel, damping: Float[Tensor, "S *agents"], split: bool, retry: bool | None = None
+) -> Factors:
+    """Factorise the matrices of all samples, of each component on its own where they are split.
+
+    Where retrying is allowed, a matrix without a factor gets ten, a hundred, ... times the damping, and the others keep
+    every bit. What comes out for one that has no factor at any damping is of no meaning.
+
+    Args:
+        model: the energy around an iterate.
+        damping: lambda of every sample, or of every agent.
+        split: whether samples fall apart into components.
+        retry: whether what has no factor is tried again with more damping; by default, where samples are split.
+    """
+    held = damping.isinf() if damping.dim() == 2 else None
+    if held is not None:
+        damping = damping.clamp_max(_HOLDING)
+    groups = _components(model, held) if split else [Group.whole(model.edges)]
+    factors = []
+    status = torch.zeros(model.samples, dtype=torch.long, device=damping.device)
+    for group in groups:
+        found, failed = blocks.factorise(model, damping, group)
+        outcome = torch.where(failed, Status.STOPPED, Status.SOLVED)
+        if (split if retry is None else retry) and failed.any():
+            _retry(model, damping, group, found, outcome)
+        factors.append(found)
+        if group.agents is None:
+            status = outcome
+        else:  # of a sample, the worst one of its components
+            status = status.scatter_reduce(0, group.agents[:, 0] // model.agents, outcome, "amax")
+    return Factors(model, groups, factors, status, held)
+
+
+def _retry(
+    model: QuadraticModel,
+    damping: Float[Tensor, "S *agents"],
+    group: Group,
+    factors: blocks.Factors,
+    outcome: Int[Tensor, " C"],
+) -> None:
+    """Factorise again, with more and more damping, what has no factor; writes factors and outcome."""
+    raised = damping.clamp_min(_LEAST_RAISED_DAMPING)
+    for _ in range(_RETRIES):
+        raised = 10.0 * raised
+        where = (outcome == Status.STOPPED).nonzero()[:, 0]
+        if len(where) == 0:
+            return
+        again, failed = blocks.factorise(model, damping + raised, group.subset(where))
+        factors.put(where, again, ~failed)
+        outcome[where[~failed]] = Status.DAMPED
+
+
+def planar(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "S N 2 K"]:
+    """Controls as models lay them out."""
+    return controls.flatten(0, 1).transpose(-1, -2).contiguous()
+
+
+def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tensor, "S N 2 K"]) -> Tensor:
+    """Vectors [C, n] of groups back in their samples, zero for agents that are in no group."""
+    steps = like.shape[-1]
+    rows = torch.zeros_like(like).flatten(0, 1)
+    for group, part in zip(groups, parts, strict=True):
+        by_agent = part.view(group.count, steps, 2, group.size).permute(0, 3, 2, 1)
+        if group.agents is None:
+            return by_agent.reshape(like.shape)
+        rows[group.agents] = by_agent
+    return rows.view_as(like)
+
+
+def _gather(group: Group, values: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "C n"]:
+    """Vectors of samples as a group orders its unknowns."""
+    by_agent = values if group.agents is None else values.flatten(0, 1)[group.agents]
+    return by_agent.permute(0, 3, 2, 1).reshape(group.count, -1)
+
+
+class _Step(torch.autograd.Function):
+    """u -> u + alpha d with its adjoint; see the module's docstring."""
+
+    @staticmethod
+    def forward(ctx: Any, game: Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        parameters = game.with_tensors(tensors)
+        model = QuadraticModel(game.energy, game.scene, parameters, controls, not game.split)
+        factors = factorise(model, game.damping, game.split)
+        step = factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
+        status = factors.status.view(controls.shape[:2])
+        moved = controls + game.step_size * step
+        sound = game.known & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
+        keep = sound[..., None, None, None]
+        status = torch.where(sound, status, Status.STOPPED)
+        value = model.value.view(controls.shape[:2])
+        if any(ctx.needs_input_grad):
+            ctx.game, ctx.factors = game, factors
+            ctx.save_for_backward(torch.where(keep, step, 0.0), sound, *tensors)
+        ctx.mark_non_differentiable(status, value)
+        return torch.where(keep, moved, controls), status, value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        game, factors = ctx.game, ctx.factors
+        model = factors.model
+        step, sound, *tensors = ctx.saved_tensors
+        shape = cotangent.shape
+        adjoint = factors.solve(game.step_size * planar(cotangent))
+        adjoint = torch.where(sound.flatten()[:, None, None, None], adjoint, 0.0)
+        by_controls, by = game.pullback(model, tensors, adjoint, planar(step))
+        by_controls = torch.where(sound[..., None, None, None], by_controls, 0.0)
+        by = [torch.where(sound.view(*shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
+        return None, cotangent + by_controls, *by
+
+
+def _undeclared(
+    game: Game, controls: Tensor, tensors: Sequence[Tensor], directions: Tensor
+) -> tuple[Tensor, list[Tensor]]:
+    """phi's gradient for undeclared features, by automatic differentiation."""
+    assert game.undeclared is not None
+    with torch.enable_grad():
+        controls = controls.detach().requires_grad_()
+        leaves = [tensor.detach().requires_grad_() for tensor in tensors]
+        residuals, (along_adjoint, along_step) = game.undeclared.linearisation(
+            game.scene, game.with_tensors(leaves), controls, directions
+        )
+        phi = -(along_adjoint * (residuals + along_step)).sum()
+        by_controls, *by = torch.autograd.grad(phi, [controls, *leaves], allow_unused=True, materialize_grads=True)
+    return by_controls, list(by)

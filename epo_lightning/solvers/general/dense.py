@@ -1,0 +1,200 @@
+"""Derivatives of any energy as dense arrays, by automatic differentiation: for energies whose structure no solver knows.
+
+Samples are independent of each other, so one product of Hessians and vectors serves all of them: a Hessian of n controls
+takes n products, whatever the batch. Rows and columns follow ``controls.flatten(2)``. Absent agents have a 1 on the diagonal
+and zeros elsewhere: they change no factorisation and no solution.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from epo_lightning.game.energy import RESIDUALS, Energy
+from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.solvers.general import descent
+
+_PRODUCTS = 64
+"""Products of matrices and vectors that are computed together: a bound on memory."""
+
+
+@runtime_checkable
+class PiecewiseQuadratic(Protocol):
+    """An energy of residuals that are linear by pieces, and which knows its curvature without automatic differentiation."""
+
+    def hessian(
+        self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+    ) -> Float[Tensor, "B M n n"]:
+        """d2E/du2, which is J^T J of the residuals too, n = 2 N K; zero for absent agents."""
+
+
+def gradient(
+    energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M N K 2"]]:
+    """E and dE/du, both differentiable if gradients are recorded; zero for absent agents."""
+    taped = torch.is_grad_enabled()
+    with torch.enable_grad():
+        if not controls.requires_grad:
+            controls = controls.detach().requires_grad_()
+        value = energy(scene, parameters, controls)
+        (slope,) = torch.autograd.grad(value.sum(), controls, create_graph=taped)
+    return (value, slope) if taped else (value.detach(), slope)
+
+
+def hessian(
+    energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+) -> Float[Tensor, "B M n n"]:
+    """d2E/du2, n = 2 N K; differentiable if gradients are recorded.
+
+    By n reverse passes through the gradient, or by the energy itself if it is :class:`PiecewiseQuadratic`.
+    """
+    if isinstance(energy, PiecewiseQuadratic):
+        return _closed_form(energy, scene, parameters, controls)
+    taped = torch.is_grad_enabled()
+    with torch.enable_grad():
+        if not controls.requires_grad:
+            controls = controls.detach().requires_grad_()
+        _, slope = gradient(energy, scene, parameters, controls)
+        parts = [torch.zeros_like(units) for units in _units(controls).split(_PRODUCTS)]
+        if slope.requires_grad:  # or the energy is linear
+            parts = [
+                torch.autograd.grad(
+                    slope,
+                    controls,
+                    units,
+                    retain_graph=True,
+                    create_graph=taped,
+                    is_grads_batched=True,
+                    materialize_grads=True,
+                )[0]
+                for units in _units(controls).split(_PRODUCTS)
+            ]
+        return _of_present(scene, torch.cat(parts).flatten(3).movedim(0, 2))
+
+
+def gauss_newton(
+    energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+) -> Float[Tensor, "B M n n"]:
+    """J^T J of the residuals' Jacobian J, the Hessian without second derivatives of residuals, n = 2 N K.
+
+    Differentiable with respect to controls and parameters if gradients are recorded.
+
+    Raises:
+        ValueError: the energy is no sum of squares.
+    """
+    if RESIDUALS not in energy.offers:
+        raise ValueError(
+            f"{type(energy).__name__} has no residuals, of which Gauss-Newton matrices are made; take the exact Hessian"
+        )
+    if isinstance(energy, PiecewiseQuadratic):
+        return _closed_form(energy, scene, parameters, controls)
+    energy.validate(scene, parameters, controls)
+    if hasattr(energy, "linearisation"):
+        _, changes = energy.linearisation(scene, parameters, controls, _units(controls))
+    else:
+
+        def residuals(at: Tensor) -> Tensor:
+            named = energy.residuals(scene, parameters, at)  # type: ignore[attr-defined]
+            return torch.cat([residual.flatten(2) for residual in named.values()], -1)
+
+        along = torch.func.vmap(lambda unit: torch.func.jvp(residuals, (controls,), (unit,))[1], chunk_size=_PRODUCTS)
+        changes = along(_units(controls))
+    jacobian = changes.movedim(0, -1)
+    return _of_present(scene, jacobian.mT @ jacobian)
+
+
+def attach(
+    energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"], exact: bool
+) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
+    """The controls of a solution with the gradient that the implicit function theorem gives them, and a status.
+
+    At a minimum g(u, p) = dE/du = 0 for every game p near by, so du/dp = -H^-1 dg/dp. With u and H held constant,
+
+        u - H^-1 (g(u, p) - g(u, p) held constant)
+
+    has the value u and this derivative, with respect to whatever g is made of: the parameters, the scene, and the weights of
+    energies that are networks. The same as
+    :func:`epo_lightning.solvers.gauss_newton.implicit.attach` for energies of any kind.
+
+    Args:
+        energy, scene, parameters: the game.
+        controls: its solution.
+        exact: whether H is the Hessian or its Gauss-Newton approximation.
+
+    Returns:
+        controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H has no Cholesky factor, that is, where the
+        controls are no minimum; such a sample has a gradient of zero.
+    """
+    controls = controls.detach()
+    if scene.history.dtype != controls.dtype:
+        scene = scene.to(controls.dtype)
+    with torch.no_grad():
+        matrix = (hessian if exact else gauss_newton)(energy, scene, parameters, controls)
+        factor, sound = factorise(matrix)
+    scene, parameters = _silenced(scene, parameters, sound)
+    with torch.enable_grad():
+        value, slope = gradient(energy, scene, parameters, torch.where(_wide(sound, controls), controls, 0.0))
+        flat = slope.detach().flatten(2)
+        descent.say_if_far(value, flat, torch.cholesky_solve(flat[..., None], factor)[..., 0], sound)
+        move = torch.cholesky_solve((slope - slope.detach()).flatten(2)[..., None], factor).view_as(controls)
+        return controls - torch.where(_wide(sound, move), move, 0.0), torch.where(
+            sound, Status.SOLVED, Status.STOPPED
+        ).long()
+
+
+def factorise(matrix: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
+    """Lower Cholesky factors and which matrices have one; the identity in place of the others."""
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    # What is no number in the lower triangle reaches the diagonal of its row: what is above is never looked at.
+    sound = (failed == 0) & factor.diagonal(dim1=-2, dim2=-1).isfinite().all(-1)
+    if sound.device.type == "cpu" and sound.all():
+        return factor, sound
+    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    return torch.where(sound[..., None, None], factor, identity), sound
+
+
+def _units(controls: Tensor) -> Float[Tensor, "n B M N K 2"]:
+    """All n unit vectors of controls, the same for every sample."""
+    count = controls.shape[2:].numel()
+    units = torch.eye(count, dtype=controls.dtype, device=controls.device)
+    return units.view(count, 1, 1, *controls.shape[2:]).expand(count, *controls.shape)
+
+
+def _closed_form(
+    energy: PiecewiseQuadratic, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
+) -> Float[Tensor, "B M n n"]:
+    """What the energy knows, with ones on the diagonal for absent agents."""
+    matrix = energy.hessian(scene, parameters, controls)
+    absent = ~scene.agent_mask.repeat_interleave(2 * controls.shape[3], 1)
+    matrix.diagonal(dim1=-2, dim2=-1).add_(absent[:, None])
+    return matrix
+
+
+def _of_present(scene: Scene, matrix: Float[Tensor, "B M n n"]) -> Float[Tensor, "B M n n"]:
+    """The matrix with rows and columns of the identity for absent agents."""
+    agents = scene.agent_mask.shape[1]
+    present = scene.agent_mask[:, None].repeat_interleave(matrix.shape[-1] // max(1, agents), -1)
+    both = present[..., :, None] & present[..., None, :]
+    return torch.where(both, matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device))
+
+
+def _wide(sound: Bool[Tensor, "B M"], like: Tensor) -> Tensor:
+    return sound.view(*sound.shape, *[1] * (like.dim() - 2))
+
+
+def _silenced(scene: Scene, parameters: GameParameters, sound: Bool[Tensor, "B M"]) -> tuple[Scene, GameParameters]:
+    """The games that have a solution, and zeros in place of the others, so that what is wrong there reaches no gradient."""
+
+    def silence(tensor: Tensor) -> Tensor:
+        return torch.where(_wide(sound, tensor), tensor, torch.zeros_like(tensor))
+
+    context, some = parameters.context, sound.any(1)
+    silent = dataclasses.replace(parameters, context=None).map(silence)
+    if context is not None:
+        context = torch.where(some[:, None, None], context, 0.0)
+    scene = dataclasses.replace(scene, agent_mask=scene.agent_mask & some[:, None])
+    return scene, dataclasses.replace(silent, context=context)

@@ -1,0 +1,146 @@
+"""Limited-memory BFGS, for any energy that has a gradient: no Hessian, some more steps.
+
+``torch.optim.LBFGS`` has one history and one line search for all samples, which would make a forecast depend on the batch it
+is in. Here every sample has its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from epo_lightning.game.energy import GRADIENT, Energy
+from epo_lightning.registry import ConfigError, register
+from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.solvers.base import STATIONARY, Minimiser
+from epo_lightning.solvers.general import descent
+from epo_lightning.solvers.general.dense import gradient
+
+_DECREASE = 1e-4
+"""Share of the decrease that the gradient promises with which a step is accepted (Armijo)."""
+_CURVATURE = 1e-10
+"""Cosine between a step and the change of the gradient below which they are not remembered: there is no curvature in it."""
+_SHORTEST = 1e-12
+"""Share of a direction at which the search along it is given up."""
+
+
+@register("solver", "lbfgs")
+@dataclass(frozen=True)
+class LBFGS(Minimiser):
+    """Quasi-Newton steps with the two-loop recursion (Nocedal and Wright, Algorithm 7.4) and backtracking.
+
+    What TGL minimises with (history 65, at most 1000 iterations, tolerance 1e-3). Every evaluation is one step: a sample
+    either accepts the trial and turns to a new direction, or shortens its step by quadratic interpolation. Where a whole
+    search fails, the history is dropped, and then the sample.
+
+    Solutions are constants to automatic differentiation; ``backward=implicit`` is what learns through them.
+
+    Attributes:
+        steps: how often energy and gradient are evaluated at most.
+        tolerance: a sample has converged where the largest entry of its gradient, or of a full step, is no larger than this;
+            or where it cannot be improved in its precision.
+        history: how many steps are remembered.
+    """
+
+    needs = frozenset({GRADIENT})
+    provides = frozenset({STATIONARY})
+
+    steps: int = 200
+    tolerance: float = 1e-6
+    history: int = 20
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise ConfigError(f"solver.steps must be 0 or more, not {self.steps}")
+        if not 0 <= self.tolerance < float("inf"):
+            raise ConfigError(f"solver.tolerance must be 0 or more, and finite, not {self.tolerance}")
+        if self.history < 1:
+            raise ConfigError(f"solver.history must be 1 or more, not {self.history}")
+
+    @torch.no_grad()
+    def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
+        scene, controls = descent.begin(energy, scene, parameters)
+        if controls.numel() == 0:
+            return descent.nothing(controls)
+        value, slope = gradient(energy, scene, parameters, controls)
+        initial, sound = value, descent.finite(value, slope)
+        status = descent.first_status(sound)
+        done = ~sound | (descent.largest(slope) <= self.tolerance)
+        shape = *controls.shape[:2], self.history, slope[0, 0].numel()
+        moves, changes = slope.new_zeros(shape), slope.new_zeros(shape)
+        direction, length = _downhill(slope), torch.ones_like(value)
+        for _ in range(self.steps):
+            if descent.ended(done):
+                break
+            there = torch.where(_wide(done), controls, controls + _wide(length) * direction)
+            trial = gradient(energy, scene, parameters, there)
+            promised = length * _dot(slope.flatten(2), direction.flatten(2))
+            better = (trial[0] <= value + _DECREASE * promised) | descent.level(value, slope, *trial)
+            better = ~done & descent.finite(*trial) & better
+
+            move, change = (there - controls).flatten(2), (trial[1] - slope).flatten(2)
+            curved = better & (_dot(move, change) > _CURVATURE * move.norm(dim=-1) * change.norm(dim=-1))
+            moves, changes = _remember(curved, moves, move), _remember(curved, changes, change)
+            near = (length == 1.0) & (descent.largest(there - controls) <= self.tolerance)
+            controls = torch.where(_wide(better), there, controls)
+            # The parabola through both energies and the slope between them.
+            shorter = -0.5 * length * promised / (trial[0] - value - promised)
+            shorter = shorter.nan_to_num(0.0).clamp(0.1 * length, 0.5 * length)
+            value, slope = torch.where(better, trial[0], value), torch.where(_wide(better), trial[1], slope)
+            done = done | (better & (near | (descent.largest(slope) <= self.tolerance)))
+
+            failed = ~done & ~better & (length < _SHORTEST)
+            remembers = (moves != 0).flatten(2).any(-1)
+            done = done | (failed & ~remembers)
+            onward = -_times(moves, changes, slope)
+            forget = failed | (better & (_dot(slope.flatten(2), onward.flatten(2)) >= 0))
+            moves, changes = (torch.where(forget[..., None, None], 0.0, kept) for kept in (moves, changes))
+            fresh = _wide(forget | ~(changes != 0).flatten(2).any(-1))
+            onward = torch.where(fresh, _downhill(slope), onward)
+            turned = better | failed
+            direction = torch.where(_wide(turned), onward, direction)
+            length = torch.where(turned, 1.0, shorter)
+        return descent.solution(energy, scene, controls, (initial, value), slope, status)
+
+
+def _wide(samples: Tensor) -> Tensor:
+    return samples[..., None, None, None]
+
+
+def _dot(one: Tensor, other: Tensor) -> Tensor:
+    return (one * other).sum(-1)
+
+
+def _downhill(slope: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "B M N K 2"]:
+    """The direction of steepest descent, no longer than one."""
+    return -slope / _wide(slope.flatten(2).norm(dim=-1).clamp_min(1.0))
+
+
+def _remember(
+    whose: Tensor, memory: Float[Tensor, "B M L n"], newest: Float[Tensor, "B M n"]
+) -> Float[Tensor, "B M L n"]:
+    """The memory without its oldest entry and with the newest as its last one, for some samples."""
+    return torch.where(whose[..., None, None], torch.cat((memory[:, :, 1:], newest[:, :, None]), 2), memory)
+
+
+def _times(
+    moves: Float[Tensor, "B M L n"], changes: Float[Tensor, "B M L n"], slope: Float[Tensor, "B M N K 2"]
+) -> Float[Tensor, "B M N K 2"]:
+    """The inverse Hessian that the history tells of, times the gradient. Entries of zero change nothing."""
+    curvature = _dot(moves, changes)
+    inverse = torch.where(curvature > 0, 1.0 / torch.where(curvature > 0, curvature, 1.0), 0.0)
+    result, shares = slope.flatten(2), []
+    for entry in reversed(range(moves.shape[2])):
+        share = inverse[:, :, entry] * _dot(moves[:, :, entry], result)
+        result = result - share[..., None] * changes[:, :, entry]
+        shares.append(share)
+    newest = changes[:, :, -1].square().sum(-1)
+    scale = torch.where(newest > 0, curvature[:, :, -1] / torch.where(newest > 0, newest, 1.0), 1.0)
+    result = scale[..., None] * result
+    for entry, share in enumerate(reversed(shares)):
+        back = inverse[:, :, entry] * _dot(changes[:, :, entry], result)
+        result = result + (share - back)[..., None] * moves[:, :, entry]
+    return result.view_as(slope)

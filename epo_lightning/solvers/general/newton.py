@@ -1,0 +1,158 @@
+"""Newton's method with the exact Hessian, for any energy that has a gradient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from epo_lightning.game.energy import GRADIENT, Energy
+from epo_lightning.registry import ConfigError, register
+from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.solvers.base import STATIONARY, Minimiser
+from epo_lightning.solvers.general import descent
+from epo_lightning.solvers.general.dense import factorise, gradient, hessian
+
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-7, 1e7
+_TRIES = 6
+"""Steps that are tried with one Hessian, which costs more than all of them."""
+_SHORTEST = 0.03
+"""Share of a step below which it is not shortened any more, but damped."""
+
+
+@register("solver", "newton")
+@dataclass(frozen=True)
+class Newton(Minimiser):
+    """Steps -(H + lambda I)^-1 grad E with a damping lambda that makes the matrix positive definite, no longer than helps.
+
+    Without a Cholesky factor lambda is multiplied by 10. A step that does not lower the energy is shortened, to where the
+    slope along it would vanish if it changed linearly, which costs no other factor; when that does not help soon, lambda is
+    multiplied by 10 as well. A whole step that is accepted divides it by 10. Lambda is the sample's own, begins at 1e-3 and
+    stays within [1e-7, 1e7]. Near a minimum the number of correct digits about doubles with every step; where residuals are
+    linear by pieces (:class:`~epo_lightning.solvers.general.dense.PiecewiseQuadratic`), it is reached in a few.
+
+    Solutions are constants to automatic differentiation; ``backward=implicit`` is what learns through them.
+
+    Attributes:
+        steps: how many Hessians are computed at most.
+        tolerance: a sample has converged where the largest entry of its gradient, or of a step with little damping, is no
+            larger than this; or where it cannot be improved in its precision.
+    """
+
+    needs = frozenset({GRADIENT})
+    provides = frozenset({STATIONARY})
+
+    steps: int = 50
+    tolerance: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise ConfigError(f"solver.steps must be 0 or more, not {self.steps}")
+        if not 0 <= self.tolerance < float("inf"):
+            raise ConfigError(f"solver.tolerance must be 0 or more, and finite, not {self.tolerance}")
+
+    @torch.no_grad()
+    def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
+        scene, controls = descent.begin(energy, scene, parameters)
+        if controls.numel() == 0:
+            return descent.nothing(controls)
+        value, slope = gradient(energy, scene, parameters, controls)
+        sound = descent.finite(value, slope)
+        done = ~sound | (descent.largest(slope) <= self.tolerance)
+        now = _Iterate(
+            controls, value, slope, torch.full_like(value, _FIRST_DAMPING), descent.first_status(sound), done
+        )
+        for _ in range(self.steps):
+            if descent.ended(now.done):
+                break
+            going = ~now.done.all(1)
+            if going.device.type != "cpu" or going.all():
+                now = self._advanced(energy, scene, parameters, now)
+            else:  # scenes that have converged cost nothing
+                now = now.with_(going, self._advanced(energy, scene[going], parameters[going], now.of(going)))
+        return descent.solution(energy, scene, now.controls, (value, now.value), now.slope, now.status)
+
+    def _advanced(self, energy: Energy, scene: Scene, parameters: GameParameters, now: _Iterate) -> _Iterate:
+        """One Hessian further."""
+        controls, value, slope, damping, status, done = vars(now).values()
+        matrix = hessian(energy, scene, parameters, controls)
+        known = matrix.flatten(2).sum(-1).isfinite()
+        status = torch.where(done | known, status, int(Status.STOPPED))
+        done = done | ~known
+        open_, stale, length = ~done, ~done, torch.ones_like(value)
+        move, definite = torch.zeros_like(controls), torch.zeros_like(done)
+        for _ in range(_TRIES):
+            if descent.ended(~open_):
+                break
+            if not descent.ended(~stale):
+                move, definite = _steps(matrix, damping, slope, stale, move, definite)
+            there = torch.where(_wide(open_), controls + _wide(length) * move, controls)
+            trial = gradient(energy, scene, parameters, there)
+            better = (trial[0] < value) | descent.level(value, slope, *trial)
+            better = open_ & definite & descent.finite(*trial) & better
+            promised = -(slope * move).flatten(2).sum(-1)
+            whole = length == 1.0
+            near = whole & (damping <= _FIRST_DAMPING) & (descent.largest(move) <= self.tolerance)
+            exhausted = definite & (length * promised <= descent.rounding(value))
+            stuck = open_ & ~better & (exhausted | (damping >= _MOST_DAMPING))
+            status = torch.where(open_ & ~definite & (status == Status.SOLVED), int(Status.DAMPED), status)
+            # Where the slope along the step would vanish, from what it is at both ends.
+            share = promised / (promised + (trial[1] * move).flatten(2).sum(-1))
+            shorter = length * share.nan_to_num(0.0).clamp(0.1, 0.5)
+            controls = torch.where(_wide(better), there, controls)
+            value, slope = torch.where(better, trial[0], value), torch.where(_wide(better), trial[1], slope)
+            done = done | stuck | (better & (near | (descent.largest(slope) <= self.tolerance)))
+            stale = open_ & ~better & (~definite | (shorter < _SHORTEST))
+            length = torch.where(stale, 1.0, shorter)
+            less, more = (damping / 10).clamp_min(_LEAST_DAMPING), (damping * 10).clamp_max(_MOST_DAMPING)
+            damping = torch.where(stale, more, torch.where(better & whole, less, damping))
+            open_ = open_ & ~better & ~stuck
+            stale = stale & open_
+        return _Iterate(controls, value, slope, damping, status, done)
+
+
+@dataclass(frozen=True)
+class _Iterate:
+    """Where every sample is, the energy and the gradient there, its damping, and whether it has come to an end."""
+
+    controls: Float[Tensor, "B M N K 2"]
+    value: Float[Tensor, "B M"]
+    slope: Float[Tensor, "B M N K 2"]
+    damping: Float[Tensor, "B M"]
+    status: Int[Tensor, "B M"]
+    done: Bool[Tensor, "B M"]
+
+    def of(self, scenes: Bool[Tensor, " B"]) -> _Iterate:
+        """The iterates of some scenes."""
+        return _Iterate(**{name: tensor[scenes] for name, tensor in vars(self).items()})
+
+    def with_(self, scenes: Bool[Tensor, " B"], others: _Iterate) -> _Iterate:
+        """The same with other iterates of some scenes."""
+        new = vars(others)
+        return _Iterate(**{name: tensor.index_put((scenes,), new[name]) for name, tensor in vars(self).items()})
+
+
+def _wide(samples: Tensor) -> Tensor:
+    return samples[..., None, None, None]
+
+
+def _steps(
+    matrix: Float[Tensor, "B M n n"],
+    damping: Float[Tensor, "B M"],
+    slope: Float[Tensor, "B M N K 2"],
+    which: Bool[Tensor, "B M"],
+    move: Float[Tensor, "B M N K 2"],
+    definite: Bool[Tensor, "B M"],
+) -> tuple[Float[Tensor, "B M N K 2"], Bool[Tensor, "B M"]]:
+    """The damped steps of some samples and whether they have a factor, beside those that others had before."""
+    some = (
+        which if which.device.type == "cpu" else torch.ones_like(which)
+    )  # elsewhere the host would wait for the count
+    chosen = matrix[some]
+    chosen.diagonal(dim1=-2, dim2=-1).add_(damping[some][..., None])
+    factor, sound = factorise(chosen)
+    step = -torch.cholesky_solve(slope[some].flatten(1)[..., None], factor).view_as(slope[some])
+    new, found = move.masked_scatter(_wide(some), step), definite.masked_scatter(some, sound)
+    return torch.where(_wide(which), new, move), torch.where(which, found, definite)

@@ -1,0 +1,363 @@
+"""Thousands of broken exiD files and Lanelet2 maps: each ends in one sentence, or in a recording that can be trusted."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import Counter
+
+import numpy as np
+import polars as pl
+import pytest
+
+from data.recorded.formats.exid_files import ORIGIN, SETTING, drive, road, write
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.formats.exid import USED, exid
+from epo_lightning.data.recorded.formats.lanelet2 import read_map
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error")]
+
+TRIALS = 2500
+PATIENCE = 5.0
+"""No file may take longer than this [s]."""
+VALUES = [
+    *(
+        "",
+        " ",
+        "nan",
+        "NaN",
+        "inf",
+        "-inf",
+        "1e400",
+        "1e300",
+        "-1e300",
+        "1e20",
+        "99999999999999999999",
+        "-1",
+        "0",
+        "1e-320",
+    ),
+    *(
+        "x",
+        "1;2",
+        ";",
+        '"',
+        "'",
+        "\x00",
+        "ä",
+        "1_0",
+        "0x10",
+        "1,5",
+        "1.5.2",
+        "--1",
+        "None",
+        "True",
+        "9223372036854775807",
+    ),
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def warmed(tmp_path_factory):
+    """Centrelines are compiled before anything is timed."""
+    path = tmp_path_factory.mktemp("map") / "map.osm"
+    path.write_text(str(road()))
+    read_map(path, ORIGIN)
+
+
+def attempt(read, folder, label):
+    """What was read, or None and the sentence that says why not."""
+    started = time.perf_counter()
+    try:
+        found, problem = read(), ""
+    except RecordingError as error:
+        found, problem = None, str(error)
+    except BaseException as error:
+        raise AssertionError(label) from error
+    assert time.perf_counter() - started < PATIENCE, label
+    if found is None:
+        assert re.fullmatch(rf"{re.escape(str(folder))}\S*(, row \d+)?: .{{10,}}", problem), f"{label}: {problem!r}"
+    return found, problem
+
+
+def flip(content, random):
+    for _ in range(random.integers(1, 6)):
+        place = random.integers(len(content))
+        content = content[:place] + bytes([random.integers(256)]) + content[place + 1 :]
+    return content
+
+
+def truncate(content, random):
+    return content[: random.integers(len(content))]
+
+
+def splice(content, random):
+    """A piece of a file repeated, moved or removed."""
+    a, b, c = np.sort(random.integers(0, len(content) + 1, 3))
+    return random.choice(
+        [content[:a] + content[b:], content[:b] + content[a:], content[:a] + content[b:c] + content[a:b]]
+    )
+
+
+def table(content):
+    return [line.split(b",") for line in content.splitlines()]
+
+
+def text(cells):
+    return b"".join(b",".join(row) + b"\n" for row in cells)
+
+
+def set_cells(content, random):
+    cells = table(content)
+    for _ in range(random.integers(1, 4)):
+        row = cells[random.integers(len(cells))]
+        row[random.integers(len(row))] = str(random.choice(VALUES)).encode()
+    return text(cells)
+
+
+def set_used_cell(content, random):
+    """A value of a column that matters, also in every row."""
+    cells = table(content)
+    column = random.integers(11)
+    value = str(random.choice(VALUES)).encode()
+    rows = range(1, len(cells)) if random.random() < 0.3 else [random.integers(1, len(cells))]
+    for row in rows:
+        cells[row][min(column, len(cells[row]) - 1)] = value
+    return text(cells)
+
+
+def swap_columns(content, random):
+    """The names of two columns exchanged, but not their values."""
+    cells = table(content)
+    a, b = random.integers(min(11, len(cells[0])), size=2)
+    cells[0][a], cells[0][b] = cells[0][b], cells[0][a]
+    return text(cells)
+
+
+def shuffle_columns(content, random):
+    cells = table(content)
+    order = random.permutation(len(cells[0]))
+    return text([[row[place] for place in order] for row in cells])
+
+
+def drop_column(content, random):
+    cells = table(content)
+    place = random.integers(len(cells[0]))
+    return text([row[:place] + row[place + 1 :] for row in cells])
+
+
+def double_column(content, random):
+    cells = table(content)
+    place = random.integers(len(cells[0]))
+    return text([[*row, row[place]] for row in cells])
+
+
+def swap_rows(content, random):
+    lines = content.splitlines(keepends=True)
+    a, b = random.integers(0, len(lines), 2)
+    lines[a], lines[b] = lines[b], lines[a]
+    return b"".join(lines)
+
+
+def double_row(content, random):
+    lines = content.splitlines(keepends=True)
+    lines.insert(random.integers(len(lines)), lines[random.integers(len(lines))])
+    return b"".join(lines)
+
+
+def drop_rows(content, random):
+    lines = content.splitlines(keepends=True)
+    first = random.integers(len(lines))
+    del lines[first : first + random.integers(1, 4)]
+    return b"".join(lines)
+
+
+def scale_column(content, random):
+    """Another unit."""
+    cells = table(content)
+    column = random.integers(4, 11)
+    factor = random.choice([0.001, 0.0174533, 0.3048, 3.6, -1, 57.3, 1000])
+    for row in cells[1:]:
+        if column < len(row) and re.fullmatch(rb"-?[0-9.]+", row[column]):
+            row[column] = str(float(row[column]) * factor).encode()
+    return text(cells)
+
+
+CSV = [
+    *(flip, truncate, splice, set_cells, set_used_cell, swap_columns, shuffle_columns, drop_column, double_column),
+    *(swap_rows, double_row, drop_rows, scale_column),
+]
+HARMLESS = {shuffle_columns}
+
+
+def test_tracks_and_metadata(tmp_path):
+    random = np.random.default_rng(0)
+    folder = write(tmp_path / "exid", drive(frames=8), setting=SETTING | {"duration": 1.0})
+    (source,) = exid(folder)
+    whole = source.read()
+    files = [file for file in source.files if file.suffix == ".csv"]
+    contents = {file: file.read_bytes() for file in files}
+    outcomes: Counter[str] = Counter()
+    for trial in range(TRIALS):
+        file = files[random.choice(3, p=(0.6, 0.25, 0.15))]
+        change = CSV[random.integers(len(CSV))]
+        content = change(contents[file], random)
+        file.write_bytes(content)
+        label = f"trial {trial}: {change.__name__} of {file.name}"
+        found, problem = attempt(lambda: exid(folder)[0].read(), folder, f"{label}: {content!r}")
+        assert not (problem and change in HARMLESS), f"{label}: {problem}"
+        outcome = "error" if found is None else check_recording(found, whole, folder, label)
+        outcomes[f"{change.__name__}: {outcome}"] += 1
+        file.write_bytes(contents[file])
+    print(*sorted(outcomes.items()), sep="\n")
+    errors = sum(count for name, count in outcomes.items() if name.endswith("error"))
+    assert 0.3 < errors / TRIALS < 0.95, "both outcomes are well represented"
+
+
+def check_recording(found, whole, folder, label):
+    """A recording from broken files holds what these files say, row by row, and agrees with itself."""
+    tracks = found.tracks.check("fuzz")
+    assert found.lanes is not None
+    assert len(found.lanes) == len(whole.lanes), label
+    rows = pl.read_csv(folder / "data" / "07_tracks.csv", columns=list(USED), infer_schema=False, quote_char=None)
+    assert len(rows) == len(tracks), f"{label}: rows were lost"
+    rows = rows.select(pl.col("*").str.strip_chars(' "').cast(pl.Float64)).sort("trackId", maintain_order=True)
+    np.testing.assert_array_equal(tracks.ids[tracks.agent], rows["trackId"], label)
+    np.testing.assert_array_equal(tracks.frame, rows["frame"], label)
+    np.testing.assert_array_equal(tracks.position, rows.select("xCenter", "yCenter"), label)
+    np.testing.assert_array_equal(tracks.velocity, rows.select("xVelocity", "yVelocity"), label)
+    turns = (tracks.heading - np.deg2rad(rows["heading"].to_numpy())) / (2 * np.pi)
+    np.testing.assert_allclose(turns, turns.round(), atol=1e-9, err_msg=label)
+    if len(tracks) != len(whole.tracks):
+        assert found.dropped, f"{label}: there are {len(tracks)} rows instead of {len(whole.tracks)}, unsaid"
+    names = ("rate", "agent", "frame", "position", "heading", "velocity", "ids", "size", "kind")
+    same = all(np.array_equal(getattr(tracks, name), getattr(whole.tracks, name)) for name in names)
+    return "the same" if same else "as the file says"
+
+
+def attributes(text, random):
+    """One value of one attribute."""
+    places = list(re.finditer(r"='([^']*)'", text))
+    place = places[random.integers(len(places))]
+    value = random.choice([*VALUES, "2", "999", "way", "left", "walkway", "lanelet", "delete"])
+    value = str(value).replace("\x00", "").replace("'", "")
+    return text[: place.start(1)] + value + text[place.end(1) :]
+
+
+def element(kind):
+    """Elements of a kind removed, doubled, or exchanged."""
+
+    def change(text, random):
+        places = list(re.finditer(rf"<{kind} [^>]*/>|<{kind} .*?</{kind}>", text))
+        a, b = (places[random.integers(len(places))] for _ in range(2))
+        match random.integers(3):
+            case 0:
+                return text[: a.start()] + text[a.end() :]
+            case 1:
+                return text[: a.start()] + a[0] + text[a.start() :]
+            case _:
+                return text[: a.start()] + b[0] + text[a.end() :]
+
+    change.__name__ = f"element_{kind}"
+    return change
+
+
+def one_node(text, random):
+    """Ways of one node, which may be anyone's."""
+    places = list(re.finditer(r"(<way [^>]*>)(?:<nd [^>]*/>)+", text))
+    place = places[random.integers(len(places))]
+    return (
+        text[: place.start()]
+        + place[1]
+        + f"<nd ref='{random.integers(1, 40)}'/>" * random.integers(1, 3)
+        + text[place.end() :]
+    )
+
+
+def tangle(text, random):
+    """Nodes under other numbers: ways that cross, rings, lanes that lead into themselves and into one another."""
+    for _ in range(random.integers(1, 12)):
+        places = list(re.finditer(r"<nd ref='(\d+)'", text))
+        place = places[random.integers(len(places))]
+        text = text[: place.start(1)] + str(random.integers(1, 37)) + text[place.end(1) :]
+    return text
+
+
+def other_ways(text, random):
+    """Lanelets between other ways."""
+    return re.sub(r"(<member type='way' ref=)'\d+'", lambda m: f"{m[1]}'{random.integers(1, 10)}'", text)
+
+
+def bomb(text, random):
+    entities = '<!ENTITY e0 "lol">' + "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 10))
+    doctype = random.choice(
+        [f"<!DOCTYPE osm [{entities}]>", "<!DOCTYPE osm SYSTEM 'file:///etc/passwd'>", "<!DOCTYPE osm>"]
+    )
+    return text.replace("<osm", f"{doctype}<osm", 1).replace("highway", "&e9;", 1)
+
+
+def encoding(text, random):
+    return text.replace(
+        "UTF-8", str(random.choice(["UTF-16", "klingon", "big5", "utf-7", "idna", "ascii", "hex", ""])), 1
+    )
+
+
+def nest(text, random):
+    depth = 20_000
+    return text.replace("<node", "<a>" * depth + "</a>" * depth + "<node", 1) if random.random() < 0.1 else text
+
+
+def as_bytes(change):
+    def changed(text, random):
+        return change(text.encode(), random)
+
+    changed.__name__ = change.__name__
+    return changed
+
+
+XML = [
+    *(as_bytes(change) for change in (flip, truncate, splice)),
+    *(element(kind) for kind in ("node", "way", "relation", "member", "nd", "tag")),
+    *(attributes, attributes, one_node, tangle, tangle, other_ways, bomb, encoding, nest),
+]
+
+
+def test_maps(tmp_path):
+    random = np.random.default_rng(1)
+    text = str(road())
+    path = tmp_path / "map.osm"
+    path.write_text(text)
+    whole = read_map(path, ORIGIN)
+    outcomes: Counter[str] = Counter()
+    for trial in range(TRIALS):
+        change = XML[random.integers(len(XML))]
+        changed = change(text, random)
+        path.write_bytes(changed if isinstance(changed, bytes) else changed.encode())
+        label = f"trial {trial}: {change.__name__}"
+        dropped: Counter[str] = Counter()
+        lanes, _ = attempt(lambda counts=dropped: read_map(path, ORIGIN, dropped=counts), path, f"{label}: {changed!r}")
+        outcome = "error" if lanes is None else check_lanes(lanes, whole, dropped, path, label)
+        assert change.__name__ != "bomb" or outcome == "error", label
+        outcomes[f"{change.__name__}: {outcome}"] += 1
+    print(*sorted(outcomes.items()), sep="\n")
+    errors = sum(count for name, count in outcomes.items() if name.endswith("error"))
+    assert 0.2 < errors / TRIALS < 0.9, "both outcomes are well represented"
+
+
+def check_lanes(lanes, whole, dropped, path, label):
+    """Lanes of a broken map agree with one another, and none went missing unsaid."""
+    lanes.check("fuzz")
+    declared = len(re.findall(rb"<tag k='type' v='lanelet'", path.read_bytes()))
+    hidden = len(re.findall(rb"action='delete'", path.read_bytes()))
+    assert len(lanes) + sum(dropped.values()) >= declared - hidden, f"{label}: lanes were lost"
+    for lane, following in enumerate(lanes.successors):
+        for successor in following:
+            np.testing.assert_array_equal(lanes.left[lane][-1], lanes.left[successor][0], label)
+            np.testing.assert_array_equal(lanes.right[lane][-1], lanes.right[successor][0], label)
+    for lane, beside in enumerate(lanes.adjacent_left):
+        if beside >= 0:
+            np.testing.assert_array_equal(lanes.left[lane], lanes.right[beside], label)
+    for changes, beside in ((lanes.left_of, lanes.adjacent_left), (lanes.right_of, lanes.adjacent_right)):
+        assert ((changes == -1) | (changes == beside)).all(), label
+    same = len(lanes) == len(whole) and np.array_equal(np.concatenate(lanes.centre), np.concatenate(whole.centre))
+    return "dropped" if dropped else "the same" if same else "as the file says"

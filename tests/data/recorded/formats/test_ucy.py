@@ -1,0 +1,125 @@
+"""Pedestrians of UCY: the columns, the raster of time, where those who stand look, and bad files."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from epo_lightning.data.recorded.formats.ucy import ucy
+from epo_lightning.data.recorded.tracks import RecordingError
+from epo_lightning.registry import lookup
+from epo_lightning.scene import KINDS
+
+SHARED = Path(os.environ.get("EPO_SHARED", "../shared")) / "data/ucy"
+ROWS = """
+   1  7   0.0 0.0 5.0   1.0 0.0  0.5
+   11 7   0.4 0.0 5.2   1.0 0.0  0.5
+   21 7   0.8 0.0 5.4   0.0 0.0  0.0
+   11 3  -1.0 0.0 2.0   0.0 0.0  0.0
+   21 3  -1.0 0.0 2.0   0.0 0.0 -1.0
+   31 5   9.0 0.0 9.0   0.0 0.0  0.0
+"""
+
+
+def write(folder: Path, content: str | bytes) -> Path:
+    (folder / "square").mkdir(parents=True, exist_ok=True)
+    path = folder / "square/obsmat.txt"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def read(folder: Path, content: str | bytes = ROWS):
+    path = write(folder, content)
+    (source,) = ucy(folder)
+    assert (source.name, source.group, source.files) == ("square", "square", (path,))
+    return source.read()
+
+
+def test_is_a_format():
+    assert lookup("format", "ucy") is ucy
+
+
+def test_columns(tmp_path):
+    recording = read(tmp_path)
+    tracks = recording.tracks
+    assert (recording.name, recording.group, recording.lanes) == ("square", "square", None)
+    assert not recording.dropped
+    assert tracks.rate == 2.5
+    assert tracks.ids.tolist() == [3, 5, 7]
+    assert tracks.agent.tolist() == [0, 0, 1, 2, 2, 2]
+    assert tracks.frame.tolist() == [1, 2, 3, 0, 1, 2]
+    assert tracks.position[3:].tolist() == [[0.0, 5.0], [0.4, 5.2], [0.8, 5.4]]
+    assert tracks.velocity[1].tolist() == [0.0, -1.0]
+    assert tracks.size.tolist() == [[0.5, 0.5]] * 3
+    assert [KINDS[kind] for kind in tracks.kind] == ["pedestrian"] * 3
+    # The one who stops still faces where he walked; where the one who starts will go nobody knows, nor of the third.
+    walked = np.arctan2(0.5, 1.0)
+    np.testing.assert_allclose(tracks.heading, [0.0, -np.pi / 2, 0.0, walked, walked, walked])
+
+
+def test_order_of_rows_says_nothing(tmp_path):
+    expected = read(tmp_path).tracks
+    shuffled = read(tmp_path, "\r\n".join(sorted(ROWS.splitlines(), reverse=True))).tracks
+    for name, value in vars(expected).items():
+        np.testing.assert_array_equal(getattr(shuffled, name), value)
+
+
+def test_raster_of_six_frames(tmp_path):
+    tracks = read(tmp_path, "6 1 0 0 0 1 0 0\n12 1 1 0 0 1 0 0\n24 1 3 0 0 1 0 0\n30 1 4 0 0 1 0 0").tracks
+    assert tracks.rate == pytest.approx(25 / 6)
+    assert tracks.frame.tolist() == [0, 1, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "the file is empty; rows of frame, pedestrian, x"),
+        ("\n  \n", "the file is empty"),
+        (b"\xff\xfe\x00", "the file is no text .*fetch it again"),
+        (ROWS.replace("9.0", "nine"), "row 7: x is 'nine'; a finite number was expected"),
+        (ROWS + "31 5 9.0", "row 8: there are 3 columns; frame, pedestrian, x, z, y, vx, vz, vy were expected"),
+        (ROWS.replace("9.0", "1_000"), "row 7: x is '1_000'"),
+        (ROWS.replace("9.0", "nan"), "row 7: x is 'nan'; a finite number was expected"),
+        (ROWS.replace("31 5", "31.5 5"), "row 7: frame is '31.5'; a whole number"),
+        (ROWS.replace("31 5", "31 1e12"), r"row 7: pedestrian is '1e12'; a whole number up to 1e\+09 was expected"),
+        (ROWS.replace("31 5", "21 7"), "frame 2 of track 7 comes after its frame 2: time must go forward"),
+        (ROWS.replace("31 5", "32 5"), "frame 32 of pedestrian 5 is none of those annotated, which are 10 apart"),
+        (ROWS.replace("9.0", "9e9"), r"position \[9000000000.0, 9000000000.0\] of track 5 .* another unit"),
+        (ROWS.replace("-1.0", "-999"), "velocity"),
+        ("1 1 0 0 0 0 0 0\n1 2 0 0 0 0 0 0", "all rows are of one frame"),
+        ("0 1 0 0 0 0 0 0\n100 1 0 0 0 0 0 0", "a frame rate of 0.25 Hz"),
+    ],
+)
+def test_bad_files(tmp_path, content, message):
+    with warnings.catch_warnings(), pytest.raises(RecordingError, match=f"obsmat.txt.*{message}"):
+        warnings.simplefilter("error")
+        read(tmp_path, content)
+
+
+def test_bad_folders(tmp_path):
+    with pytest.raises(RecordingError, match=r"there is no obsmat.txt in this folder"):
+        ucy(tmp_path)
+    write(tmp_path / "a", ROWS)
+    write(tmp_path / "b", ROWS)
+    with pytest.raises(RecordingError, match="a folder of the same name: rename one"):
+        ucy(tmp_path)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason=f"no recordings of UCY in {SHARED}")
+def test_recordings():
+    recordings = {source.name: source.read() for source in ucy(SHARED)}
+    counts = {name: (len(each.tracks), len(each.tracks.ids)) for name, each in recordings.items()}
+    assert counts == {"zara01": (5024, 148), "zara02": (9537, 204)}
+    for recording in recordings.values():
+        tracks = recording.tracks
+        assert tracks.rate == 2.5
+        same = np.diff(tracks.agent) == 0
+        assert (np.diff(tracks.frame)[same] == 1).all()
+        moved = np.diff(tracks.position, axis=0)[same] * tracks.rate
+        assert np.median(np.linalg.norm(moved - tracks.velocity[:-1][same], axis=1)) < 0.01
+        assert tracks.speed.min() >= 0
+        assert 0.5 < np.median(tracks.speed) < 2.0

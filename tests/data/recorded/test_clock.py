@@ -1,0 +1,101 @@
+"""One clock for all agents: against scipy's filter and plain interpolation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import savgol_filter
+
+from epo_lightning.data.recorded.clock import stretches
+from epo_lightning.data.recorded.tracks import TrackTable
+from epo_lightning.registry import ConfigError
+
+from .roads import FOUR, curve, traffic
+
+
+def walk(seed: int, rate: float, lengths: list[int], gap: int = 3) -> TrackTable:
+    """Agents that wander and turn, each seen in one stretch or in two with a gap between them."""
+    random = np.random.default_rng(seed)
+    agent, frame = [], []
+    for number, length in enumerate(lengths):
+        steps = np.arange(length) + int(random.integers(0, 30))
+        steps[length // 2 :] += gap * (number % 2)
+        agent.append(np.full(length, number))
+        frame.append(steps)
+    rows = sum(lengths)
+    heading = np.concatenate([np.cumsum(random.normal(size=length) * 0.3) for length in lengths])
+    wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
+    return TrackTable(
+        rate=rate,
+        agent=np.concatenate(agent),
+        frame=np.concatenate(frame),
+        position=random.normal(size=(rows, 2)).cumsum(0),
+        heading=wrapped,
+        velocity=random.normal(size=(rows, 2)),
+        ids=np.arange(len(lengths)),
+        size=np.ones((len(lengths), 2)),
+        kind=np.zeros(len(lengths), int),
+    )
+
+
+def pieces(tracks: TrackTable):
+    """Rows of every uninterrupted stretch, by a loop."""
+    found, rows = [], [0]
+    for row in range(1, len(tracks)):
+        if tracks.agent[row] != tracks.agent[row - 1] or tracks.frame[row] != tracks.frame[row - 1] + 1:
+            found.append(rows)
+            rows = []
+        rows.append(row)
+    return [*found, rows]
+
+
+@given(st.integers(0, 10_000), st.sampled_from([(25.0, 0.2), (10.0, 0.2), (30.0, 0.2), (7.0, 0.5), (2.5, 0.4)]))
+@settings(max_examples=40)
+def test_states_are_interpolated_on_a_common_clock(seed, times):
+    rate, dt = times
+    tracks = walk(seed, rate, [40, 61, 83])
+    clock, dropped = stretches(tracks, dt, None, shortest=1)
+    assert dropped["gaps in tracks"] == 1
+    expected = []
+    for rows in pieces(tracks):
+        time = tracks.frame[rows] / rate
+        steps = np.arange(np.ceil(time[0] / dt - 1e-6), np.floor(time[-1] / dt + 1e-6) + 1)
+        heading = np.unwrap(tracks.heading[rows])
+        columns = [*tracks.position[rows].T, heading, *tracks.velocity[rows].T]
+        x, y, angle, vx, vy = (np.interp(steps * dt, time, column) for column in columns)
+        expected.append(np.stack([x, y, angle, vx * np.cos(angle) + vy * np.sin(angle)], 1))
+    assert clock.count.tolist() == [len(part) for part in expected]
+    np.testing.assert_allclose(clock.state, np.concatenate(expected), atol=1e-9)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20)
+def test_smoothing_is_the_filter_of_savitzky_and_golay(seed):
+    tracks = walk(seed, 10.0, [40, 61, 83, 12])
+    clock, dropped = stretches(tracks, 0.1, 1.0, shortest=1)  # windows of eleven rows; every row is a step
+    kept = [rows for rows in pieces(tracks) if len(rows) >= 11]
+    assert dropped["tracks shorter than a window"] == len(pieces(tracks)) - len(kept)
+    smooth = lambda values, **how: savgol_filter(values, 11, 2, axis=0, **how)  # noqa: E731
+    expected = []
+    for rows in kept:
+        angle = smooth(np.unwrap(tracks.heading[rows]))
+        velocity = smooth(tracks.position[rows], deriv=1, delta=0.1)
+        along = velocity[:, 0] * np.cos(angle) + velocity[:, 1] * np.sin(angle)
+        expected.append(np.column_stack([smooth(tracks.position[rows]), angle, along]))
+    np.testing.assert_allclose(clock.state, np.concatenate(expected), atol=1e-8)
+
+
+def test_a_clock_faster_than_the_recording_is_refused():
+    with pytest.raises(ConfigError, match=r"data\.windows\.dt=0\.02 .* 25 frames per second: use 0\.04"):
+        stretches(traffic(curve(None), FOUR), 0.02, None, 1)
+
+
+def test_a_recording_without_traffic_gives_nothing():
+    tracks = traffic(curve(None), FOUR)
+    empty = {f.name: getattr(tracks, f.name)[:0] for f in dataclasses.fields(tracks) if f.name != "rate"}
+    clock, _ = stretches(TrackTable(rate=10.0, **empty), 0.2, 1.0, 1)
+    assert len(clock.count) == len(clock.state) == 0

@@ -1,0 +1,174 @@
+"""Where agents are on lanes, who changes, who follows whom: against loops that anybody can check."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.lanes import LaneGraph, Polylines, lane_changes
+from epo_lightning.data.recorded.routes import Routes
+from epo_lightning.data.simulate.leaders import leaders
+
+from .roads import FOUR, WIDTH, curve, road, traffic
+
+
+@given(st.integers(0, 10_000))
+def test_projection_is_the_nearest_point_of_a_line_that_goes_straight_on(seed):
+    random = np.random.default_rng(seed)
+    lines = [np.cumsum(random.normal((1.5, 0.0), size=(random.integers(2, 6), 2)), 0) for _ in range(4)]
+    lines[1] = np.repeat(lines[1], 2, axis=0)  # equal points in succession
+    of, position = random.integers(0, 4, 20), random.normal(size=(20, 2)) * 4
+    along, offset = Polylines(lines).project(of, position)
+    foot, tangent = Polylines(lines).at(of, along)
+    np.testing.assert_allclose(np.linalg.norm(tangent, axis=1), 1.0)
+    for i in range(20):
+        line = np.unique(lines[of[i]], axis=0, return_index=True)[1]
+        points = lines[of[i]][np.sort(line)]
+        length = shapely.LineString(points).length
+        inside = shapely.LineString(points).distance(shapely.Point(position[i]))
+        assert np.linalg.norm(position[i] - foot[i]) == pytest.approx(abs(offset[i]), abs=1e-9)
+        assert abs(offset[i]) <= inside + 1e-9
+        if 0 < along[i] < length:
+            assert abs(offset[i]) == pytest.approx(inside, abs=1e-9)
+        way = position[i] - foot[i]
+        assert np.sign(offset[i]) == (np.sign(tangent[i, 0] * way[1] - tangent[i, 1] * way[0]) or 1)
+
+
+@given(st.floats(150, 2000), st.floats(-3, 3), st.integers(0, 10_000))
+@settings(max_examples=25)
+def test_agents_are_found_on_their_lanes_wherever_the_road_lies(radius, turn, seed):
+    random = np.random.default_rng(seed)
+    place = curve(radius, turn, (5e4, -3e5))
+    lanes = road(place)
+    along, lane = random.uniform(1, 599, 50), random.integers(0, 3, 50)
+    offset = random.uniform(-1.7, 1.7, 50)
+    position, heading = place(along, lane * WIDTH + offset)
+    found = lanes.locate(position, heading + random.uniform(-0.5, 0.5, 50))
+    np.testing.assert_array_equal(found.lane, lane + 3 * (along // 200).astype(int))
+    np.testing.assert_allclose(found.offset, offset, atol=0.1)  # chords of the arc
+
+
+def test_who_heads_against_a_lane_or_is_beside_the_road_is_on_none():
+    lanes = road(curve(None))
+    position = np.array([[50.0, 0.0], [50.0, -2.5], [50.0, -3.5], [50.0, 0.0]])
+    assert lanes.locate(position, np.array([np.pi, 0.0, 0.0, 0.3])).lane.tolist() == [-1, 0, -1, 0]
+
+
+def test_a_lane_change_is_the_first_row_on_the_lane_beside():
+    lanes = road(curve(None))
+    tracks = traffic(curve(None), FOUR)
+    found = lanes.locate(tracks.position, tracks.heading)
+    changed = np.flatnonzero(lane_changes(tracks.agent, found, lanes))
+    assert tracks.agent[changed].tolist() == [0]
+    assert tracks.position[changed[0], 1] >= WIDTH / 2 >= tracks.position[changed[0] - 1, 1]
+    # Driving on from one section into the next is none, though the lane is another one.
+    assert len(np.unique(found.lane[tracks.agent == 1])) == 2
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=30)
+def test_leaders_are_the_nearest_ahead(seed):
+    random = np.random.default_rng(seed)
+    vehicles = [(i, random.uniform(0, 500), int(random.integers(0, 3)), 20.0, None) for i in range(8)]
+    lanes, tracks = road(curve(None)), traffic(curve(None), vehicles, seconds=1.0, rate=2.0)
+    found = lanes.locate(tracks.position, tracks.heading)
+    leader, distance = leaders(tracks, found, lanes)
+    for row in range(len(tracks)):
+        x, lane = tracks.position[row, 0], found.lane[row] % 3
+        ahead = [
+            (tracks.position[other, 0] - x, other)
+            for other in range(len(tracks))
+            if tracks.frame[other] == tracks.frame[row]
+            and found.lane[other] % 3 == lane
+            and tracks.position[other, 0] > x
+        ]
+        nearest = min(ahead, default=(np.inf, -1))
+        expected = nearest if nearest[0] < 250 else (np.inf, -1)
+        assert (pytest.approx(distance[row]), leader[row]) == expected
+
+
+def crossing(angle: float):
+    """Two straight lanes that cross at the origin, as under a bridge; the second one turned by ``angle``."""
+    one, other = (road(curve(None, turn, (-100 * np.cos(turn), -100 * np.sin(turn))), 1, 1) for turn in (0.0, angle))
+    both = {n: [*getattr(one, n), *getattr(other, n)] for n in ("left", "right", "centre", "successors")}
+    none = np.full(2, -1)
+    return LaneGraph(
+        ids=np.arange(2),
+        **both,
+        left_of=none,
+        right_of=none,
+        adjacent_left=none,
+        adjacent_right=none,
+        speed_limit=np.full(2, np.nan),
+        kind=np.zeros(2, int),
+    )
+
+
+@pytest.mark.parametrize("degrees", [20, 45, 70])
+def test_who_drives_over_or_under_a_road_is_not_on_it(degrees):
+    lanes = crossing(np.radians(degrees))
+    along = np.linspace(-20, 20, 81)
+    position = np.stack([along, np.full(81, 0.5)], 1)  # half a metre left of the middle, right along the lane
+    assert (lanes.locate(position, np.zeros(81)).lane == 0).all()
+
+
+@pytest.mark.parametrize("length", [3.0, 4.0, 8.0, 200.0])
+def test_changes_are_seen_on_lanelets_of_any_length(length):
+    place = curve(None)
+    lanes = road(place, 2, int(400 / length) + 1, length)
+    position, _ = place(np.arange(0, 300, 6.0), np.where(np.arange(50) < 25, 0.0, WIDTH))  # 30 m/s at 5 Hz
+    found = lanes.locate(position, np.zeros(50))
+    assert np.flatnonzero(lane_changes(np.zeros(50, int), found, lanes)).tolist() == [25]
+
+
+def test_routes_of_a_loop_go_on_where_the_agent_is():
+    """A lane that leads into a ring and over its own beginning."""
+    angles = np.linspace(-np.pi / 2, np.pi, 60)
+    ring = np.stack([60 + 40 * np.cos(angles), 40 + 40 * np.sin(angles)], 1)
+    lines = [
+        np.stack([np.linspace(0, 60, 13), np.zeros(13)], 1),
+        ring,
+        np.stack([np.full(9, 20.0), np.linspace(40, -40, 9)], 1),  # down over the first lane at x = 20
+    ]
+
+    def beside(line, offset):
+        way = np.gradient(line, axis=0)
+        normal = np.stack([-way[:, 1], way[:, 0]], 1) / np.linalg.norm(way, axis=1, keepdims=True)
+        return line + offset * normal
+
+    none = np.full(3, -1)
+    lanes = LaneGraph(
+        np.arange(3),
+        [beside(line, 1.8) for line in lines],
+        [beside(line, -1.8) for line in lines],
+        lines,
+        [(1,), (2,), ()],
+        *(none,) * 4,
+        np.full(3, np.nan),
+        np.zeros(3, int),
+    ).check("loop")
+    x = np.arange(15.0, 30.0)
+    position, speed = np.stack([x, np.full(15, -0.3)], 1), np.full(15, 10.0)
+    route = Routes(lanes).of(position, speed, lanes.locate(position, np.zeros(15)), 4.0)
+    own = route.candidates[:, route.line == 1]
+    # From 12.5 m ahead (braking) to 64 m: never down the other side of the loop.
+    np.testing.assert_allclose(own[:, 0], np.stack([x + 12.5, np.zeros(15)], 1), atol=0.05)
+    assert (own[..., 0] > x[:, None]).all()
+
+
+def test_graphs_that_cannot_be_maps_are_refused():
+    lanes = road(curve(None))
+    for change, message in (
+        ({"successors": [(99,)] * len(lanes)}, "leads into one that does not exist"),
+        ({"left_of": np.full(len(lanes), 99)}, "beside one that does not exist"),
+        ({"centre": [line[:1] for line in lanes.centre]}, "has no length"),
+        ({"left": [line * np.nan for line in lanes.left]}, "no metres"),
+    ):
+        with pytest.raises(RecordingError, match=message):
+            dataclasses.replace(lanes, **change).check("map.osm")

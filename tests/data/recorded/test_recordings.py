@@ -1,0 +1,178 @@
+"""Recordings as a data module: splits without leaks, a cache that is complete or not there, errors that say what to do."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from epo_lightning.data import cache
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.recordings import RecordedData, _fingerprint
+from epo_lightning.data.recorded.tracks import Source
+from epo_lightning.registry import ConfigError, register
+
+from .roads import FOUR, curve, recording
+
+WINDOWS = {"dt": 0.2}
+READ: list[str] = []
+"""Recordings that were read, in order."""
+
+
+@register("format", "roads")
+def roads(folder: Path) -> list[Source]:
+    """Files ``<group>-<number>.road``; what is in them is how far the road is turned."""
+
+    def source(file: Path) -> Source:
+        def read():
+            READ.append(file.stem)
+            if (folder / "stop").exists() and file.stem == "b-5":
+                raise RecordingError(file, "the disk is full: make room")
+            text = file.read_text()
+            if text == "empty":
+                return recording(vehicles=FOUR[:2], name=file.stem)
+            return recording(curve(800.0, float(text)), name=file.stem)
+
+        return Source(file.stem, file.stem.partition("-")[0], (file,), read)
+
+    return [source(file) for file in folder.glob("*.road")]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = tmp_path / "roads"
+    made.mkdir()
+    for number, group in enumerate("aaabbbccc"):
+        (made / f"{group}-{number}.road").write_text(str(0.1 * number))
+    return made
+
+
+def data(folder: Path, **changes) -> RecordedData:
+    arguments = {"dataset": "roads", "format": "roads", "windows": WINDOWS, "test": ["a"], "batch_size": 8}
+    where = {"folder": str(folder), "root": str(folder.parent / "cache")}
+    return RecordedData(**{**arguments, **where, **changes})
+
+
+def test_generate_once_then_train_from_the_cache(folder):
+    module = data(folder)
+    made = module.generate(workers=1, progress=False)
+    written = made.stat().st_mtime_ns
+    assert module.generate(workers=1, progress=False) == made
+    assert made.stat().st_mtime_ns == written
+    assert not list(made.parent.glob(".*parts*"))
+    module.setup("fit")
+    batch = next(iter(module.train_dataloader()))
+    assert batch.history.shape == (8, 4, 10, 4)
+    assert batch.lanes.shape == (8, 32, 10, 4)
+    assert batch.goal_candidates.shape == (8, 4, module.candidates, 2)
+    report = module.report()
+    names = report["recordings"]
+    assert {name[0] for name in names["test"]} == {"a"}
+    assert not set(names["train"]) & set(names["val"])
+    assert report["train"]["scenes"] == len(module.dataset("train")) > 0
+
+
+def test_splits_are_drawn_by_group_where_none_is_named(folder):
+    drawn = data(folder, test=None, val_by="group").splits(data(folder).sources())
+    groups = [{source.group for source in drawn[part]} for part in ("train", "val", "test")]
+    assert [len(group) for group in groups] == [1, 1, 1]
+    assert set.union(*groups) == set("abc")
+    other = {
+        tuple(s.name for s in data(folder, test=None, seed=seed).splits(data(folder).sources())["test"])
+        for seed in range(9)
+    }
+    assert len(other) > 1
+
+
+def test_what_was_extracted_before_an_error_is_not_extracted_again(folder, tmp_path):
+    one = data(folder).generate(workers=1, progress=False)
+    again = data(folder, root=str(tmp_path / "again"))
+    (folder / "stop").touch()
+    READ.clear()
+    with pytest.raises(ConfigError, match="the disk is full"):
+        again.generate(workers=1, progress=False)
+    before = len(READ)
+    (folder / "stop").unlink()
+    two = again.generate(workers=1, progress=False)
+    assert before < 9
+    assert len(READ) == 9 + 1  # only the one that failed was read twice
+    for part in ("train", "val", "test"):
+        assert (one / f"{part}.safetensors").read_bytes() == (two / f"{part}.safetensors").read_bytes()
+
+
+def test_the_set_depends_on_what_is_in_the_files(folder):
+    before = data(folder).digest
+    assert data(folder).digest == before
+    assert data(folder, frame="fixed").digest != before
+    assert data(folder, windows={"dt": 0.2, "radius": 50.0}).digest != before
+    (folder / "a-0.road").write_text("3.0")
+    assert data(folder).digest != before
+
+
+def test_fingerprints_see_every_byte_of_small_files_and_large_changes_of_large_ones(tmp_path):
+    file = tmp_path / "tracks.csv"
+    for size in (1, 1000, 900_000):
+        content = bytearray(np.random.default_rng(0).bytes(size))
+        file.write_bytes(content)
+        before = _fingerprint(file)
+        content[size // 2] ^= 1
+        file.write_bytes(content)
+        assert _fingerprint(file) != before
+    large = bytearray(20_000_000)
+    file.write_bytes(large)
+    before = _fingerprint(file)
+    large[9_000_000:10_000_000] = b"1" * 1_000_000
+    file.write_bytes(large)
+    assert _fingerprint(file) != before
+
+
+def test_a_split_without_scenes_is_an_error_that_says_where_they_went(folder):
+    for file in folder.glob("a-*.road"):
+        file.write_text("empty")
+    with pytest.raises(ConfigError, match=r"'test' of roads has not a single scene .*too few agents around: \d+"):
+        data(folder).generate(workers=1, progress=False)
+
+
+def test_recordings_without_scenes_keep_their_place(folder):
+    (folder / "a-0.road").write_text("empty")
+    module = data(folder)
+    module.generate(workers=1, progress=False)
+    module.setup("test")
+    test = module.dataset("test")
+    assert {entry["recording"] for entry in test.provenance(range(len(test)))} == {"a-1", "a-2"}
+    assert (test[torch.arange(len(test))].frame[:, :2].abs() > 0).all()
+
+
+def test_missing_data_and_misspelt_keys_say_what_to_do(folder, tmp_path):
+    for changes, message in (
+        ({"windows": {"dt": 0.2, "horzion": 20}}, "did you mean 'horizon'"),
+        ({"windows": {"agents": 2.5}}, "data.windows.agents must be a whole number"),
+        ({"format": "raods"}, "did you mean 'roads'"),
+        ({"frame": "moving"}, "unknown data.frame"),
+        ({"map": False}, "lane_change asks for lanes"),
+        ({"val_share": 1.5}, "share between 0 and 1"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            data(folder, **changes)
+    with pytest.raises(ConfigError, match=r"point data\.folder at it"):
+        _ = RecordedData("roads", "roads", str(tmp_path / "nowhere"), WINDOWS).config
+    with pytest.raises(ConfigError, match=r"which no recording has: .*known: a, b, c"):
+        data(folder, test=["d"]).generate(progress=False)
+    with pytest.raises(ConfigError, match="leave none for train, val"):
+        data(folder, test=["a", "b", "c"]).generate(progress=False)
+    (tmp_path / "bare").mkdir()
+    with pytest.raises(ConfigError, match="holds no recording in the format 'roads'"):
+        data(tmp_path / "bare").generate(progress=False)
+    with pytest.raises(cache.CacheError, match=r"epo generate data=roads"):
+        data(folder).setup("fit")
+
+
+def test_of_several_at_once_one_makes_the_set_and_the_others_wait(folder):
+    READ.clear()
+    with ThreadPoolExecutor(3) as pool:
+        made = list(pool.map(lambda _: data(folder).generate(workers=1, progress=False), range(3)))
+    assert len(set(made)) == 1
+    assert len(READ) == 9

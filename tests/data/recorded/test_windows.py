@@ -1,0 +1,302 @@
+"""From recordings to scenes: which agents, and what is known of them, against a loop over everything."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.lanes import lane_changes
+from epo_lightning.data.recorded.scenes import RecordedScenes
+from epo_lightning.data.recorded.windows import Extract, Recipe, extract, joined
+from epo_lightning.registry import ConfigError
+
+from .roads import FOUR, WIDTH, curve, recording
+
+
+def tables(scenes: Extract) -> dict[str, torch.Tensor]:
+    return {f.name: torch.from_numpy(np.ascontiguousarray(getattr(scenes, f.name))) for f in dataclasses.fields(scenes)}
+
+
+def scenes_of(of, recipe=Recipe(), frame="fixed"):  # noqa: B008 - frozen
+    found, _ = extract(of, recipe)
+    data = RecordedScenes(tables(found), recipe.dt, frame, [of.name])
+    return data[torch.arange(len(data))], data
+
+
+def crowd(seed: int, count: int = 9):
+    """Vehicles all over the road, some of whom change lane."""
+    random = np.random.default_rng(seed)
+    return [
+        (
+            int(number),
+            random.uniform(0, 250),
+            int(random.integers(0, 2)),
+            random.uniform(15, 35),
+            random.uniform(0, 8) if random.uniform() < 0.3 else None,
+        )
+        for number in random.permutation(100)[:count]
+    ]
+
+
+def obvious(of, recipe: Recipe) -> set[tuple[int, frozenset[int]]]:
+    """The windows of a recording, by frame and track ids, found one by one. Every track lasts the whole recording."""
+    tracks = of.tracks
+    found = of.lanes.locate(tracks.position, tracks.heading)
+    step = round(recipe.dt * tracks.rate)
+    agents = [tracks.agent == a for a in range(len(tracks.ids))]
+    at = [tracks.position[rows][::step] for rows in agents]
+    lane = [found.lane[rows][::step] for rows in agents]
+    changed = []
+    for a, rows in enumerate(agents):
+        coarse = np.flatnonzero(rows)[::step]
+        part = dataclasses.replace(
+            found, lane=found.lane[coarse], along=found.along[coarse], offset=found.offset[coarse]
+        )
+        changed.append(np.flatnonzero(lane_changes(np.full(len(coarse), a), part, of.lanes)))
+    windows = set()
+    for now in range(recipe.history - 1, len(at[0]) - recipe.horizon):
+        if now % recipe.every:
+            continue
+        for focal in range(len(at)):
+            distance = [(np.linalg.norm(at[focal][now] - at[other][now]), other) for other in range(len(at))]
+            limit = np.inf if recipe.radius is None else recipe.radius
+            chosen = [other for away, other in sorted(distance)[: recipe.agents] if away <= limit]
+            first, last = now - recipe.history + 1, now + recipe.horizon
+            moving = any(((changed[a] > first) & (changed[a] <= last)).any() for a in chosen)
+            if len(chosen) < recipe.least_agents or (recipe.lane_change and not moving):
+                continue
+            if any(lane[a][now] < 0 for a in chosen):
+                continue
+            windows.add((now * step, frozenset(tracks.ids[chosen].tolist())))
+    return windows
+
+
+@given(
+    st.integers(0, 10_000),
+    st.sampled_from(
+        [
+            Recipe(),
+            Recipe(lane_change=False, radius=30.0),
+            Recipe(agents=6, least_agents=2, radius=40.0, every=3),
+            Recipe(agents=1, least_agents=1),
+            Recipe(agents=32, least_agents=3, radius=None),
+        ]
+    ),
+)
+@settings(max_examples=25, deadline=None)
+def test_windows_are_those_that_a_loop_finds(seed, recipe):
+    of = recording(vehicles=crowd(seed))
+    scenes, counts = extract(of, recipe)
+    expected = obvious(of, recipe)
+    assert counts["scenes"] == len(expected)
+    if scenes is None:
+        assert not expected
+        return
+    data = RecordedScenes(tables(scenes), recipe.dt, "fixed", [of.name])
+    known = data.provenance(range(len(data)))
+    assert {(entry["frame"], frozenset(entry["tracks"])) for entry in known} == expected
+    dropped = sum(
+        counts[reason]
+        for reason in ("too few agents around", "the same agents twice", "no lane change", "an agent on no lane")
+        if reason in counts
+    )
+    assert counts["windows"] == counts["scenes"] + dropped
+
+
+def test_a_scene_holds_what_the_recording_says():
+    of = recording(curve(700.0, 0.4, (4000.0, -900.0)))
+    scene, data = scenes_of(of)
+    tracks = of.tracks
+    for index, entry in enumerate(data.provenance(range(len(data)))):
+        for i, track in enumerate(entry["tracks"]):
+            rows = np.flatnonzero(tracks.ids[tracks.agent] == track)
+            origin = scene.frame[index, :2].numpy()
+            for states, steps in ((scene.history, np.arange(-9, 1)), (scene.future, np.arange(1, 21))):
+                at = rows[entry["frame"] + 5 * steps]
+                found = states[index, i].double().numpy()
+                np.testing.assert_allclose(found[:, :2] + origin, tracks.position[at], atol=1e-3)
+                np.testing.assert_allclose(found[:, 2], tracks.heading[at], atol=1e-5)
+                np.testing.assert_allclose(found[:, 3], tracks.speed[at], atol=1e-4)
+    centre = scene.current[..., :2].mean(1)
+    torch.testing.assert_close(centre, torch.zeros_like(centre), rtol=0, atol=1e-4)
+    assert scene.finite.all()
+
+
+def test_goals_lie_on_the_lanes_that_an_agent_may_take():
+    of = recording(vehicles=((1, 30.0, 0, 20.0, 2.0), (2, 20.0, 1, 20.0, None), (3, 10.0, 2, 20.0, None)))
+    scene, _ = scenes_of(of, Recipe(agents=3, least_agents=3))
+    goals = (scene.goal_candidates + scene.frame[:, None, None, :2])[0]
+    now = (scene.current[..., :2] + scene.frame[:, None, :2])[0]
+    line = scene.goal_reference[0, 0]
+    for i in range(3):
+        k = round(float(now[i, 1]) / WIDTH)
+        left = WIDTH * (k + 1 if k < 2 else k + 0.5)  # the lane beside, or the boundary of one's own
+        right = WIDTH * (k - 1 if k > 0 else k - 0.5)
+        for number, y in enumerate((left, WIDTH * k, right)):
+            ways = goals[i][line == number] - now[i]
+            torch.testing.assert_close(goals[i][line == number][:, 1], torch.full((20,), y).double(), rtol=0, atol=1e-3)
+            # Between braking with 4 and accelerating with 3 m/s^2 for four seconds from 20 m/s.
+            assert float(ways[0, 0]) == pytest.approx(20 * 4 - 4 * 4**2 / 2, abs=0.05)
+            assert float(ways[-1, 0]) == pytest.approx(20 * 4 + 3 * 4**2 / 2, abs=0.05)
+    for i in range(3):
+        lines = scene.references[0, i].double() + scene.frame[0, :2]
+        for number in range(3):
+            candidates = goals[i][line == number]
+            height = np.interp(candidates[:, 0], lines[number, :, 0], lines[number, :, 1])
+            np.testing.assert_allclose(height, candidates[:, 1], atol=1e-3)
+
+
+@given(st.integers(0, 10_000), st.floats(-3.1, 3.1))
+@settings(max_examples=15, deadline=None)
+def test_moving_the_world_moves_the_frame_and_nothing_else(seed, turn):
+    vehicles = crowd(seed, 6)
+    recipe = Recipe(radius=None, lane_change=False)
+    here, _ = scenes_of(recording(curve(900.0), vehicles), recipe, "aligned")
+    there, _ = scenes_of(recording(curve(900.0, turn, (-7000.0, 2500.0)), vehicles), recipe, "aligned")
+    for name in ("history", "future", "goal_candidates", "references", "reference_speed", "lanes"):
+        one, other = getattr(here, name), getattr(there, name)
+        torch.testing.assert_close(one, other, rtol=0, atol=5e-3)
+    moved, _ = scenes_of(recording(curve(900.0, 0.0, (-7000.0, 2500.0)), vehicles), recipe)
+    still, _ = scenes_of(recording(curve(900.0), vehicles), recipe)
+    for name in ("history", "future", "goal_candidates", "references", "lanes"):
+        torch.testing.assert_close(getattr(moved, name), getattr(still, name), rtol=0, atol=5e-3)
+
+
+def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
+    of = recording(vehicles=((1, 30.0, 0, 20.0, None), (2, 60.0, 1, 20.0, None)))
+    away = of.tracks.agent == 1
+    tracks = dataclasses.replace(
+        of.tracks,
+        heading=of.tracks.heading + np.where(away, np.pi, 0.0),
+        velocity=of.tracks.velocity * np.where(away, -1.0, 1.0)[:, None],
+    )
+    recipe = Recipe(agents=2, least_agents=2, lane_change=False)
+    for turn in (0.0, 1e-6, 1.0):
+        cosine, sine = np.cos(turn), np.sin(turn)
+        rotation = np.array([[cosine, -sine], [sine, cosine]])
+        turned = dataclasses.replace(
+            tracks,
+            position=tracks.position @ rotation.T,
+            heading=tracks.heading + turn,
+            velocity=tracks.velocity @ rotation.T,
+        )
+        scene, _ = scenes_of(dataclasses.replace(of, tracks=turned, lanes=None), recipe, "aligned")
+        torch.testing.assert_close(scene.current[:, 0, 2], torch.zeros(len(scene.history)), rtol=0, atol=1e-5)
+
+
+def test_tracks_may_begin_and_end_when_they_like():
+    of = recording(seconds=20.0, vehicles=[*FOUR, (12, 90.0, 2, 24.0, None)])
+    lives = np.array([500, 500, 400, 350, 150])[of.tracks.agent]  # the last one leaves long before the others
+    kept = of.tracks.frame <= lives
+    parts = {n: getattr(of.tracks, n)[kept] for n in ("agent", "frame", "position", "heading", "velocity")}
+    of = dataclasses.replace(of, tracks=dataclasses.replace(of.tracks, **parts))
+    for complete, lane_change in itertools.product((True, False), repeat=2):
+        recipe = Recipe(agents=5, least_agents=1, radius=None, lane_change=lane_change, complete=complete)
+        scene, data = scenes_of(of, recipe)
+        for index, entry in enumerate(data.provenance(range(len(data)))):
+            present = scene.agent_mask[index].sum()
+            assert present == len(entry["tracks"])
+            last = {7: 500, 3: 500, 9: 400, 4: 350, 12: 150}
+            for track in entry["tracks"]:
+                assert entry["frame"] + (100 if complete else 0) <= last[track]
+        assert scene.finite.all()
+
+
+def test_neighbours_may_be_observed_in_part():
+    of = recording()
+    late = of.tracks.frame >= np.where(of.tracks.agent == 1, 125, 0)
+    tracks = dataclasses.replace(
+        of.tracks, **{n: getattr(of.tracks, n)[late] for n in ("agent", "frame", "position", "heading", "velocity")}
+    )
+    of = dataclasses.replace(of, tracks=tracks)
+    whole, _ = scenes_of(of, Recipe(agents=4, least_agents=1))
+    assert not (whole.agent_mask.all(1)).any()
+    part, data = scenes_of(of, Recipe(agents=4, least_agents=1, complete=False))
+    seen = part.agent_mask.all(1)
+    assert seen.any()
+    for index in seen.nonzero().flatten().tolist():
+        entry = data.provenance([index])[0]
+        steps = part.history_mask[index, entry["tracks"].index(3)].sum()
+        assert int(steps) == min(10, (entry["frame"] - 125) // 5 + 1)
+    assert (part.history[~part.history_mask] == 0).all()
+    assert part.finite.all()
+
+
+def test_a_vehicle_on_no_lane_is_counted_and_left_out():
+    of = recording(vehicles=[*FOUR, (11, 90.0, 3, 24.0, None)])  # beside the road
+    _, counts = extract(of, Recipe())
+    assert counts["an agent on no lane"] > 0
+    _, fewer = extract(of, Recipe(agents=5, least_agents=5))
+    assert fewer["scenes"] == 0
+
+
+@pytest.mark.parametrize("smoothing", [None, 1.0])
+@given(st.integers(0, 10_000))
+@settings(max_examples=10, deadline=None)
+def test_what_a_network_sees_does_not_know_the_future(smoothing, seed):
+    recipe = Recipe(radius=None, lane_change=False, smoothing=smoothing)
+    of, frame = recording(vehicles=crowd(seed, 6)), 100
+    random = np.random.default_rng(seed)
+    later = of.tracks.frame > frame
+    position = of.tracks.position + np.where(later, random.normal(size=len(later)), 0.0)[:, None]
+    heading = of.tracks.heading + np.where(later, 0.3, 0.0)
+    velocity = of.tracks.velocity * np.where(later, 1.2, 1.0)[:, None]
+    other = dataclasses.replace(
+        of, tracks=dataclasses.replace(of.tracks, position=position, heading=heading, velocity=velocity)
+    )
+    now, then = scenes_of(of, recipe), scenes_of(other, recipe)
+    at = [
+        [i for i, entry in enumerate(data.provenance(range(len(data)))) if entry["frame"] == frame]
+        for _, data in (now, then)
+    ]
+    assert at[0]
+    here, there = now[0][at[0]], then[0][at[1]]
+    for name in ("history", "goal_candidates", "references", "reference_speed", "lanes", "frame", "size"):
+        # A recording's origin is the mean of all its positions, which moves what is rounded.
+        torch.testing.assert_close(getattr(here, name), getattr(there, name), rtol=0, atol=1e-4, msg=name)
+    assert (here.future - there.future).abs().max() > 0.1
+
+
+def test_a_map_of_another_place_is_refused():
+    of = recording()
+    with pytest.raises(RecordingError, match="road: 100% of all positions lie on no lane"):
+        extract(dataclasses.replace(of, lanes=recording(curve(None, 0.0, (0.0, 500.0))).lanes), Recipe())
+
+
+def test_joined_scenes_are_the_same_scenes():
+    one, two = (recording(curve(900.0, turn), name=f"{turn}") for turn in (0.0, 1.0))
+    parts = [extract(of, Recipe())[0] for of in (one, two)]
+    both = RecordedScenes(tables(joined(parts)), 0.2, "fixed", [one.name, two.name])
+    first, second = (RecordedScenes(tables(part), 0.2, "fixed", ["?"]) for part in parts)
+    assert len(both) == len(first) + len(second)
+    index = torch.arange(len(second))
+    ours, theirs = both[index + len(first)], second[index]
+    for field in dataclasses.fields(ours):
+        if isinstance(getattr(ours, field.name), torch.Tensor) and field.name != "id":
+            assert torch.equal(getattr(ours, field.name), getattr(theirs, field.name)), field.name
+    assert both.provenance([len(first)])[0]["recording"] == "1.0"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("agents", 33, "agents must be 32 or less"),
+        ("horizon", 1, "horizon must be 2 or more"),
+        ("smoothing", 1e9, "smoothing must be 10 s or less"),
+        ("history", 1, "data.windows.history must be 2 or more"),
+        ("agents", 0, "data.windows.agents must be 1"),
+        ("least_agents", 5, "lets in"),
+        ("radius", -1.0, "positive, or null"),
+        ("dt", 0.0, "data.windows.dt must be positive"),
+    ],
+)
+def test_recipes_that_cannot_work_are_refused(key, value, message):
+    with pytest.raises(ConfigError, match=message):
+        Recipe(**{key: value})

@@ -1,0 +1,344 @@
+"""Sweeps: every run once, whatever happens in between; failures seen; nothing lost, nothing done twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from experiment.conftest import TINY, Epo
+
+from epo_lightning.experiment.config.compose import compose, jobs
+from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
+from epo_lightning.experiment.sweeps.watch import names_of, result
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder, write_json
+
+SWEEP = ("sweep", "rpi_main", *TINY, "seed=0,1", "score=test")
+ROWS = ("const_vel", "v_lstm", "v_lstm_sc", "v_lstm_epo")
+SRC = Path(__file__).parents[3]
+
+
+def the_sweep(runs: str = "runs") -> Sweep:
+    (record,) = Path(runs).glob("sweeps/*/sweep.json")
+    return Sweep(record.parent.absolute())
+
+
+def marks(sweep: Sweep) -> dict[str, tuple[float, float]]:
+    """When each run's last checkpoint and scores were written."""
+    return {
+        str(job.run.path): (
+            job.run.checkpoint("last").stat().st_mtime_ns,
+            job.run.metrics_file().stat().st_mtime_ns,
+        )
+        for job in sweep.jobs
+    }
+
+
+def test_a_sweep_trains_and_scores_every_run_once(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo(*SWEEP) == 0
+    sweep = the_sweep()
+    assert len(sweep.jobs) == 8
+    assert {sweep.state(job) for job in sweep.jobs} == {"done"}
+    assert {job.run.path.parent.name for job in sweep.jobs} == set(ROWS)
+    assert all(job.identity == job.run.record["identity"] for job in sweep.jobs)
+    out = capsys.readouterr().out
+    assert "8 runs: 8 done" in out
+    assert "[8/8]" in out
+    before = marks(sweep)
+    assert epo(*SWEEP) == 0
+    assert marks(sweep) == before, "a finished run was run again"
+    # What is missing, and only that, is done.
+    first, second = sweep.jobs[2].run, sweep.jobs[3].run
+    first.metrics_file().unlink()
+    second.update(status="training")
+    second.metrics_file().unlink()
+    assert [sweep.state(job) for job in sweep.jobs].count("interrupted") == 2
+    capsys.readouterr()
+    assert epo("sweep", "status", "rpi_main") == 0
+    assert "6 done, 2 interrupted" in capsys.readouterr().out
+    assert epo(*SWEEP) == 0
+    assert {sweep.state(job) for job in sweep.jobs} == {"done"}
+    assert {path for path, mark in marks(sweep).items() if mark != before[path]} == {str(first.path), str(second.path)}
+
+
+def test_a_failed_run_is_said_and_does_not_stop_the_others(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    words = (*SWEEP, "optimizer.lr=1e25")
+    assert epo(*words) == 1
+    sweep = the_sweep()
+    states = [sweep.state(job) for job in sweep.jobs]
+    assert states.count("failed") == 6
+    assert states.count("done") == 2, "constant velocity learns nothing, so nothing can go wrong"
+    captured = capsys.readouterr()
+    assert captured.out.count("FAILED") == 6
+    assert "without a single finite validation score" in captured.out
+    assert "Traceback" not in captured.out + captured.err
+    failures = sorted((sweep.folder / "failures").iterdir())
+    assert len(failures) == 6
+    assert "Traceback" in failures[0].read_text()
+    assert all(job.run.record["status"] == "failed" for job in sweep.jobs if sweep.state(job) == "failed")
+
+
+def test_a_sweep_stops_at_a_failure_if_asked_to(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo(*SWEEP, "optimizer.lr=1e25", "--stop-on-failure") == 1
+    assert "2 done, 1 failed, 5 waiting" in capsys.readouterr().out
+
+
+def test_two_starts_of_a_sweep_do_not_meet(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm") == 0
+    with the_sweep().lock():
+        assert epo("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm") == 2
+    message = capsys.readouterr().err
+    assert "runs already (process" in message
+    assert "epo sweep status" in message
+
+
+def test_two_processes_do_not_train_the_same_run(epo: Epo, refused: Callable[..., str]) -> None:
+    words = ("train", "experiment=rpi/v_lstm", *TINY, "run_dir=run")
+    assert epo(*words) == 0
+    run = RunFolder(Path("run"))
+    run.update(status="training")
+    assert run.state == "interrupted"
+    with run.lock():
+        assert run.state == "running"
+        assert "another process" in refused("train", "resume=run")
+    assert run.state == "interrupted"
+
+
+def test_what_was_killed_before_it_had_begun_begins_again(epo: Epo) -> None:
+    words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm")
+    assert epo(*words) == 0
+    (job,) = the_sweep().jobs
+    for path in sorted(job.run.path.rglob("*"), reverse=True):
+        if path.name != "config.yaml":
+            path.rmdir() if path.is_dir() else path.unlink()
+    (job.run.path / ".run.json-abc").touch()
+    assert the_sweep().state(job) == "waiting"
+    assert epo(*words) == 0
+    assert the_sweep().state(job) == "done"
+
+
+def test_one_damaged_run_does_not_hide_the_others(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/v_lstm,rpi/const_vel") == 0
+    the_sweep().jobs[0].run.record_file.write_text("{")
+    capsys.readouterr()
+    assert epo("sweep", "status", "rpi_main") == 0
+    out = capsys.readouterr().out
+    assert "1 done, 1 failed" in out
+    assert "is not JSON" in " ".join(out.split())
+
+
+@pytest.mark.parametrize("place", ["a,b", "x(1)", "it's", "über", "a=b", "[z]", "{k}", "#5", "~t", 'q"q', "s p", "a:b"])
+def test_folders_may_be_called_anything(epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
+    (tmp_path / place).mkdir()
+    monkeypatch.chdir(tmp_path / place)
+    assert epo("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/const_vel") == 0
+    assert list((tmp_path / place).glob("runs/rpi/const_vel/*/run.json"))
+
+
+def test_times_on_other_threads_are_other_times(epo: Epo) -> None:
+    words = ("sweep", "rpi_main", "data=drawn", "budget=untrained", "seed=0", "experiment=rpi/v_lstm", "score=time")
+    for threads in (1, 2):
+        assert epo(*words, f"trainer.threads={threads}") == 0
+        (job,) = the_sweep().jobs
+        assert json.loads(job.run.metrics_file("time").read_text())["threads"] == threads
+    assert json.loads((job.run.path / "runtime-cpu-1.json").read_text())["threads"] == 1, "nothing is lost"
+
+
+def test_a_run_is_done_when_all_is_measured(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("sweep", "rpi_main", "data=drawn", "data.scenes=32", "budget=untrained", "seed=0", "experiment=rpi/v_lstm")
+    assert epo(*words, "score=test") == 0
+    (job,) = the_sweep().jobs
+    folder, scores = job.run.path, job.run.metrics_file().stat().st_mtime_ns
+    assert epo(*words, "score=[time,test]") == 0
+    sweep = Sweep.find("rpi_main", (*words[2:], "score=[time,test]"), "runs")
+    (job,) = sweep.jobs
+    assert job.measures == ("test", "time")
+    assert job.run.path == folder, "what is measured makes it another run"
+    assert sweep.state(job) == "done"
+    assert job.run.metrics_file().stat().st_mtime_ns == scores, "it was scored again"
+    capsys.readouterr()
+    for which in job.measures:
+        job.run.metrics_file(which).rename(folder / "aside")
+        assert sweep.state(job) == "interrupted"
+        (folder / "aside").rename(job.run.metrics_file(which))
+    assert re.fullmatch(r"val/minSADE \d+\.\d{4}, \d+ s, \d+\.\d ms per forecast", result(job))
+    assert epo(*words, "score=[time,test]", "trainer.threads=2") == 0
+    assert (folder / "runtime-cpu-1.json").is_file(), "another time that was measured as well"
+
+
+def test_records_of_older_versions_are_read(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path / "runs" / "sweeps" / "old")
+    job = {"overrides": [], "folder": "a", "identity": "0", "title": "a", "seed": 0}
+    jobs = [{**job, "score": score} for score in ("test", None, "time")]
+    write_json(sweep.folder / "sweep.json", {"name": "old", "jobs": jobs})
+    assert [job.measures for job in sweep.jobs] == [("test",), (), ("time",)]
+
+
+def test_runs_of_one_title_and_seed_are_told_apart(tmp_path: Path) -> None:
+    places = ("rpi/a/paper-s0", "rpi/b/paper-s0", "rpi/c/short-s0")
+    jobs = [Job((), RunFolder(tmp_path / place), "0", "EPO", 0, ()) for place in places]
+    names = names_of([*jobs, Job((), RunFolder(tmp_path / "d"), "0", "EPO", 1, ())])
+    assert list(names.values()) == [
+        *("EPO, seed 0 (a/paper-s0)", "EPO, seed 0 (b/paper-s0)", "EPO, seed 0 (short-s0)", "EPO, seed 1"),
+    ]
+
+
+def test_damaged_runs_are_named_before_anything_runs(epo: Epo, refused: Callable[..., str]) -> None:
+    words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm")
+    assert epo(*words) == 0
+    (job,) = the_sweep().jobs
+    record = job.run.record_file.read_text()
+    job.run.record_file.write_text(record[:40])
+    assert "run.json is not JSON" in refused(*words)
+    job.run.record_file.write_text(record)
+    config = job.run.config_file.read_text()
+    job.run.config_file.write_text(config.replace("lr: 0.001", "lr: 0.5"))
+    assert "optimizer.lr: 0.5 there, 0.001 here" in refused(*words)
+    job.run.config_file.write_text(config)
+    job.run.update(data_digest="other")
+    assert "data" in refused(*words)
+
+
+def test_mistakes_in_sweeps_are_refused(refused: Callable[..., str]) -> None:
+    assert "'rpi_main'" in refused("sweep", "rpi_mian")
+    assert "rpi_main" in refused("sweep", "seed=1")
+    assert "'seed'" in refused("sweep", "rpi_main", "sede=1")
+    assert "none has" in refused("sweep", "status", "rpi_main")
+    assert "run_dir" in refused("sweep", "rpi_main", "run_dir=x")
+    assert "epo generate" in refused("sweep", "rpi_main", "data.root=nowhere"), "said once, before any run begins"
+    assert "belongs to epo sweep" in refused("train", "--stop-on-failure")
+
+
+def test_sweeps_are_listed(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo("sweep") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(list((SRC / "sweeps").glob("*.yaml")))
+    assert next(line for line in lines if " rpi_main " in line).endswith("every row with three seeds")
+    assert epo("sweep", "--help") == 0
+    assert "--stop-on-failure" in capsys.readouterr().out
+    assert epo("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/const_vel") == 0
+    capsys.readouterr()
+    assert epo("sweep", "status") == 0
+    assert "1 run: 1 done" in capsys.readouterr().out
+
+
+def test_the_latest_sweep_of_a_name_is_found(tmp_path: Path) -> None:
+    for name, began in (("rpi_main-aaaaaa", "2026-01-01"), ("rpi_main-bbbbbb", "2026-02-01"), ("other", "2026-03-01")):
+        write_json(tmp_path / "sweeps" / name / "sweep.json", {"name": name.partition("-")[0], "began": began})
+    assert Sweep.find("rpi_main", [], tmp_path).label == "rpi_main-bbbbbb"
+    assert Sweep.find("rpi_main-aaaaaa", [], tmp_path).label == "rpi_main-aaaaaa"
+    with pytest.raises(ConfigError, match=r"rpi_main with these overrides.*rpi_main-bbbbbb"):
+        Sweep.find("rpi_main", ["budget=short"], tmp_path)
+    with pytest.raises(ConfigError, match="no sweep rpi_mai has begun"):
+        Sweep.find("rpi_mai", [], tmp_path)
+
+
+def test_labels_say_what_is_run_and_not_where() -> None:
+    assert label("steps", []) == label("steps", ["logger=[wandb]", "hydra/launcher=local", "runs=x"]) == "steps"
+    assert label("steps", ["hydra.sweeper.params.seed=7"]) != "steps"
+    assert label("steps", ["hydra.sweeper.n_trials=7", "hydra.launcher.n_jobs=2"]) == "steps"
+    assert label("steps", ["seed=1"]) == label("steps", ["seed=1", "trainer.threads=2"]) != "steps"
+    assert label("steps", ["a=1", "b=2"]) == label("steps", ["b=2", "a=1"])
+
+
+def test_run_folders_are_named_by_what_they_mean() -> None:
+    def variant(*words: str) -> str:
+        return compose("train", ["experiment=rpi/v_lstm_epo", *words])["variant"]
+
+    assert variant() == variant("solver.steps=2") == variant("seed=7") == variant("budget=short") == ""
+    assert variant("solver.steps=3") == variant("solver.steps=3", "seed=4", "logger=[tensorboard]") != ""
+    assert variant("solver.steps=3") != variant("solver.steps=4")
+    assert variant("trainer.limit_train_batches=1") != variant("trainer.limit_train_batches=1.0") == ""
+    assert variant("optimizer.clip=1") == variant("optimizer.clip=1.0") != ""
+
+
+def test_globs_find_experiments_in_folders() -> None:
+    listed = jobs("train", ["experiment=glob('rpi/*')", "seed=1,2,3"])
+    assert ["experiment=rpi/v_lstm_epo", "seed=2"] in listed
+    assert len(listed) == 3 * len(list((SRC / "conf" / "experiment" / "rpi").glob("*.yaml")))
+
+
+@pytest.mark.skipif(
+    find_spec("hydra_plugins.hydra_optuna_sweeper") is None, reason="the extra `search` is not installed"
+)
+def test_a_search_goes_on_where_it_was(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("sweep", "rpi_search", *TINY, "hydra.sweeper.sampler.n_startup_trials=1")
+    assert epo(*words, "hydra.sweeper.n_trials=2") == 0
+    sweep = the_sweep()
+    before = {str(job.run.path) for job in sweep.jobs}
+    assert len(before) == 2
+    interrupted = sweep.jobs[0].run
+    interrupted.update(status="training")
+    assert epo(*words, "hydra.sweeper.n_trials=3") == 0
+    assert interrupted.finished
+    assert len(sweep.jobs) == 3
+    assert before < {str(job.run.path) for job in sweep.jobs}
+    capsys.readouterr()
+    assert epo(*words, "hydra.sweeper.n_trials=3") == 0
+    assert "3 runs: 3 done" in capsys.readouterr().out
+    assert len(sweep.jobs) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", [(), ("hydra/launcher=local", "hydra.launcher.n_jobs=2")])
+@pytest.mark.parametrize(("how", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_a_stopped_sweep_says_so_and_leaves_nobody_behind(
+    tmp_path: Path, launcher: tuple[str, ...], how: signal.Signals, status: int
+) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(SRC)}
+    words = ["data=drawn", "budget=smoke", "trainer.max_epochs=2000", "trainer.limit_train_batches=1", "seed=0,1"]
+    words += ["experiment=rpi/v_lstm_sc", "callbacks.progress=none", *launcher]
+    program = [sys.executable, "-m", "epo_lightning.cli", "sweep", "rpi_main", *words]
+    process = subprocess.Popen(program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("runs/rpi/*/*/checkpoints/last.ckpt")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(how)
+    _, said = process.communicate(timeout=60)  # not before everybody who holds the pipe has ended
+    if not (launcher and how == signal.SIGTERM):  # joblib's parent has no handler of SIGTERM
+        assert process.returncode == status
+    if how == signal.SIGINT:
+        assert "epo: interrupted; the same command goes on" in said
+    assert "Traceback" not in said
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_five_times_ends_as_if_it_had_not_been(tmp_path: Path) -> None:
+    environment = {**os.environ, "EPO_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(SRC)}
+    program = [sys.executable, "-m", "epo_lightning.cli"]
+    data = ["data.games=10", "data.placements=1"]
+    subprocess.run([*program, "generate", *data, "progress=false"], cwd=tmp_path, env=environment, check=True)
+    words = [*program, "sweep", "rpi_main", *data, "budget=smoke", "trainer.max_epochs=12", "score=test"]
+
+    began = time.monotonic()
+    subprocess.run([*words, "runs=whole"], cwd=tmp_path, env=environment, check=True)
+    lasted = time.monotonic() - began
+
+    rng = random.Random(0)
+    finished: dict[str, int] = {}
+    for _ in range(5):
+        process = subprocess.Popen([*words, "runs=parts"], cwd=tmp_path, env=environment)
+        time.sleep(rng.uniform(0.3, 0.9) * lasted)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        for path in (tmp_path / "parts").glob("rpi/*/*/metrics.json"):
+            finished.setdefault(str(path), path.stat().st_mtime_ns)
+    subprocess.run([*words, "runs=parts"], cwd=tmp_path, env=environment, check=True)
+
+    whole = {path.relative_to(tmp_path / "whole"): path for path in (tmp_path / "whole").glob("rpi/*/*/metrics.json")}
+    assert len(whole) == 12
+    for name, path in whole.items():
+        assert (tmp_path / "parts" / name).read_bytes() == path.read_bytes(), name
+    assert finished, "no kill came late enough to find a finished run"
+    assert all(Path(path).stat().st_mtime_ns == mark for path, mark in finished.items()), "a finished run ran again"
+    assert json.loads((tmp_path / "parts").glob("sweeps/*/sweep.json").__next__().read_text())["name"] == "rpi_main"

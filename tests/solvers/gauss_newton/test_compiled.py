@@ -1,0 +1,260 @@
+"""The compiled layer: the suite of all backends, and what only it has: threads, a library that may be missing."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from backends import BackendSuite, gradients
+from games import ALL, BOUNDS, leaves_of, random_game, random_scene
+
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import Status
+from epo_lightning.solvers.gauss_newton import compiled
+from epo_lightning.solvers.gauss_newton.kernel import build
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+
+if isinstance(compiled._find(), str) and shutil.which("c++") is None:
+    pytest.skip("there is no C++ compiler on this machine, so the kernel was not built", allow_module_level=True)
+
+
+class TestCompiled(BackendSuite):
+    solve = staticmethod(compiled.solve)
+
+
+def test_the_kernel_was_built_from_these_sources():
+    assert compiled._library().epo_fingerprint() == build.fingerprint()
+
+
+def test_all_levels_of_instructions_agree():
+    scene, energy = random_scene(9, 3, history=2, size=1.5, dtype=torch.float64), FeatureEnergy(ALL, bounds=BOUNDS)
+    parameters = random_game(scene, modes=3, horizon=9)
+    library = compiled._library()
+    count = library.epo_levels()
+    results = []
+    try:
+        for level in range(count):
+            library.epo_choose(level)
+            leaves = leaves_of(parameters)
+            solution = compiled.solve(energy, scene, leaves, 2, 0.3, torch.full((9, 3), 10.0))
+            solution.states.square().sum().backward()
+            results.append({"controls": solution.controls.detach(), **gradients(leaves)})
+    finally:
+        library.epo_choose(count - 1)
+    assert count > 1 or platform.machine() != "x86_64", "any x86-64 of the last ten years has AVX2"
+    for result in results[:-1]:
+        for name, value in result.items():
+            torch.testing.assert_close(value, results[-1][name], rtol=1e-10, atol=1e-10, msg=name)
+
+
+def test_threads_change_no_bit():
+    scene, energy = random_scene(23, 3, history=2, size=1.0), FeatureEnergy(ALL, bounds=BOUNDS)
+    parameters = random_game(scene, modes=3, horizon=9)
+    results = []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        leaves = leaves_of(parameters)
+        solution = compiled.solve(energy, scene, leaves, 2, 0.3, torch.full((23, 3), 10.0))
+        solution.states.square().sum().backward()
+        results.append((solution, gradients(leaves)))
+    torch.set_num_threads(1)
+    (one, by_one), (three, by_three) = results
+    assert torch.equal(one.controls, three.controls)
+    assert torch.equal(one.energy, three.energy)
+    assert all(torch.equal(by_one[name], by_three[name]) for name in by_one)
+
+
+def test_memory_goes_back_when_a_solution_is_dropped():
+    """Without waiting for the garbage collector: a cycle would keep the factors of every past step."""
+    released = []
+
+    class Watched(compiled._Tape):
+        def __del__(self):
+            released.append(self.address)
+            super().__del__()
+
+    scene, energy = random_scene(3, 2, history=2), FeatureEnergy(["acc", "turnr"])
+    original, compiled._Tape = compiled._Tape, Watched
+    try:
+        for keep in (False, True):
+            leaves = leaves_of(random_game(scene, own=("acc", "turnr")))
+            solution = compiled.solve(energy, scene, leaves, 2, 0.3, torch.full((3, 2), 10.0), keep_iterates=keep)
+            del solution
+    finally:
+        compiled._Tape = original
+    assert len(released) == 2
+
+
+def test_a_reference_line_that_does_not_exist_stops_that_sample():
+    scene, energy = random_scene(3, 2, history=2), FeatureEnergy(["lane", "acc", "turnr"])
+    parameters = random_game(scene)
+    parameters.reference[1, 0, 1] = 99
+    solution = compiled.solve(energy, scene, parameters, 2, 0.3, torch.full((3, 2), 10.0))
+    assert solution.status.tolist() == [[0, 0], [Status.STOPPED, 0], [0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("energy", "agents", "dtype", "reason"),
+    [
+        (FeatureEnergy(["acc"], dynamics=Unicycle("heun")), 2, torch.float32, "integrates by euler, not heun"),
+        (FeatureEnergy(["acc"]), 65, torch.float32, "up to 64 agents, not 65"),
+        (FeatureEnergy(["acc"]), 2, torch.float16, "not torch.float16"),
+    ],
+)
+def test_what_it_cannot_solve_it_says(energy, agents, dtype, reason):
+    scene = random_scene(1, agents, history=2)
+    parameters = random_game(scene, own=("acc",))
+    assert compiled.obstacle(energy, scene, parameters) is None or dtype == torch.float32
+    assert reason in compiled.obstacle(energy, scene, parameters.to(dtype))
+
+
+def test_sixty_four_agents():
+    scene, energy = (
+        random_scene(1, 64, history=2, size=0.7, dtype=torch.float64),
+        FeatureEnergy(["acc", "turnr", "goal"]),
+    )
+    parameters = random_game(scene, modes=1, horizon=3)
+    damping = torch.ones(1, 1, dtype=torch.float64)
+    solution = compiled.solve(energy, scene, parameters, 200, 1.0, damping)
+    assert solution.gradient_norm.item() < 1e-6
+    assert (energy.terms(scene, parameters, parameters.initial_controls)["proximity"] > 0).sum() > 64
+
+
+def test_the_layer_takes_it_where_it_can_and_says_once_where_it_cannot(monkeypatch):
+    scene, energy = random_scene(2, 2, history=2), FeatureEnergy(ALL, bounds=BOUNDS)
+    parameters = random_game(scene)
+    by_default = LevenbergMarquardt()(energy, scene, parameters).controls
+    assert torch.equal(by_default, LevenbergMarquardt(backend="compiled")(energy, scene, parameters).controls)
+    plain = LevenbergMarquardt(backend="pytorch")(energy, scene, parameters).controls
+    assert not torch.equal(by_default, plain), "two ways to the same numbers differ in the last bits"
+    torch.testing.assert_close(by_default, plain, rtol=0, atol=1e-4)
+
+    monkeypatch.setattr(compiled, "_find", lambda: "it was not built")
+    compiled.say_once.cache_clear()
+    with pytest.warns(
+        UserWarning, match="the compiled layer is missing: it was not built.*Plain PyTorch does the same"
+    ):
+        assert torch.equal(LevenbergMarquardt()(energy, scene, parameters).controls, plain)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        LevenbergMarquardt()(energy, scene, parameters)
+    with pytest.raises(ValueError, match=r"solver\.backend is 'compiled', but the compiled layer is missing"):
+        LevenbergMarquardt(backend="compiled")(energy, scene, parameters)
+    with pytest.raises(RuntimeError, match="it was not built"):
+        compiled._library()
+
+
+def test_other_sources_are_noticed(tmp_path, monkeypatch):
+    monkeypatch.setattr(build, "fingerprint", lambda: 1)
+    with pytest.raises(OSError, match="built from other sources"):
+        build.load()
+    (tmp_path / "empty.so").write_bytes(b"")
+    with pytest.raises(OSError, match=r"empty\.so"):
+        build.load(tmp_path / "empty.so")
+
+
+def test_a_machine_without_a_compiler_is_told_so(tmp_path):
+    """What the installation prints, and goes on."""
+    for path in build.HERE.iterdir():
+        if path.suffix in (".py", ".hpp", ".cpp"):
+            shutil.copy(path, tmp_path)
+    found = subprocess.run(
+        [sys.executable, tmp_path / "build.py"],
+        env={"CXX": "no-such-compiler"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 1
+    assert "the compiled layer was not built" in found.stderr
+    assert "no-such-compiler" in found.stderr
+    assert not list(tmp_path.glob("epo_kernel*"))
+
+
+def test_a_scene_that_changed_before_the_backward_pass_is_noticed():
+    for name in ("history", "size", "references", "reference_speed", "agent_mask"):
+        scene, energy = random_scene(3, 2, history=2, size=2.0), FeatureEnergy(ALL, bounds=BOUNDS)
+        solution = compiled.solve(energy, scene, leaves_of(random_game(scene)), 2, 0.3, torch.full((3, 2), 10.0))
+        getattr(scene, name)[0] = getattr(scene, name)[1].clone()
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            solution.controls.sum().backward()
+
+
+_FORK = """
+import os, sys, torch
+sys.path[:0] = {path!r}
+from games import random_game, random_scene
+from epo_lightning import FeatureEnergy, LevenbergMarquardt
+torch.set_num_threads(2)
+scene = random_scene(64, 2, history=2)
+solve, energy = LevenbergMarquardt(backend="compiled"), FeatureEnergy(["acc", "turnr"])
+parameters = random_game(scene, own=("acc", "turnr"))
+expected = solve(energy, scene, parameters).controls
+child = os.fork()
+if child == 0:
+    os._exit(0 if torch.equal(solve(energy, scene, parameters).controls, expected) else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_has_threads_of_its_own():
+    path = [str(Path(__file__).parents[2]), str(Path(__file__).parents[3])]
+    subprocess.run([sys.executable, "-c", _FORK.format(path=path)], check=True, timeout=120)
+
+
+def test_an_interrupted_call_waits_for_its_threads():
+    """They write to memory that the call holds."""
+    done = []
+
+    def body(part):
+        if part == 0:
+            raise KeyboardInterrupt
+        time.sleep(0.2)
+        done.append(part)
+
+    with pytest.raises(KeyboardInterrupt):
+        compiled._in_parallel(body, [0, 1, 2])
+    assert sorted(done) == [1, 2]
+
+
+_SHORT_OF_MEMORY = """
+import resource, sys, torch
+sys.path[:0] = {path!r}
+from games import leaves_of, random_game, random_scene
+from epo_lightning import FeatureEnergy, LevenbergMarquardt
+torch.set_num_threads(1)
+scene, own = random_scene(1, 64, history=2, size=50.0), ("acc", "turnr")
+leaves = leaves_of(random_game(scene, 1, 40, own=own))
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 400 * 2**20,) * 2)
+try:
+    LevenbergMarquardt(6, backend="compiled")(FeatureEnergy(own), scene, leaves)
+except MemoryError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits the memory as Linux does")
+def test_too_little_memory_is_an_exception():
+    """Sixty-four agents that all touch leave 170 MB of factors per step."""
+    path = [str(Path(__file__).parents[2]), str(Path(__file__).parents[3])]
+    program = [sys.executable, "-c", _SHORT_OF_MEMORY.format(path=path)]
+    found = subprocess.run(program, check=True, timeout=120, capture_output=True, text=True)
+    assert "fewer scenes or modes at a time" in found.stdout
+
+
+def test_headings_beyond_reduction_stop_a_sample():
+    scene, energy = random_scene(3, 2, history=2), FeatureEnergy(["acc", "turnr", "goal"])
+    scene.history[1, 0, -1, 2] = 3e9
+    solution = compiled.solve(energy, scene, random_game(scene), 2, 0.3, torch.full((3, 2), 10.0))
+    assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2, [0, 0]]

@@ -1,0 +1,368 @@
+"""Dense derivatives against structured ones and finite differences, and implicit gradients against those of the argmin."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import pytest
+import torch
+from convex_games import convex_energy, convex_game, unaware, widen_convex
+from games import leaves_of, normal_equations, pad, random_game, random_scene, widen
+from torch import nn
+
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.energy import GRADIENT, Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import Status
+from epo_lightning.solvers.backward import Implicit
+from epo_lightning.solvers.gauss_newton import implicit
+from epo_lightning.solvers.general import descent
+from epo_lightning.solvers.general.dense import attach, factorise, gauss_newton, gradient, hessian
+from epo_lightning.solvers.general.newton import Newton
+
+FEATURES = FeatureEnergy(["goal", "vel", "acc", "turnr"], ["proximity"])
+NEWTON = Newton(100, 1e-13)
+
+
+def feature_game(scenes=2, agents=3, modes=2, horizon=5):
+    """Agents that overlap, and a game that has a minimum."""
+    scene = random_scene(scenes, agents, history=2, size=2.0, dtype=torch.float64)
+    scene = dataclasses.replace(scene, dt=0.3)
+    return scene, dataclasses.replace(random_game(scene, modes, horizon, FEATURES.own, spread=0.1), reference=None)
+
+
+class Learned(Energy):
+    """A network's energy: convex in the controls, and with weights that its minimum depends on."""
+
+    offers = frozenset({GRADIENT})
+    own, pair = ("net", "acc"), ("near",)
+    dynamics = Unicycle()
+
+    def __init__(self):
+        self.net = nn.Linear(4, 3).double()
+        self.touch = nn.Linear(2, 1).double()
+
+    def own_terms(self, scene, parameters, states, controls):
+        context = torch.where(scene.agent_mask[..., None], parameters.context, 0.0)[:, None, :, None]
+        features = torch.cat((controls, context.expand(*controls.shape[:-1], 2)), -1)
+        net = nn.functional.softplus(self.net(features)).sum((-1, -2))
+        return {"net": torch.where(scene.agent_mask[:, None], net, 0.0), "acc": 0.5 * controls.square().sum((-1, -2))}
+
+    def pair_terms(self, scene, parameters, first, second):
+        way = (first - second)[..., :2].square().sum(-1, keepdim=True)
+        near = nn.functional.softplus(self.touch(torch.cat((way, (1.0 + way).sqrt()), -1))).sum((-1, -2))
+        return {"near": torch.where(self.pair_mask(scene)[:, None], 0.01 * near, 0.0)}
+
+
+def learned_game():
+    scene, game = feature_game()
+    return scene, dataclasses.replace(game, context=torch.randn(2, 3, 2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize(
+    "own", [["goal", "vel", "acc", "turnr"], ["lane", "velref", "steer", "jerk", "turnacc", "goal"]]
+)
+def test_dense_equals_structured(own, exact):
+    scene = random_scene(2, 3, history=2, size=1.0, dtype=torch.float64)
+    game, energy = random_game(scene, 2, 5), FeatureEnergy(own)
+    if exact and "lane" in own:
+        energy = FeatureEnergy([name for name in own if name != "lane"])  # its nearest point slides
+    slope, matrix = normal_equations(energy, scene, game, game.initial_controls, exact)
+    found = (hessian if exact else gauss_newton)(energy, scene, game, game.initial_controls)
+    torch.testing.assert_close(found, matrix, rtol=1e-10, atol=1e-9)
+    torch.testing.assert_close(gradient(energy, scene, game, game.initial_controls)[1], slope, rtol=1e-10, atol=1e-10)
+
+
+def test_hessians_equal_central_differences_of_gradients():
+    scene, game = learned_game()
+    energy, controls = Learned(), game.initial_controls
+    matrix = hessian(energy, scene, game, controls)
+    for index in (0, 7, 29):
+        shift = torch.zeros_like(controls)
+        shift.flatten(2)[..., index] = 1e-5
+        with torch.no_grad():
+            change = (
+                gradient(energy, scene, game, controls + shift)[1] - gradient(energy, scene, game, controls - shift)[1]
+            ) / 2e-5
+        torch.testing.assert_close(matrix[..., index], change.flatten(2), rtol=0, atol=1e-7)
+
+
+def test_gauss_newton_is_exact_where_residuals_are_linear():
+    scene, game = convex_game()
+    for direction in ("along", "across"):
+        energy = unaware(convex_energy(direction=direction))
+        approximate = gauss_newton(energy, scene, game, game.initial_controls)
+        torch.testing.assert_close(approximate, hessian(energy, scene, game, game.initial_controls), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("function", [hessian, gauss_newton])
+@pytest.mark.parametrize("convex", [True, False])
+def test_matrices_are_differentiable_by_the_game(function, convex):
+    """What a Laplace approximation differentiates: log det H, here against central differences."""
+    scene, game = convex_game() if convex else feature_game()
+    energy = convex_energy() if convex else FEATURES
+    name, kind = ("order", "pair_weights") if convex else ("goal", "own_weights")
+
+    def logdet(weights):
+        changed = dataclasses.replace(game, **{kind: {**getattr(game, kind), name: weights}})
+        matrix = function(energy, scene, changed, game.initial_controls)
+        return torch.logdet(matrix + 50.0 * torch.eye(matrix.shape[-1], dtype=torch.float64)).sum()
+
+    weights = (4.0 * getattr(game, kind)[name]).requires_grad_()
+    (slope,) = torch.autograd.grad(logdet(weights), weights)
+    shift = torch.randn_like(weights)
+    with torch.no_grad():
+        numeric = (logdet(weights + 1e-5 * shift) - logdet(weights - 1e-5 * shift)) / 2e-5
+    assert numeric.abs() > 1e-3
+    torch.testing.assert_close((slope * shift).sum(), numeric, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("function", [hessian, gauss_newton])
+@pytest.mark.parametrize("convex", [True, False])
+def test_absent_agents_have_rows_of_the_identity(function, convex):
+    scene, game = convex_game() if convex else feature_game()
+    energy = convex_energy() if convex else FEATURES
+    matrix = function(energy, scene, game, game.initial_controls)
+    wide = widen_convex(game, 1) if convex else widen(game, 1)
+    padded = function(energy, pad(scene, 1), wide, wide.initial_controls)
+    size = matrix.shape[-1]
+    torch.testing.assert_close(padded[..., :size, :size], matrix, rtol=0, atol=1e-11)
+    assert (padded[..., size:, :size] == 0).all()
+    assert (padded[..., :size, size:] == 0).all()
+    rest = padded[..., size:, size:]
+    assert torch.equal(rest, torch.eye(rest.shape[-1], dtype=torch.float64).expand_as(rest))
+
+
+def test_matrices_without_a_factor_are_found_and_leave_the_others_alone():
+    square = torch.randn(6, 4, 4, dtype=torch.float64)
+    matrix = square @ square.mT + torch.eye(4, dtype=torch.float64)
+    expected = torch.linalg.cholesky(matrix)
+    assert torch.equal(factorise(matrix)[0], expected)
+    matrix[1, 3, 0] = matrix[1, 0, 3] = torch.nan
+    matrix[2, 1, 1] = torch.inf
+    matrix[3, 2, 1] = matrix[3, 1, 2] = -torch.inf
+    matrix[4] -= 50.0 * torch.eye(4, dtype=torch.float64)
+    factor, sound = factorise(matrix)
+    assert sound.tolist() == [True, False, False, False, False, True]
+    assert torch.equal(factor[sound], expected[sound])
+    assert torch.equal(factor[~sound], torch.eye(4, dtype=torch.float64).expand(4, 4, 4))
+
+
+def test_energies_without_residuals_have_no_gauss_newton_matrix():
+    scene, game = learned_game()
+    with pytest.raises(ValueError, match="Learned has no residuals"):
+        gauss_newton(Learned(), scene, game, game.initial_controls)
+
+
+def solved(energy, scene, game, exact=True):
+    """Controls at the minimum, with the gradient of ``dense.attach``."""
+    with torch.no_grad():
+        solution = NEWTON(energy, scene, game)
+    assert solution.gradient_norm.max() < 1e-9
+    controls, status = attach(energy, scene, game, solution.controls, exact)
+    assert torch.equal(controls.detach(), solution.controls)
+    assert (status == Status.SOLVED).all()
+    return controls
+
+
+def differences(energy, scene, game, replace, tensor, cotangent, step=1e-5):
+    """d <cotangent, argmin> / d tensor by central differences along random directions, and these directions."""
+    shifts = torch.randn(3, *tensor.shape, dtype=tensor.dtype)
+    found = []
+    for shift in shifts:
+        ends = [NEWTON(energy, scene, replace(tensor + sign * step * shift)).controls for sign in (1, -1)]
+        found.append(((ends[0] - ends[1]) * cotangent).sum() / (2 * step))
+    return torch.stack(found), shifts
+
+
+CASES = {"convex": (convex_energy, convex_game), "features": (lambda: FEATURES, feature_game)}
+BY = ("own_weights", "pair_weights", "goals")
+
+
+def relative(analytic, numeric):
+    return ((analytic - numeric).norm() / numeric.norm()).item()
+
+
+@pytest.mark.parametrize("by", BY)
+@pytest.mark.parametrize("case", CASES)
+def test_implicit_gradients_equal_central_differences_of_the_argmin(case, by):
+    make, play = CASES[case]
+    energy, (scene, game) = make(), play()
+    game = dataclasses.replace(game, initial_controls=NEWTON(energy, scene, game).controls)
+    name = {"own_weights": "goal", "pair_weights": energy.pair[0], "goals": None}[by]
+    tensor = getattr(game, by) if name is None else getattr(game, by)[name]
+
+    def replace(values):
+        return dataclasses.replace(game, **{by: values if name is None else {**getattr(game, by), name: values}})
+
+    cotangent = torch.randn_like(game.initial_controls)
+    leaf = tensor.clone().requires_grad_()
+    (slope,) = torch.autograd.grad((solved(energy, scene, replace(leaf)) * cotangent).sum(), leaf)
+    numeric, shifts = differences(energy, scene, game, replace, tensor, cotangent)
+    assert relative((slope * shifts).flatten(1).sum(1), numeric) < 1e-6
+    approximate = solved(energy, scene, replace(leaf), exact=False)
+    (slope,) = torch.autograd.grad((approximate * cotangent).sum(), leaf)
+    error = relative((slope * shifts).flatten(1).sum(1), numeric)
+    assert (error < 1e-6) == (case == "convex")
+
+
+def test_networks_learn_through_the_minimum():
+    scene, game = learned_game()
+    energy = Learned()
+    cotangent = torch.randn_like(game.initial_controls)
+    context = game.context.clone().requires_grad_()
+    controls = solved(energy, scene, dataclasses.replace(game, context=context))
+    leaves = [context, energy.net.weight, energy.touch.weight]
+    slopes = torch.autograd.grad((controls * cotangent).sum(), leaves)
+    numeric, shifts = differences(
+        energy, scene, game, lambda z: dataclasses.replace(game, context=z), game.context, cotangent
+    )
+    assert relative((slopes[0] * shifts).flatten(1).sum(1), numeric) < 1e-6
+    for weight, slope in zip(leaves[1:], slopes[1:], strict=True):
+        kept = weight.detach().clone()
+
+        def changed(values, weight=weight):
+            weight.data.copy_(values)
+            return game
+
+        numeric, shifts = differences(energy, scene, game, changed, kept, cotangent)
+        weight.data.copy_(kept)
+        assert relative((slope * shifts).flatten(1).sum(1), numeric) < 1e-6
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_gradients_are_those_of_the_structured_layer(exact):
+    scene, game = feature_game()
+    controls = NEWTON(FEATURES, scene, game).controls
+    cotangent = torch.randn_like(controls)
+    found = []
+    for function in (attach, implicit.attach):
+        leaves = leaves_of(game)
+        (function(FEATURES, scene, leaves, controls, exact)[0] * cotangent).sum().backward()
+        found.append(
+            [*(w.grad for w in leaves.own_weights.values()), leaves.pair_weights["proximity"].grad, leaves.goals.grad]
+        )
+        assert leaves.initial_controls.grad is None or (leaves.initial_controls.grad == 0).all()
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-10)
+
+
+def test_a_common_scale_of_all_weights_has_no_gradient():
+    scene, game = feature_game()
+    leaves = leaves_of(game)
+    (solved(FEATURES, scene, leaves) * torch.randn_like(game.initial_controls)).sum().backward()
+    weights = [*leaves.own_weights.values(), leaves.pair_weights["proximity"]]
+    along = sum((weight * weight.grad).sum(-1) for weight in weights)
+    length = sum((weight * weight.grad).abs().sum(-1) for weight in weights)
+    assert (along.abs() < 1e-9 * length).all()
+    # In the convex game one weight is held, so that the scale of the others is learned.
+    scene, game = convex_game()
+    leaves = leaves_of(game)
+    (solved(convex_energy(), scene, leaves) * torch.randn_like(game.initial_controls)).sum().backward()
+    weights = [leaves.own_weights[name] for name in convex_energy().weighted[0]] + [leaves.pair_weights["order"]]
+    along = sum((weight * weight.grad).sum(-1) for weight in weights)
+    length = sum((weight * weight.grad).abs().sum(-1) for weight in weights)
+    assert (along.abs() > 1e-4 * length).all()
+
+
+def test_what_is_no_minimum_has_no_gradient():
+    scene, game = feature_game(scenes=3)
+    game = dataclasses.replace(game, initial_controls=NEWTON(FEATURES, scene, game).controls)
+    controls = game.initial_controls.clone()
+    broken = game.own_weights["vel"].clone()
+    broken[0, 0] = torch.nan
+    # Held together by nothing but a hinge, which pushes agents apart: a saddle.
+    loose = {name: weight.clone() for name, weight in game.own_weights.items()}
+    for weight in loose.values():
+        weight[1, 1] = 0.0
+    controls[1, 1] = 0.0
+    game = dataclasses.replace(game, own_weights={**loose, "vel": torch.where(broken.isnan(), broken, loose["vel"])})
+    leaves = leaves_of(game)
+    found, status = attach(FEATURES, scene, leaves, controls, True)
+    expected = torch.zeros(3, 2, dtype=torch.long)
+    expected[0, 0] = expected[1, 1] = Status.STOPPED
+    assert torch.equal(status, expected)
+    assert torch.equal(found.detach(), controls)
+    found.square().sum().backward()
+    for slope in (
+        *(w.grad for w in leaves.own_weights.values()),
+        leaves.pair_weights["proximity"].grad,
+        leaves.goals.grad,
+    ):
+        assert slope.isfinite().all()
+        assert (slope[expected == Status.STOPPED] == 0).all()
+        assert (slope[expected == Status.SOLVED] != 0).any()
+
+
+def test_a_scene_of_no_numbers_leaves_networks_alone():
+    scene, game = learned_game()
+    energy = Learned()
+
+    def slopes(scene, game):
+        controls = NEWTON(energy, scene, game).controls
+        found, status = attach(energy, scene, game, controls, True)
+        parameters = [*energy.net.parameters(), *energy.touch.parameters()]
+        return status, torch.autograd.grad(found.square().sum(), parameters)
+
+    _, expected = slopes(scene[1], game[1])
+    history = scene.history.clone()
+    history[0] = torch.nan
+    context = game.context.clone()
+    context[0] = torch.nan
+    status, found = slopes(dataclasses.replace(scene, history=history), dataclasses.replace(game, context=context))
+    assert (status[0] == Status.STOPPED).all()
+    assert (status[1] == Status.SOLVED).all()
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+
+
+def test_padding_and_batches_do_not_change_gradients():
+    scene, game = convex_game(scenes=3)
+    energy, teach = convex_energy(), Implicit()
+
+    def slopes(scene, game, agents=3):
+        leaves = leaves_of(game)
+        solution = teach(NEWTON, energy, scene, leaves)
+        solution.states[:, :, :agents, :, :2].square().sum().backward()
+        return leaves.own_weights["lateral"].grad, leaves.goals.grad
+
+    together = slopes(scene, game)
+    alone = slopes(scene[1], game[1])
+    padded = slopes(pad(scene, 1), widen_convex(game, 1))
+    for whole, one, wide in zip(together, alone, padded, strict=True):
+        torch.testing.assert_close(whole[1:2], one, rtol=1e-11, atol=1e-12)
+        torch.testing.assert_close(wide[:, :, :3], whole, rtol=1e-11, atol=1e-12)
+        assert (wide[:, :, 3:] == 0).all()
+
+
+@pytest.mark.parametrize("kind", ["features", "convex", "gauss_newton"])
+def test_solutions_that_are_no_minima_are_told_of_once(kind, monkeypatch):
+    energy, (scene, game) = (convex_energy(), convex_game()) if kind == "convex" else (FEATURES, feature_game())
+    teach = Implicit("gauss_newton" if kind == "gauss_newton" else "exact")
+    monkeypatch.setattr(descent, "_said", False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        teach(NEWTON, energy, scene, leaves_of(game))
+        with torch.no_grad():
+            teach(Newton(steps=0), energy, scene, game)  # nothing is differentiated
+    far = leaves_of(game)
+    with pytest.warns(UserWarning, match=r"backward=implicit: \d+ % of the solutions .* no minima .*solver.steps"):
+        teach(Newton(steps=0), energy, scene, far)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        teach(Newton(steps=0), energy, scene, far)
+
+
+@pytest.mark.parametrize(
+    ("shares", "told"), [((2e-3, 2e-3, 5e-4), "67 %"), ((2e-3, 5e-4, 5e-4), None), ((0.0, 0.0, 0.0), None)]
+)
+def test_only_most_of_a_batch_makes_a_warning(shares, told, monkeypatch):
+    monkeypatch.setattr(descent, "_said", False)
+    left = torch.tensor(shares, dtype=torch.float64)[:, None]
+    slope, value = (2.0 * left).sqrt()[..., None], torch.ones_like(left)  # with a Hessian of 1
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        descent.say_if_far(value, slope, slope, left.isfinite())
+    assert [told in str(warning.message) for warning in caught] == ([True] if told else [])
