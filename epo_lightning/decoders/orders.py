@@ -11,9 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from epo_lightning.decoders.mlp import MLP
-from epo_lightning.game.convex_energy import ACROSS, ConvexEnergy
-from epo_lightning.game.energy import pairs
-from epo_lightning.scene import Scene
+from epo_lightning.game.pairs import pairs
 
 
 class Orders(nn.Module):
@@ -26,7 +24,8 @@ class Orders(nn.Module):
     Args:
         width: size of the agent features.
         modes: number M of joint modes.
-        symmetric: whether the order is the same for both agents (:attr:`ConvexEnergy.symmetric`).
+        symmetric: whether the order keeps its sign when the two agents swap names
+            (:attr:`~epo_lightning.game.pair_order.PairOrder.symmetric`).
     """
 
     def __init__(self, width: int, modes: int, symmetric: bool = False) -> None:
@@ -44,7 +43,8 @@ class Orders(nn.Module):
         Args:
             z: features of the agents.
             mask: agents that are present.
-            matter: pairs whose order matters (:func:`ordered`); others keep +1, and do not count in the probability.
+            matter: pairs whose order matters (:meth:`~epo_lightning.game.pair_order.PairOrder.matters`); others keep +1, and
+                do not count in the probability.
         """
         first, second = pairs(z.shape[1], z.device)
         z = torch.where(mask[..., None], z, 0.0)
@@ -55,11 +55,6 @@ class Orders(nn.Module):
         order = most_likely(logits, matter, self.modes)
         score = torch.where(matter[:, None], F.logsigmoid(order * logits[:, None]), 0.0).sum(-1)
         return order, score, logits
-
-
-def ordered(energy: ConvexEnergy, scene: Scene, steps: int) -> Bool[Tensor, "B P"]:
-    """Pairs whose order matters: the energy holds both, present, to it at one of the steps 1 .. K at least."""
-    return energy.pair_mask(scene) & energy.near(scene, steps).any(-1)
 
 
 def repeated(modes: Shaped[Tensor, "B M D"]) -> Bool[Tensor, "B M"]:
@@ -94,35 +89,6 @@ def most_likely(logits: Float[Tensor, "B P"], matter: Bool[Tensor, "B P"], modes
     turned = turned.gather(1, rank[..., None].expand_as(turned))
     likeliest = torch.where(matter & (logits < 0), -1.0, 1.0).to(logits.dtype)[:, None]
     return torch.where(turned, -likeliest, likeliest)
-
-
-def observed_order(energy: ConvexEnergy, scene: Scene) -> tuple[Float[Tensor, "B P"], Bool[Tensor, "B P"]]:
-    """The orders that agents took, and of which pairs they are known; others have +1.
-
-    Who goes first (``along``) is who is ahead at the last step at which both were observed: where one overtakes the other,
-    they are closest while side by side, and neither is ahead. On which side they pass (``across``) is seen at the closest
-    such step. Known is the order of pairs that were observed at some step together, if their order matters
-    (:func:`ordered`).
-
-    Raises:
-        ValueError: the scene has no future.
-    """
-    if scene.future is None or scene.future_mask is None:
-        raise ValueError("the observed order is that of scene.future [B, N, K, 4], which is None")
-    first, second = pairs(scene.agent_mask.shape[1], scene.agent_mask.device)
-    observed = scene.future_mask & scene.agent_mask[..., None]
-    together = observed[:, first] & observed[:, second]
-    position = torch.where(observed[..., None], scene.future[..., :2], 0.0)
-    apart = position[:, first] - position[:, second]
-    if energy.direction == ACROSS:
-        decisive = torch.where(together, apart.square().sum(-1), torch.inf).argmin(-1)
-    else:
-        step = torch.arange(together.shape[-1], device=together.device)
-        decisive = torch.where(together, step, -1).argmax(-1)
-    way = apart.gather(2, decisive[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
-    known = together.any(-1) & ordered(energy, scene, together.shape[-1])
-    behind = known & ((energy.directions(scene) * way).sum(-1) < 0)
-    return torch.where(behind, -1.0, 1.0).to(position.dtype), known
 
 
 def order_loss(

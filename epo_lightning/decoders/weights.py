@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from epo_lightning.decoders.mlp import MLP
-from epo_lightning.game.energy import pairs
+from epo_lightning.game.pairs import pairs
 
 
 def _by_name(weights: Float[Tensor, "B R out"], names: Sequence[str], modes: int) -> dict[str, Float[Tensor, "B M R"]]:

@@ -16,13 +16,12 @@ from torch import Tensor
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.goals import NO_CANDIDATE, GoalDecoder, choose, given_goals, most_likely
 from epo_lightning.decoders.motions import Motions
-from epo_lightning.decoders.orders import Orders, ordered, repeated
+from epo_lightning.decoders.orders import Orders, repeated
 from epo_lightning.decoders.probabilities import SceneProbabilities
 from epo_lightning.decoders.strategies import InitialStrategies
 from epo_lightning.decoders.weights import OwnWeights, PairWeights
 from epo_lightning.forecasters.base import Forecaster, Task
 from epo_lightning.forecasters.combination import Combination
-from epo_lightning.game.convex_energy import ConvexEnergy
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
 from epo_lightning.game.features import OWN_FEATURES
@@ -118,10 +117,8 @@ class EPO(Forecaster):
         self.goals = (
             GoalDecoder(width, scale) if task.candidates > 1 and energy.needs & {"goals", "reference"} else None
         )
-        self.orders = None
-        if "order" in energy.needs:
-            assert isinstance(energy, ConvexEnergy)
-            self.orders = Orders(width, games, energy.symmetric)
+        self.pair_order = energy.pair_order
+        self.orders = None if self.pair_order is None else Orders(width, games, self.pair_order.symmetric)
         # Where energies or orders do not say how likely a mode is, the network does.
         says = chooses or self.orders is not None
         self.probabilities = None if says else SceneProbabilities(width, modes, horizon, scale)
@@ -194,10 +191,9 @@ class EPO(Forecaster):
 
     def _orders(self, z: Tensor, scene: Scene) -> tuple[Tensor, Tensor, Tensor] | None:
         """Orders of the pairs that the energy holds to one, with their log-probabilities and logits."""
-        if self.orders is None:
+        if self.orders is None or self.pair_order is None:
             return None
-        assert isinstance(self.energy, ConvexEnergy)
-        return self.orders(z, scene.agent_mask, ordered(self.energy, scene, self.task.horizon))
+        return self.orders(z, scene.agent_mask, self.pair_order.matters(scene, self.task.horizon))
 
     def _probabilities_of(self, orders: tuple[Tensor, Tensor, Tensor], logits: Tensor | None) -> Tensor:
         """How likely the order of every mode is, and that everybody heads where they do in it, [B, M].

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from epo_lightning.game.circles import disc, length_of, row_extent, row_overlap
 from epo_lightning.game.dynamics import Dynamics
-from epo_lightning.game.energy import pairs
 from epo_lightning.game.network_energy import NetworkEnergy, check_hidden
 from epo_lightning.game.networks import MOTION, Layers, motion, squared_distances
+from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import SPEED, GameParameters, Scene
 

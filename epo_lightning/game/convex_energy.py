@@ -22,21 +22,19 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.game.circles import disc
 from epo_lightning.game.double_integrator import DoubleIntegrator, rotate
-from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy, check_names, pairs
+from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy, check_names
+from epo_lightning.game.pair_order import ALONG, DIRECTIONS, PairOrder
+from epo_lightning.game.pairs import pair_mask, pairs
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import HEADING, SPEED, GameParameters, Scene
 
 FLOOR = 1e-3
 """What is added to the squared weight of accelerations across: a curvature in every control, large enough for float32."""
-ALONG, ACROSS = "along", "across"
-DIRECTIONS = (ALONG, ACROSS)
-_STILL = 1e-3
-"""Speed [m/s], distance [m] or length below which a vector has no direction."""
 
 
 @dataclass(frozen=True)
@@ -139,21 +137,16 @@ class ConvexEnergy(Energy):
     ``acc`` and ``lat_acc``, the accelerations along and across [m/s^2]; ``jerk`` and ``lat_jerk``, their rates [m/s^3].
 
     The pair term ``order`` keeps a distance d_ij, half the sum of both lengths and a gap, on one side: s_ij = +1 where agent
-    i is to be ahead of agent j in the direction n_ij, -1 where behind. Only those steps count (a_t) at which both, going on
-    at constant velocity, would be near each other: an order says nothing about agents that are far apart.
-
-    - ``along``: n_ij is the mean heading of both at t0, and the order who goes first (merges). Agents that swap names swap
-      the sign of their order. Where headings oppose each other, n_ij is their common line, towards positive x.
-    - ``across``: n_ij is their relative velocity v_i - v_j at t0, turned to the left, and the order on which side they pass:
-      +1 where each leaves the other on its right. That is the same for both, whoever is called i. Without a relative
-      velocity, n_ij is the line that joins them, turned; without that too, the y axis.
+    i is to be ahead of agent j in the direction n_ij, -1 where behind (:class:`~epo_lightning.game.pair_order.PairOrder`
+    defines n_ij). Only those steps count (a_t) at which both, at constant velocity, would be near each other: an order says
+    nothing about agents that are far apart.
 
     Attributes:
         own: names as above, of which ``acc`` (of weight 1, not decoded) and ``lat_acc`` must be two: they give every control
             a curvature, without which there would be more than one solution.
         pair: ``["order"]``, or nothing.
         gap: distance [m] to be kept besides half the lengths.
-        direction: ``along`` or ``across``.
+        direction: ``along`` or ``across``, the meaning of an order.
         within: distance [m] up to which agents are near each other.
         dynamics: a :class:`~epo_lightning.game.double_integrator.DoubleIntegrator`.
     """
@@ -202,10 +195,10 @@ class ConvexEnergy(Energy):
         """Names of the terms of goals."""
         return {name for name in self.own if _OWN[name][1] == "goals"}
 
-    @property
-    def symmetric(self) -> bool:
-        """Whether an order is the same for both of a pair, whoever comes first, or the opposite."""
-        return self.direction == ACROSS
+    @cached_property
+    def pair_order(self) -> PairOrder | None:
+        """The order that pairs keep; None without the pair term."""
+        return PairOrder(self.direction, self.within) if self.pair else None
 
     def residuals(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
@@ -257,7 +250,8 @@ class ConvexEnergy(Energy):
             count = torch.where(active, self._order_weight(scene, parameters).square()[..., None], 0.0)
             between = (motions.position.mT * count.transpose(1, 2)[..., None, :]) @ motions.position  # [B, P, M, K, K]
             heading = self.initial(scene)[:, 0, :, HEADING]
-            line = self.directions(scene)
+            assert self.pair_order is not None
+            line = self.pair_order.directions(scene)
             ends = [rotate(line, -heading[:, which]) for which in (first, second)]
             signed = torch.nn.functional.one_hot(torch.stack((first, second)), agents).to(controls.dtype)
             sides = signed[0][..., None] * ends[0][:, :, None] - signed[1][..., None] * ends[1][:, :, None]
@@ -328,52 +322,26 @@ class ConvexEnergy(Energy):
 
     def _order_weight(self, scene: Scene, parameters: GameParameters) -> Float[Tensor, "B M P"]:
         """Weights of the order, zero where an agent is absent."""
-        return torch.where(self.pair_mask(scene)[:, None], parameters.pair_weights["order"], 0.0)
+        return torch.where(pair_mask(scene)[:, None], parameters.pair_weights["order"], 0.0)
 
     def _short(
         self, scene: Scene, parameters: GameParameters, first: Tensor, second: Tensor
     ) -> Float[Tensor, "B M P K"]:
         """The hinges: what the distance falls short of [m], zero at steps that do not count and where an agent is absent."""
         assert parameters.order is not None
-        exists = self.pair_mask(scene)[:, None]
+        assert self.pair_order is not None
+        exists = pair_mask(scene)[:, None]
         order = torch.where(exists, parameters.order, 1.0)[..., None]
-        ahead = (self.directions(scene)[:, None, :, None] * (first - second)[..., :2]).sum(-1)
+        ahead = (self.pair_order.directions(scene)[:, None, :, None] * (first - second)[..., :2]).sum(-1)
         short = torch.relu(self.distance(scene)[:, None, :, None] - order * ahead)
-        counts = (self.near(scene, first.shape[3]) & exists[:, 0, :, None])[:, None]
+        counts = (self.pair_order.near(scene, first.shape[3]) & exists[:, 0, :, None])[:, None]
         return torch.where(counts, short, 0.0)
-
-    def directions(self, scene: Scene) -> Float[Tensor, "B P 2"]:
-        """The unit vectors n_ij, in which i is ahead of j for an order of +1. Constants of the scene."""
-        initial = self.initial(scene)[:, 0]
-        first, second = pairs(initial.shape[1], initial.device)
-        axis = torch.stack((initial[..., HEADING].cos(), initial[..., HEADING].sin()), -1)
-        if self.direction == ALONG:
-            line = axis[:, first]
-            # Towards positive x, or positive y for what is upright: the same for both, whoever comes first.
-            upright = line[..., 0].abs() < _STILL
-            towards = torch.where(upright, line[..., 1], line[..., 0])
-            line = torch.where((towards < 0)[..., None], -line, line)
-            return _direction(axis[:, first] + axis[:, second], line)
-        velocity = initial[..., SPEED, None] * axis
-        joining = initial[:, first, :2] - initial[:, second, :2]
-        upwards = torch.stack((torch.ones_like(joining[..., 0]), torch.zeros_like(joining[..., 0])), -1)
-        towards = _direction(velocity[:, first] - velocity[:, second], _direction(joining, upwards))
-        return torch.stack((-towards[..., 1], towards[..., 0]), -1)
 
     def distance(self, scene: Scene) -> Float[Tensor, "B P"]:
         """d_ij, what is to be kept: half of both lengths, as discs have them, and the gap."""
         radius = disc(self.size(scene))
         first, second = pairs(radius.shape[1], radius.device)
         return radius[:, first] + radius[:, second] + self.gap
-
-    def near(self, scene: Scene, steps: int) -> Bool[Tensor, "B P K"]:
-        """a_t, the steps 1 .. K at which both would be near each other at constant velocity."""
-        initial = self.initial(scene)[:, 0]
-        first, second = pairs(initial.shape[1], initial.device)
-        axis = torch.stack((initial[..., HEADING].cos(), initial[..., HEADING].sin()), -1)
-        time = scene.dt * torch.arange(1, steps + 1, dtype=initial.dtype, device=initial.device)
-        position = initial[..., None, :2] + time[:, None] * (initial[..., SPEED, None] * axis)[..., None, :]
-        return (position[:, first] - position[:, second]).square().sum(-1) <= self.within**2
 
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
         """Refuse tensors that do not fit together, naming the one that does not and the shape it should have.
@@ -408,9 +376,3 @@ class ConvexEnergy(Energy):
             raise ValueError("the energy has the term 'velref', but scene.reference_speed [B, N] is None")
         if self.pair and scene.size is None:
             raise ValueError("orders keep distances, for which scene.size [B, N, 2] is needed, which is None")
-
-
-def _direction(vector: Float[Tensor, "*batch 2"], otherwise: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
-    """The unit vector, or that of another one where it vanishes."""
-    length = vector.norm(dim=-1, keepdim=True)
-    return torch.where(length > _STILL, vector / length.clamp_min(_STILL), otherwise)

@@ -14,10 +14,12 @@ from collections.abc import Iterable, Sequence
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.game.dynamics import Dynamics
+from epo_lightning.game.pair_order import PairOrder
+from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import GameParameters, Scene
 
@@ -27,12 +29,6 @@ named features whose structure a solver knows."""
 
 _TABLE_ENTRIES = 2_000_000
 """Steps of pairs of candidates that are looked at together: a bound on memory."""
-
-
-def pairs(agents: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
-    """First and second agents i < j of all P pairs, in the order of every pairwise tensor."""
-    first, second = torch.triu_indices(agents, agents, 1, device=device)
-    return first, second
 
 
 def check_names(kind: str, names: Sequence[str], known: Iterable[str], what: str) -> None:
@@ -78,6 +74,11 @@ class Energy(ABC):
     def heading(self) -> set[str]:
         """Names of the own terms that say where an agent is heading."""
         return set()
+
+    @property
+    def pair_order(self) -> PairOrder | None:
+        """The order of pairs that the energy takes as given in ``parameters.order``; None for energies without orders."""
+        return None
 
     @abstractmethod
     def own_terms(
@@ -175,11 +176,6 @@ class Energy(ABC):
     def initial(self, scene: Scene) -> Float[Tensor, "B 1 N 4"]:
         """The states x_0, zero for absent agents."""
         return torch.where(scene.agent_mask[..., None], scene.current, 0.0)[:, None]
-
-    def pair_mask(self, scene: Scene) -> Bool[Tensor, "B P"]:
-        """Pairs of which both agents exist."""
-        first, second = pairs(scene.agent_mask.shape[1], scene.agent_mask.device)
-        return scene.agent_mask[:, first] & scene.agent_mask[:, second]
 
     def size(self, scene: Scene) -> Float[Tensor, "B N 2"]:
         """The agents' lengths and widths, zero for absent agents.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from epo_lightning.game.circles import disc, overlap, separation
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, check_names, pairs
+from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, check_names
 from epo_lightning.game.features import (
     OWN_FEATURES,
     PAIR_FEATURES,
@@ -27,6 +27,7 @@ from epo_lightning.game.features import (
     slope,
     violation,
 )
+from epo_lightning.game.pairs import pair_mask, pairs
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene
 
@@ -202,7 +203,7 @@ class FeatureEnergy(Energy):
             else:
                 value, steepness = self.pair_shape(pair, distance, self.reach(scene)[:, None, :, None])
                 change = steepness * closing
-            exists = self.pair_mask(scene)[:, None, :, None]
+            exists = pair_mask(scene)[:, None, :, None]
             weight = self.pair_weight(scene, parameters, name)[..., None]
             yield name, weight * torch.where(exists, value, 0.0), weight * torch.where(exists, change, 0.0)
 
@@ -341,7 +342,7 @@ class FeatureEnergy(Energy):
 
     def pair_weight(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B M P"]:
         """Weights of a pair feature, zero for pairs with an absent agent."""
-        return torch.where(self.pair_mask(scene)[:, None], parameters.pair_weights[name], 0.0)
+        return torch.where(pair_mask(scene)[:, None], parameters.pair_weights[name], 0.0)
 
     def extent(self, scene: Scene) -> Float[Tensor, "B N"] | None:
         """How far from their positions agents can be felt by others; None where a pair feature knows no limit."""

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import GameParameters, Scene
 
@@ -125,7 +126,7 @@ class NetworkEnergy(nn.Module, Energy):
     ) -> dict[str, Float[Tensor, "B C P"]]:
         terms = self.features.pair_terms(scene, parameters, first, second) if self.features else {}
         value = self.network_pair(scene, parameters, first, second)
-        return {**terms, self.pair_term: torch.where(self.pair_mask(scene)[:, None], value, 0.0)}
+        return {**terms, self.pair_term: torch.where(pair_mask(scene)[:, None], value, 0.0)}
 
     def tables(
         self, scene: Scene, parameters: GameParameters, candidates: Float[Tensor, "B C N K 2"]
@@ -136,7 +137,7 @@ class NetworkEnergy(nn.Module, Energy):
         states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
         unary, pair = self.network_tables(scene, parameters, states)
         unary = torch.where(scene.agent_mask[..., None], unary.transpose(1, 2), 0.0)
-        pair = torch.where(self.pair_mask(scene)[..., None, None], pair, 0.0)
+        pair = torch.where(pair_mask(scene)[..., None, None], pair, 0.0)
         if self.features is None:
             return unary, pair
         more, more_pair = self.features.tables(scene, parameters, candidates)

@@ -9,9 +9,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from epo_lightning.game.dynamics import Dynamics
-from epo_lightning.game.energy import GRADIENT, pairs
+from epo_lightning.game.energy import GRADIENT
 from epo_lightning.game.network_energy import NetworkEnergy, check_hidden
 from epo_lightning.game.networks import ENCOUNTER, MOTION, Layers, encounter, motion
+from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import register
 from epo_lightning.scene import GameParameters, Scene
 

@@ -6,8 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 
 from epo_lightning import losses
-from epo_lightning.decoders.orders import observed_order, order_loss
-from epo_lightning.game.convex_energy import ConvexEnergy
+from epo_lightning.decoders.orders import order_loss
 from epo_lightning.game.energy import Energy
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term, imitation_terms
@@ -46,9 +45,8 @@ class Imitation(Objective):
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
         relaxation = self.relaxation.at(step)
         terms = imitation_terms(scene, forecast, self.weights, relaxation, self.power)
-        if forecast.order_logits is not None:
-            assert isinstance(energy, ConvexEnergy)
-            entropy = order_loss(forecast.order_logits, *observed_order(energy, scene))
+        if forecast.order_logits is not None and energy.pair_order is not None:
+            entropy = order_loss(forecast.order_logits, *energy.pair_order.observed(scene))
             terms["probability"] = (self.weights["probability"], entropy)
         starts = forecast.initial_states
         if starts is not None and starts.requires_grad:

@@ -26,9 +26,10 @@ from torch.autograd.function import once_differentiable
 
 from epo_lightning import losses
 from epo_lightning.game.circles import separation
-from epo_lightning.game.energy import RESIDUALS, Energy, pairs
+from epo_lightning.game.energy import RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy, along
 from epo_lightning.game.features import Source, foot, signal, signal_change
+from epo_lightning.game.pairs import pair_mask, pairs
 from epo_lightning.game.selection import evaluated
 from epo_lightning.game.tracking import demonstrated, observed_controls
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
@@ -341,7 +342,7 @@ def _of_pairs(
     ends = torch.cat((first, second))
     both = [energy.at_pair_steps(states[:, :, members]) for members in (first, second)]
     distance, normal = separation(both[0][..., :2], both[1][..., :2])
-    exists = energy.pair_mask(scene)[:, None, :, None]
+    exists = pair_mask(scene)[:, None, :, None]
     rows, changes = [distance[..., :0]], [moved.new_zeros(*moved.shape[:3], len(ends), 0)]
     for name, pair in energy.pair_features.items():
         weight = energy.pair_weight(scene, parameters, name)[..., None]

@@ -11,7 +11,7 @@ from games import pad, random_scene, reordered
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from epo_lightning.decoders.orders import Orders, most_likely, observed_order, order_loss, ordered, repeated
+from epo_lightning.decoders.orders import Orders, most_likely, order_loss, repeated
 from epo_lightning.game.convex_energy import ConvexEnergy
 from epo_lightning.scene import Scene
 
@@ -144,35 +144,35 @@ def test_who_goes_first_is_who_is_ahead_in_the_end():
     energy = ConvexEnergy(["acc", "lat_acc"], direction="along")
     # The second one overtakes: behind at first, and in the end too where only then both are seen.
     scene = crossing([[(1.0, 0.0), (2.0, 0.0), (3.0, 0.0)], [(0.5, 3.0), (1.9, 1.0), (6.0, 1.0)]])
-    order, known = observed_order(energy, scene)
+    order, known = energy.pair_order.observed(scene)
     assert order.tolist() == [[-1.0]]
     assert known.all()
     unseen = dataclasses.replace(scene, future_mask=torch.tensor([[[True, True, True], [True, True, False]]]))
-    assert observed_order(energy, unseen)[0].tolist() == [[1.0]]
+    assert energy.pair_order.observed(unseen)[0].tolist() == [[1.0]]
     apart = dataclasses.replace(scene, future_mask=torch.tensor([[[True, False, False], [False, True, True]]]))
-    assert not observed_order(energy, apart)[1].any()
+    assert not energy.pair_order.observed(apart)[1].any()
     with pytest.raises(ValueError, match=r"scene\.future"):
-        observed_order(energy, dataclasses.replace(scene, future=None, future_mask=None))
+        energy.pair_order.observed(dataclasses.replace(scene, future=None, future_mask=None))
 
 
 @pytest.mark.parametrize("slip", [-0.2, 0.2])
 def test_overtaking_is_no_matter_of_who_is_ahead_while_side_by_side(slip):
     energy = ConvexEnergy(["acc", "lat_acc"], direction="along")
     scene = crossing([[(1.0, 0.0), (2.0, 0.0), (3.0, 0.0)], [(-3.0, 3.0), (2.0 + slip, 3.0), (8.0, 3.0)]])
-    assert observed_order(energy, scene)[0].tolist() == [[-1.0]]
+    assert energy.pair_order.observed(scene)[0].tolist() == [[-1.0]]
 
 
 def test_pairs_that_are_never_near_have_no_order():
     scene = crossing([[(1.0, 0.0), (2.0, 0.0)], [(1.0, 3.0), (2.0, 3.0)]])
     for within, matters in ((2.9, False), (3.1, True)):
         energy = ConvexEnergy(["acc", "lat_acc"], within=within)
-        assert ordered(energy, scene, 2).tolist() == [[matters]]
-        order, known = observed_order(energy, scene)
+        assert energy.pair_order.matters(scene, 2).tolist() == [[matters]]
+        order, known = energy.pair_order.observed(scene)
         assert known.tolist() == [[matters]]
         assert order_loss(torch.full_like(order, 2.0), order, known).item() == pytest.approx(
             matters * 0.126928, abs=1e-6
         )
-        padded = ordered(energy, pad(scene, 1), 2)
+        padded = energy.pair_order.matters(pad(scene, 1), 2)
         assert padded.tolist() == [[matters, False, False]]
 
 
@@ -180,29 +180,29 @@ def test_on_which_side_they_pass():
     energy = ConvexEnergy(["acc", "lat_acc"], direction="across")
     # Oncoming along x; the first keeps left of the second as it drives, which thus is on its right.
     scene = crossing([[(1.0, 0.5), (2.0, 0.5)], [(3.0, -0.5), (2.0, -0.5)]], headings=(0.0, torch.pi))
-    assert observed_order(energy, scene)[0].tolist() == [[1.0]]
-    assert observed_order(energy, reordered(scene, [1, 0]))[0].tolist() == [[1.0]]
+    assert energy.pair_order.observed(scene)[0].tolist() == [[1.0]]
+    assert energy.pair_order.observed(reordered(scene, [1, 0]))[0].tolist() == [[1.0]]
     mirrored = crossing([[(1.0, -0.5), (2.0, -0.5)], [(3.0, 0.5), (2.0, 0.5)]], headings=(0.0, torch.pi))
-    assert observed_order(energy, mirrored)[0].tolist() == [[-1.0]]
+    assert energy.pair_order.observed(mirrored)[0].tolist() == [[-1.0]]
     # What counts is where they are closest: later the first one is on the other side.
     later = crossing(
         [[(1.0, 0.5), (2.0, 0.5), (9.0, -5.0)], [(3.0, -0.5), (2.0, -0.5), (-9.0, 5.0)]], headings=(0.0, torch.pi)
     )
-    assert observed_order(energy, later)[0].tolist() == [[1.0]]
+    assert energy.pair_order.observed(later)[0].tolist() == [[1.0]]
 
 
 @pytest.mark.parametrize("direction", ["along", "across"])
 def test_observed_orders_of_padded_and_renamed_agents(direction):
     energy = ConvexEnergy(["acc", "lat_acc"], direction=direction)
     scene = random_scene(4, 3, horizon=5, history=2, dtype=torch.float64)
-    order, known = observed_order(energy, scene)
-    padded, unknown = observed_order(energy, pad(scene, 1))
+    order, known = energy.pair_order.observed(scene)
+    padded, unknown = energy.pair_order.observed(pad(scene, 1))
     _, second = torch.triu_indices(4, 4, 1)
     assert torch.equal(padded[:, second < 3], order)
     assert torch.equal(unknown[:, second < 3], known)
     assert not unknown[:, second == 3].any()
-    swapped, _ = observed_order(energy, reordered(scene, [2, 1, 0]))
-    sign = 1.0 if energy.symmetric else -1.0
+    swapped, _ = energy.pair_order.observed(reordered(scene, [2, 1, 0]))
+    sign = 1.0 if energy.pair_order.symmetric else -1.0
     assert torch.equal(swapped, sign * order[:, [2, 1, 0]])
     assert order.min() < order.max()
 

@@ -46,7 +46,7 @@ def test_modes_of_orders_and_goals_are_as_likely_as_both(agents):
     forecaster = tgl(5)
     forecast = forecaster(scene)
     assert isinstance(forecaster.energy, ConvexEnergy)
-    matter = forecaster.energy.pair_mask(scene) & forecaster.energy.near(scene, 8).any(-1)
+    matter = forecaster.energy.pair_order.matters(scene, 8)
     order, goals = forecast.parameters.order, forecast.parameters.goals
     assert (forecast.order_logits[~matter] == 0).all()
     assert (order.mT[~matter] == 1).all()

@@ -20,8 +20,9 @@ from scipy.optimize import minimize
 
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.game.convex_energy import FLOOR
-from epo_lightning.game.energy import Energy, pairs
+from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import build
 from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scene, Solution
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium

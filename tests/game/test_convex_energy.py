@@ -91,7 +91,7 @@ def test_energy_equals_loops_over_agents_and_steps(direction):
     values = energy(scene, game, game.initial_controls)
     expected = [[by_loops(energy, scene, game, b, m) for m in range(2)] for b in range(2)]
     torch.testing.assert_close(values, torch.tensor(expected, dtype=torch.float64), rtol=1e-12, atol=0)
-    near = energy.near(scene, 6)
+    near = energy.pair_order.near(scene, 6)
     assert near.any()
     assert not near.all()
     residuals = energy.residuals(scene, game, game.initial_controls)
@@ -132,7 +132,7 @@ def test_names_of_agents_and_the_frame_do_not_matter(direction):
         game,
         own_weights={name: weight[..., names] for name, weight in game.own_weights.items()},
         pair_weights={name: weight[..., names] for name, weight in game.pair_weights.items()},  # (1, 2), (0, 2), (0, 1)
-        order=(1.0 if energy.symmetric else -1.0) * game.order[..., names],
+        order=(1.0 if energy.pair_order.symmetric else -1.0) * game.order[..., names],
         goals=game.goals[:, :, names],
         initial_controls=game.initial_controls[:, :, names],
     )
@@ -223,7 +223,7 @@ def test_directions_where_the_first_choice_vanishes():
     along, across = (convex_energy(["acc", "lat_acc"], direction) for direction in DIRECTIONS)
 
     def direction(energy, *states):
-        return energy.directions(still(states))[0, 0].tolist()
+        return energy.pair_order.directions(still(states))[0, 0].tolist()
 
     # Oncoming: their line, the same for both.
     assert direction(along, (0, 0, 0, 1), (9, 0, math.pi, 1)) == pytest.approx([1, 0])

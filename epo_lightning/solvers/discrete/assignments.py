@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from epo_lightning.game.energy import pairs
+from epo_lightning.game.pairs import pairs
 
 LIMIT = 4096
 """Up to how many joint assignments C^N all of them are looked at."""

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from epo_lightning.game.energy import pairs
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.pairs import pairs
 from epo_lightning.scene import GameParameters, Scene
 
 

@@ -35,6 +35,7 @@ from epo_lightning.game.features import (
     steering,
     steering_curvatures,
 )
+from epo_lightning.game.pairs import pair_mask
 from epo_lightning.scene import HEADING, SPEED, TURN_RATE, GameParameters, Scene
 from epo_lightning.solvers.gauss_newton.edges import Edges
 
@@ -418,7 +419,7 @@ class QuadraticModel:
         if feature.needs:
             modes = self.samples // len(self.scene.agent_mask)
             sizes = edges.ends(self.of.size(self.scene).repeat_interleave(modes, 0)[:, :, None])
-        exists = self.of.pair_mask(self.scene)[:, None].expand(-1, self.samples // len(self.scene.agent_mask), -1)
+        exists = pair_mask(self.scene)[:, None].expand(-1, self.samples // len(self.scene.agent_mask), -1)
         exists = exists.flatten().index_select(0, edges.pair)[:, None]
         if feature.stepwise:  # eight slopes per step, in the states of both, instead of 4 K through the function
             unit = torch.eye(8, dtype=states.dtype, device=states.device)

@@ -14,8 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from epo_lightning.game.energy import GRADIENT, Energy, pairs
+from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.pairs import pairs
 from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS, equilibrium_values
 from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status, Tables
 from epo_lightning.solvers.diagnostics import quasi_newton

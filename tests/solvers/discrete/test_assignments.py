@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from epo_lightning.game.energy import pairs
+from epo_lightning.game.pairs import pairs
 from epo_lightning.solvers.discrete import assignments
 
 NAN, INF = float("nan"), float("inf")

@@ -14,6 +14,7 @@ from torch import nn
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.pairs import pair_mask
 from epo_lightning.scene import Status
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.gauss_newton import implicit
@@ -52,7 +53,7 @@ class Learned(Energy):
     def pair_terms(self, scene, parameters, first, second):
         way = (first - second)[..., :2].square().sum(-1, keepdim=True)
         near = nn.functional.softplus(self.touch(torch.cat((way, (1.0 + way).sqrt()), -1))).sum((-1, -2))
-        return {"near": torch.where(self.pair_mask(scene)[:, None], 0.01 * near, 0.0)}
+        return {"near": torch.where(pair_mask(scene)[:, None], 0.01 * near, 0.0)}
 
 
 def learned_game():

@@ -1,0 +1,115 @@
+"""The order of a pair of agents: which of them goes first, or on which side they pass each other.
+
+An order is a sign s_ij = +1 or -1 for every pair. An energy that takes orders as given declares them by
+:attr:`~epo_lightning.game.energy.Energy.pair_order`; a decoder predicts them, objectives learn from observed ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning.game.pairs import pair_mask, pairs
+from epo_lightning.scene import HEADING, SPEED, Scene
+
+ALONG, ACROSS = "along", "across"
+DIRECTIONS = (ALONG, ACROSS)
+_STILL = 1e-3
+"""Speed [m/s], distance [m] or length below which a vector has no direction."""
+
+
+@dataclass(frozen=True)
+class PairOrder:
+    """The meaning of an order +1 or -1: agent i of a pair (i, j) is ahead of j in a direction n_ij, or behind.
+
+    - ``along``: n_ij is the mean heading of both at t0, and the order says which agent goes first (merges). Agents that swap
+      names swap the sign of their order. Where headings oppose each other, n_ij is their common line, towards positive x.
+    - ``across``: n_ij is their relative velocity v_i - v_j at t0, turned to the left, and the order says on which side they
+      pass: +1 where each leaves the other on its right. The sign is the same for both agents. Without a relative velocity,
+      n_ij is the line that joins them, turned; without that too, the y axis.
+
+    Attributes:
+        direction: ``along`` or ``across``.
+        within: distance [m] up to which two agents are near each other, so that their order matters.
+    """
+
+    direction: str
+    within: float
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the order keeps its sign when the two agents swap names."""
+        return self.direction == ACROSS
+
+    def directions(self, scene: Scene) -> Float[Tensor, "B P 2"]:
+        """The unit vectors n_ij, in which i is ahead of j for an order of +1. Constants of the scene."""
+        initial = _initial(scene)
+        first, second = pairs(initial.shape[1], initial.device)
+        axis = torch.stack((initial[..., HEADING].cos(), initial[..., HEADING].sin()), -1)
+        if self.direction == ALONG:
+            line = axis[:, first]
+            # Towards positive x, or towards positive y for upright lines, so that both agents of a pair agree on it.
+            upright = line[..., 0].abs() < _STILL
+            towards = torch.where(upright, line[..., 1], line[..., 0])
+            line = torch.where((towards < 0)[..., None], -line, line)
+            return _direction(axis[:, first] + axis[:, second], line)
+        velocity = initial[..., SPEED, None] * axis
+        joining = initial[:, first, :2] - initial[:, second, :2]
+        upwards = torch.stack((torch.ones_like(joining[..., 0]), torch.zeros_like(joining[..., 0])), -1)
+        towards = _direction(velocity[:, first] - velocity[:, second], _direction(joining, upwards))
+        return torch.stack((-towards[..., 1], towards[..., 0]), -1)
+
+    def near(self, scene: Scene, steps: int) -> Bool[Tensor, "B P K"]:
+        """The steps 1 .. K at which both agents would be near each other at constant velocity."""
+        initial = _initial(scene)
+        first, second = pairs(initial.shape[1], initial.device)
+        axis = torch.stack((initial[..., HEADING].cos(), initial[..., HEADING].sin()), -1)
+        time = scene.dt * torch.arange(1, steps + 1, dtype=initial.dtype, device=initial.device)
+        position = initial[..., None, :2] + time[:, None] * (initial[..., SPEED, None] * axis)[..., None, :]
+        return (position[:, first] - position[:, second]).square().sum(-1) <= self.within**2
+
+    def matters(self, scene: Scene, steps: int) -> Bool[Tensor, "B P"]:
+        """The pairs whose order matters: both agents are present, and near each other at one step 1 .. K at least."""
+        return pair_mask(scene) & self.near(scene, steps).any(-1)
+
+    def observed(self, scene: Scene) -> tuple[Float[Tensor, "B P"], Bool[Tensor, "B P"]]:
+        """The orders in the observed future, +1 where unknown, and the pairs whose order is known.
+
+        The agent that goes first (``along``) is the one ahead at the last step at which both were observed: when one
+        overtakes the other they are closest side by side, where neither is ahead. The passing side (``across``) is read at
+        the closest such step. An order is known for pairs observed together at some step, if it matters
+        (:meth:`matters`).
+
+        Raises:
+            ValueError: the scene has no future.
+        """
+        if scene.future is None or scene.future_mask is None:
+            raise ValueError("observed orders are read from scene.future [B, N, K, 4], which is None")
+        first, second = pairs(scene.agent_mask.shape[1], scene.agent_mask.device)
+        observed = scene.future_mask & scene.agent_mask[..., None]
+        together = observed[:, first] & observed[:, second]
+        position = torch.where(observed[..., None], scene.future[..., :2], 0.0)
+        apart = position[:, first] - position[:, second]
+        if self.direction == ACROSS:
+            decisive = torch.where(together, apart.square().sum(-1), torch.inf).argmin(-1)
+        else:
+            step = torch.arange(together.shape[-1], device=together.device)
+            decisive = torch.where(together, step, -1).argmax(-1)
+        way = apart.gather(2, decisive[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
+        known = together.any(-1) & self.matters(scene, together.shape[-1])
+        behind = known & ((self.directions(scene) * way).sum(-1) < 0)
+        return torch.where(behind, -1.0, 1.0).to(position.dtype), known
+
+
+def _initial(scene: Scene) -> Float[Tensor, "B N 4"]:
+    """The states x_0, zero for absent agents."""
+    return torch.where(scene.agent_mask[..., None], scene.current, 0.0)
+
+
+def _direction(vector: Float[Tensor, "*batch 2"], otherwise: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+    """The unit vector, or ``otherwise`` where the vector vanishes."""
+    length = vector.norm(dim=-1, keepdim=True)
+    return torch.where(length > _STILL, vector / length.clamp_min(_STILL), otherwise)
