@@ -21,6 +21,8 @@ path or version, so that two equal runs give the same bytes.
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
 import socket
@@ -86,6 +88,20 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ConfigError(f"{path} holds no JSON object")
     return content
+
+
+def read_log(path: Path) -> list[dict[str, str]]:
+    """The rows of a ``metrics.csv`` as text without empty entries, each with a whole number ``step``.
+
+    A missing file has no rows. A last line without its line break is left out: it was cut off by a kill or a full disk.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8", errors="replace")
+    except FileNotFoundError:
+        return []
+    lines = io.StringIO(text[: text.rfind("\n") + 1], newline="")
+    rows = [{key: value for key, value in row.items() if key and value} for row in csv.DictReader(lines)]
+    return [row for row in rows if row.get("step", "").isdecimal()]
 
 
 @dataclass(frozen=True)

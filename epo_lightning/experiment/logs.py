@@ -6,17 +6,17 @@ them has missed can be told again from the folder (:func:`publish`).
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
 from epo_lightning.experiment.config.settings import DashboardSettings, LoggerSettings, Settings, read
+from epo_lightning.experiment.csv_log import CSVLog
 from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.experiment.dashboards.aside import Aside
 from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
@@ -24,41 +24,14 @@ from epo_lightning.experiment.dashboards.mlflow import MLflow
 from epo_lightning.experiment.dashboards.tensorboard import TensorBoard
 from epo_lightning.experiment.dashboards.wandb import WandB
 from epo_lightning.identity import SECTIONS, identity
-from epo_lightning.run_folder import RunFolder, read_json
-
-
-class CSVLog(CSVLogger):
-    """``logs/metrics.csv``; a continued run keeps the rows up to the step it continues from."""
-
-    def __init__(self, run: RunFolder, flush: int, continued_from: int = 0) -> None:
-        kept = _read(run.logs / "metrics.csv", continued_from) if continued_from else []
-        (run.logs / "metrics.csv").unlink(missing_ok=True)
-        super().__init__(run.path, name=run.logs.name, version="")
-        self._flush = flush
-        if kept:
-            self.experiment.metrics = kept
-            self.save()
-
-    def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
-        super().log_metrics(dict(metrics), step)
-        if len(self.experiment.metrics) >= self._flush:
-            self.save()
-
-
-def _read(path: Path, until: float = float("inf")) -> list[dict[str, Any]]:
-    """The rows of a metrics.csv below step ``until``, as text and without empty entries."""
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [{key: value for key, value in row.items() if key and value} for row in csv.DictReader(file)]
-    return [row for row in rows if str(row.get("step", "")).isdigit() and int(row["step"]) < until]
+from epo_lightning.run_folder import RunFolder, read_json, read_log
 
 
 def rows(run: RunFolder) -> list[Row]:
     """Everything in the run's metrics.csv."""
     return [
         (int(row["step"]), {key: float(value) for key, value in row.items() if key != "step"})
-        for row in _read(run.logs / "metrics.csv")
+        for row in read_log(run.logs / "metrics.csv")
     ]
 
 

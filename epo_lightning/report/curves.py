@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import statistics
@@ -21,6 +19,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report.paper import STEPS, is_papers
 from epo_lightning.report.style import MODES, VEHICLES, style
 from epo_lightning.report.tables import Row
+from epo_lightning.run_folder import read_log
 
 METRIC = "val/minSADE"
 """What training watches."""
@@ -92,7 +91,7 @@ def learning_curves(rows: Iterable[Row], metric: str = METRIC) -> tuple[list[Cur
         if not any(run.learned for run in row.runs):
             continue
         try:
-            logs = [read_log(run.path / "logs" / "metrics.csv", metric) for run in row.runs]
+            logs = [validation_log(run.path / "logs" / "metrics.csv", metric) for run in row.runs]
         except ConfigError as error:
             notes.append(f"{row.name} is left out: {error}")
             continue
@@ -104,27 +103,26 @@ def learning_curves(rows: Iterable[Row], metric: str = METRIC) -> tuple[list[Cur
     return curves, notes
 
 
-def read_log(file: Path, metric: str) -> dict[int, float]:
-    """The values of one column by how many training steps were done; of a step that was logged twice, the later one.
+def validation_log(file: Path, metric: str) -> dict[int, float]:
+    """The finite values of one column of a ``metrics.csv``, by the number of training steps done; the last one of a step.
 
     Raises:
-        ConfigError: the file is missing, or holds no whole line with this column.
+        ConfigError: the file cannot be read, or no row has a finite number in this column.
     """
     try:
-        text = file.read_text(encoding="utf-8", errors="replace")
+        rows = read_log(file)
     except OSError as error:
         raise ConfigError(f"cannot read {file} ({error.strerror})") from error
     values: dict[int, float] = {}
-    # What follows the last line break was being written when the run was stopped.
-    for record in csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1])):
+    for row in rows:
         try:
-            step, value = int(record["step"] or ""), float(record[metric] or "")
+            value = float(row[metric])
         except (KeyError, ValueError, TypeError):
             continue
         if math.isfinite(value):
-            values[step + 1] = value  # the log counts from zero: step 3 is the fourth
+            values[int(row["step"]) + 1] = value  # the log counts from zero: step 3 is the fourth
     if not values:
-        raise ConfigError(f"{file} holds no {metric} of any step")
+        raise ConfigError(f"{file} {'has no finite ' + metric if rows else 'is missing or has no row'}")
     return values
 
 

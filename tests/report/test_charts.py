@@ -13,7 +13,7 @@ from matplotlib.text import Text
 
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.charts import charts_of
-from epo_lightning.report.curves import Curve, draw_learning, draw_steps, learning_curves, read_log, steps_curves
+from epo_lightning.report.curves import Curve, draw_learning, draw_steps, learning_curves, steps_curves, validation_log
 from epo_lightning.report.made import distinct, how_made
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES, STEPS
 from epo_lightning.report.runs import collect, find_runs
@@ -71,7 +71,7 @@ def test_a_row_without_a_sound_log_is_left_out_with_a_note(tmp_path: Path) -> No
     curves, notes = learning_curves(distinct(build_tables(collect(tmp_path))))
     assert [curve.name for curve in curves] == ["whole"]
     assert sorted(note.split(" ")[0] for note in notes) == ["empty", "missing", "nan", "other"]
-    assert any("missing/logs/metrics.csv (No such file or directory)" in note for note in notes)
+    assert any("missing/logs/metrics.csv is missing or has no row" in note for note in notes)
     with pytest.raises(ValueError, match="no row"):
         draw_learning([])
 
@@ -79,9 +79,9 @@ def test_a_row_without_a_sound_log_is_left_out_with_a_note(tmp_path: Path) -> No
 def test_the_half_of_a_line_is_no_value_and_a_repeated_step_counts_once(tmp_path: Path) -> None:
     file = tmp_path / "metrics.csv"
     file.write_text("epoch,step,val/minSADE\n0,99,0.5\n1,199,0.4\n1,199,0.3\n2,x9,0.2\n2,299,0.2")
-    assert read_log(file, "val/minSADE") == {100: 0.5, 200: 0.3}
-    with pytest.raises(ConfigError, match=r"metrics\.csv holds no val/minFDE"):
-        read_log(file, "val/minFDE")
+    assert validation_log(file, "val/minSADE") == {100: 0.5, 200: 0.3}
+    with pytest.raises(ConfigError, match=r"metrics\.csv has no finite val/minFDE"):
+        validation_log(file, "val/minFDE")
 
 
 def test_the_s_curve_joins_rows_that_differ_in_steps_alone(tmp_path: Path) -> None:
