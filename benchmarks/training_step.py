@@ -124,7 +124,7 @@ class Step:
             self.batches: Iterator[Scene] = _forever(data.train_dataloader())
         except ConfigError:
             self.made_up = True
-            self.batches = _random_scenes(data.batch_size, data.horizon, data.dt)
+            self.batches = _random_scenes(data.batch_size, data.task.horizon, data.task.dt)
         self.optimizer = self.model.optimizer.configure(self.model.parameters(), 1000)["optimizer"]
         self.clock = Clock()
         self.cut: Cut | None = None

@@ -94,6 +94,15 @@ def lookup(kind: str, name: str) -> Callable[..., Any]:
     return parts[name]
 
 
+def parameters(kind: str, name: str) -> Mapping[str, inspect.Parameter]:
+    """The arguments of a part's constructor by name: the schema of its configuration.
+
+    Raises:
+        ConfigError: as :func:`lookup`.
+    """
+    return inspect.signature(lookup(kind, name)).parameters
+
+
 def check(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:
     """Compare a part's configuration with its constructor's signature, without building it.
 
@@ -108,8 +117,7 @@ def check(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) ->
     if not config.get("name"):
         _load(kind)
         raise ConfigError(f"{kind}.name is missing: {nearest('', _PARTS.get(kind, {}))}")
-    part = lookup(kind, config["name"])
-    schema = inspect.signature(part).parameters
+    schema = parameters(kind, config["name"])
     keys = set(config) - {"name"}
     known = set(schema) - set(supplied)
     for key in sorted(keys - known):
@@ -120,15 +128,22 @@ def check(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) ->
 
 
 def build(kind: str, config: Mapping[str, Any], **supplied: Any) -> Any:
-    """Build the part that ``config["name"]`` selects, with the other keys and ``supplied`` as keyword arguments.
+    """Build the part that ``config["name"]`` selects.
+
+    Args:
+        kind: the kind of part.
+        config: ``name`` and the part's keyword arguments.
+        supplied: further arguments, of which the constructor is given those that it names.
 
     Raises:
         ConfigError: as :func:`check`, or a value that the part refuses.
     """
     check(kind, config, supplied)
     arguments = {key: value for key, value in config.items() if key != "name"}
+    named = parameters(kind, config["name"])
+    arguments |= {key: value for key, value in supplied.items() if key in named}
     try:
-        return lookup(kind, config["name"])(**arguments, **supplied)
+        return lookup(kind, config["name"])(**arguments)
     except ConfigError:
         raise
     except (TypeError, ValueError) as error:

@@ -11,6 +11,7 @@ ROOT = Path(epo_lightning.__file__).parent
 FLOORS = {
     "scene": set(),
     "registry": set(),
+    "task": {"registry"},
     "identity": set(),
     "run_folder": {"registry"},
     "optimizers": {"registry"},
@@ -21,10 +22,11 @@ FLOORS = {
     "metrics": {"scene", "registry"},
     "decoders": {"scene", "game"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
-    "data": {"scene", "registry"},
+    "data": {"scene", "registry", "task"},
     "objectives": {"scene", "registry", "game", "solvers", "decoders", "losses"},
     "forecasters": {
         "scene",
+        "task",
         "objectives",
         "registry",
         "game",

@@ -19,6 +19,7 @@ from torch.utils.data.distributed import DistributedSampler
 
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
+from epo_lightning.task import Task
 
 
 class SceneDataset(Protocol):
@@ -136,19 +137,14 @@ class SceneDataModule(LightningDataModule):
     """Loaders over the splits ``train``, ``val`` and ``test``; a subclass says how a split is opened.
 
     Attributes:
-        subsets: names of the subsets that ``Scene.subset`` counts; empty where there are none.
-        dt: time step [s].
-        horizon: future steps K.
+        task: sizes and units of the scenes; every data module sets it, in its class or its constructor.
         share: of the scenes of every split that is used.
         num_agents: agents per scene N.
         order_seed: of the order of the batches; the data's own seed unless a run sets its own.
     """
 
-    subsets: tuple[str, ...] = ()
-    dt: float
-    horizon: int
+    task: Task
     num_agents: int
-    has_map = False
 
     def __init__(self, batch_size: int, seed: int, share: float = 1.0) -> None:
         super().__init__()

@@ -23,6 +23,7 @@ from epo_lightning.data.recorded.windows import MOST_AGENTS, SPACING, VECTORS, R
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import KINDS
+from epo_lightning.task import Task
 
 VERSION = 1
 """Of the draws: raised whenever the same seed would give other scenes."""
@@ -39,25 +40,20 @@ class Kind:
 
     Attributes:
         agents: of a scene, unless told otherwise.
-        history, horizon, dt: steps H and K, and their length [s].
+        history: number H of observed steps.
+        task: sizes and units, those of the real data.
         tables: from (scenes, agents, kind, generator) to the columns that records of this task have.
-        subsets, shape, scale, has_map: as in the task's own data module.
     """
 
     agents: int
     history: int
-    horizon: int
-    dt: float
+    task: Task
     tables: Callable[[int, int, Kind, torch.Generator], dict[str, Tensor]]
-    subsets: tuple[str, ...] = ()
-    shape: str = "disc"
-    scale: float = 1.0
-    has_map: bool = False
 
     @property
     def time(self) -> Tensor:
         """When the steps of history and future are [s]; the last step of the history is at zero."""
-        return self.dt * torch.arange(1 - self.history, self.horizon + 1, dtype=torch.float64)
+        return self.task.dt * torch.arange(1 - self.history, self.task.horizon + 1, dtype=torch.float64)
 
 
 def _between(low: float, high: float, *shape: int, draw: torch.Generator) -> Tensor:
@@ -80,7 +76,7 @@ def _walkers(scenes: int, agents: int, kind: Kind, draw: torch.Generator, apart:
     speed = _between(0.7, 1.5, scenes, agents, draw=draw)
     heading = _between(-torch.pi, torch.pi, scenes, agents, draw=draw)
     turn = _between(-0.1, 0.1, scenes, agents, draw=draw)
-    half = 0.5 * kind.horizon * kind.dt
+    half = 0.5 * kind.task.horizon * kind.task.dt
     way = torch.stack((heading.cos(), heading.sin()), -1)
     start = _between(-apart, apart, scenes, agents, 2, draw=draw) - half * speed[..., None] * way
     return _curves(start, heading, speed, turn, kind.time)
@@ -161,7 +157,7 @@ def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dic
     states = torch.stack((x, y, torch.atan2(sideways, forwards), torch.hypot(forwards, sideways)), -1)
 
     now, pace = states[:, :, kind.history - 1].flatten(0, 1), speed.flatten()
-    until = kind.horizon * kind.dt
+    until = kind.task.horizon * kind.task.dt
     far = pace * until + 0.5 * ACCELERATING * until**2
     near = pace * until - 0.5 * BRAKING * until**2
     middle = LANE_WIDTH * (lane.flatten()[:, None] + torch.arange(1, -2, -1))  # left, own, right
@@ -191,11 +187,14 @@ def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dic
 
 
 LIKE: Mapping[str, Kind] = {
-    "rpi": Kind(RPIData.num_agents, 19, RPIData.horizon, RPIData.dt, _rpi, RPIData.subsets),
+    "rpi": Kind(RPIData.num_agents, 19, RPIData.task, _rpi),
     "highway": Kind(
-        *(Recipe.agents, Recipe.history, Recipe.horizon, Recipe.dt, _highway), shape="box", scale=20.0, has_map=True
+        Recipe.agents,
+        Recipe.history,
+        Task(Recipe.horizon, Recipe.dt, shape="box", candidates=LINES * PER_LINE, map=True, scale=20.0),
+        _highway,
     ),
-    "pedestrians": Kind(4, 8, 12, 0.4, _pedestrians, scale=5.0),
+    "pedestrians": Kind(4, 8, Task(12, 0.4, candidates=0, scale=5.0), _pedestrians),
 }
 """Tasks whose scenes can be drawn."""
 
@@ -225,9 +224,7 @@ class DrawnData(SceneDataModule):
         if scenes < 1:
             raise ConfigError(f"data.scenes must be 1 or more, not {scenes}")
         self.num_agents, self.scenes = self.kind.agents if agents is None else agents, scenes
-        self.dt, self.horizon, self.subsets = self.kind.dt, self.kind.horizon, self.kind.subsets
-        self.shape, self.scale, self.has_map = self.kind.shape, self.kind.scale, self.kind.has_map
-        self.candidates = LINES * PER_LINE if self.has_map else int(like == "rpi")
+        self.task = self.kind.task
 
     @property
     def digest(self) -> str:
@@ -253,4 +250,4 @@ class DrawnData(SceneDataModule):
             tables = self.kind.tables(-(-self.scenes // 2), self.num_agents, self.kind, draw)
             return RPIDataset(tables, seed=self.seed)
         tables = self.kind.tables(self.scenes, self.num_agents, self.kind, draw)
-        return RecordedScenes(tables, self.dt, "aligned", [split])
+        return RecordedScenes(tables, self.task.dt, "aligned", [split])

@@ -26,6 +26,7 @@ from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSet
 from epo_lightning.forecasters import build_forecaster, check_model
 from epo_lightning.registry import ConfigError, build
 from epo_lightning.run_folder import RunFolder
+from epo_lightning.task import Task
 
 
 def build_data(section: Mapping[str, Any]) -> Any:
@@ -35,23 +36,18 @@ def build_data(section: Mapping[str, Any]) -> Any:
         ConfigError: an unknown part or key, or a value that it refuses.
     """
     check_part("data", section)
-    return build("data", section)
+    data = build("data", section)
+    if not isinstance(getattr(data, "task", None), Task):
+        raise ConfigError(
+            f"data {section['name']!r} declares no task: set {type(data).__name__}.task to an epo_lightning.task.Task"
+        )
+    return data
 
 
 def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
-    """All that a forecaster is built from, as plain values: what a checkpoint remembers of its architecture."""
+    """The model's configuration: all that a forecaster is built from, as plain values that a checkpoint can store."""
     sections = {kind: dict(getattr(settings, kind)) for kind in PARTS if kind != "data"}
-    return {
-        **sections,
-        "goal": settings.goal,
-        "horizon": int(data.horizon),
-        "dt": float(data.dt),
-        "subsets": list(data.subsets),
-        "shape": getattr(data, "shape", "disc"),
-        "candidates": int(getattr(data, "candidates", 1)),
-        "map": bool(getattr(data, "has_map", False)),
-        "scale": float(getattr(data, "scale", 1.0)),
-    }
+    return {**sections, "goal": settings.goal, **data.task.to_config()}
 
 
 def build_model(settings: Settings, data: Any) -> LightningModule:

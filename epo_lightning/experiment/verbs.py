@@ -51,7 +51,7 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     if (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
         words = [f"experiment={row}", *(o for o in overrides if o.startswith("data."))]
     else:
-        words = [f"experiment={'exid' if data.has_map else 'ucy'}/v_lstm_epo", *overrides]
+        words = [f"experiment={'exid' if data.task.map else 'ucy'}/v_lstm_epo", *overrides]
     print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,33 +9,39 @@ from typing import Any
 
 import torch
 
-from epo_lightning.forecasters.base import Forecaster, Task
-from epo_lightning.registry import ConfigError, build, check, lookup, nearest
+from epo_lightning.forecasters.base import Forecaster
+from epo_lightning.registry import ConfigError, build, check, nearest, parameters
+from epo_lightning.task import TASK_KEYS, Task
 
 __all__ = ["Forecaster", "Task", "build_forecaster", "check_model", "load"]
 
-_PARTS = ("backbone", "dynamics", "energy", "solver", "backward", "objective")
-_SECTIONS = ("forecaster", "optimizer", *_PARTS)
-_SUPPLIED = {
+SUPPLIED: Mapping[str, tuple[str, ...]] = {
     "backbone": ("goal_input", "map_input", "scale"),
+    "dynamics": (),
     "energy": ("dynamics", "width", "horizon", "shape", "scale"),
+    "solver": (),
+    "backward": (),
+    "objective": (),
+    "optimizer": (),
+    "forecaster": ("task", "optimizer", "backbone", "dynamics", "energy", "solver", "backward", "objective"),
 }
-"""What parts are told, if they ask, by whoever builds them."""
-_TASK = ("horizon", "dt", "subsets", "shape", "candidates", "map", "scale")
+"""Constructor arguments by kind that :func:`build_forecaster` supplies and a configuration must not set; a part is given
+those of them that its constructor names. The order is that in which parts are built."""
 GOALS = ("energy", "all")
-"""Who is told a given goal: the energy alone (the paper), or the network of every learned forecaster as well."""
+"""Receivers of a given goal: the energy alone (the paper), or also the network of every learned forecaster."""
 
 
 def check_model(model: Mapping[str, Any]) -> None:
     """Check a model's configuration without building anything: names, keys and the choice of ``goal``.
 
     Raises:
-        ConfigError: what is unknown or missing, and the nearest known name.
+        ConfigError: an unknown or missing key, with the nearest known name.
     """
+    known = (*SUPPLIED, *TASK_KEYS, "goal")
     for key in model:
-        if key not in (*_SECTIONS, *_TASK, "goal"):
-            raise ConfigError(f"unknown key {key!r} of a model: {nearest(key, (*_SECTIONS, *_TASK, 'goal'))}")
-    for section in _SECTIONS:
+        if key not in known:
+            raise ConfigError(f"unknown key {key!r} of a model: {nearest(key, known)}")
+    for section in SUPPLIED:
         if section not in model:
             raise ConfigError(f"the model's configuration lacks the section {section!r}")
     if model["goal"] not in GOALS:
@@ -46,48 +51,48 @@ def check_model(model: Mapping[str, Any]) -> None:
             f"goal is 'all', but this data gives no goal that the network could be told, only {model['candidates']} "
             "candidates for each agent: use goal=energy, with which the forecaster chooses among them"
         )
-    check("optimizer", model["optimizer"])
-    check("forecaster", model["forecaster"], supplied=("task", "optimizer", *_PARTS))
-    for kind in _PARTS:
-        check(kind, model[kind], supplied=_SUPPLIED.get(kind, ()))
+    for kind, supplied in SUPPLIED.items():
+        check(kind, model[kind], supplied)
 
 
 def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
-    """Build a forecaster and the parts that its constructor asks for.
+    """Build a forecaster and the parts that its constructor names, in the order in which they depend on each other.
 
     Args:
         model: the sections ``forecaster``, ``backbone``, ``dynamics``, ``energy``, ``solver``, ``backward``, ``objective``
             and ``optimizer``, each with the ``name`` of a part and its arguments; ``goal`` (``energy`` or ``all``); and the
-            task: ``horizon``, ``dt``, ``subsets``, ``shape``, ``candidates``, ``map`` and ``scale``.
+            fields of a :class:`~epo_lightning.task.Task`.
 
     Raises:
         ConfigError: as :func:`check_model`, or a value that a part refuses.
     """
     check_model(model)
-    wanted = inspect.signature(lookup("forecaster", model["forecaster"]["name"])).parameters
-    task = Task(
-        model["horizon"],
-        model["dt"],
-        tuple(model.get("subsets", ())),
-        model.get("shape", "disc"),
-        model.get("candidates", 1),
-        model.get("map", False),
-        model.get("scale", 1.0),
-    )
-    told: dict[str, Any] = {"horizon": task.horizon, "shape": task.shape, "scale": task.scale, "map_input": task.map}
-    told["goal_input"] = model["goal"] == "all"
-    parts: dict[str, Any] = {}
-    for kind in _PARTS:
-        # An energy is made of the dynamics, and knows the width of the backbone's features.
-        if kind in wanted or (kind == "dynamics" and "energy" in wanted):
-            asked = inspect.signature(lookup(kind, model[kind]["name"])).parameters
-            supplied = {name: told[name] for name in _SUPPLIED.get(kind, ()) if name in asked}
-            parts[kind] = built = build(kind, model[kind], **supplied)
-            told |= {"dynamics": built} if kind == "dynamics" else {}
-            told |= {"width": built.width} if kind == "backbone" else {}
-    parts = {kind: part for kind, part in parts.items() if kind in wanted}
-    optimizer = build("optimizer", model["optimizer"])
-    forecaster: Forecaster = build("forecaster", model["forecaster"], task=task, optimizer=optimizer, **parts)
+    task = Task.from_config(model)
+    named = parameters("forecaster", model["forecaster"]["name"])
+    parts: dict[str, Any] = {"task": task}
+    # Parts that the forecaster does not name are not built: their weights would be drawn from the same random numbers.
+    if "backbone" in named:
+        parts["backbone"] = build(
+            "backbone", model["backbone"], goal_input=model["goal"] == "all", map_input=task.map, scale=task.scale
+        )
+    if "dynamics" in named or "energy" in named:
+        parts["dynamics"] = build("dynamics", model["dynamics"])
+    if "energy" in named:
+        of_features = {"width": parts["backbone"].width} if "backbone" in named else {}
+        parts["energy"] = build(
+            "energy",
+            model["energy"],
+            dynamics=parts["dynamics"],
+            horizon=task.horizon,
+            shape=task.shape,
+            scale=task.scale,
+            **of_features,
+        )
+    for kind in ("solver", "backward", "objective"):
+        if kind in named:
+            parts[kind] = build(kind, model[kind])
+    parts["optimizer"] = build("optimizer", model["optimizer"])
+    forecaster: Forecaster = build("forecaster", model["forecaster"], **parts)
     forecaster.configuration = dict(model)
     return forecaster
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,30 +13,7 @@ from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.objectives.base import Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.scene import JointForecast, Scene
-
-
-@dataclass(frozen=True)
-class Task:
-    """What a data set asks of every forecaster.
-
-    Attributes:
-        horizon: number K of future steps.
-        dt: length of a time step [s].
-        subsets: names of the subsets of the data that metrics are also reported for.
-        shape: agents' outline in the overlap rates, ``disc`` or ``box``.
-        candidates: number G of goal candidates per agent. One is a given goal; where there are more, scenes also bring
-            reference lines, the line of each candidate, and reference speeds.
-        map: whether scenes bring lanes.
-        scale: metres that an input or output of one stands for.
-    """
-
-    horizon: int
-    dt: float
-    subsets: tuple[str, ...] = ()
-    shape: str = "disc"
-    candidates: int = 1
-    map: bool = False
-    scale: float = 1.0
+from epo_lightning.task import Task
 
 
 class Forecaster(LightningModule):

@@ -20,7 +20,7 @@ from epo_lightning.decoders.orders import Orders, repeated
 from epo_lightning.decoders.probabilities import SceneProbabilities
 from epo_lightning.decoders.strategies import InitialStrategies
 from epo_lightning.decoders.weights import OwnWeights, PairWeights
-from epo_lightning.forecasters.base import Forecaster, Task
+from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
@@ -32,6 +32,7 @@ from epo_lightning.scene import GameParameters, JointForecast, Scene, Status
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
+from epo_lightning.task import Task
 
 INITIAL = ("decoded", "zero", "motions")
 """Where solutions start, or between what they choose: strategies of the network's, (the paper's ablation "no init") controls

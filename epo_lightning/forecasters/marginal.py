@@ -10,13 +10,14 @@ from torch import Tensor
 from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.trajectories import Trajectories
-from epo_lightning.forecasters.base import Forecaster, Task
+from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.metrics.functional import marginal_to_joint
 from epo_lightning.objectives.base import Terms, checked_weights
 from epo_lightning.objectives.terms import observed_future
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
 from epo_lightning.scene import HEADING, JointForecast, Scene
+from epo_lightning.task import Task
 
 
 @register("forecaster", "marginal")

@@ -16,6 +16,7 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose, hydra, jobs, options_of, tree
 from epo_lightning.experiment.config.settings import Settings, read
 from epo_lightning.forecasters import build_forecaster
+from epo_lightning.task import Task
 
 CONF = tree() / "conf"
 
@@ -88,7 +89,7 @@ def test_data_sets_can_be_described(data: str) -> None:
 def test_backbones_and_forecasters_can_be_built_for_highways(backbone: str, forecaster: str) -> None:
     words = ["experiment=rpi/v_lstm", "energy=exid", f"backbone={backbone}", f"forecaster={forecaster}"]
     settings = read(Settings, compose("train", words))
-    data = SimpleNamespace(horizon=20, dt=0.2, subsets=(), shape="box", candidates=60, has_map=True)
+    data = SimpleNamespace(task=Task(20, 0.2, shape="box", candidates=60, map=True))
     built = build_forecaster(assembly.describe_model(settings, data))
     assert (built.task.candidates, built.task.map) == (60, True)
     learned = [name for name, _ in built.named_parameters()]

@@ -51,7 +51,7 @@ def test_a_scene_is_what_the_vocabulary_says(data):
     assert scene.future.shape == (8, 2, 40, 4)
     assert scene.goal_candidates.shape == (8, 2, 1, 2)
     assert (scene.size == 0.5).all()
-    assert scene.dt == module.dt == 0.1
+    assert scene.dt == module.task.dt == 0.1
     assert scene.history.dtype == torch.float32
     rows = records(50)
     for i in range(8):

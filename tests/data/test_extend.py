@@ -55,7 +55,7 @@ def test_the_documented_format_becomes_scenes(settings, tmp_path):
     scene = next(iter(data.val_dataloader()))
     assert scene.history.shape == (min(32, len(scene.history)), 4, 10, 4)
     assert scene.agent_mask.all()
-    assert data.shape == "box"
+    assert data.task.shape == "box"
     assert scene.lanes is None
 
 

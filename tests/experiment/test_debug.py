@@ -115,8 +115,9 @@ def watched(change: Callable[[Forecaster, list[Scene]], None]) -> str:
     few = FewBatches(data, 2)
     config = compose("train", ["experiment=rpi/v_lstm_sc"])
     parts = ("backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective")
-    task = {"horizon": data.horizon, "dt": data.dt, "subsets": list(data.subsets)}
-    forecaster = build_forecaster({**{part: config[part] for part in (*parts, "optimizer", "goal")}, **task})
+    forecaster = build_forecaster(
+        {**{part: config[part] for part in (*parts, "optimizer", "goal")}, **data.task.to_config()}
+    )
     change(forecaster, few.batches)
     quiet = {
         "logger": False,

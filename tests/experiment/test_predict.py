@@ -17,6 +17,7 @@ from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment.predict import MEANING, choose, even, eventful
 from epo_lightning.registry import register
 from epo_lightning.scene import KINDS, JointForecast, Scene
+from epo_lightning.task import Task
 
 Epo = Callable[..., int]
 LANE = 3.6
@@ -72,7 +73,7 @@ class RoadSet:
 class TinyRoad(SceneDataModule):
     """See the module."""
 
-    dt, horizon, num_agents, shape = 0.2, 20, 3, "box"
+    task, num_agents = Task(horizon=20, dt=0.2, shape="box"), 3
     digest = "tiny-road"
 
     def __init__(self, batch_size: int = 4) -> None:

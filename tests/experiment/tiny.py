@@ -14,6 +14,7 @@ from lightning.pytorch import LightningDataModule
 
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
+from epo_lightning.task import Task
 
 CONF = Path(__file__).parents[1] / "configs" / "conf"
 
@@ -59,8 +60,7 @@ class _Loader:
 class Tiny(LightningDataModule):
     """See the module."""
 
-    subsets = ("executed", "alternative")
-    dt, horizon, num_agents = 0.1, 40, 2
+    task, num_agents = Task(horizon=40, dt=0.1, subsets=("executed", "alternative")), 2
 
     def __init__(self, batch_size: int = 16, count: int = 64, seed: int = 0) -> None:
         super().__init__()

@@ -26,6 +26,7 @@ from epo_lightning.data.recorded.tracks import Source
 from epo_lightning.data.recorded.windows import Extract, Recipe, extract, joined
 from epo_lightning.data.workers import finished
 from epo_lightning.registry import ConfigError, lookup, nearest, register
+from epo_lightning.task import Task
 
 VERSION = 2
 """Of the extraction: raised whenever the same recordings would give other scenes."""
@@ -98,8 +99,7 @@ class RecordedData(SceneDataModule):
         self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
         self.list_sources = lookup("format", format)
         self.recipe = _recipe(windows)
-        self.has_map, self.candidates = map, LINES * PER_LINE if map else 0
-        self.dt, self.horizon, self.num_agents = self.recipe.dt, self.recipe.horizon, self.recipe.agents
+        self.num_agents = self.recipe.agents
         if self.recipe.lane_change and not map:
             raise ConfigError("data.windows.lane_change asks for lanes, but data.map is false: set it to false as well")
         self.test = None if test is None else [str(group) for group in test]
@@ -116,7 +116,9 @@ class RecordedData(SceneDataModule):
         self.test_share, self.val_share, self.val_by = test_share, val_share, val_by
         if not 0 < scale < np.inf:
             raise ConfigError(f"data.scale must be positive, not {scale}: the metres that an input of one stands for")
-        self.frame, self.shape, self.scale = frame, shape, scale
+        self.frame = frame
+        candidates = LINES * PER_LINE if map else 0
+        self.task = Task(self.recipe.horizon, float(self.recipe.dt), (), shape, candidates, map=map, scale=float(scale))
         self.root = Path(root).expanduser() if root else cache.default_root()
 
     def sources(self) -> list[Source]:
@@ -185,7 +187,7 @@ class RecordedData(SceneDataModule):
             "format": self.format,
             "recordings": self.identity(sources),
             "windows": dataclasses.asdict(self.recipe),
-            "map": self.has_map,
+            "map": self.task.map,
             "splits": {part: [source.name for source in held] for part, held in self.splits(sources).items()},
         }
 
@@ -232,7 +234,7 @@ class RecordedData(SceneDataModule):
         files = {name: parts / f"{number:04d}.safetensors" for number, name in enumerate(recordings)}
         done = [name for name, file in files.items() if _complete(file)]
         tasks = [
-            (source, self.recipe, self.has_map, files[name]) for name, source in recordings.items() if name not in done
+            (source, self.recipe, self.task.map, files[name]) for name, source in recordings.items() if name not in done
         ]
         kept = "finished recordings are kept"
         for _ in finished(
@@ -289,7 +291,7 @@ class RecordedData(SceneDataModule):
         folder = self.folder
         tables = cache.load(folder, split, command=self.command)
         names = cache.manifest(folder, self.command)["report"]["recordings"][split]
-        return RecordedScenes(tables, self.dt, self.frame, names)
+        return RecordedScenes(tables, self.task.dt, self.frame, names)
 
 
 def _fingerprint(file: Path) -> list[Any]:

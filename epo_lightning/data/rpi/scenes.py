@@ -14,6 +14,7 @@ from epo_lightning.data.datamodule import SceneDataModule, SceneDataset, epoch_g
 from epo_lightning.data.rpi.splits import PARTS, SPLITS
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import Scene
+from epo_lightning.task import Task
 
 TARGETS = ("executed", "sampled", "both")
 SOLVERS = ("potential", "feedback")
@@ -61,7 +62,7 @@ class RPIDataset:
         history = self.history[record]
         return Scene(
             history=history,
-            dt=RPIData.dt,
+            dt=RPIData.task.dt,
             future=self.futures[record, mode],
             goal_candidates=self.goals[record].unsqueeze(2),
             size=history.new_full((*history.shape[:2], 2), DISC_DIAMETER),
@@ -99,11 +100,8 @@ class RPIData(SceneDataModule):
         share: of the scenes of every split that is used, drawn once.
     """
 
-    subsets = SUBSETS
-    dt = 0.1
-    horizon = 40
+    task = Task(horizon=40, dt=0.1, subsets=SUBSETS)
     num_agents = 2
-    shape = "disc"
 
     def __init__(
         self,

@@ -67,7 +67,7 @@ def test_generate_once_then_train_from_the_cache(folder):
     batch = next(iter(module.train_dataloader()))
     assert batch.history.shape == (8, 4, 10, 4)
     assert batch.lanes.shape == (8, 32, 10, 4)
-    assert batch.goal_candidates.shape == (8, 4, module.candidates, 2)
+    assert batch.goal_candidates.shape == (8, 4, module.task.candidates, 2)
     report = module.report()
     names = report["recordings"]
     assert {name[0] for name in names["test"]} == {"a"}

@@ -1,0 +1,64 @@
+"""The task that a data set sets: sizes and units of its scenes, which every forecaster is built for."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from epo_lightning.registry import ConfigError
+
+
+@dataclass(frozen=True)
+class Task:
+    """Sizes and units of the scenes of a data set.
+
+    Attributes:
+        horizon: number K of future steps.
+        dt: length of a time step [s].
+        subsets: names of the subsets that ``Scene.subset`` counts; metrics are also reported for each of them.
+        shape: agents' outline in the overlap rates, ``disc`` or ``box``.
+        candidates: number G of goal candidates per agent. One is a given goal; where there are more, scenes also bring
+            reference lines, the line of each candidate, and reference speeds.
+        map: whether scenes bring lanes.
+        scale: metres that an input or output of one stands for.
+
+    Raises:
+        ConfigError: a size or unit that no scene can have.
+    """
+
+    horizon: int
+    dt: float
+    subsets: tuple[str, ...] = ()
+    shape: str = "disc"
+    candidates: int = 1
+    map: bool = False
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.horizon < 1 or self.candidates < 0:
+            raise ConfigError(
+                f"a task has 1 future step or more and 0 goal candidates or more, not horizon={self.horizon}, "
+                f"candidates={self.candidates}"
+            )
+        for name in ("dt", "scale"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"a task's {name} must be positive and finite, not {getattr(self, name)}")
+        if self.shape not in ("disc", "box"):
+            raise ConfigError(f"a task's shape must be disc or box, not {self.shape!r}")
+
+    @classmethod
+    def from_config(cls, model: Mapping[str, Any]) -> Task:
+        """The task in a model's configuration; checkpoints of older versions may lack entries that have a default."""
+        values = {name: model[name] for name in TASK_KEYS if name in model}
+        return cls(**{**values, "subsets": tuple(values.get("subsets", ()))})
+
+    def to_config(self) -> dict[str, Any]:
+        """Plain values, as a checkpoint stores them."""
+        return {**dataclasses.asdict(self), "subsets": list(self.subsets)}
+
+
+TASK_KEYS = tuple(field.name for field in dataclasses.fields(Task))
+"""Keys of a model's configuration that belong to its task."""
