@@ -25,8 +25,8 @@ import csv
 import io
 import json
 import os
+import secrets
 import socket
-import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -47,20 +47,46 @@ LOCK = ".lock"
 HEADER = "# The resolved configuration of this run.\n"
 
 
-def write_bytes(path: Path, content: bytes | memoryview) -> None:
-    """Write ``path`` as a whole or not at all."""
+@contextmanager
+def whole_file(path: Path, suffix: str = "") -> Iterator[Path]:
+    """A new, empty file beside ``path``, which replaces ``path`` at the end and is deleted after an exception.
+
+    It has the permissions that the umask leaves.
+
+    Args:
+        path: of the final file; its folder is made.
+        suffix: of the temporary name, for programs that choose a format by it.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
+    temporary = path.with_name(f".{path.name}-{secrets.token_hex(4)}{suffix}")
     try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
+        temporary.touch(0o666, exist_ok=False)
+        yield temporary
+        temporary.replace(path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def errors_naming(path: Path) -> Iterator[None]:
+    """Let every OSError name ``path``: that of a full disk names no file."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def write_bytes(path: Path, content: bytes | memoryview) -> None:
+    """Write ``path`` as a whole or not at all.
+
+    Raises:
+        OSError: the folder is read-only or the disk is full; it names ``path``.
+    """
+    with errors_naming(path), whole_file(path) as temporary, temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def write_text(path: Path, text: str) -> None:

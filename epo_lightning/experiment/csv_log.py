@@ -13,7 +13,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
-from epo_lightning.run_folder import RunFolder, read_log, write_text
+from epo_lightning.run_folder import RunFolder, errors_naming, read_log, write_text
 
 
 class CSVLog(Logger):
@@ -90,7 +90,7 @@ def _text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 def _append(path: Path, text: str) -> None:
     """Add lines at the end of a file, or leave it as it was."""
-    with path.open("ab", buffering=0) as file:
+    with errors_naming(path), path.open("ab", buffering=0) as file:
         end = file.seek(0, os.SEEK_END)
         try:
             left = memoryview(text.encode())

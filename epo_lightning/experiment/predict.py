@@ -15,7 +15,7 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import PredictSettings, Settings, read
 from epo_lightning.experiment.evaluate import open_checkpoint, open_data, split_of
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.run_folder import RunFolder, write_bytes, write_json
 from epo_lightning.scene import HEADING, KINDS, JointForecast, Scene, X, Y
 
 MEANING = {
@@ -59,7 +59,7 @@ def predict(settings: PredictSettings) -> list[Path]:
         ConfigError: no run, checkpoint or data, or files in ``out`` that would be overwritten.
     """
     assembly.quiet()
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     run = RunFolder.open(settings.run)
     out = Path(settings.out).expanduser()
@@ -72,9 +72,7 @@ def predict(settings: PredictSettings) -> list[Path]:
     forecast = forecast_of(forecaster, scenes)
     tensors = dict(_tensors(scenes, forecast))
     out.mkdir(parents=True, exist_ok=True)
-    temporary = tensors_file.with_suffix(".tmp")
-    save_file(tensors, temporary)
-    temporary.replace(tensors_file)
+    write_bytes(tensors_file, save(tensors))
     pictures = draw(settings, of_run.title, forecaster, scenes, forecast)
     index = {
         "run": str(run.path),

@@ -27,7 +27,8 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
 
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.style import HISTORY, LANE, ROAD, TRUTH, VEHICLES, save, style, whole
+from epo_lightning.report.style import HISTORY, LANE, ROAD, TRUTH, VEHICLES, save, style
+from epo_lightning.run_folder import whole_file
 from epo_lightning.scene import HEADING, KINDS, SPEED, JointForecast, Scene
 
 Color = str | tuple[float, float, float]
@@ -115,7 +116,7 @@ def animate(scene: Scene, forecast: JointForecast, path: str | Path, title: str 
         figure, (axes,) = _layout(ground, [future], "", moving=True)
         _draw_road(axes, ground)
         frames = _moving(axes, ground, future, parts)
-        with whole(path, ending) as temporary:
+        with whole_file(path, ending) as temporary:
             write = _write_gif if ending == ".gif" else _write_mp4
             write(figure, frames, ground.dt / parts, temporary)
     return path

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import os
 import re
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +12,8 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from epo_lightning.run_folder import whole_file
 
 MODES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Okabe and Ito's colours; the first two modes are red and blue as in the paper."""
@@ -59,9 +59,10 @@ def style() -> Iterator[None]:
 def save(figure: Figure, path: str | Path) -> Path:
     """Write a PNG as a whole; the same picture gives the same bytes."""
     FigureCanvasAgg(figure)  # no display, and no figure that pyplot remembers
-    with whole(path, ".png") as temporary:
+    path = Path(path)
+    with whole_file(path, ".png") as temporary:
         figure.savefig(temporary, dpi=DPI, bbox_inches="tight", pad_inches=0.08, metadata={"Software": None})
-    return Path(path)
+    return path
 
 
 def svg(figure: Figure, name: str) -> str:
@@ -83,25 +84,3 @@ def svg(figure: Figure, name: str) -> str:
         drawing = re.sub(superfluous, "", drawing, flags=re.DOTALL)
     drawing = re.sub(r'\b(id="|href="#|url\(#)', rf"\g<1>{name}-", drawing)
     return re.sub(r'^<svg[^>]*?(viewBox="[^"]*")[^>]*>', r'<svg \1 aria-hidden="true" focusable="false">', drawing)
-
-
-@contextmanager
-def whole(path: str | Path, suffix: str) -> Iterator[Path]:
-    """A file beside ``path`` to write to, which becomes ``path`` when all went well and vanishes when not.
-
-    Args:
-        path: of the picture; its folder is made.
-        suffix: says which format the file is of.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-", suffix=suffix)
-    os.close(descriptor)
-    temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
