@@ -163,6 +163,7 @@ def _help(arguments: Arguments) -> None:
     from textwrap import fill
 
     from epo_lightning.experiment.config.compose import hydra, options_of, tree
+    from epo_lightning.experiment.config.sources import HIGHWAYS
 
     if arguments.verb == "sweep":
         print(SWEEP_USAGE)
@@ -195,7 +196,10 @@ def _help(arguments: Arguments) -> None:
                 "debug",
                 "sweeps",
             ):
-                words = " | ".join(options_of(instance, group))
+                options = options_of(instance, group)
+                if group == "experiment":  # the rows on highways once, and not for each data set again
+                    options = [name for name in options if name.partition("/")[0] not in HIGHWAYS]
+                words = " | ".join(options)
                 print(fill(words, 120, initial_indent=f"  {group + '=':<14}", subsequent_indent=" " * 16))
 
 

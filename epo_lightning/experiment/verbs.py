@@ -42,13 +42,15 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     settings = check("generate", config)
     from epo_lightning.experiment import assembly
     from epo_lightning.experiment.config.compose import tree
+    from epo_lightning.experiment.config.sources import HIGHWAYS
 
     data = assembly.build_data(settings.data)
     folder = data.generate(workers=settings.workers, progress=settings.progress)
     print(f"\ndata in {folder}, digest {data.digest}")
     _print_report(data.report())
-    row = f"{settings.data.get('dataset', 'rpi')}/v_lstm_epo"
-    if (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
+    dataset = settings.data.get("dataset", "rpi")
+    row = f"{dataset}/v_lstm_epo"
+    if dataset in HIGHWAYS or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
         words = [f"experiment={row}", *(o for o in overrides if o.startswith("data."))]
     else:
         words = [f"experiment={'exid' if data.task.map else 'ucy'}/v_lstm_epo", *overrides]

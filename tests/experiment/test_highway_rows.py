@@ -12,11 +12,14 @@ from pathlib import Path
 import pytest
 from experiment.conftest import Epo
 
-from epo_lightning.experiment.config.compose import tree
+from epo_lightning.experiment.config.compose import compose, hydra, jobs, options_of, tree
+from epo_lightning.experiment.config.settings import Settings, read
+from epo_lightning.experiment.config.sources import HIGHWAYS
+from epo_lightning.experiment.train import folder_for
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "exid_sim"
 DATA = (f"data.folder={FIXTURE}", "data.batch_size=4")
-ROWS = sorted(file.stem for file in (tree() / "conf" / "experiment" / "exid").glob("*.yaml"))
+ROWS = sorted(file.stem for file in (tree() / "conf" / "experiment" / "highway").glob("*.yaml"))
 SHARED = Path(os.environ.get("EPO_SHARED", Path(__file__).parents[2].parent / "shared"))
 
 
@@ -24,18 +27,36 @@ def test_the_rows_are_the_papers() -> None:
     backbones = ("v_lstm", "vibes", "hivt_m")
     main = {f"{backbone}{suffix}" for backbone in backbones for suffix in ("", "_sc", "_epo")}
     assert set(ROWS) == main | {"const_vel", "v_lstm_epo_no_init", "v_lstm_epo_no_goal"}
-    for data in ("us101", "highway_sim"):
-        twins = sorted(file.stem for file in (tree() / "conf" / "experiment" / data).glob("*.yaml"))
-        assert twins == ROWS
+    with hydra() as instance:
+        options = options_of(instance, "experiment")
+    for data in HIGHWAYS:
+        assert sorted(name.partition("/")[2] for name in options if name.startswith(f"{data}/")) == ROWS
 
 
-@pytest.mark.parametrize("data", ["us101", "highway_sim"])
-@pytest.mark.parametrize("row", ROWS)
-def test_twins_on_other_data_differ_in_one_line(data: str, row: str) -> None:
-    folder = tree() / "conf" / "experiment"
-    one, other = ((folder / name / f"{row}.yaml").read_text().splitlines()[2:] for name in ("exid", data))
-    assert len(one) == len(other)
-    assert sum(a != b for a, b in zip(one, other, strict=True)) == 1
+@pytest.mark.parametrize("data", HIGHWAYS)
+@pytest.mark.parametrize("row", ["vibes_epo", "v_lstm_epo_no_goal"])
+@pytest.mark.parametrize("budget", ["paper", "short"])
+def test_both_names_of_a_row_are_the_same_run(data: str, row: str, budget: str) -> None:
+    new = compose("train", [f"experiment=highway/{row}", f"data={data}", f"budget={budget}"])
+    old = compose("train", [f"experiment={data}/{row}", f"budget={budget}"])
+    assert new == old
+    assert (new["experiment"], new["variant"], new["data"]["dataset"]) == (f"{data}/{row}", "", data)
+    assert folder_for(read(Settings, new)).path == Path(f"runs/{data}/{row}/{budget}-s0")
+
+
+def test_other_data_and_other_settings_get_folders_of_their_own() -> None:
+    words = (["data=us101"], ["data=highway_sim"], ["data=drawn"], ["data=us101", "data.seed=3"], [])
+    configs = [compose("train", ["experiment=highway/vibes", *more]) for more in words]
+    assert len({folder_for(read(Settings, config)).path for config in configs}) == len(words)
+    assert [config["experiment"] for config in configs][2] == "highway/vibes"  # not one of the highway data sets
+
+
+def test_old_names_work_in_globs_and_sweeps() -> None:
+    assert len(jobs("train", ["experiment=glob('us101/*')"])) == len(ROWS)
+    main = [compose("train", job) for job in jobs("train", ["sweeps=us101_main"])]
+    assert len({folder_for(read(Settings, config)).path for config in main}) == 30
+    assert {config["experiment"].partition("/")[0] for config in main} == {"us101"}
+    assert {config["data"]["dataset"] for config in main} == {"us101"}
 
 
 def test_rows_from_recordings_to_the_table(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

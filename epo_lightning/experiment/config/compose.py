@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from epo_lightning.experiment.config.sources import recorded_name
 from epo_lightning.identity import canonical, essence
 from epo_lightning.registry import ConfigError, nearest
 
@@ -99,6 +100,7 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
     values = _plain_values(config)
     if choices.get("experiment"):
+        choices["experiment"] = recorded_name(choices["experiment"], choices.get("data", ""))
         values["experiment"] = choices["experiment"]
     if "trainer" in values:
         own = canonical(essence({**values, "seed": None}))

@@ -1,32 +1,82 @@
-"""How Hydra sees the configuration tree: options also in folders within a group, and ``sweeps/`` beside it as a group."""
+"""Sources of Hydra's configuration tree: options in folders within a group, rows on highways, and the group ``sweeps``."""
 
 from __future__ import annotations
 
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult
+from omegaconf import OmegaConf
 
 GROUP = "sweeps"
+HIGHWAYS = ("exid", "us101", "highway_sim")
+"""Data sets of highways, each of which has all rows of ``experiment/highway/`` under its own name."""
+EXPERIMENTS = "experiment"
 
 
 class TreeSource(FileConfigSource):
-    """A folder in which ``rpi/v_lstm`` is an option of ``experiment``, so that ``glob('rpi/*')`` finds it."""
+    """A folder in which ``rpi/v_lstm`` is an option of ``experiment``, so that ``glob('rpi/*')`` finds it.
+
+    ``experiment=us101/vibes`` is ``experiment=highway/vibes data=us101`` in one word: such a name has no file of its own.
+    """
 
     @staticmethod
     def scheme() -> str:
         return "tree"
 
+    def load_config(self, config_path: str) -> ConfigResult:
+        row = self._row_on_highways(config_path)
+        if row is None:
+            return super().load_config(config_path)
+        data, name = row
+        return ConfigResult(
+            config=OmegaConf.create({"defaults": [f"highway/{name}", {"override /data": data}]}),
+            path=f"{self.scheme()}://{self.path}",
+            provider=self.provider,
+            header={"package": "_global_"},
+        )
+
+    def is_config(self, config_path: str) -> bool:
+        return super().is_config(config_path) or self._row_on_highways(config_path) is not None
+
+    def is_group(self, config_path: str) -> bool:
+        return super().is_group(config_path) or self._is_highway(config_path)
+
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        if not super().is_group(config_path) and self._is_highway(config_path):
+            config_path = f"{EXPERIMENTS}/highway"
         found = super().list(config_path, results_filter)
-        if results_filter is not ObjectType.CONFIG or not config_path:
-            return found
-        for folder in super().list(config_path, ObjectType.GROUP):
-            found += [f"{folder}/{option}" for option in self.list(f"{config_path}/{folder}", ObjectType.CONFIG)]
-        return sorted(found)
+        if config_path == EXPERIMENTS and results_filter in (None, ObjectType.GROUP):
+            found += [data for data in HIGHWAYS if self._is_highway(f"{EXPERIMENTS}/{data}")]
+        if results_filter is ObjectType.CONFIG and config_path:
+            for folder in self.list(config_path, ObjectType.GROUP):
+                found += [f"{folder}/{option}" for option in self.list(f"{config_path}/{folder}", ObjectType.CONFIG)]
+        return sorted(set(found))
+
+    def _is_highway(self, config_path: str) -> bool:
+        group, _, data = config_path.partition("/")
+        return group == EXPERIMENTS and data in HIGHWAYS and super().is_group(f"{EXPERIMENTS}/highway")
+
+    def _row_on_highways(self, config_path: str) -> tuple[str, str] | None:
+        """Data set and row of an option that has no file: ``us101`` and ``vibes`` of ``experiment/us101/vibes``."""
+        folder, _, name = config_path.removesuffix(".yaml").rpartition("/")
+        if super().is_config(config_path) or not self._is_highway(folder):
+            return None
+        if not super().is_config(f"{EXPERIMENTS}/highway/{name}"):
+            return None
+        return folder.partition("/")[2], name
+
+
+def recorded_name(experiment: str, data: str) -> str:
+    """Name under which a run is recorded: ``us101/vibes`` for ``experiment=highway/vibes data=us101``.
+
+    Both ways to ask for a row on a data set lead to the same run folder, and rows on two data sets never to one.
+    """
+    folder, _, row = experiment.partition("/")
+    return f"{data}/{row}" if folder == "highway" and data in HIGHWAYS else experiment
 
 
 class SweepsSource(FileConfigSource):
-    """The folder that holds ``sweeps/``, of which nothing else is seen.
+    """The parent folder of ``sweeps/``, whose other contents Hydra does not see.
 
     Hydra takes every folder below an entry of its search path for a group. The parent of ``sweeps/`` is the root of a
     checkout, where ``runs/`` would then shadow the key ``runs`` as soon as the first run was written.
