@@ -1,4 +1,8 @@
-"""Training objectives (Appendix C.4). Every loss is the mean over scenes of what it says."""
+"""Terms of training objectives (Appendix C.4). Every loss is a mean over scenes.
+
+Cross entropies take log-probabilities (:attr:`~epo_lightning.scene.JointForecast.log_probabilities`): the gradient by the
+logits is softmax - one-hot then, also where the probability itself is smaller than any number of its precision.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +16,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Relaxation:
-    """A share of the imitation loss that goes to the mean over modes instead of the closest one, fading out.
+    """Share of the imitation loss that is the mean over modes instead of the closest mode; it fades to zero.
 
-    The paper's loss trains only the closest mode, so a mode that starts out far from the data in some scenes is never
-    taught there: it stays dead. A small share early on draws every mode to where the data are, and then lets go.
+    The paper's loss trains only the closest mode. A mode that starts far from the data in some scenes gets no gradient there
+    and stays unused. A small share early in training draws every mode towards the data.
 
     Attributes:
-        share: of the mean, at the first step; 0 is the paper's loss.
-        steps: optimisation steps after which it has faded, linearly, to zero.
+        share: share of the mean at the first step; 0 is the paper's loss.
+        steps: optimisation steps over which the share falls linearly to zero.
     """
 
     share: float = 0.0
@@ -27,7 +31,9 @@ class Relaxation:
 
     def __post_init__(self) -> None:
         if not 0 <= self.share <= 1 or self.steps < 1:
-            raise ValueError(f"relaxation must be in [0, 1] over 1 step or more, not {self.share} over {self.steps}")
+            raise ValueError(
+                f"relaxation must be in [0, 1] and relaxation_steps 1 or more, not {self.share} and {self.steps}"
+            )
 
     def at(self, step: int) -> float:
         """The share at an optimisation step."""
@@ -40,10 +46,19 @@ def distances(
     mask: Bool[Tensor, "B N K"],
     power: float = 1.0,
 ) -> Float[Tensor, "B M N"]:
-    """Mean Euclidean distance [m] of each agent's futures to the observed one, over observed steps; 0 without any.
+    """Mean Euclidean distance [m] of each agent's futures from the observed one, over observed steps; 0 without any.
 
-    A ``power`` raises every step's distance to it; TGL takes 1.05.
+    The distance of every step is raised to ``power``; TGL uses 1.05.
+
+    Raises:
+        ValueError: futures and observation that have other numbers of scenes, agents or steps.
     """
+    batch, _, agents, steps, _ = positions.shape
+    if future.shape[:3] != (batch, agents, steps) or mask.shape != future.shape[:3]:
+        raise ValueError(
+            f"the forecast has shape {list(positions.shape)} [B, M, N, K, 2], but the observed future "
+            f"{list(future.shape)} [B, N, K, 4] and its mask {list(mask.shape)}: the horizon K of data and model must agree"
+        )
     observed = mask[:, None]
     truth = torch.where(mask[..., None], future[..., :2], 0.0)[:, None]
     error = torch.linalg.vector_norm(torch.where(observed[..., None], positions - truth, 0.0), dim=-1)
@@ -61,71 +76,72 @@ def _mean_over_agents(values: Tensor, mask: Bool[Tensor, "B N K"]) -> Tensor:
 def scene_imitation(
     distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0
 ) -> tuple[Float[Tensor, ""], Int[Tensor, " B"]]:
-    """L_imit, the minSADE: distance of the joint future closest to the observed one, and which that is."""
+    """L_imit, the minSADE: distance of the joint future closest to the observed one, and the index of that mode."""
     joint = _mean_over_agents(distance, mask)
     closest, mode = joint.min(1)
     return torch.lerp(closest, joint.mean(1), relaxation).mean(), mode
 
 
 def scene_probability(
-    probabilities: Float[Tensor, "B M"], mode: Int[Tensor, " B"], mask: Bool[Tensor, "B N K"]
+    log_probabilities: Float[Tensor, "B M"], mode: Int[Tensor, " B"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, ""]:
     """L_prob: cross entropy between the joint futures' probabilities and the closest one; 0 where nothing was observed."""
-    entropy = -log(probabilities).gather(1, mode[:, None])[:, 0]
+    entropy = _cross_entropy(log_probabilities.gather(1, mode[:, None])[:, 0])
     return torch.where(mask.flatten(1).any(1), entropy, 0.0).mean()
 
 
 def goal(
-    probabilities: Float[Tensor, "B N G"],
+    log_probabilities: Float[Tensor, "B N G"],
     candidates: Float[Tensor, "B N G 2"],
     exists: Bool[Tensor, "B N G"],
     final: Float[Tensor, "B N 2"],
     observed: Bool[Tensor, "B N"],
 ) -> Float[Tensor, ""]:
-    """L_goal: cross entropy between each agent's goal probabilities and the candidate closest to where it ended up.
+    """L_goal: cross entropy between each agent's goal probabilities and the candidate closest to its ``final`` position.
 
     Averaged over the agents that have a candidate and whose last step was ``observed``.
     """
     counts = observed & exists.any(-1)
     way = torch.where((exists & counts[..., None])[..., None], candidates - final[:, :, None], torch.inf)
     closest = way.square().sum(-1).argmin(-1)
-    cost = -log(probabilities).gather(-1, closest[..., None])
-    return _mean_over_agents(cost[..., 0], counts[..., None]).mean()
+    cost = _cross_entropy(log_probabilities.gather(-1, closest[..., None])[..., 0])
+    return _mean_over_agents(cost, counts[..., None]).mean()
 
 
 def marginal_imitation(
     distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0
 ) -> tuple[Float[Tensor, ""], Int[Tensor, "B N"]]:
-    """The minADE: each agent's distance to its own closest future, averaged, and which future that is."""
+    """The minADE: mean over agents of the distance of their own closest futures, and the indices of these modes."""
     closest, mode = distance.min(1)
     return _mean_over_agents(torch.lerp(closest, distance.mean(1), relaxation), mask).mean(), mode
 
 
 def marginal_probability(
-    probabilities: Float[Tensor, "B M N"], mode: Int[Tensor, "B N"], mask: Bool[Tensor, "B N K"]
+    log_probabilities: Float[Tensor, "B M N"], mode: Int[Tensor, "B N"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, ""]:
     """Cross entropy between each agent's probabilities and its own closest future, averaged over agents."""
-    return _mean_over_agents(-log(probabilities).gather(1, mode[:, None])[:, 0], mask).mean()
+    return _mean_over_agents(_cross_entropy(log_probabilities.gather(1, mode[:, None])[:, 0]), mask).mean()
 
 
-def log(probabilities: Tensor) -> Tensor:
-    """The logarithm, finite also where a probability is too small for its precision."""
-    return probabilities.clamp_min(torch.finfo(probabilities.dtype).tiny).log()
+def _cross_entropy(log_probability: Tensor) -> Tensor:
+    """-log p. An impossible mode (a repeated one) costs as much as the smallest number, without a gradient."""
+    least = math.log(torch.finfo(log_probability.dtype).tiny)
+    return -torch.where(log_probability == -torch.inf, least, log_probability)
 
 
 def joint_density(log_density: Float[Tensor, " B"], mask: Bool[Tensor, "B N K"]) -> Float[Tensor, ""]:
-    """-log p of what was observed of every scene; 0 where that is nothing."""
+    """Negative log density of every scene's observation; 0 for scenes without any."""
     return torch.where(mask.flatten(1).any(1), surprise(log_density), 0.0).mean()
 
 
 def marginal_density(
     log_density: Float[Tensor, "B M N"], mode: Int[Tensor, "B N"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, ""]:
-    """As :func:`marginal_probability`, but of logarithms: the least likely future is still learned from."""
+    """Negative log density of each agent's own closest future, averaged over agents."""
     return _mean_over_agents(surprise(log_density.gather(1, mode[:, None])[:, 0]), mask).mean()
 
 
 def surprise(log_density: Tensor) -> Tensor:
-    """-log p; what cannot happen, or has no probability, costs what the smallest number would, and teaches nothing."""
+    """-log p. An impossible or unknown (NaN) outcome costs as much as the smallest number, without a gradient."""
     least = torch.finfo(log_density.dtype).tiny
     return -torch.where(log_density.isfinite(), log_density, math.log(least))

@@ -1,6 +1,6 @@
-"""The vocabulary: what is observed, what is inferred, what is solved and what is forecast.
+"""Data classes of the project: the observed scene, the inferred game, its solution and the forecast.
 
-Shapes use one alphabet everywhere:
+All shapes are written in one alphabet:
 
 ====  =========================  ======  ================================================================
 B     scenes in a batch          P       pairs of agents i < j, P = N (N - 1) / 2
@@ -16,9 +16,11 @@ L     lane polylines             V       vectors of a lane polyline
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from numbers import Real
 from typing import Any, TypeVar
 
 import torch
@@ -27,7 +29,7 @@ from torch import Tensor
 
 X, Y, HEADING, SPEED = range(4)
 KINDS = ("car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "other")
-"""What agents can be; ``Scene.kind`` is an index into this."""
+"""Classes of agents; ``Scene.kind`` is an index into this tuple."""
 ACCELERATION, TURN_RATE = range(2)
 
 
@@ -35,10 +37,10 @@ Batch = TypeVar("Batch", bound="_Batch")
 
 
 class _Batch:
-    """Tensors that share their leading dimension B, moved and indexed together."""
+    """A data class of tensors that share their leading dimension B; they are moved and indexed together."""
 
     def map(self: Batch, function: Callable[[Tensor], Tensor]) -> Batch:
-        """Apply ``function`` to every tensor, also inside mappings, tuples and batches within this one."""
+        """A copy with ``function`` applied to every tensor, also inside nested mappings, tuples and batches."""
 
         def visit(value: Any) -> Any:
             if isinstance(value, Tensor):
@@ -55,50 +57,79 @@ class _Batch:
         return type(self)(**{field.name: visit(getattr(self, field.name)) for field in fields})
 
     def to(self: Batch, target: torch.device | torch.dtype | str) -> Batch:
-        """Move to a device, or convert the floating-point tensors to another precision."""
+        """A copy on another device, or with its floating-point tensors in another precision."""
         if isinstance(target, torch.dtype):
             return self.map(lambda tensor: tensor.to(target) if tensor.is_floating_point() else tensor)
         return self.map(lambda tensor: tensor.to(target))
 
     def __getitem__(self: Batch, index: Any) -> Batch:
-        """Choose scenes of the batch; an integer keeps the batch dimension."""
+        """The chosen scenes of the batch; an integer keeps the batch dimension."""
         if isinstance(index, int):
             index = [index]
         return self.map(lambda tensor: tensor[index])
 
 
+_FLOAT, _INTEGER, _MASK = "floating-point", "integer", "boolean"
+
+_FIELDS: Mapping[str, tuple[str, tuple[str | int, ...], str | None]] = {
+    "history": (_FLOAT, ("B", "N", "H", 4), None),
+    "history_mask": (_MASK, ("B", "N", "H"), None),
+    "agent_mask": (_MASK, ("B", "N"), None),
+    "future": (_FLOAT, ("B", "N", "K", 4), None),
+    "future_mask": (_MASK, ("B", "N", "K"), "future"),
+    "goal_candidates": (_FLOAT, ("B", "N", "G", 2), None),
+    "goal_mask": (_MASK, ("B", "N", "G"), "goal_candidates"),
+    "goal_reference": (_INTEGER, ("B", "N", "G"), "goal_candidates"),
+    "size": (_FLOAT, ("B", "N", 2), None),
+    "kind": (_INTEGER, ("B", "N"), None),
+    "lanes": (_FLOAT, ("B", "L", "V", 4), None),
+    "lane_mask": (_MASK, ("B", "L", "V"), "lanes"),
+    "references": (_FLOAT, ("B", "N", "R", "Q", 2), None),
+    "reference_mask": (_MASK, ("B", "N", "R"), "references"),
+    "reference_speed": (_FLOAT, ("B", "N"), None),
+    "frame": (_FLOAT, ("B", 3), None),
+    "subset": (_INTEGER, ("B",), None),
+    "id": (_INTEGER, ("B",), None),
+}
+"""Kind of number, shape, and field that must be given as well, of every tensor of a :class:`Scene`."""
+
+_LEAST = {"H": (1, "step; the last one is the current state, t0"), "K": (1, "step"), "Q": (2, "points of each line")}
+"""Smallest sizes of some dimensions, and what they count."""
+
+
 @dataclass(frozen=True)
 class Scene(_Batch):
-    """What is known of B scenes: agents' histories, their sizes, and, while learning, their futures.
+    """A batch of B observed scenes: agents' histories and sizes, the map and, in training, the agents' futures.
 
-    Positions are in one fixed frame for the whole scene. Masks are True where an entry is real; whatever stands behind a
-    False never influences a result. A mask that is left out means that everything is real.
+    Positions are in one fixed frame for the whole scene. Masks are True where an entry is real; values behind a False
+    never influence a result. A mask that is left out means that every entry is real.
 
     Attributes:
         history: states x, y [m], heading [rad], speed [m/s]; the last step is the current one, t0.
         dt: length of a time step [s].
-        history_mask: which history steps were observed. An agent that is present is observed at t0.
-        agent_mask: which agents exist.
+        history_mask: observed steps of the history. An agent that is present is observed at t0.
+        agent_mask: agents that exist; the others are padding.
         future: observed states after t0, the first one dt later; None when forecasting.
-        future_mask: which future steps were observed.
-        goal_candidates: positions [m] that an agent may be heading for; G = 1 where the goal is given (RPI).
-        goal_mask: which candidates exist.
+        future_mask: observed steps of the future.
+        goal_candidates: possible goal positions [m] of each agent; G = 1 where the goal is given (RPI).
+        goal_mask: candidates that exist.
         goal_reference: index of the reference line on which each candidate lies.
         size: length and width [m].
-        kind: what an agent is, an index into :data:`KINDS`.
+        kind: class of each agent, an index into :data:`KINDS`.
         lanes: the map, as polylines of vectors from one point of a lane to the next: x, y of both [m].
-        lane_mask: which of these vectors exist.
+        lane_mask: lane vectors that exist.
         references: lines that an agent may follow, as points [m] (lane centres); a line with fewer points repeats its
             last one.
-        reference_mask: which of these lines exist.
-        reference_speed: the speed at which an agent would like to travel [m/s].
-        frame: origin x, y [m] and rotation [rad] that lead back to the recording's coordinates:
+        reference_mask: reference lines that exist.
+        reference_speed: desired speed of each agent [m/s].
+        frame: origin x, y [m] and rotation [rad] of the transformation back to the recording's coordinates:
             world = R(rotation) position + origin.
         subset: index of the named subset of the data that the future belongs to (RPI: executed 0, alternative 1).
-        id: which record of its data set a scene is.
+        id: index of the scene's record in its data set.
 
     Raises:
-        ValueError: a shape that does not fit the history, or a time step that is not positive.
+        TypeError: a field that is not a tensor (numpy arrays included), or a time step that is not a number.
+        ValueError: a shape or type of number that does not fit, or a time step that is not positive and finite.
     """
 
     history: Float[Tensor, "B N H 4"]
@@ -122,72 +153,51 @@ class Scene(_Batch):
     id: Int[Tensor, " B"] | None = None
 
     def __post_init__(self) -> None:
-        if self.history.dim() != 4 or self.history.shape[-1] != 4:
-            raise ValueError(
-                f"scene.history has shape {list(self.history.shape)}; it takes [B, N, H, 4]: x, y, heading, speed"
-            )
-        if self.history.shape[2] == 0:
-            raise ValueError("scene.history has no step; the last one is the current state, t0")
-        for name in ("history_mask", "agent_mask", "future_mask", "goal_mask", "lane_mask", "reference_mask"):
-            mask = getattr(self, name)
-            if mask is not None and mask.dtype != torch.bool:
-                raise ValueError(
-                    f"scene.{name} is of type {mask.dtype}; masks are torch.bool, True where an entry is real"
-                )
-        if not self.dt > 0:
-            raise ValueError(f"scene.dt must be positive, not {self.dt}")
-        batch, agents, steps, _ = self.history.shape
-        for name, shape in (
-            ("history_mask", (batch, agents, steps)),
-            ("agent_mask", (batch, agents)),
-            ("size", (batch, agents, 2)),
-            ("kind", (batch, agents)),
-            ("reference_speed", (batch, agents)),
-            ("frame", (batch, 3)),
-        ):
-            given = getattr(self, name)
-            if given is not None and given.shape != shape:
-                raise ValueError(f"scene.{name} has shape {list(given.shape)}; this history takes {list(shape)}")
-        if self.lanes is not None and (self.lanes.dim() != 4 or len(self.lanes) != batch or self.lanes.shape[-1] != 4):
-            raise ValueError(f"scene.lanes has shape {list(self.lanes.shape)}; this history takes [{batch}, L, V, 4]")
-        for name, of in (
-            ("goal_mask", "goal_candidates"),
-            ("goal_reference", "goal_candidates"),
-            ("lane_mask", "lanes"),
-        ):
-            given, owner = getattr(self, name), getattr(self, of)
-            if given is not None and (owner is None or given.shape != owner.shape[:-1]):
-                takes = "None" if owner is None else f"of shape {list(owner.shape)}"
-                raise ValueError(f"scene.{name} has shape {list(given.shape)}, but scene.{of} is {takes}")
-        lines = self.references
-        if lines is not None and (
-            lines.dim() != 5 or lines.shape[:2] != (batch, agents) or lines.shape[3] < 2 or lines.shape[4] != 2
-        ):
-            expected = f"[{batch}, {agents}, R, Q, 2] with Q of at least 2 points"
-            raise ValueError(f"scene.references has shape {list(lines.shape)}; this history takes {expected}")
-        if self.reference_mask is not None:
-            if lines is None:
-                raise ValueError("scene.reference_mask says which of scene.references exist, which is None")
-            if self.reference_mask.shape != lines.shape[:3]:
-                given = list(self.reference_mask.shape)
-                raise ValueError(
-                    f"scene.reference_mask has shape {given}; these references take {list(lines.shape[:3])}"
-                )
+        # Shapes and types only: values would have to be fetched from the accelerator. See `validate_values`.
+        if not isinstance(self.dt, Real) or isinstance(self.dt, bool):
+            raise TypeError(f"scene.dt is a {type(self.dt).__name__}; it takes a number of seconds")
+        if not 0 < self.dt < math.inf:
+            raise ValueError(f"scene.dt must be positive and finite [s], not {self.dt}")
+        sizes: dict[str, int] = {}
+        for name, (numbers, shape, owner) in _FIELDS.items():
+            value = getattr(self, name)
+            if value is not None:
+                if owner is not None and getattr(self, owner) is None:
+                    raise ValueError(f"scene.{name} describes scene.{owner}, which is None: give both or neither")
+                _check_tensor(name, value, numbers, shape, sizes)
+            elif name == "history":
+                raise TypeError("scene.history is None; it takes a tensor [B, N, H, 4]: x, y, heading, speed")
 
-        def default(name: str, shape: torch.Size) -> None:
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, torch.ones(shape, dtype=torch.bool, device=self.history.device))
+        for name, (numbers, shape, owner) in _FIELDS.items():
+            if numbers == _MASK and getattr(self, name) is None and (owner is None or getattr(self, owner) is not None):
+                ones = torch.ones([sizes[str(dim)] for dim in shape], dtype=torch.bool, device=self.history.device)
+                object.__setattr__(self, name, ones)
 
-        default("history_mask", self.history.shape[:-1])
-        default("agent_mask", self.history.shape[:2])
-        if self.future is not None:
-            default("future_mask", self.future.shape[:-1])
-        if self.goal_candidates is not None:
-            default("goal_mask", self.goal_candidates.shape[:-1])
-        if self.lanes is not None:
-            default("lane_mask", self.lanes.shape[:-1])
-        if lines is not None:
-            default("reference_mask", lines.shape[:-2])
+    def validate_values(self) -> None:
+        """Refuse values that no forecaster can use. Reads the tensors, so on an accelerator it waits for them.
+
+        Raises:
+            ValueError: a length or width that is not positive, or the index of a reference line that does not exist.
+        """
+        if self.size is not None:
+            bad = (self.size <= 0).any(-1) & self.agent_mask
+            if bad.any():
+                scene, agent = bad.nonzero()[0].tolist()
+                raise ValueError(
+                    f"scene.size[{scene}, {agent}] is {self.size[scene, agent].tolist()}; length and width must be "
+                    "positive [m]"
+                )
+        if self.goal_reference is not None and self.references is not None:
+            lines = self.references.shape[2]
+            assert self.goal_mask is not None
+            bad = (self.goal_reference < 0) | (self.goal_reference >= lines)
+            bad &= self.goal_mask & self.agent_mask[..., None]
+            if bad.any():
+                at = bad.nonzero()[0].tolist()
+                raise ValueError(
+                    f"scene.goal_reference{at} is {int(self.goal_reference[tuple(at)])}; scene.references holds the "
+                    f"lines 0 to {lines - 1}"
+                )
 
     @property
     def current(self) -> Float[Tensor, "B N 4"]:
@@ -196,47 +206,72 @@ class Scene(_Batch):
 
     @property
     def finite(self) -> Bool[Tensor, " B"]:
-        """Which scenes hold finite numbers wherever their masks say that an entry is real."""
+        """Scenes whose real entries are all finite; values behind a mask do not count."""
+        result = torch.ones(len(self.history), dtype=torch.bool, device=self.history.device)
+        references = None if self.references is None else self.references.flatten(3)
+        speed = None if self.reference_speed is None else self.reference_speed[..., None]
+        for values, mask in (
+            (self.history, self.history_mask),
+            (self.future, self.future_mask),
+            (self.goal_candidates, self.goal_mask),
+            (self.size, None),
+            (references, self.reference_mask),
+            (speed, None),
+        ):
+            if values is not None:
+                bad = ~values.isfinite().all(-1)
+                bad &= self.agent_mask.view(*self.agent_mask.shape, *[1] * (bad.dim() - 2))
+                result &= ~(bad if mask is None else bad & mask).flatten(1).any(1)
+        if self.lanes is not None:
+            assert self.lane_mask is not None
+            result &= (self.lanes.isfinite().all(-1) | ~self.lane_mask).flatten(1).all(1)
+        return result
 
-        def sound(values: Tensor | None, mask: Tensor | None) -> Tensor:
-            if values is None:
-                return torch.ones(len(self.history), dtype=torch.bool, device=self.history.device)
-            bad = ~values.isfinite().all(-1)
-            bad &= self.agent_mask.view(*self.agent_mask.shape, *[1] * (bad.dim() - 2))
-            return ~(bad if mask is None else bad & mask).flatten(1).any(1)
 
-        return (
-            sound(self.history, self.history_mask)
-            & sound(self.future, self.future_mask)
-            & sound(self.goal_candidates, self.goal_mask)
-            & sound(self.size, None)
-            & sound(None if self.references is None else self.references.flatten(3), self.reference_mask)
-            & sound(None if self.reference_speed is None else self.reference_speed[..., None], None)
-            & self._finite_lanes
-        )
+def _check_tensor(name: str, value: Any, numbers: str, shape: tuple[str | int, ...], sizes: dict[str, int]) -> None:
+    """Compare one field of a scene with its declaration; ``sizes`` collects the sizes of the dimensions by letter.
 
-    @property
-    def _finite_lanes(self) -> Bool[Tensor, " B"]:
-        if self.lanes is None:
-            return torch.ones(len(self.history), dtype=torch.bool, device=self.history.device)
-        return (self.lanes.isfinite().all(-1) | ~self.lane_mask).flatten(1).all(1)  # type: ignore[operator]
+    Raises:
+        TypeError: not a tensor.
+        ValueError: another type of number or another shape.
+    """
+    if not isinstance(value, Tensor):
+        kind = type(value)
+        raise TypeError(f"scene.{name} is a {kind.__module__}.{kind.__qualname__}; convert it with torch.as_tensor")
+    given = "boolean" if value.dtype == torch.bool else "floating-point" if value.is_floating_point() else "integer"
+    if given != numbers:
+        hint = "; masks are torch.bool, True where an entry is real" if numbers == _MASK else ""
+        raise ValueError(f"scene.{name} is of type {value.dtype}, but takes {numbers} numbers{hint}")
+    expected = [sizes.get(dim, dim) if isinstance(dim, str) else dim for dim in shape]
+    fits = value.dim() == len(expected) and all(
+        isinstance(want, str) or want == got for want, got in zip(expected, value.shape, strict=True)
+    )
+    if not fits:
+        words = ", ".join(map(str, expected))
+        raise ValueError(f"scene.{name} has shape {list(value.shape)}; this scene takes [{words}]")
+    for dim, got in zip(shape, value.shape, strict=True):
+        least, unit = _LEAST.get(str(dim), (0, ""))
+        if got < least:
+            raise ValueError(f"scene.{name} has shape {list(value.shape)}; it takes at least {least} {unit}")
+        if isinstance(dim, str):
+            sizes[dim] = got
 
 
 @dataclass(frozen=True)
 class GameParameters(_Batch):
-    """The game that the network infers for every scene and mode (Section 4.2), p = (w, g), and where its solution starts.
+    """The inferred game of every scene and mode (Section 4.2), p = (w, g), and the strategies at which its solver starts.
 
     Attributes:
-        own_weights: weight of each named feature of an agent; enters the energy squared.
+        own_weights: weight of each named feature of an agent; the energy squares it.
         pair_weights: weight of each named feature of a pair i < j, in the order of ``torch.triu_indices(N, N, 1)``.
-        goals: where each agent is heading [m]; None for energies without a goal feature.
-        initial_controls: the strategies from which the solver starts, one for every mode; or between which it chooses, any
-            number C of them.
+        goals: goal position of each agent [m]; None for energies without a goal feature.
+        initial_controls: the strategies from which the solver starts, one for every mode; or, for solvers that choose, any
+            number C of candidate strategies.
         reference: index of the reference line that an agent follows, the one its goal lies on; None for energies without a
             lane feature.
         context: features z of the agents, for energies that are networks.
-        order: +1 or -1 for every pair i < j, on which side of each other they pass or who goes first, for energies that are
-            convex given the order.
+        order: +1 or -1 for every pair i < j: the side on which they pass, or the agent that goes first; for energies that
+            are convex given the order.
     """
 
     own_weights: Mapping[str, Float[Tensor, "B M N"]]
@@ -248,7 +283,7 @@ class GameParameters(_Batch):
     order: Float[Tensor, "B M P"] | None = None
 
     def for_modes(self, modes: int) -> GameParameters:
-        """These games for M modes: one game becomes that of them all. Initial strategies stay as they are."""
+        """The same games for M modes: a single game is repeated for all of them. Initial strategies stay unchanged."""
 
         def widen(tensor: Tensor | None) -> Tensor | None:
             return None if tensor is None else tensor.expand(-1, modes, *tensor.shape[2:])
@@ -264,26 +299,27 @@ class GameParameters(_Batch):
 
 
 class Status(IntEnum):
-    """How the minimisation of one scene and mode went."""
+    """Outcome of the minimisation of one scene and mode."""
 
     SOLVED = 0
     """Every step was taken as the method defines it."""
     DAMPED = 1
     """A factorisation succeeded with more damping only, or steps were shortened."""
     STOPPED = 2
-    """A step could not be taken and the last good iterate was kept; or an implicit gradient was asked for where the Hessian
+    """A step could not be taken and the last good iterate was kept; or an implicit gradient was requested where the Hessian
     is not positive definite."""
 
 
 @dataclass(frozen=True)
 class Tables(_Batch):
-    """Energies of C candidate strategies of every agent, and the density p(k) = exp(-E(k)) / Z over who takes which.
+    """Energies of C candidate strategies per agent, and the density p(k) = exp(-E(k)) / Z over joint choices k.
 
     Attributes:
-        states: the candidates; agents' candidates of one number do not belong together.
+        states: states of the candidates; equal candidate numbers of different agents are unrelated.
         unary: E_i of every candidate.
-        pair: E_ij of every two candidates, (k, l) for i's k-th and j's l-th, pairs in the order of ``torch.triu_indices``.
-        log_marginals: log p(k_i), exact or as sum-product finds them; zero for absent agents' first candidate.
+        pair: E_ij of every two candidates: entry (k, l) is agent i's k-th with agent j's l-th; pairs in the order of
+            ``torch.triu_indices``.
+        log_marginals: log p(k_i), exact or from sum-product messages; zero for the first candidate of absent agents.
         log_partition: log Z, exact or Bethe's approximation.
     """
 
@@ -296,17 +332,18 @@ class Tables(_Batch):
 
 @dataclass(frozen=True)
 class Solution(_Batch):
-    """Joint strategies that a solver found, and how well.
+    """Joint strategies found by a solver, with their energy and status.
 
     Attributes:
         controls: joint strategies u.
-        states: the states x_1 .. x_K that they lead to.
+        states: the states x_1 .. x_K that result from ``controls``.
         initial_energy, energy: E at the initial strategies and at ``controls``.
         gradient_norm: Euclidean norm of dE/du at ``controls``.
         status: a :class:`Status` per scene and mode.
-        iterates: u_0 .. u_S, when asked for.
-        tables: of the candidates, for solvers that choose among some; the joint modes are then the most likely choices.
-        assignment: which candidates these are, where the joint modes are choices among those of ``tables``.
+        iterates: u_0 .. u_S, for solvers that are told to keep them.
+        tables: energies of the candidates, for solvers that choose among candidates; the joint modes are then the most
+            likely choices.
+        assignment: index of the candidate that each agent takes in each mode, for the same solvers.
     """
 
     controls: Float[Tensor, "B M N K 2"]
@@ -322,17 +359,17 @@ class Solution(_Batch):
 
 @dataclass(frozen=True)
 class Equilibrium(_Batch):
-    """How close the most likely joint mode of a forecast is to an open-loop Nash equilibrium of its game.
+    """Distance of a forecast's most likely joint mode from an open-loop Nash equilibrium of its game.
 
     Attributes:
         initial, energy: E at the strategies from which the solver started, and at the forecast.
-        optimum: E at the local minimum that a tightly converged descent from the forecast leads to; never above ``energy``.
-            NaN where the energy, or the objective of one agent, was given up while it was still falling: energies that are
-            networks need not have a minimum.
+        optimum: E at the local minimum that a tightly converged descent from the forecast reaches; never above ``energy``.
+            NaN where the descent of the energy, or of one agent's objective, ended while it was still falling: energies
+            that are networks need not have a minimum.
         gradient_norm: Euclidean norm of dE/du at the forecast; NaN where strategies are chosen among candidates.
-        nash_gap: what each agent could gain by changing its strategy alone, to a local best response; zero where absent,
-            NaN where ``optimum`` is.
-        objective: J_i, what each agent minimises, at the forecast; zero where absent, NaN where it has no natural zero.
+        nash_gap: decrease of J_i when agent i alone changes to a local best response; zero for absent agents, NaN where
+            ``optimum`` is NaN.
+        objective: J_i, the agent's own objective, at the forecast; zero for absent agents, NaN where it has no natural zero.
     """
 
     initial: Float[Tensor, " B"]
@@ -347,20 +384,28 @@ class Equilibrium(_Batch):
 class JointForecast(_Batch):
     """M joint futures of all agents of a scene and their probabilities.
 
+    Losses read the logits, from which a gradient flows however small a probability is. A forecaster that gives none is
+    scored by its probabilities.
+
     Attributes:
-        states: futures; agents of one mode belong together.
-        probabilities: of the joint modes; sum to one, zero for modes that repeat an earlier one.
-        agent_probabilities: of each agent's own modes, for forecasters that are marginal (per agent); the joint modes
-            are then ordered so that mode m is everyone's m-th most likely one.
-        controls: the strategies behind ``states``, where the forecaster has any.
+        states: futures; the agents of one mode belong together.
+        probabilities: probabilities of the joint modes; they sum to one and are zero for modes that repeat an earlier one.
+        agent_probabilities: each agent's probabilities of its own modes, for marginal forecasters; the joint modes are
+            then ordered so that mode m consists of every agent's m-th most likely one.
+        controls: the strategies behind ``states``, for forecasters that have any.
         initial_states: the futures of the strategies from which the solver started.
         parameters: the inferred game.
-        solution: how the game was solved.
-        goal_probabilities: of each agent's goal candidates, for forecasters that choose among them.
-        order_logits: of every pair's order being +1, zero where it does not matter; for forecasters whose modes are orders.
+        solution: the solver's result.
+        goal_probabilities: each agent's probabilities of its goal candidates, for forecasters that choose among them.
+        order_logits: logit of every pair's order being +1, zero where it does not matter; for forecasters whose modes are
+            orders.
         own_energy: energy by feature and agent at the solution.
         pair_energy: energy by feature and pair at the solution.
-        equilibrium: how close the most likely mode is to an equilibrium, where that was asked for.
+        equilibrium: distance of the most likely mode from an equilibrium, where it was measured.
+        logits: unnormalised log-probabilities of the joint modes, of which ``probabilities`` are the softmax; -inf for
+            modes that repeat an earlier one.
+        agent_logits: the same for ``agent_probabilities``, over dimension 1.
+        goal_logits: the same for ``goal_probabilities``, over the last dimension.
     """
 
     states: Float[Tensor, "B M N K 4"]
@@ -375,3 +420,28 @@ class JointForecast(_Batch):
     own_energy: Mapping[str, Float[Tensor, "B M N"]] | None = None
     pair_energy: Mapping[str, Float[Tensor, "B M P"]] | None = None
     equilibrium: Equilibrium | None = None
+    logits: Float[Tensor, "B M"] | None = None
+    agent_logits: Float[Tensor, "B M N"] | None = None
+    goal_logits: Float[Tensor, "B N G"] | None = None
+
+    @property
+    def log_probabilities(self) -> Float[Tensor, "B M"]:
+        """Logarithms of ``probabilities``, for losses."""
+        return _log(self.logits, self.probabilities, 1)
+
+    @property
+    def agent_log_probabilities(self) -> Float[Tensor, "B M N"] | None:
+        """Logarithms of ``agent_probabilities``, for losses; None for forecasters without any."""
+        return None if self.agent_probabilities is None else _log(self.agent_logits, self.agent_probabilities, 1)
+
+    @property
+    def goal_log_probabilities(self) -> Float[Tensor, "B N G"] | None:
+        """Logarithms of ``goal_probabilities``, for losses; None for forecasters without any."""
+        return None if self.goal_probabilities is None else _log(self.goal_logits, self.goal_probabilities, 2)
+
+
+def _log(logits: Tensor | None, probabilities: Tensor, dim: int) -> Tensor:
+    """Log-probabilities from logits; without any, from probabilities, of which zero counts as the smallest number."""
+    if logits is not None:
+        return logits.log_softmax(dim)
+    return probabilities.clamp_min(torch.finfo(probabilities.dtype).tiny).log()

@@ -1,6 +1,8 @@
-"""Goal decoding: where agents are heading."""
+"""Goal decoding: the goal position of every agent in every mode, given by the data or chosen among candidates."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,73 +13,155 @@ from epo_lightning.decoders.mlp import MLP
 from epo_lightning.scene import Scene
 
 NO_CANDIDATE = -1e9
-"""Logit of what is no candidate: a softmax makes it an exact zero, and stays finite where there is nothing else."""
+"""Logit of absent candidates: their softmax is exactly zero, and finite for agents that have no candidate at all."""
+
+
+@dataclass(frozen=True)
+class Goals:
+    """Goals of all agents in every mode.
+
+    Attributes:
+        exist: agents that have a goal.
+        positions: goal positions [m], zero for agents without a goal; None where the energy asks for no goals.
+        reference: index of the reference line on which each goal lies; None where the scene names no lines.
+        logits: logits of the candidates, ``NO_CANDIDATE`` for absent ones; None where goals are not chosen.
+        chosen: index of the candidate chosen in each mode; None where goals are not chosen.
+    """
+
+    exist: Bool[Tensor, "B N"]
+    positions: Float[Tensor, "B M N 2"] | None = None
+    reference: Int[Tensor, "B M N"] | None = None
+    logits: Float[Tensor, "B N G"] | None = None
+    chosen: Int[Tensor, "B M N"] | None = None
+
+    @property
+    def probabilities(self) -> Float[Tensor, "B N G"] | None:
+        """Probabilities of the candidates, zero for absent ones; None where goals are not chosen."""
+        return None if self.logits is None else self.logits.softmax(-1).where(self.logits > NO_CANDIDATE, 0.0)
+
+    @property
+    def log_probability(self) -> Float[Tensor, "B M"]:
+        """Log-probability of every mode's joint choice of goals, zero where goals are not chosen; without a gradient.
+
+        Goals are trained by the agents' final positions, not by the mode that came closest.
+        """
+        if self.logits is None or self.chosen is None:
+            return torch.zeros((), device=self.exist.device)
+        choices = self.logits.detach().log_softmax(-1).gather(-1, self.chosen.transpose(1, 2))
+        return torch.where(self.exist[..., None], choices, 0.0).sum(1)
 
 
 def given_goals(scene: Scene) -> Float[Tensor, "B N 2"]:
-    """The one goal that a scene gives for each agent, zero for absent agents (RPI: "the goal is given and not predicted").
+    """The single given goal of each agent, zero for agents without one (RPI: "the goal is given and not predicted").
 
     Raises:
-        ValueError: the scene gives no goal, or several candidates of which one would have to be chosen.
+        ValueError: the scene gives no goal, or several candidates per agent.
     """
     if scene.goal_candidates is None:
-        raise ValueError("this forecaster is told the agents' goals, but scene.goal_candidates is None")
+        raise ValueError("this forecaster reads given goals, but scene.goal_candidates [B, N, 1, 2] is None")
     if scene.goal_candidates.shape[2] != 1:
         raise ValueError(
             f"this forecaster takes one given goal per agent, but scene.goal_candidates holds "
             f"{scene.goal_candidates.shape[2]}: give it shape [B, N, 1, 2]"
         )
-    return scene.goal_candidates[:, :, 0].where(scene.agent_mask[..., None], 0.0)
+    return scene.goal_candidates[:, :, 0].where(_exist(scene)[:, :, :1], 0.0)
+
+
+class NoGoals(nn.Module):
+    """Stand-in for a goal decoder where the energy asks for no goals."""
+
+    def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Goals:
+        """No goals."""
+        return Goals(torch.zeros_like(scene.agent_mask))
+
+
+class GivenGoals(nn.Module):
+    """The goals that the data gives, the same in every mode; nothing is learned.
+
+    Args:
+        modes: number M of games.
+    """
+
+    def __init__(self, modes: int) -> None:
+        super().__init__()
+        self.modes = modes
+
+    def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Goals:
+        """The given goals.
+
+        Raises:
+            ValueError: the scene gives no goal, or several candidates per agent.
+        """
+        positions = given_goals(scene)[:, None].expand(-1, self.modes, -1, -1)
+        return Goals(_exist(scene)[:, :, 0], positions)
 
 
 class GoalDecoder(nn.Module):
-    """phi_goal: how likely an agent is to head for each of its candidates, shared by all agents (after TNT).
+    """phi_goal: probability of each of an agent's goal candidates, one network for all agents (after TNT).
 
     The agent's feature is concatenated to each candidate's position relative to the agent (Appendix C.1, "Goal Decoder").
+    Mode m takes every agent's m-th most likely candidate.
 
     Args:
         width: size of the agent features.
         scale: metres that an input of one stands for.
+        modes: number M of games.
     """
 
-    def __init__(self, width: int, scale: float = 1.0) -> None:
+    def __init__(self, width: int, scale: float = 1.0, modes: int = 1) -> None:
         super().__init__()
-        self.width, self.scale = width, scale
+        self.width, self.scale, self.modes = width, scale, modes
         self.mlp = MLP(width + 2, 64, 1, norm="batch", bias=False)
 
-    def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B N G"]:
-        """Logits of the candidates, ``NO_CANDIDATE`` where there is none.
+    def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Goals:
+        """The M most likely goals of every agent, with the logits of all candidates.
+
+        Raises:
+            ValueError: the scene has no candidates.
+        """
+        logits = self.logits(z, scene)
+        chosen = most_likely(logits, self.modes)
+        return Goals(_exist(scene).any(-1), *choose(scene, chosen), logits, chosen)
+
+    def logits(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B N G"]:
+        """Logits of the candidates, ``NO_CANDIDATE`` for absent ones.
 
         Raises:
             ValueError: the scene has no candidates.
         """
         candidates, exists = goal_candidates(scene)
         way = (candidates - scene.current[:, :, None, :2])[exists] / self.scale
-        # The first layer of the concatenation, without writing the feature down once for every candidate.
+        # The first layer of the concatenation, without a copy of the agent's feature for every candidate.
         first = self.mlp.hidden[0]
         assert isinstance(first, nn.Linear)
         of_agent, of_way = first.weight.split([self.width, 2], 1)
         agent = F.linear(z, of_agent, first.bias).flatten(0, 1)
-        whose = exists.flatten(0, 1).nonzero()[:, 0]
-        logits = self.mlp.after_first(agent[whose] + F.linear(way, of_way))
+        owner = exists.flatten(0, 1).nonzero()[:, 0]
+        logits = self.mlp.after_first(agent[owner] + F.linear(way, of_way))
         return logits.new_full(exists.shape, NO_CANDIDATE).masked_scatter(exists, logits)
 
 
 def goal_candidates(scene: Scene) -> tuple[Float[Tensor, "B N G 2"], Bool[Tensor, "B N G"]]:
-    """Where agents may be heading for, and which of these candidates exist; absent agents have none.
+    """Goal candidates of all agents, and the mask of those that exist; absent agents have none.
 
     Raises:
         ValueError: the scene has no candidates.
     """
-    if scene.goal_candidates is None or scene.goal_mask is None:
+    if scene.goal_candidates is None:
         raise ValueError(
             "this forecaster chooses among goal candidates, but scene.goal_candidates [B, N, G, 2] is None"
         )
-    return scene.goal_candidates, scene.goal_mask & scene.agent_mask[..., None]
+    return scene.goal_candidates, _exist(scene)
+
+
+def _exist(scene: Scene) -> Bool[Tensor, "B N G"]:
+    """Goal candidates that exist, of agents that exist."""
+    assert scene.goal_mask is not None
+    return scene.goal_mask & scene.agent_mask[..., None]
 
 
 def most_likely(logits: Float[Tensor, "B N G"], modes: int) -> Int[Tensor, "B M N"]:
-    """The M most likely candidates of every agent, in that order; who has fewer begins anew with the first."""
+    """Indices of the M most likely candidates of every agent, in that order; an agent with fewer repeats them in turn."""
     order = logits.argsort(dim=-1, descending=True, stable=True)
     count = (logits > NO_CANDIDATE).sum(-1, keepdim=True).clamp_min(1)
     rank = torch.arange(modes, device=logits.device) % count
@@ -85,7 +169,7 @@ def most_likely(logits: Float[Tensor, "B N G"], modes: int) -> Int[Tensor, "B M 
 
 
 def choose(scene: Scene, chosen: Int[Tensor, "B M N"]) -> tuple[Float[Tensor, "B M N 2"], Int[Tensor, "B M N"] | None]:
-    """Positions of the chosen candidates and the reference lines they lie on; zero for agents without any."""
+    """Positions of the chosen candidates and the reference lines on which they lie; zero for agents without candidates."""
     candidates, exists = goal_candidates(scene)
     agent = torch.arange(chosen.shape[2], device=chosen.device)
     index = torch.arange(len(chosen), device=chosen.device)[:, None, None], agent, chosen

@@ -1,7 +1,7 @@
-"""Candidates from a model of motion instead of a network (DSDNet, Zeng et al., ECCV 2020).
+"""Candidate strategies from a model of motion instead of a network (DSDNet, Zeng et al., ECCV 2020).
 
-A mixture of 30% straight lines, 20% circular arcs and 50% clothoids around how agents move now. What is drawn at random
-there comes from a quasi-random sequence here: forecasts repeat, and few candidates still cover the ranges evenly.
+A mixture of 30% straight lines, 20% circular arcs and 50% clothoids that continue the present motion. DSDNet draws them at
+random; here they come from a quasi-random sequence, so that forecasts repeat and few candidates cover the ranges evenly.
 """
 
 from __future__ import annotations
@@ -12,27 +12,28 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from epo_lightning.scene import SPEED
+from epo_lightning.scene import SPEED, Scene
 
 STRAIGHT, ARCS = 0.3, 0.2
-"""Shares of lines and of circles; the rest are clothoids."""
+"""Shares of straight lines and of circular arcs; the rest are clothoids."""
 _BASES = (2, 3, 5)
-"""Of Halton's sequence: prime to each other, so that no two coordinates agree and no clothoid is a circle."""
+"""Bases of Halton's sequence: coprime, so that no two coordinates agree and no clothoid is a circle."""
 _FIRST = 2
-"""Halton's first number in base 2 is 1/2, an acceleration of zero: a straight line with it is the first candidate again."""
+"""Index of the first Halton number in use. Number 1 is 1/2 in base 2: an acceleration of zero, and a straight line with it
+would repeat the first candidate."""
 
 
 class Motions(nn.Module):
-    """C strategies of every agent for the unicycle; nothing is learned.
+    """C candidate strategies of every agent for the unicycle; nothing is learned.
 
-    The first keeps speed and heading. The others accelerate constantly, a in [-A, A], until they stand, and follow a curve:
-    none, one of constant curvature kappa, or a clothoid, whose curvature changes linearly with the way covered, from one
-    value at the start to another at the end. The turn rate is v kappa, so who stands does not turn. Curvatures are uniform
-    in [-kappa_max, kappa_max], or as far as A allows sideways, |kappa| v^2 <= A, where that is narrower: without that bound,
-    most curves at the speed of a motorway are none that anybody can drive.
+    The first keeps speed and heading. The others accelerate constantly, a in [-A, A], until the agent stands, and follow a
+    straight line, an arc of constant curvature kappa, or a clothoid, whose curvature changes linearly with the distance
+    covered. The turn rate is v kappa, so a standing agent does not turn. Curvatures are uniform in [-kappa_max, kappa_max],
+    or in the narrower range that keeps the lateral acceleration |kappa| v^2 <= A: without that bound, most curves at
+    motorway speed could not be driven.
 
-    The original moves a bicycle model; one whose steering angle is delta is about this unicycle with kappa = tan(delta) /
-    wheelbase. Drawing quasi-randomly and the bound on sideways acceleration are departures from it.
+    The original moves a bicycle model; one with steering angle delta is about this unicycle with kappa = tan(delta) /
+    wheelbase. The quasi-random sequence and the bound on lateral acceleration are departures from it.
 
     Args:
         horizon: number K of future steps.
@@ -57,30 +58,34 @@ class Motions(nn.Module):
         self.horizon, self.acceleration, self.curvature = horizon, acceleration, curvature
         self.register_buffer("points", _mixture(count), persistent=False)
 
-    def forward(self, current: Float[Tensor, "B N 4"], dt: float) -> Float[Tensor, "B C N K 2"]:
-        """Controls of all candidates: acceleration [m/s^2] and turn rate [rad/s].
+    def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B C N K 2"]:
+        """Controls of all candidates: acceleration [m/s^2] and turn rate [rad/s]; ``z`` is not read."""
+        return self.controls(scene.current.where(scene.agent_mask[..., None], 0.0), scene.dt)
+
+    def controls(self, current: Float[Tensor, "B N 4"], dt: float) -> Float[Tensor, "B C N K 2"]:
+        """Controls of all candidates, for each agent independently of the others.
 
         Args:
-            current: states at t0. Agents do not matter to each other.
+            current: states at t0.
             dt: length of a time step [s].
         """
         speed = current[:, None, :, None, SPEED]
-        accelerates, bends, bends_finally = self.points.to(current)[:, None, None].unbind(-1)
+        acceleration, curvature, last_curvature = self.points.to(current)[:, None, None].unbind(-1)
         step = torch.arange(self.horizon + 1, dtype=current.dtype, device=current.device)
-        # Who drives backwards already may go on, but no faster.
-        speeds = torch.maximum(speed + self.acceleration * accelerates * dt * step, speed.clamp_max(0.0))
+        # Braking ends at a standstill; an agent that drives backwards already keeps at most its speed.
+        speeds = torch.maximum(speed + self.acceleration * acceleration * dt * step, speed.clamp_max(0.0))
         before = speeds[..., :-1]
         fastest = speeds.abs().amax(-1, keepdim=True)
         least = torch.finfo(current.dtype).tiny
         limit = (self.acceleration / fastest.square().clamp_min(least)).clamp_max(self.curvature)
-        way = before.abs().cumsum(-1) - before.abs()  # covered before every step, in units of dt
-        share = way / way[..., -1:].clamp_min(least)
-        bend = limit * torch.lerp(bends.expand_as(share), bends_finally.expand_as(share), share)
-        return torch.stack((speeds.diff(dim=-1) / dt, before * bend), -1)
+        covered = before.abs().cumsum(-1) - before.abs()  # distance before every step, in units of dt
+        share = covered / covered[..., -1:].clamp_min(least)
+        kappa = limit * torch.lerp(curvature.expand_as(share), last_curvature.expand_as(share), share)
+        return torch.stack((speeds.diff(dim=-1) / dt, before * kappa), -1)
 
 
 def _mixture(count: int) -> Float[Tensor, "C 3"]:
-    """Acceleration, first and last curvature of every candidate in units of their largest values."""
+    """Acceleration, first and last curvature of every candidate, relative to their largest values."""
     others = count - 1
     lines, circles = round(STRAIGHT * others), round(ARCS * others)
     numbers = [[_radical_inverse(_FIRST + number, base) for base in _BASES] for number in range(others)]

@@ -1,9 +1,11 @@
-"""Orders as modes: who goes first, or who passes on which side, of every pair of agents (TGL's subspace predictor).
+"""Orders as modes: the agent of every pair that goes first, or the side on which they pass (TGL's subspace predictor).
 
-A game that is convex given the order has one solution for each order, so joint modes are orders: the M most likely ones.
+A game that is convex given the orders has one solution for each of them, so the joint modes are the M most likely orders.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Shaped
@@ -14,12 +16,26 @@ from epo_lightning.decoders.mlp import MLP
 from epo_lightning.game.pairs import pairs
 
 
+class DecodedOrders(NamedTuple):
+    """The M most likely orders of all pairs.
+
+    Attributes:
+        order: +1 or -1 for every pair and mode.
+        log_probability: log-probability of every mode's order.
+        logits: logit of every pair's order being +1, zero for pairs whose order does not matter.
+    """
+
+    order: Float[Tensor, "B M P"]
+    log_probability: Float[Tensor, "B M"]
+    logits: Float[Tensor, "B P"]
+
+
 class Orders(nn.Module):
-    """phi_order: how likely the order of a pair is +1, from the features of both agents, shared by all pairs.
+    """phi_order: probability that the order of a pair is +1, from the features of both agents; one network for all pairs.
 
     p(s_ij = +1) = sigmoid(l_ij), and pairs are independent of each other given the features. The logit is
-    l_ij = f(z_i, z_j) - f(z_j, z_i), so agents that swap names swap the sign of their order, as who goes first asks for; or
-    f(z_i, z_j) + f(z_j, z_i) for orders that are the same for both, as the side on which they pass.
+    l_ij = f(z_i, z_j) - f(z_j, z_i), which changes its sign when the two agents swap names, as needed for the agent that
+    goes first; or f(z_i, z_j) + f(z_j, z_i) for orders that are the same for both, as the side on which they pass.
 
     Args:
         width: size of the agent features.
@@ -37,13 +53,13 @@ class Orders(nn.Module):
 
     def forward(
         self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"], matter: Bool[Tensor, "B P"]
-    ) -> tuple[Float[Tensor, "B M P"], Float[Tensor, "B M"], Float[Tensor, "B P"]]:
-        """The M most likely orders, their log-probabilities, and the logits of pairs, zero for pairs that have no order.
+    ) -> DecodedOrders:
+        """The M most likely orders with their log-probabilities and logits.
 
         Args:
             z: features of the agents.
             mask: agents that are present.
-            matter: pairs whose order matters (:meth:`~epo_lightning.game.pair_order.PairOrder.matters`); others keep +1, and
+            matter: pairs whose order matters (:meth:`~epo_lightning.game.pair_order.PairOrder.matters`); others keep +1 and
                 do not count in the probability.
         """
         first, second = pairs(z.shape[1], z.device)
@@ -53,14 +69,14 @@ class Orders(nn.Module):
         matter = matter & mask[:, first] & mask[:, second]
         logits = torch.where(matter, forth + back if self.symmetric else forth - back, 0.0)
         order = most_likely(logits, matter, self.modes)
-        score = torch.where(matter[:, None], F.logsigmoid(order * logits[:, None]), 0.0).sum(-1)
-        return order, score, logits
+        log_probability = torch.where(matter[:, None], F.logsigmoid(order * logits[:, None]), 0.0).sum(-1)
+        return DecodedOrders(order, log_probability, logits)
 
 
 def repeated(modes: Shaped[Tensor, "B M D"]) -> Bool[Tensor, "B M"]:
-    """Which modes are an earlier one again, by the choices that make a mode: where there are fewer than M, they begin anew.
+    """Modes whose choices are those of an earlier mode: where there are fewer than M choices, they repeat in turn.
 
-    Nothing is more likely for being named twice, so repeats have a probability of zero.
+    Repeated modes get a probability of zero, so that no outcome is counted twice.
     """
     same = (modes[:, :, None] == modes[:, None]).all(-1)
     return same.tril(-1).any(-1)
@@ -68,11 +84,11 @@ def repeated(modes: Shaped[Tensor, "B M D"]) -> Bool[Tensor, "B M"]:
 
 @torch.no_grad()
 def most_likely(logits: Float[Tensor, "B P"], matter: Bool[Tensor, "B P"], modes: int) -> Float[Tensor, "B M P"]:
-    """The M most likely orders of independent pairs, in that order; where there are fewer, they begin anew.
+    """The M most likely orders of independent pairs, most likely first; where there are fewer, they repeat in turn.
 
-    The likeliest order has the sign of every logit, and to turn the sign of a pair costs |l| of log-probability. The M
-    cheapest sets of signs to turn are found pair by pair: those of some pairs are among the M cheapest of the pairs before,
-    with and without the next one. Pairs that do not matter keep +1.
+    The most likely order has the sign of every logit, and each turned sign of a pair costs |l| of log-probability. The M
+    cheapest sets of turned signs are found pair by pair: the M cheapest sets of the first p pairs are M cheapest sets of the
+    first p - 1 pairs, with or without pair p. Pairs that do not matter keep +1.
     """
     batch, count = logits.shape
     cost = logits.new_full((batch, modes), torch.inf)
@@ -94,6 +110,6 @@ def most_likely(logits: Float[Tensor, "B P"], matter: Bool[Tensor, "B P"], modes
 def order_loss(
     logits: Float[Tensor, "B P"], order: Float[Tensor, "B P"], known: Bool[Tensor, "B P"]
 ) -> Float[Tensor, ""]:
-    """Cross entropy between the pairs' probabilities and the orders they took: mean over scenes of that over known pairs."""
+    """Cross entropy of the observed orders: mean over scenes of the mean over pairs whose order is known."""
     entropy = torch.where(known, -F.logsigmoid(order * torch.where(known, logits, 0.0)), 0.0)
     return (entropy.sum(-1) / known.sum(-1).clamp_min(1)).mean()

@@ -1,4 +1,4 @@
-"""Scene probability decoding: how likely each joint future is."""
+"""Scene probability decoding: the probability of each joint future."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from epo_lightning.decoders.mlp import MLP
 
 
 class SceneProbabilities(nn.Module):
-    """phi_prob: probabilities of the M joint futures from all agents' features and all futures (Section 4.4).
+    """phi_prob: logits of the M joint futures from all agents' features and all futures (Section 4.4).
 
     The paper concatenates the features and trajectories of all agents and applies a linear layer. Here that layer has the
     same block for every agent, so its result is a sum over agents: any number of agents, in any order, with any padding.
-    The futures are read as positions relative to the agent's current one and are not trained through this decoder.
+    Futures enter as positions relative to the agent's current one, without a gradient.
 
     Args:
         width: size of the agent features.
@@ -38,7 +38,7 @@ class SceneProbabilities(nn.Module):
         current: Float[Tensor, "B N 2"],
         mask: Bool[Tensor, "B N"],
     ) -> Float[Tensor, "B M"]:
-        """Probabilities, which sum to one over the modes."""
+        """Logits of the joint futures; their softmax over the modes are the probabilities."""
         travelled = (positions.detach() - current[:, None, :, None]).transpose(1, 2).flatten(2)
         agents = self.agent(torch.cat((z, travelled / self.scale), -1))
-        return self.scene(torch.where(mask[..., None], agents, 0.0).sum(1)).softmax(-1)
+        return self.scene(torch.where(mask[..., None], agents, 0.0).sum(1))

@@ -1,4 +1,4 @@
-"""Trajectory decoding: futures of each agent on its own, as the marginal baselines predict them."""
+"""Trajectory decoding: futures of each agent independently of the others, for the marginal baselines."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from epo_lightning.decoders.mlp import MLP
 
 
 class Trajectories(nn.Module):
-    """M futures of an agent and their marginal probabilities from the agent's feature z_i, shared by all agents.
+    """M futures of an agent and their logits from the agent's feature z_i, one network for all agents.
 
     Args:
         width: size of the agent features.
         modes: number M of modes of each agent.
         horizon: number K of future steps.
-        scale: metres that a network output of one stands for.
+        scale: metres at a network output of one.
     """
 
     def __init__(self, width: int, modes: int, horizon: int, scale: float = 1.0) -> None:
@@ -29,6 +29,6 @@ class Trajectories(nn.Module):
     def forward(
         self, z: Float[Tensor, "B N D"], current: Float[Tensor, "B N 2"]
     ) -> tuple[Float[Tensor, "B M N K 2"], Float[Tensor, "B M N"]]:
-        """Positions [m] and each agent's probabilities, which sum to one over the modes."""
+        """Positions [m], and logits of each agent's own modes."""
         travelled = (self.scale * self.positions(z)).unflatten(-1, (self.modes, self.horizon, 2)).transpose(1, 2)
-        return current[:, None, :, None] + travelled, self.logits(z).softmax(-1).transpose(1, 2)
+        return current[:, None, :, None] + travelled, self.logits(z).transpose(1, 2)

@@ -1,4 +1,4 @@
-"""Weight decoding: how much each agent, and each pair of agents, cares about every named feature."""
+"""Weight decoding: the weights of the energy's named features for every agent and every pair of agents."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ def _by_name(weights: Float[Tensor, "B R out"], names: Sequence[str], modes: int
 
 
 class OwnWeights(nn.Module):
-    """phi_own: weights W_i of an agent's own features from that agent's feature z_i alone, shared by all agents.
+    """phi_own: weights W_i of an agent's own features from its feature z_i alone, one network for all agents.
 
     Args:
         width: size of the agent features.
         modes: number M of joint modes.
-        features: names of the own features.
-        start: weight that a network output of zero stands for, one for all features or by name (others: 1). An output of
-            one doubles it: signals are metres here and hundredths of a radian there, and so are their weights.
+        features: names of the own features; without any there is no network.
+        start: weight at a network output of zero, one for all features or by name (others: 1). The output scales it, and
+            an output of one doubles it: some features are metres and some are hundredths of a radian, so their weights
+            differ in size.
     """
 
     start: Tensor
@@ -37,26 +38,28 @@ class OwnWeights(nn.Module):
         self.modes, self.features = modes, tuple(features)
         starts = [float(start.get(name, 1.0) if isinstance(start, Mapping) else start) for name in self.features]
         self.register_buffer("start", torch.tensor(starts * modes), persistent=False)
-        self.mlp = MLP(width, 64, modes * len(self.features), norm="batch")
+        self.mlp = MLP(width, 64, modes * len(self.features), norm="batch") if self.features else None
 
     def forward(self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> dict[str, Float[Tensor, "B M N"]]:
-        """Weights by feature name."""
+        """Weights by feature name; ``mask`` marks the agents that exist."""
+        if self.mlp is None:
+            return {}
         return _by_name(self.start * (1.0 + self.mlp(z, mask)), self.features, self.modes)
 
 
 class PairWeights(nn.Module):
-    """phi_pair: interaction weights of a pair from the features of both agents, shared by all pairs.
+    """phi_pair: interaction weights of a pair from the features of both agents, one network for all pairs.
 
     For two agents this is the paper's decoder on the concatenation of all agent features. For more agents the paper
-    concatenates all N of them, which ties a model to one N; a decoder per pair does not. Which agent of a pair comes first
-    may mean something (RPI: the robot); where it does not, ``symmetric`` weights are the mean over both orders.
+    concatenates all N of them, which ties a model to one N; a decoder per pair does not. The first agent of a pair may be
+    a special one (RPI: the robot); where agents are exchangeable, ``symmetric`` weights are the mean over both orders.
 
     Args:
         width: size of the agent features.
         modes: number M of joint modes.
-        features: names of the pair features.
-        start: weight that a network output of zero stands for.
-        symmetric: whether the order of agents is of no consequence.
+        features: names of the pair features; without any there is no network.
+        start: weight at a network output of zero.
+        symmetric: whether weights are the same in both orders of the two agents.
     """
 
     def __init__(
@@ -64,10 +67,12 @@ class PairWeights(nn.Module):
     ) -> None:
         super().__init__()
         self.modes, self.features, self.start, self.symmetric = modes, tuple(features), start, symmetric
-        self.mlp = MLP(2 * width, 64, modes * len(self.features), norm="layer")
+        self.mlp = MLP(2 * width, 64, modes * len(self.features), norm="layer") if self.features else None
 
     def forward(self, z: Float[Tensor, "B N D"]) -> dict[str, Float[Tensor, "B M P"]]:
         """Weights by feature name."""
+        if self.mlp is None:
+            return {}
         first, second = pairs(z.shape[1], z.device)
         weights = self.mlp(torch.cat((z[:, first], z[:, second]), -1))
         if self.symmetric:

@@ -1,4 +1,4 @@
-"""The kinematic baseline: everybody goes on as they are."""
+"""The kinematic baseline: every agent keeps its speed and heading."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from epo_lightning.task import Task
 
 @register("forecaster", "constant_velocity")
 class ConstantVelocity(Forecaster):
-    """Const. Vel.: one joint future, controls of zero (Section 5, "Baselines"). Nothing is learned."""
+    """Const. Vel.: one joint future with controls of zero (Section 5, "Baselines"). Nothing is learned."""
 
     def __init__(self, task: Task, optimizer: Adam, dynamics: Unicycle) -> None:
         super().__init__(task, optimizer)

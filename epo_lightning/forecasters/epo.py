@@ -1,7 +1,7 @@
-"""Energy-based potential games: the network infers a game, and the forecast is what minimises its energy (Sections 3, 4).
+"""Energy-based potential games: the network infers a game, and the forecast minimises its energy (Sections 3, 4).
 
-The paper's own method (+EPO, Algorithm 1) is one choice of energy, minimiser, derivative and objective; the others of its
-Table 1, and the cells that the literature left empty, are other choices of the same four parts.
+The paper's own method (+EPO, Algorithm 1) is one choice of energy, minimiser, derivative and objective. The other methods of
+its Table 1, and the cells that the literature left empty, are other choices of the same four parts.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from epo_lightning.backbones.base import Backbone
-from epo_lightning.decoders.goals import NO_CANDIDATE, GoalDecoder, choose, given_goals, most_likely
+from epo_lightning.decoders.goals import GivenGoals, GoalDecoder, Goals, NoGoals
 from epo_lightning.decoders.motions import Motions
-from epo_lightning.decoders.orders import Orders, repeated
+from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
 from epo_lightning.decoders.probabilities import SceneProbabilities
-from epo_lightning.decoders.strategies import InitialStrategies
+from epo_lightning.decoders.strategies import InitialStrategies, ZeroStrategies
 from epo_lightning.decoders.weights import OwnWeights, PairWeights
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.combination import Combination
@@ -28,43 +28,47 @@ from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import GameParameters, JointForecast, Scene, Status
+from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.task import Task
 
 INITIAL = ("decoded", "zero", "motions")
-"""Where solutions start, or between what they choose: strategies of the network's, (the paper's ablation "no init") controls
-of zero, or motions that the dynamics allows."""
+"""Initial strategies, or candidates for solvers that choose: decoded by the network, controls of zero (the paper's ablation
+"no init"), or a mixture of motions of the unicycle."""
 
 EXAMINED = 512
-"""Scenes, evenly spread over a split, whose equilibrium is measured where no fast layer and no table does it."""
+"""Scenes of a split, evenly spread, whose equilibrium is measured for energies without a fast layer or tables."""
 
 
 @register("forecaster", "epo")
 class EPO(Forecaster):
-    """Weights, goals and initial strategies from the network; joint strategies from the energy's minimisation.
+    """Forecaster whose network infers weights, goals and initial strategies of a game, and whose solver plays it.
 
     Where the data has several goal candidates and the energy a goal or a lane, mode m of an agent heads for its m-th most
-    likely candidate, along the line on which that lies. A single candidate is a given goal, of all modes. A minimiser that
-    chooses among candidates plays one game, and its M best joint choices are the modes; others play a game per mode.
+    likely candidate, along the line on which that lies. A single candidate is a given goal, the same in all modes. A
+    minimiser that chooses among candidates plays one game, and its M best joint choices are the modes; others play one game
+    per mode.
 
     Args:
         backbone: the observation encoder phi_glob.
-        energy: what the network's parameters weigh.
-        solver: what minimises the energy.
-        backward: which derivative the solution has.
-        objective: what is learned.
+        energy: the energy, which the decoded weights parametrise.
+        solver: the minimiser of the energy.
+        backward: the derivative of the solution.
+        objective: the training objective.
         modes: number M of joint modes.
-        own_start: own weights that a network output of zero stands for, which scale it as well: one number, or some by the
-            feature's name while the others are 1. ``vel`` pulls speeds towards zero and has to start small on highways.
-        pair_start: pair weight that a network output of zero stands for.
-        symmetric_pairs: whether pair weights ignore which agent comes first, so that forecasts do not depend on the order of
-            agents.
+        own_start: own weights at a network output of zero, which scale the output as well: one number for all features, or
+            numbers by name while the others are 1. ``vel`` pulls speeds towards zero and has to start small on highways.
+        pair_start: pair weight at a network output of zero.
+        symmetric_pairs: whether pair weights are the same in both orders of two agents, so that forecasts do not depend on
+            the order of agents.
         initial: ``decoded``, ``zero`` or ``motions``.
-        control_scale: initial control that a network output of one stands for.
+        control_scale: initial control at a network output of one.
         motions: largest ``acceleration`` [m/s^2] and ``curvature`` [1/m] of initial motions.
+
+    Raises:
+        ConfigError: parts that do not work together, with the changes that would work; or a value out of its range.
     """
 
     def __init__(
@@ -93,8 +97,8 @@ class EPO(Forecaster):
             raise ConfigError(f"unknown forecaster.initial {initial!r}: {nearest(str(initial), INITIAL)}")
         if chooses and initial == "zero":
             raise ConfigError(
-                "the solver chooses among candidates, and with forecaster.initial=zero they are all the same: decoded "
-                "learns them, motions samples them"
+                "the solver chooses among candidates, which forecaster.initial=zero makes all the same: use decoded, which "
+                "learns them, or motions"
             )
         if initial == "motions" and not isinstance(energy.dynamics, Unicycle):
             raise ConfigError(
@@ -102,7 +106,7 @@ class EPO(Forecaster):
                 "motions are those of a unicycle; choose decoded or zero"
             )
         if not 0 < control_scale < math.inf:
-            raise ConfigError(f"forecaster.control_scale must be positive, and finite, not {control_scale}")
+            raise ConfigError(f"forecaster.control_scale must be positive and finite, not {control_scale}")
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
         self.differentiate, self.objective = backward, objective  # Lightning calls something else `backward`
@@ -110,114 +114,110 @@ class EPO(Forecaster):
         width, scale, horizon = backbone.width, task.scale, task.horizon
         own, pair = energy.weighted
         start = _checked(own_start, own, energy.own)
-        self.own_weights = OwnWeights(width, games, own, start) if own else None
-        self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs) if pair else None
-        self.strategies = InitialStrategies(width, starts, horizon, control_scale) if initial == "decoded" else None
         ranges = {} if motions is None and initial != "motions" else _ranges(motions)
-        self.motions = Motions(horizon, starts, **ranges) if initial == "motions" else None
-        self.goals = (
-            GoalDecoder(width, scale) if task.candidates > 1 and energy.needs & {"goals", "reference"} else None
-        )
-        self.pair_order = energy.pair_order
-        self.orders = None if self.pair_order is None else Orders(width, games, self.pair_order.symmetric)
-        # Where energies or orders do not say how likely a mode is, the network does.
-        says = chooses or self.orders is not None
-        self.probabilities = None if says else SceneProbabilities(width, modes, horizon, scale)
+        # The order of construction is part of the result: every module draws its initial weights here.
+        self.own_weights = OwnWeights(width, games, own, start)
+        self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs)
+        self.strategies: InitialStrategies | ZeroStrategies | Motions
+        if initial == "decoded":
+            self.strategies = InitialStrategies(width, starts, horizon, control_scale)
+        elif initial == "zero":
+            self.strategies = ZeroStrategies(starts, horizon)
+        else:
+            self.strategies = Motions(horizon, starts, **ranges)
+        self.goals: GoalDecoder | GivenGoals | NoGoals
+        if task.candidates > 1 and energy.needs & {"goals", "reference"}:
+            self.goals = GoalDecoder(width, scale, games)
+        elif "goals" in energy.needs:
+            self.goals = GivenGoals(games)
+        else:
+            self.goals = NoGoals()
+        order = energy.pair_order
+        self.orders = None if order is None else Orders(width, games, order.symmetric)
+        # The network decodes probabilities where neither energies of choices nor orders define them.
+        defined = chooses or order is not None
+        self.probabilities = None if defined else SceneProbabilities(width, modes, horizon, scale)
 
     def forward(self, scene: Scene) -> JointForecast:
+        """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 2."""
         z = self.backbone(scene)
-        logits = None if self.goals is None else self.goals(z, scene)
-        orders = self._orders(z, scene)
-        parameters = self.infer(scene, z, logits, None if orders is None else orders[0])
-        solver = self.solver if self.training else self.solver.for_test()
-        solution = self.differentiate(solver, self.energy, scene, parameters)
-        if solution.tables is not None:
-            stopped = (solution.status == Status.STOPPED).any(1, keepdim=True)
-            assert solution.assignment is not None
-            probabilities = _once(-torch.where(stopped, 0.0, solution.energy), solution.assignment)
-            initial = None
-        else:
-            starts = parameters.initial_controls
-            # Initial strategies that learn through the solution do not learn from their own states as well.
-            starts = starts.detach() if self.differentiate.teaches_start else starts
-            initial = self.energy.dynamics.rollout(self.energy.initial(scene), starts, scene.dt)
-            if orders is not None:
-                probabilities = self._probabilities_of(orders, logits)
-            else:
-                assert self.probabilities is not None
-                current = scene.current.where(scene.agent_mask[..., None], 0.0)
-                positions = solution.states[..., :2]
-                probabilities = self.probabilities(z, positions, current[..., :2], scene.agent_mask)
+        goals = self.goals(z, scene)
+        orders = self._decode_orders(z, scene)
+        parameters = self._infer_game(z, scene, goals, orders)
+        solution = self.differentiate(self._minimiser, self.energy, scene, parameters)
+        logits = self._mode_logits(z, scene, goals, orders, solution)
         return JointForecast(
             states=solution.states,
-            probabilities=probabilities,
+            probabilities=logits.softmax(1),
             controls=solution.controls,
-            initial_states=initial,
+            initial_states=self._initial_states(scene, parameters),
             parameters=parameters,
             solution=solution,
-            goal_probabilities=None if logits is None else logits.softmax(-1).where(logits > NO_CANDIDATE, 0.0),
-            order_logits=None if orders is None else orders[2],
+            goal_probabilities=goals.probabilities,
+            order_logits=None if orders is None else orders.logits,
+            logits=logits,
+            goal_logits=goals.logits,
         )
 
-    def infer(
-        self, scene: Scene, z: Tensor, logits: Tensor | None = None, order: Tensor | None = None
-    ) -> GameParameters:
-        """The game of every mode: decoded weights and initial strategies, and goals, given or chosen by their ``logits``.
+    def _decode_orders(self, z: Tensor, scene: Scene) -> DecodedOrders | None:
+        """The most likely orders of the pairs; None for energies without orders."""
+        order = self.energy.pair_order
+        if self.orders is None or order is None:
+            return None
+        return self.orders(z, scene.agent_mask, order.matters(scene, self.task.horizon))
+
+    def _infer_game(self, z: Tensor, scene: Scene, goals: Goals, orders: DecodedOrders | None) -> GameParameters:
+        """The game of every mode: decoded weights and initial strategies, with its goals and orders.
 
         Raises:
-            ValueError: the scene lacks the goals or the reference lines that the energy asks for.
+            ValueError: the scene lacks the reference lines that the energy asks for.
         """
-        own_weights = {} if self.own_weights is None else self.own_weights(z, scene.agent_mask)
-        goals = reference = None
-        if logits is not None:
-            goals, reference = choose(scene, most_likely(logits, self.solver.games(self.modes)))
-            if "reference" in self.energy.needs and reference is None:
-                raise ValueError("the energy follows reference lines, but scene.goal_reference [B, N, G] is None")
-            # Who has no candidate heads nowhere, not for the origin.
-            heads = (logits > NO_CANDIDATE).any(-1)[:, None]
-            own_weights |= {
-                name: own_weights[name].where(heads, 0.0) for name in self.energy.heading & own_weights.keys()
-            }
-        elif "goals" in self.energy.needs:
-            goals = given_goals(scene)[:, None].expand(-1, self.solver.games(self.modes), -1, -1)
+        if "reference" in self.energy.needs and goals.reference is None:
+            raise ValueError("the energy follows reference lines, but scene.goal_reference [B, N, G] is None")
+        own_weights = self.own_weights(z, scene.agent_mask)
+        # Agents without a goal get zero goal weights, so that the origin, which stands for their goal, does not attract them.
+        for name in self.energy.heading & own_weights.keys():
+            own_weights[name] = own_weights[name].where(goals.exist[:, None], 0.0)
         return GameParameters(
             own_weights=own_weights,
-            pair_weights={} if self.pair_weights is None else self.pair_weights(z),
-            initial_controls=self._starts(scene, z),
-            goals=goals,
-            reference=reference,
+            pair_weights=self.pair_weights(z),
+            initial_controls=self.strategies(z, scene),
+            goals=goals.positions,
+            reference=goals.reference,
             context=z if "context" in self.energy.needs else None,
-            order=order,
+            order=None if orders is None else orders.order,
         )
 
-    def _orders(self, z: Tensor, scene: Scene) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Orders of the pairs that the energy holds to one, with their log-probabilities and logits."""
-        if self.orders is None or self.pair_order is None:
-            return None
-        return self.orders(z, scene.agent_mask, self.pair_order.matters(scene, self.task.horizon))
+    @property
+    def _minimiser(self) -> Minimiser:
+        return self.solver if self.training else self.solver.for_test()
 
-    def _probabilities_of(self, orders: tuple[Tensor, Tensor, Tensor], logits: Tensor | None) -> Tensor:
-        """How likely the order of every mode is, and that everybody heads where they do in it, [B, M].
+    def _mode_logits(
+        self, z: Tensor, scene: Scene, goals: Goals, orders: DecodedOrders | None, solution: Solution
+    ) -> Tensor:
+        """Unnormalised log-probabilities of the joint modes, [B, M].
 
-        Goals are taught by where agents ended up, not by which mode came closest, so no gradient goes to their ``logits``.
+        Modes that are choices among candidates have the density exp(-E), modes that are orders the probability of their
+        orders and goals; for all others the network decodes it.
         """
-        order, score, _ = orders
-        if logits is None:
-            return _once(score, order)
-        chosen = most_likely(logits, order.shape[1])
-        choices = logits.detach().log_softmax(-1).gather(-1, chosen.transpose(1, 2))  # zero where there is a single one
-        heads = (logits > NO_CANDIDATE).any(-1)[..., None]
-        score = score + torch.where(heads, choices, 0.0).sum(1)
-        return _once(score, torch.cat((order.long(), chosen), -1))
+        if solution.assignment is not None:
+            stopped = (solution.status == Status.STOPPED).any(1, keepdim=True)
+            return _once(-torch.where(stopped, 0.0, solution.energy), solution.assignment)
+        if orders is not None:
+            choices = orders.order if goals.chosen is None else torch.cat((orders.order.long(), goals.chosen), -1)
+            return _once(orders.log_probability + goals.log_probability, choices)
+        assert self.probabilities is not None
+        current = scene.current.where(scene.agent_mask[..., None], 0.0)
+        return self.probabilities(z, solution.states[..., :2], current[..., :2], scene.agent_mask)
 
-    def _starts(self, scene: Scene, z: Tensor) -> Tensor:
-        """Initial strategies."""
-        if self.strategies is not None:
-            return self.strategies(z)
-        if self.motions is not None:
-            return self.motions(scene.current.where(scene.agent_mask[..., None], 0.0), scene.dt)
-        batch, agents, _ = z.shape
-        return z.new_zeros(batch, self.solver.starts(self.modes), agents, self.task.horizon, 2)
+    def _initial_states(self, scene: Scene, parameters: GameParameters) -> Tensor | None:
+        """The states of the initial strategies, [B, M, N, K, 4]; None where these are candidates, which are no modes."""
+        if TABLES in self.solver.provides:
+            return None
+        starts = parameters.initial_controls
+        # Initial strategies that are trained through the solution are not trained by their own states as well.
+        starts = starts.detach() if self.differentiate.teaches_start else starts
+        return self.energy.dynamics.rollout(self.energy.initial(scene), starts, scene.dt)
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
         assert forecast.parameters is not None
@@ -240,14 +240,14 @@ class EPO(Forecaster):
         if report is None:
             return forecast
         if RESIDUALS not in self.energy.offers:
-            # Where an energy may be negative, zero means nothing, and a share of an objective neither.
+            # An energy that may be negative has no natural zero, so a gap relative to the objective means nothing.
             report = dataclasses.replace(report, objective=torch.full_like(report.objective, torch.nan))
         whole = report.map(lambda t: t.new_full((scenes, *t.shape[1:]), torch.nan).index_copy(0, chosen, t))
         return dataclasses.replace(forecast, equilibrium=whole)
 
     @property
     def _batches(self) -> int:
-        """Of the split that is tested; one for whoever asks without a trainer."""
+        """Number of test batches; 1 outside a Trainer."""
         counts = self._trainer.num_test_batches if self._trainer is not None else [1]
         return int(sum(counts)) or 1
 
@@ -256,35 +256,35 @@ class EPO(Forecaster):
 
 
 def _check_needs(energy: Energy, task: Task) -> None:
-    """Refuse an energy that refers to what the data does not give.
+    """Refuse an energy that needs fields which the data does not provide.
 
     Raises:
-        ConfigError: the message names what is lacking.
+        ConfigError: the message names the missing fields.
     """
     known = {"size", "context", "order"} | ({"goals"} if task.candidates else set())
     lacking = energy.needs - known - ({"reference", "reference_speed"} if task.candidates > 1 else set())
     if lacking:
         raise ConfigError(
-            f"features of energy.own need {', '.join(sorted(lacking))}, which this data does not give: leave them out, "
-            "or choose data with a map"
+            f"features of energy.own need {', '.join(sorted(lacking))}, which this data does not provide: leave the "
+            "features out, or choose data with a map"
         )
 
 
 def _once(score: Tensor, modes: Tensor) -> Tensor:
-    """Probabilities [B, M] of modes from their logarithms, up to a factor: a mode that repeats another has none."""
-    return torch.where(repeated(modes), -torch.inf, score).softmax(1)
+    """Logits [B, M] of modes, -inf for a mode that repeats an earlier one."""
+    return torch.where(repeated(modes), -torch.inf, score)
 
 
 def _ranges(motions: Mapping[str, float] | None) -> dict[str, float]:
-    """What limits initial motions.
+    """Largest acceleration and curvature of initial motions.
 
     Raises:
-        ConfigError: a name that is missing or unknown.
+        ConfigError: a missing or unknown name.
     """
     known, given = ("acceleration", "curvature"), dict(motions or {})
     if set(given) != set(known):
         raise ConfigError(
-            "forecaster.motions must name acceleration [m/s^2] and curvature [1/m], which initial=motions takes, not "
+            "forecaster.motions must name acceleration [m/s^2] and curvature [1/m] for initial=motions, not "
             f"{', '.join(sorted(map(str, given))) or 'nothing'}"
         )
     return given
@@ -293,22 +293,22 @@ def _ranges(motions: Mapping[str, float] | None) -> dict[str, float]:
 def _checked(
     start: float | Mapping[str, float], features: Sequence[str], all_features: Sequence[str]
 ) -> float | Mapping[str, float]:
-    """The weights that own features start from. Names of features that other energies have are idle.
+    """Initial weights of own features. Names of features that only other energies have are accepted and unused.
 
     Args:
-        start: as configured.
+        start: the configured value.
         features: own terms whose weight is decoded.
         all_features: all own terms of the energy.
 
     Raises:
-        ConfigError: the name of no feature, or of one whose weight is fixed, or a weight that is not positive.
+        ConfigError: an unknown feature, a feature whose weight is fixed, or a weight that is not positive.
     """
     named, known = start if isinstance(start, Mapping) else {"all": start}, {"all", *features, *OWN_FEATURES}
     for name, value in named.items():
         if name in all_features and name not in features:
             raise ConfigError(
-                f"forecaster.own_start.{name} starts nothing: this energy holds {name} fixed; it decodes weights of "
-                f"{', '.join(features) or 'nothing'}"
+                f"forecaster.own_start.{name} has no effect: this energy fixes the weight of {name}; it decodes weights "
+                f"of {', '.join(features) or 'no feature'}"
             )
         if name not in known:
             raise ConfigError(f"unknown feature forecaster.own_start.{name}: {nearest(name, known)}")

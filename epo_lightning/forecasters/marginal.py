@@ -1,4 +1,4 @@
-"""The marginal baselines: every agent's futures on their own (V-LSTM, VIBES, HiVT-M)."""
+"""The marginal baselines, which predict every agent independently of the others (V-LSTM, VIBES, HiVT-M)."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from epo_lightning.task import Task
 
 @register("forecaster", "marginal")
 class Marginal(Forecaster):
-    """Trajectories per agent, trained by minADE and a classification loss per agent (Section 5, "Baselines").
+    """Forecaster of trajectories per agent, trained by minADE and a classification loss (Section 5, "Baselines").
 
-    Joint futures are made afterwards: each agent's modes are ordered by probability, and joint mode m is everyone's m-th.
+    Joint futures are made afterwards: each agent's modes are ordered by probability, and joint mode m consists of every
+    agent's m-th.
 
     Args:
         backbone: the observation encoder.
@@ -51,22 +52,24 @@ class Marginal(Forecaster):
 
     def forward(self, scene: Scene) -> JointForecast:
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
-        positions, probabilities = self.decoder(self.backbone(scene), current[..., :2])
-        states, probabilities = marginal_to_joint(_with_motion(positions, current, scene.dt), probabilities)
-        # A sum of logarithms: the product over many agents and modes is smaller than any number of this precision.
-        joint = losses.log(probabilities).where(scene.agent_mask[:, None], 0.0).sum(-1).softmax(1)
+        positions, logits = self.decoder(self.backbone(scene), current[..., :2])
+        states, logits = marginal_to_joint(_with_motion(positions, current, scene.dt), logits)
+        # The product of probabilities, as a sum of logarithms: over many agents it is smaller than any float32 number.
+        joint = logits.log_softmax(1).where(scene.agent_mask[:, None], 0.0).sum(-1)
         return JointForecast(
             states=states,
-            probabilities=joint,
-            agent_probabilities=probabilities,
+            probabilities=joint.softmax(1),
+            agent_probabilities=logits.softmax(1),
+            logits=joint,
+            agent_logits=logits,
         )
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         future, mask = observed_future(scene)
         distance = losses.distances(forecast.states[..., :2], future, mask)
         imitation, mode = losses.marginal_imitation(distance, mask, self.relaxation.at(self.global_step))
-        assert forecast.agent_probabilities is not None
-        probability = losses.marginal_probability(forecast.agent_probabilities, mode, mask)
+        assert forecast.agent_log_probabilities is not None
+        probability = losses.marginal_probability(forecast.agent_log_probabilities, mode, mask)
         return {
             "imitation": (self.loss_weights["imitation"], imitation),
             "probability": (self.loss_weights["probability"], probability),
@@ -74,7 +77,7 @@ class Marginal(Forecaster):
 
 
 def _with_motion(positions: Tensor, current: Tensor, dt: float) -> Tensor:
-    """States from positions: heading and speed of the way from each step to the next; a standing agent keeps its heading."""
+    """States from positions, with heading and speed of the motion between steps; a standing agent keeps its heading."""
     before = torch.cat((current[:, None, :, None, :2].expand_as(positions[..., :1, :]), positions[..., :-1, :]), -2)
     travelled = (positions - before).detach()
     length = travelled.norm(dim=-1)

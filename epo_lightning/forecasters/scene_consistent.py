@@ -1,4 +1,4 @@
-"""The scene-consistent baselines: joint controls straight from the network (+SC)."""
+"""The scene-consistent baselines, which decode joint controls without a game (+SC)."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from epo_lightning.task import Task
 
 @register("forecaster", "scene_consistent")
 class SceneConsistent(Forecaster):
-    """Controls of all agents, unrolled, trained by minSADE and the scene probability loss (Section 5, "Baselines").
+    """Forecaster of the controls of all agents, trained by minSADE and scene probability loss (Section 5, "Baselines").
 
     Args:
         backbone: the observation encoder.
-        dynamics: what turns controls into states.
+        dynamics: the model that turns controls into states.
         modes: number M of joint modes.
         loss_weights: lambda of ``imitation`` and ``probability``.
-        control_scale: control that a network output of one stands for.
+        control_scale: control at a network output of one.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
     """
 
@@ -53,14 +53,11 @@ class SceneConsistent(Forecaster):
 
     def forward(self, scene: Scene) -> JointForecast:
         z = self.backbone(scene)
-        controls = self.strategies(z)
+        controls = self.strategies(z, scene)
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
         states = self.dynamics.rollout(current[:, None], controls, scene.dt)
-        return JointForecast(
-            states=states,
-            probabilities=self.probabilities(z, states[..., :2], current[..., :2], scene.agent_mask),
-            controls=controls,
-        )
+        logits = self.probabilities(z, states[..., :2], current[..., :2], scene.agent_mask)
+        return JointForecast(states, logits.softmax(1), controls=controls, logits=logits)
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         return imitation_terms(scene, forecast, self.loss_weights, self.relaxation.at(self.global_step))

@@ -75,7 +75,7 @@ class Contrastive(Objective):
             "contrastive": (of_shown - of_drawn).mean(),
             "magnitude": sizes.mean(),
             "initial": proposal(starts, solution.states.detach(), scene.agent_mask & taught[:, None]),
-            "probability": losses.scene_probability(forecast.probabilities, mode, mask),
+            "probability": losses.scene_probability(forecast.log_probabilities, mode, mask),
         }
         return {
             **{name: (self.weights[name], value) for name, value in values.items()},

@@ -1,4 +1,4 @@
-"""Learning from the solution: the joint future closest to the observed one is drawn towards it (Section 4.4, Eq. 12)."""
+"""Imitation through the solution: the joint future closest to the observed one is drawn towards it (Section 4.4, Eq. 12)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from epo_lightning.scene import JointForecast, Scene
 
 @register("objective", "imitation")
 class Imitation(Objective):
-    """The paper's loss, lambda_1 L_imit + lambda_2 L_goal + lambda_3 L_prob, through whatever derivative the solution has.
+    """The paper's loss, lambda_1 L_imit + lambda_2 L_goal + lambda_3 L_prob, through the derivative of the solution.
 
     Args:
-        weights: lambda of ``imitation``, ``goal`` (idle where no goal is decoded) and ``probability``; and ``initial``, what
-            imitation by the initial strategies counts where no derivative reaches them through the solution (idle where one
-            does). Where orders of agents are decoded, their cross entropy takes the place of ``probability``.
-        power: of distances; 1 is the paper's, TGL's is 1.05.
+        weights: lambda of ``imitation``, ``goal`` (unused where no goal is decoded), ``probability`` and ``initial``. The
+            last one weighs the imitation loss of the initial strategies where no derivative reaches them through the
+            solution, and is unused elsewhere. Where orders of agents are decoded, their cross entropy takes the place of
+            ``probability``.
+        power: exponent of the distances; the paper's is 1, TGL's 1.05.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
     """
 

@@ -81,8 +81,8 @@ class Laplace(Objective):
         log_density, sound = log_densities(
             energy, scene, forecast.parameters, controls[:, None].expand(-1, modes, -1, -1, -1), self.damping
         )
-        known = sound.any(1)
-        joint = losses.log(forecast.probabilities) + torch.where(sound, log_density, -torch.inf)
+        joint = forecast.log_probabilities + torch.where(sound, log_density, -torch.inf)
+        known = (joint != -torch.inf).any(1)
         joint = torch.where(known[:, None], joint, 0.0)
         count = 2 * demonstrated(scene).sum((1, 2)).clamp_min(1)
         density = torch.where(known, -joint.logsumexp(1) / count, 0.0).mean()

@@ -1,4 +1,4 @@
-"""Terms that objectives share: what was observed, and which goals were reached."""
+"""Loss terms that several objectives share."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from epo_lightning.scene import JointForecast, Scene
 
 
 def observed_future(scene: Scene) -> tuple[Float[Tensor, "B N K 4"], Bool[Tensor, "B N K"]]:
-    """The futures that a forecaster learns from, and which of their steps are real.
+    """The observed futures, and the mask of their real steps.
 
     Raises:
         ValueError: the scene has no future.
     """
     if scene.future is None or scene.future_mask is None:
-        raise ValueError("learning needs scene.future, which is None")
+        raise ValueError("training needs scene.future [B, N, K, 4], which is None")
     return scene.future, scene.future_mask & scene.agent_mask[..., None]
 
 
 def goal_term(scene: Scene, forecast: JointForecast, weight: float) -> Terms:
-    """L_goal for forecasters that choose among goal candidates; nothing for others."""
-    if forecast.goal_probabilities is None:
+    """L_goal for forecasters that choose among goal candidates; empty for others."""
+    if forecast.goal_log_probabilities is None:
         return {}
     future, mask = observed_future(scene)
     final, observed = future[:, :, -1, :2], mask[:, :, -1]
-    return {"goal": (weight, losses.goal(forecast.goal_probabilities, *goal_candidates(scene), final, observed))}
+    return {"goal": (weight, losses.goal(forecast.goal_log_probabilities, *goal_candidates(scene), final, observed))}
 
 
 def imitation_terms(
     scene: Scene, forecast: JointForecast, weights: Mapping[str, float], relaxation: float, power: float = 1.0
 ) -> Terms:
-    """Imitation of the closest joint future, and the probability that it was given."""
+    """Distance of the closest joint future, and the cross entropy of its probability."""
     future, mask = observed_future(scene)
     distance = losses.distances(forecast.states[..., :2], future, mask, power)
     imitation, mode = losses.scene_imitation(distance, mask, relaxation)
-    probability = losses.scene_probability(forecast.probabilities, mode, mask)
+    probability = losses.scene_probability(forecast.log_probabilities, mode, mask)
     return {"imitation": (weights["imitation"], imitation), "probability": (weights["probability"], probability)}
