@@ -427,21 +427,34 @@ class JointForecast(_Batch):
     @property
     def log_probabilities(self) -> Float[Tensor, "B M"]:
         """Logarithms of ``probabilities``, for losses."""
-        return _log(self.logits, self.probabilities, 1)
+        return log_probabilities(self.probabilities, self.logits, 1)
 
     @property
     def agent_log_probabilities(self) -> Float[Tensor, "B M N"] | None:
         """Logarithms of ``agent_probabilities``, for losses; None for forecasters without any."""
-        return None if self.agent_probabilities is None else _log(self.agent_logits, self.agent_probabilities, 1)
+        if self.agent_probabilities is None:
+            return None
+        return log_probabilities(self.agent_probabilities, self.agent_logits, 1)
 
     @property
     def goal_log_probabilities(self) -> Float[Tensor, "B N G"] | None:
         """Logarithms of ``goal_probabilities``, for losses; None for forecasters without any."""
-        return None if self.goal_probabilities is None else _log(self.goal_logits, self.goal_probabilities, 2)
+        if self.goal_probabilities is None:
+            return None
+        return log_probabilities(self.goal_probabilities, self.goal_logits, 2)
 
 
-def _log(logits: Tensor | None, probabilities: Tensor, dim: int) -> Tensor:
-    """Log-probabilities from logits; without any, from probabilities, of which zero counts as the smallest number."""
-    if logits is not None:
-        return logits.log_softmax(dim)
-    return probabilities.clamp_min(torch.finfo(probabilities.dtype).tiny).log()
+def log_probabilities(probabilities: Tensor, logits: Tensor | None, dim: int) -> Tensor:
+    """Logarithms of probabilities, whose gradient does not vanish when a probability underflows.
+
+    Args:
+        probabilities: softmax of the logits.
+        logits: unnormalised log-probabilities. Without any, a probability of zero counts as the smallest number.
+        dim: dimension over which probabilities sum to one.
+    """
+    least = torch.finfo(probabilities.dtype).tiny
+    logs = probabilities.clamp_min(least).log()
+    if logits is None:
+        return logs
+    # Both are exact for probabilities that are not tiny, but differ in the last digit: results of earlier versions repeat.
+    return torch.where(probabilities > math.sqrt(least), logs, logits.log_softmax(dim))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 
+import jaxtyping
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from epo_lightning import losses
+from epo_lightning.scene import JointForecast
 
 MASK = torch.ones(1, 2, 1, dtype=torch.bool)
 DISTANCE = torch.tensor([[[1.0, 5.0], [3.0, 1.0]]])  # [B=1, M=2, N=2]
@@ -49,14 +51,74 @@ def test_relaxation_adds_the_mean_over_modes_and_fades():
 
 
 def test_probabilities_are_scored_at_the_closest_mode():
-    probabilities = torch.tensor([[0.25, 0.75]])
-    assert losses.scene_probability(probabilities, torch.tensor([1]), MASK).item() == pytest.approx(0.2877, abs=1e-4)
-    agents = torch.tensor([[[0.25, 0.5], [0.75, 0.5]]])
+    logs = torch.tensor([[0.25, 0.75]]).log()
+    assert losses.scene_probability(logs, torch.tensor([1]), MASK).item() == pytest.approx(0.2877, abs=1e-4)
+    agents = torch.tensor([[[0.25, 0.5], [0.75, 0.5]]]).log()
     value = losses.marginal_probability(agents, torch.tensor([[1, 0]]), MASK)
     assert value.item() == pytest.approx((0.2877 + 0.6931) / 2, abs=1e-4)
-    certain = torch.tensor([[1.0, 0.0]], requires_grad=True)
-    assert losses.scene_probability(certain, torch.tensor([1]), MASK).isfinite()
-    assert losses.scene_probability(probabilities, torch.tensor([1]), ~MASK) == 0, "nothing was observed"
+    assert losses.scene_probability(logs, torch.tensor([1]), ~MASK) == 0, "nothing was observed"
+
+
+def unlikely(logits: torch.Tensor) -> JointForecast:
+    """A forecast of 2 modes and 2 agents, whose modes and goals have the same logits [1, 2]."""
+    per_agent = logits[..., None].expand(-1, -1, 2)
+    return JointForecast(
+        torch.zeros(1, 2, 2, 1, 4),
+        logits.softmax(1),
+        agent_probabilities=per_agent.softmax(1),
+        goal_probabilities=per_agent.mT.softmax(2),
+        logits=logits,
+        agent_logits=per_agent,
+        goal_logits=per_agent.mT,
+    )
+
+
+@pytest.mark.parametrize("kind", ["scene", "marginal", "goal"])
+def test_the_gradient_survives_a_probability_that_underflows(kind):
+    """softmax(0, -200) is (1, 0) in float32; the gradient by the logits is softmax - one-hot all the same."""
+    logits = torch.tensor([[0.0, -200.0]], requires_grad=True)
+    forecast = unlikely(logits)
+    if kind == "scene":
+        loss = losses.scene_probability(forecast.log_probabilities, torch.tensor([1]), MASK)
+    elif kind == "marginal":
+        loss = losses.marginal_probability(forecast.agent_log_probabilities, torch.tensor([[1, 1]]), MASK)
+    else:
+        candidates = torch.tensor([9.0, 0.0]).view(1, 1, 2, 1).expand(1, 2, 2, 2)  # the second one is closest
+        exists, observed = torch.ones(1, 2, 2, dtype=torch.bool), torch.ones(1, 2, dtype=torch.bool)
+        loss = losses.goal(forecast.goal_log_probabilities, candidates, exists, torch.zeros(1, 2, 2), observed)
+    assert loss.item() == pytest.approx(200.0)
+    loss.backward()
+    assert logits.grad.tolist() == [[1.0, -1.0]]
+
+
+def test_modes_without_any_probability_cost_a_finite_amount_and_have_no_gradient():
+    """A mode that repeats an earlier one has a logit of -inf; it may be the closest one all the same."""
+    score = torch.tensor([[0.5, 0.3]], requires_grad=True)
+    logits = torch.where(torch.tensor([[False, True]]), -torch.inf, score)
+    forecast = unlikely(logits)
+    loss = losses.scene_probability(forecast.log_probabilities, torch.tensor([1]), MASK)
+    assert loss.item() == pytest.approx(-math.log(torch.finfo(torch.float32).tiny))
+    loss.backward()
+    assert score.grad.tolist() == [[0.0, 0.0]]
+
+
+def test_forecasts_without_logits_are_scored_by_their_probabilities():
+    probabilities = torch.tensor([[0.25, 0.75, 0.0]], requires_grad=True)
+    forecast = JointForecast(torch.zeros(1, 3, 2, 1, 4), probabilities)
+    assert forecast.log_probabilities[0, :2].exp().tolist() == [0.25, 0.75]
+    assert forecast.log_probabilities.isfinite().all()
+    assert forecast.agent_log_probabilities is forecast.goal_log_probabilities is None
+    forecast.log_probabilities.sum().backward()
+    assert probabilities.grad.isfinite().all()
+
+
+def test_a_future_of_another_length_is_refused(monkeypatch):
+    """One step would be broadcast over all of them."""
+    positions, future, mask = torch.zeros(1, 2, 2, 5, 2), torch.zeros(1, 2, 1, 4), torch.ones(1, 2, 1, dtype=torch.bool)
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users run it
+    for wrong in ((future, mask), (future.expand(-1, -1, 5, -1), mask)):
+        with pytest.raises(ValueError, match="the horizon K of data and model must agree"):
+            losses.distances(positions, *wrong)
 
 
 @settings(deadline=None)
@@ -79,7 +141,8 @@ def test_goals_are_scored_at_the_candidate_closest_to_the_last_position(scenes):
     batch = len(scenes)
     candidates, exists = torch.full((batch, 2, 3, 2), torch.nan), torch.zeros(batch, 2, 3, dtype=torch.bool)
     final, observed = torch.full((batch, 2, 2), torch.nan), torch.zeros(batch, 2, dtype=torch.bool)
-    probabilities = torch.rand(batch, 2, 3).softmax(-1).requires_grad_()
+    probabilities = torch.rand(batch, 2, 3).softmax(-1)
+    logs = probabilities.log().requires_grad_()
     of_scenes = []
     for b, agents in enumerate(scenes):
         costs = []
@@ -94,7 +157,7 @@ def test_goals_are_scored_at_the_candidate_closest_to_the_last_position(scenes):
             if seen and way:
                 costs.append(-math.log(probabilities[b, i, min(way, key=way.get)].item()))
         of_scenes.append(sum(costs) / len(costs) if costs else 0.0)
-    loss = losses.goal(probabilities, candidates, exists, final, observed)
+    loss = losses.goal(logs, candidates, exists, final, observed)
     assert loss.item() == pytest.approx(sum(of_scenes) / batch, abs=1e-5)
     loss.backward()
-    assert probabilities.grad.isfinite().all()
+    assert logs.grad.isfinite().all()

@@ -16,25 +16,109 @@ def as_users_run_it(monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
-def test_what_does_not_fit_is_refused_by_name():
-    history = torch.zeros(2, 3, 5, 4)
-    with pytest.raises(ValueError, match=r"scene\.dt must be positive"):
-        Scene(history, 0.0)
-    with pytest.raises(ValueError, match=r"scene\.size has shape \[2, 2, 2\]; this history takes \[2, 3, 2\]"):
-        Scene(history, 0.1, size=torch.ones(2, 2, 2))
-    with pytest.raises(ValueError, match=r"scene\.agent_mask has shape \[2, 4\]"):
-        Scene(history, 0.1, agent_mask=torch.ones(2, 4, dtype=torch.bool))
-    with pytest.raises(ValueError, match=r"scene\.reference_speed has shape \[2\]; this history takes \[2, 3\]"):
-        Scene(history, 0.1, reference_speed=torch.ones(2))
-    with pytest.raises(ValueError, match=r"scene\.references has shape \[2, 3, 4, 1, 2\]"):
-        Scene(history, 0.1, references=torch.zeros(2, 3, 4, 1, 2))
-    with pytest.raises(ValueError, match=r"scene\.reference_mask has shape \[2, 3, 1\]; these references take"):
-        mask = torch.ones(2, 3, 1, dtype=torch.bool)
-        Scene(history, 0.1, references=torch.zeros(2, 3, 4, 6, 2), reference_mask=mask)
-    with pytest.raises(ValueError, match=r"scene\.reference_mask says which"):
-        Scene(history, 0.1, reference_mask=mask)
-    with pytest.raises(ValueError, match=r"scene\.history has shape \[2, 3, 5, 3\]"):
-        Scene(history[..., :3], 0.1)
+FIELDS = {
+    "future": torch.zeros(2, 3, 7, 4),
+    "goal_candidates": torch.zeros(2, 3, 6, 2),
+    "size": torch.ones(2, 3, 2),
+    "lanes": torch.zeros(2, 5, 8, 4),
+    "references": torch.zeros(2, 3, 4, 6, 2),
+}
+"""Fields that fit a history [2, 3, 5, 4]."""
+
+
+def a_mask(*shape: int) -> torch.Tensor:
+    return torch.ones(*shape, dtype=torch.bool)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"history": torch.zeros(2, 3, 5, 3)}, r"scene\.history has shape \[2, 3, 5, 3\]; .* takes \[B, N, H, 4\]"),
+        ({"history": torch.zeros(2, 3, 4)}, r"scene\.history has shape \[2, 3, 4\]"),
+        ({"history": torch.zeros(2, 3, 0, 4)}, r"scene\.history .* at least 1 step; the last one is the current state"),
+        ({"history": torch.zeros(2, 3, 5, 4, dtype=torch.long)}, r"scene\.history is of type torch\.int64"),
+        ({"history_mask": a_mask(2, 3, 4)}, r"scene\.history_mask has shape \[2, 3, 4\]; .* takes \[2, 3, 5\]"),
+        ({"agent_mask": a_mask(2, 4)}, r"scene\.agent_mask has shape \[2, 4\]; this scene takes \[2, 3\]"),
+        ({"future": torch.zeros(2, 3, 4)}, r"scene\.future has shape \[2, 3, 4\]; this scene takes \[2, 3, K, 4\]"),
+        ({"future": torch.zeros(2, 2, 7, 4)}, r"scene\.future has shape \[2, 2, 7, 4\]"),
+        ({"future": torch.zeros(2, 3, 7, 2)}, r"scene\.future has shape \[2, 3, 7, 2\]"),
+        ({"future": torch.zeros(2, 3, 0, 4)}, r"scene\.future has shape .* at least 1 step"),
+        ({"future_mask": a_mask(2, 3, 6)}, r"scene\.future_mask has shape \[2, 3, 6\]; this scene takes \[2, 3, 7\]"),
+        (
+            {"future": None, "future_mask": a_mask(2, 3, 7)},
+            r"scene\.future_mask describes scene\.future, which is None",
+        ),
+        ({"goal_candidates": torch.zeros(2, 3, 2)}, r"scene\.goal_candidates has shape .* takes \[2, 3, G, 2\]"),
+        ({"goal_candidates": torch.zeros(2, 4, 6, 2)}, r"scene\.goal_candidates has shape \[2, 4, 6, 2\]"),
+        ({"goal_mask": a_mask(2, 3, 5)}, r"scene\.goal_mask has shape \[2, 3, 5\]; this scene takes \[2, 3, 6\]"),
+        ({"goal_reference": torch.zeros(2, 3, 6)}, r"scene\.goal_reference is of type torch\.float32, .* integer"),
+        ({"size": torch.ones(2, 2, 2)}, r"scene\.size has shape \[2, 2, 2\]; this scene takes \[2, 3, 2\]"),
+        ({"size": torch.ones(2, 3)}, r"scene\.size has shape \[2, 3\]"),
+        ({"kind": torch.zeros(2, 2, dtype=torch.long)}, r"scene\.kind has shape \[2, 2\]"),
+        ({"lanes": torch.zeros(3, 5, 8, 4)}, r"scene\.lanes has shape .* takes \[2, L, V, 4\]"),
+        ({"lane_mask": a_mask(2, 5)}, r"scene\.lane_mask has shape \[2, 5\]; this scene takes \[2, 5, 8\]"),
+        ({"lanes": None, "lane_mask": a_mask(2, 5, 8)}, r"scene\.lane_mask describes scene\.lanes, which is None"),
+        ({"references": torch.zeros(2, 3, 4, 1, 2)}, r"scene\.references has shape .* at least 2 points"),
+        ({"reference_mask": a_mask(2, 3, 1)}, r"scene\.reference_mask has shape .* takes \[2, 3, 4\]"),
+        ({"references": None, "reference_mask": a_mask(2, 3, 4)}, r"scene\.reference_mask describes scene\.references"),
+        ({"reference_speed": torch.ones(2)}, r"scene\.reference_speed has shape \[2\]; this scene takes \[2, 3\]"),
+        ({"frame": torch.zeros(2, 2)}, r"scene\.frame has shape \[2, 2\]; this scene takes \[2, 3\]"),
+        ({"subset": torch.zeros(3, dtype=torch.long)}, r"scene\.subset has shape \[3\]; this scene takes \[2\]"),
+        ({"id": torch.zeros(2)}, r"scene\.id is of type torch\.float32, but takes integer"),
+        ({"agent_mask": torch.ones(2, 3)}, r"scene\.agent_mask is of type torch\.float32, .* masks are torch\.bool"),
+        ({"history_mask": torch.ones(2, 3, 5)}, r"scene\.history_mask is of type torch\.float32"),
+        ({"dt": 0.0}, r"scene\.dt must be positive and finite \[s\], not 0\.0"),
+        ({"dt": -0.1}, r"scene\.dt must be positive"),
+        ({"dt": float("nan")}, r"scene\.dt must be positive and finite \[s\], not nan"),
+        ({"dt": float("inf")}, r"scene\.dt must be positive and finite \[s\], not inf"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name(wrong, message):
+    Scene(torch.zeros(2, 3, 5, 4), 0.1, **FIELDS)
+    with pytest.raises(ValueError, match=message):
+        Scene(**{"history": torch.zeros(2, 3, 5, 4), "dt": 0.1, **FIELDS, **wrong})
+
+
+@pytest.mark.parametrize("name", ["history", *FIELDS])
+def test_arrays_and_lists_are_refused_by_name(name):
+    fields = {"history": torch.zeros(2, 3, 5, 4), **FIELDS}
+    for given, kind in ((fields[name].numpy(), r"numpy\.ndarray"), (fields[name].tolist(), r"builtins\.list")):
+        with pytest.raises(TypeError, match=rf"scene\.{name} is a {kind}; convert it with torch\.as_tensor"):
+            Scene(**{**fields, "dt": 0.1, name: given})
+    with pytest.raises(TypeError, match=r"scene\.dt is a Tensor; it takes a number of seconds"):
+        Scene(**fields, dt=torch.tensor(0.1))
+
+
+def test_masks_that_are_left_out_mean_that_everything_is_real():
+    scene = Scene(torch.zeros(2, 3, 5, 4), 0.1, **FIELDS)
+    shapes = {"history": (2, 3, 5), "agent": (2, 3), "future": (2, 3, 7), "goal": (2, 3, 6), "lane": (2, 5, 8)}
+    for name, shape in {**shapes, "reference": (2, 3, 4)}.items():
+        mask = getattr(scene, f"{name}_mask")
+        assert mask.shape == shape
+        assert mask.all()
+    bare = Scene(torch.zeros(2, 3, 5, 4), 0.1)
+    assert bare.future_mask is bare.goal_mask is bare.lane_mask is bare.reference_mask is None
+
+
+def test_values_that_no_forecaster_can_use_are_refused_where_agents_exist():
+    scene = random_scene(3, 2)
+    scene.validate_values()
+    for bad in (0.0, -1.0):
+        scene.size[1, 1, 0] = bad
+        with pytest.raises(ValueError, match=r"scene\.size\[1, 1\] is .*length and width must be positive"):
+            scene.validate_values()
+        scene.agent_mask[1, 1] = False
+        scene.validate_values()
+        scene.agent_mask[1, 1] = True
+    scene.size[1, 1, 0] = 1.0
+    named = Scene(**{**vars(scene), "goal_reference": torch.ones(3, 2, 1, dtype=torch.long)})
+    named.validate_values()
+    for bad in (2, -1):
+        named.goal_reference[2, 0, 0] = bad
+        with pytest.raises(ValueError, match=rf"scene\.goal_reference\[2, 0, 0\] is {bad}; .* lines 0 to 1"):
+            named.validate_values()
+    named.goal_mask[2, 0, 0] = False
+    named.validate_values()
 
 
 def test_scenes_are_chosen_and_converted_as_a_whole():
@@ -58,18 +142,6 @@ def test_only_what_is_real_has_to_be_finite():
     scene.reference_mask[2, 1, 1] = False
     scene.agent_mask[0, 0] = False
     assert scene.finite.all()
-
-
-@pytest.mark.parametrize("name", ["agent_mask", "history_mask"])
-def test_masks_are_boolean(name):
-    mask = torch.ones((1, 2) if name == "agent_mask" else (1, 2, 3))
-    with pytest.raises(ValueError, match=rf"scene\.{name} is of type torch\.float32; masks are torch\.bool"):
-        Scene(torch.zeros(1, 2, 3, 4), 0.1, **{name: mask})
-
-
-def test_a_history_has_a_current_state():
-    with pytest.raises(ValueError, match="has no step"):
-        Scene(torch.zeros(1, 2, 0, 4), 0.1)
 
 
 def test_batches_within_a_batch_are_indexed_with_it():

@@ -1,4 +1,4 @@
-"""What all forecasters share: how they are trained, measured, saved and asked."""
+"""Base class of all forecasters: training, metrics, checkpoints and prediction."""
 
 from __future__ import annotations
 
@@ -38,21 +38,25 @@ class Forecaster(LightningModule):
         self.test_metrics = ForecastMetrics(task.subsets, task.shape)
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
-        """Weight and value of every term of the training objective (Eq. 12)."""
+        """Weight and value of every term of the training objective (Eq. 12), by name."""
         raise NotImplementedError
 
     @torch.no_grad()
     def predict(self, scene: Scene) -> JointForecast:
-        """Forecast in evaluation mode, with everything that explains the forecast.
+        """The forecast in evaluation mode, with the energies that explain it.
 
-        A scene that holds non-finite numbers is answered with NaN, with a warning that names it, and leaves the forecasts of
-        the others as they are.
+        The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
+        other scenes of the batch are the same as without it.
 
         Raises:
-            ValueError: the scene does not fit the data that this forecaster was trained for.
+            TypeError: the argument is not a :class:`Scene`.
+            ValueError: the scene's time step is not the forecaster's, or its sizes or line indices cannot be used.
         """
+        if not isinstance(scene, Scene):
+            raise TypeError(f"predict takes an epo_lightning.scene.Scene, not a {type(scene).__name__}")
         if abs(scene.dt - self.task.dt) > 1e-6:
             raise ValueError(f"the scene has dt = {scene.dt} s, but this forecaster was built for {self.task.dt} s")
+        scene.validate_values()
         broken = (~scene.finite).nonzero().flatten().tolist()
         if broken:
             warnings.warn(
@@ -69,11 +73,11 @@ class Forecaster(LightningModule):
         return forecast.map(lambda tensor: _blank(tensor, broken)) if broken else forecast
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
-        """Add what is of interest to a reader but not to training."""
+        """The forecast with the energy of every feature added; computed for predictions, not in training."""
         return forecast
 
     def examine(self, scene: Scene, forecast: JointForecast) -> JointForecast:
-        """Add what is measured in tests but is too dear for every validation."""
+        """The forecast with measurements added that are made in tests but cost too much for every validation."""
         return forecast
 
     def training_step(self, scene: Scene, _: int) -> Tensor:
@@ -108,7 +112,7 @@ class Forecaster(LightningModule):
         return self.optimizer.configure(parameters, self.trainer.estimated_stepping_batches)
 
     def configure_gradient_clipping(self, *_: Any, **__: Any) -> None:
-        """Clip by the optimizer's own limit, so that a run's recipe is in one place."""
+        """Clip by the limit of the optimizer's configuration instead of the Trainer's."""
         if self.optimizer.clip is not None:
             torch.nn.utils.clip_grad_norm_(self.parameters(), self.optimizer.clip)
 

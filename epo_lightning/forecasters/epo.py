@@ -175,7 +175,7 @@ class EPO(Forecaster):
         if "reference" in self.energy.needs and goals.reference is None:
             raise ValueError("the energy follows reference lines, but scene.goal_reference [B, N, G] is None")
         own_weights = self.own_weights(z, scene.agent_mask)
-        # Agents without a goal get zero goal weights, so that the origin, which stands for their goal, does not attract them.
+        # Agents without a goal have the position (0, 0) for it: zero goal weights keep it from attracting them.
         for name in self.energy.heading & own_weights.keys():
             own_weights[name] = own_weights[name].where(goals.exist[:, None], 0.0)
         return GameParameters(

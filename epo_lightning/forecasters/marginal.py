@@ -16,7 +16,7 @@ from epo_lightning.objectives.base import Terms, checked_weights
 from epo_lightning.objectives.terms import observed_future
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
-from epo_lightning.scene import HEADING, JointForecast, Scene
+from epo_lightning.scene import HEADING, JointForecast, Scene, log_probabilities
 from epo_lightning.task import Task
 
 
@@ -53,13 +53,15 @@ class Marginal(Forecaster):
     def forward(self, scene: Scene) -> JointForecast:
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
         positions, logits = self.decoder(self.backbone(scene), current[..., :2])
-        states, logits = marginal_to_joint(_with_motion(positions, current, scene.dt), logits)
+        states = _with_motion(positions, current, scene.dt)
+        states, probabilities, logits = marginal_to_joint(states, logits.softmax(1), logits)
         # The product of probabilities, as a sum of logarithms: over many agents it is smaller than any float32 number.
-        joint = logits.log_softmax(1).where(scene.agent_mask[:, None], 0.0).sum(-1)
+        of_agents = log_probabilities(probabilities, logits, 1)
+        joint = of_agents.where(scene.agent_mask[:, None], 0.0).sum(-1)
         return JointForecast(
             states=states,
             probabilities=joint.softmax(1),
-            agent_probabilities=logits.softmax(1),
+            agent_probabilities=probabilities,
             logits=joint,
             agent_logits=logits,
         )

@@ -1,7 +1,5 @@
-"""How good a forecast is (Section 5, Metrics): definitions, and torchmetrics classes that add them up."""
+"""Metrics of a forecast (Section 5, Metrics): definitions in ``functional``, and a torchmetrics class that adds them up."""
 
-from epo_lightning.metrics.displacement import MinADE, MinFDE, MinSADE, MinSFDE
 from epo_lightning.metrics.forecast import METRICS, ForecastMetrics
-from epo_lightning.metrics.overlap import OverlapRate
 
-__all__ = ["METRICS", "ForecastMetrics", "MinADE", "MinFDE", "MinSADE", "MinSFDE", "OverlapRate"]
+__all__ = ["METRICS", "ForecastMetrics"]

@@ -15,7 +15,7 @@ from epo_lightning.metrics.functional.overlap import Shape, check_choice, overla
 from epo_lightning.scene import JointForecast, Scene
 
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "overlap_authors")
-"""What every forecaster is scored by; displacements in m, overlaps as rates."""
+"""Scores of every forecaster; displacements in m, overlaps as rates."""
 INITIAL_METRICS = ("initial/minSADE", "initial/minSFDE")
 """Scores of the strategies from which the solver started (the paper's figure over the number of steps S)."""
 EQUILIBRIUM_METRICS = (
@@ -26,25 +26,44 @@ EQUILIBRIUM_METRICS = (
     "nash_gap",
     "nash_gap_relative",
 )
-"""How close the most likely joint mode is to an equilibrium of its game (:class:`~epo_lightning.scene.Equilibrium`): of the
-agents of a scene, the largest gap, and the largest share of its objective J_i that an agent could save."""
+"""Distance of the most likely joint mode from an equilibrium of its game (:class:`~epo_lightning.scene.Equilibrium`); of a
+scene's agents the largest Nash gap, and the largest one relative to the agent's own objective J_i."""
 MODE_METRICS = tuple(f"minSADE_{k}" for k in range(1, 17))
-"""The minSADE among the k most likely joint modes, for forecasts of several; more than sixteen are not told apart."""
+"""The minSADE among the k most likely joint modes, for forecasts with several modes; k is 16 at most."""
 COLUMNS = METRICS + INITIAL_METRICS + EQUILIBRIUM_METRICS + MODE_METRICS
 _OF_SUBSETS = len(METRICS + INITIAL_METRICS)
 
 
 class ForecastMetrics(Metric):
-    """Means over scenes of all metrics of the tables in Section 5, computed once per batch.
+    """Means over scenes of all metrics of the tables in Section 5, as a torchmetrics Metric.
 
-    Forecasts that carry a report on their equilibrium are scored by it as well, over all scenes alone. A scene whose report
-    holds no finite number (a game that overflows) is not counted there: it would hide what is known of all the others, and a
-    forecast that is broken shows in the displacements, which are infinite then.
+    Absent agents (``Scene.agent_mask``) and unobserved steps (``Scene.future_mask``) do not count. The states are sums in
+    double precision, so that batches and processes of any sizes add up to the same mean: a float32 sum over the 60 000
+    scenes of a data set loses the digits that tables print.
+
+    Forecasts with a measured equilibrium are scored by it as well, over all scenes but not by subset. A scene whose
+    measurement is not finite (a game that overflows) does not count there, because one such scene would make the mean of
+    all others infinite; a broken forecast still shows in the displacements, which are infinite then.
 
     Args:
         subsets: names of the subsets that ``Scene.subset`` numbers, e.g. ``("executed", "alternative")`` for RPI. Each
             gets its own scores, ``"executed/minADE"``; a scene with a number beyond the names belongs to none of them.
-        shape: of the agents when they overlap, ``disc`` or ``box``.
+        shape: outline of the agents in overlap rates, ``disc`` or ``box``.
+
+    Example:
+        One scene, one mode, two agents that stand still, and a forecast that is 0.3 m off for one of them:
+
+        >>> from epo_lightning.scene import JointForecast, Scene
+        >>> states = torch.tensor([[0.0, 0.0, 0.0, 0.0], [5.0, 0.0, 0.0, 0.0]]).view(1, 2, 1, 4)
+        >>> scene = Scene(history=states, dt=0.1, future=states, size=torch.ones(1, 2, 2))
+        >>> predicted = states[:, None].clone()
+        >>> predicted[0, 0, 0, 0, 0] = 0.3
+        >>> forecast = JointForecast(predicted, probabilities=torch.ones(1, 1))
+        >>> metrics = ForecastMetrics()
+        >>> metrics.update(forecast, scene)
+        >>> {name: round(float(score), 3) for name, score in metrics.compute().items()}  # doctest: +NORMALIZE_WHITESPACE
+        {'minADE': 0.15, 'minFDE': 0.15, 'minSADE': 0.15, 'minSFDE': 0.15,
+         'overlap_jfp': 0.0, 'overlap_authors': 0.0}
     """
 
     is_differentiable = False
@@ -58,7 +77,7 @@ class ForecastMetrics(Metric):
         super().__init__(**options)
         check_choice("shape", shape, get_args(Shape))
         self.subsets, self.shape = tuple(subsets), shape
-        # First row: all scenes; then one for each subset. Sums in double precision, see SceneMean.
+        # The first row is for all scenes, the others for one subset each.
         zeros = torch.zeros(1 + len(self.subsets), len(COLUMNS), dtype=torch.float64)
         self.add_state("total", zeros, dist_reduce_fx="sum")
         self.add_state("count", zeros.clone(), dist_reduce_fx="sum")
@@ -67,7 +86,7 @@ class ForecastMetrics(Metric):
         """Count a batch of scenes.
 
         Raises:
-            ValueError: the scene holds no future to compare with, or no sizes.
+            ValueError: the scene has no future or no sizes, or another number of agents or steps than the forecast.
         """
         values = forecast_values(forecast, scene, self.shape)
         groups = torch.ones(len(values), 1, dtype=torch.bool, device=values.device)
@@ -83,8 +102,8 @@ class ForecastMetrics(Metric):
     def compute(self) -> dict[str, Tensor]:
         """Scores by name.
 
-        The six metrics over all scenes are always there, NaN before the first scene; those of a subset, of initial
-        strategies, of equilibria and of some modes only where there was one.
+        The six metrics over all scenes are always present, NaN before the first scene; the scores of a subset, of initial
+        strategies, of equilibria and of the most likely modes are present where there was a scene that has them.
         """
         mean = self.total / self.count
         scores = dict(zip(METRICS, mean[0], strict=False))
@@ -96,15 +115,15 @@ class ForecastMetrics(Metric):
 
 
 def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> Float[Tensor, "B metrics"]:
-    """Every metric of every scene, in the order in which they are named above, in float64; NaN where there is none.
+    """All metrics of every scene, in the order of ``COLUMNS``, in float64; NaN where a scene has no value.
 
     Raises:
-        ValueError: the scene holds no future to compare with, or no sizes.
+        ValueError: the scene has no future or no sizes.
     """
     if scene.future is None or scene.future_mask is None:
-        raise ValueError("metrics compare with what happened: Scene.future is missing")
+        raise ValueError("displacements need scene.future [B, N, K, 4], which is None")
     if scene.size is None:
-        raise ValueError("overlap rates need the sizes of agents: Scene.size is missing")
+        raise ValueError("overlap rates need scene.size [B, N, 2], which is None")
     assert scene.agent_mask is not None
     mask = scene.future_mask & scene.agent_mask[..., None]
     states, future = forecast.states, scene.future
@@ -122,9 +141,9 @@ def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> Float[
 
 
 def equilibrium_values(forecast: JointForecast) -> list[Float[Tensor, " B"]]:
-    """``EQUILIBRIUM_METRICS`` of every scene; NaN where there is no finite value.
+    """``EQUILIBRIUM_METRICS`` of every scene; NaN where a value is not finite.
 
-    Agents whose objective is not positive have no relative gap: nothing says what to compare with.
+    Agents whose objective is not positive have no relative gap.
     """
     found = forecast.equilibrium
     if found is None:

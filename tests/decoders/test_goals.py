@@ -35,10 +35,10 @@ def test_logits_are_those_of_the_concatenation(training):
     decoder, scene = GoalDecoder(8, scale=50.0), highway_scene(4, 3)
     scene.agent_mask[1, 2] = False
     z = torch.randn(4, 3, 8)
-    decoder(z, scene)  # the running statistics have seen something
+    decoder.logits(z, scene)  # the running statistics have seen something
     decoder.train(training)
     exists = scene.goal_mask & scene.agent_mask[..., None]
-    logits = decoder(z, scene)
+    logits = decoder.logits(z, scene)
     torch.testing.assert_close(logits[exists], concatenated(decoder.mlp, z, scene, 50.0), rtol=1e-4, atol=1e-4)
     assert (logits[~exists] == NO_CANDIDATE).all()
 
@@ -46,12 +46,12 @@ def test_logits_are_those_of_the_concatenation(training):
 @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
 def test_padding_changes_neither_logits_nor_gradients(filling):
     decoder, scene, z = GoalDecoder(8, scale=50.0), highway_scene(4, 3), torch.randn(4, 5, 8)
-    logits = decoder(z[:, :3], scene)
+    logits = decoder.logits(z[:, :3], scene)
     logits.softmax(-1)[..., 0].sum().backward()
     learned = [parameter for parameter in decoder.parameters() if parameter.requires_grad]
     gradients = [parameter.grad.clone() for parameter in learned]
     decoder.zero_grad()
-    padded = decoder(z, pad(scene, agents=2, filling=filling, candidates=3))
+    padded = decoder.logits(z, pad(scene, agents=2, filling=filling, candidates=3))
     torch.testing.assert_close(padded[:, :3, :6], logits, rtol=0, atol=1e-5)
     assert (padded[:, 3:] == NO_CANDIDATE).all()
     assert (padded[..., 6:] == NO_CANDIDATE).all()
@@ -62,7 +62,7 @@ def test_padding_changes_neither_logits_nor_gradients(filling):
 def test_nobody_has_a_candidate():
     decoder, scene = GoalDecoder(8).eval(), highway_scene(2, 3)
     scene.goal_mask[:] = False
-    logits = decoder(torch.randn(2, 3, 8), scene)
+    logits = decoder.logits(torch.randn(2, 3, 8), scene)
     assert (logits == NO_CANDIDATE).all()
     goals, reference = choose(scene, most_likely(logits, 4))
     assert goals.shape == (2, 4, 3, 2)

@@ -18,7 +18,7 @@ DT = 0.2
 
 def rolled(motions: Motions, current: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Controls, and the states x_0 .. x_K."""
-    controls = motions(current, DT)
+    controls = motions.controls(current, DT)
     states = Unicycle().rollout(current[:, None], controls, DT)
     start = current[:, None, :, None].expand(*states.shape[:3], 1, 4)
     return controls, torch.cat((start, states), 3)
@@ -109,11 +109,13 @@ def test_who_rolls_backwards_is_neither_stopped_at_once_nor_made_faster():
 def test_all_candidates_are_different_and_the_same_for_everybody(count):
     motions = Motions(8, count, 2.0, 0.3)
     current = moving() + torch.tensor([0.0, 0.0, 0.0, 2.0])  # too fast to stand after a step, when all brake alike
-    controls = motions(current, DT)
+    controls = motions.controls(current, DT)
     different = (controls[:, :, None] - controls[:, None]).abs().amax((-1, -2)).amin((0, 3))
     assert (different[~torch.eye(count, dtype=torch.bool)] > 1e-6).all()
-    assert torch.equal(controls, Motions(8, count, 2.0, 0.3)(current, DT)), "nothing is drawn at random"
-    assert torch.equal(controls[1:, :, 2:3], motions(current[1:, 2:3], DT)), "agents do not matter to each other"
+    assert torch.equal(controls, Motions(8, count, 2.0, 0.3).controls(current, DT)), "nothing is drawn at random"
+    assert torch.equal(controls[1:, :, 2:3], motions.controls(current[1:, 2:3], DT)), (
+        "agents do not matter to each other"
+    )
     assert not list(motions.parameters())
     assert not motions.state_dict()
 

@@ -136,7 +136,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("rpi_jfp", {"modes": 0}, r"forecaster\.modes must be 1 or more"),
     ("rpi_tgl", {"modes": -1}, r"forecaster\.modes must be 1 or more"),
     ("rpi_tgl", {"initial": "motions"}, "motions are those of a unicycle"),
-    ("rpi_tgl", {"own_start": {"acc": 0.2}}, r"own_start\.acc starts nothing: this energy holds acc fixed"),
+    ("rpi_tgl", {"own_start": {"acc": 0.2}}, r"own_start\.acc has no effect: this energy fixes the weight of acc"),
     (
         "rpi_dsdnet",
         {"motions": {"acceleration": 1.0}},

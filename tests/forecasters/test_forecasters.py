@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import jaxtyping
+import numpy
 import pytest
 import torch
 from games import random_scene
@@ -93,7 +95,7 @@ EPO = TestEPO.config
         ({"energy": {"name": "features", "own": ["gaol"]}}, "did you mean 'goal'"),
         (
             {"energy": {"name": "features", "own": ["lane", "velref"]}},
-            "need reference, reference_speed, which this data does not give",
+            "need reference, reference_speed, which this data does not provide",
         ),
         ({"energy": {"name": "features"}}, r"missing key energy\.own"),
         ({"solver": {"name": "levenberg_marquardt", "stepsize": 1}}, "did you mean 'step_size'"),
@@ -138,3 +140,14 @@ def test_what_is_dear_to_examine_is_examined_in_some_scenes(monkeypatch):
     assert report.energy.isfinite().tolist() == [True, False] * 3
     alone = forecaster.examine(scene[[2]], forecast[[2]]).equilibrium
     torch.testing.assert_close(report.energy[2], alone.energy[0])
+
+
+def test_what_cannot_be_predicted_is_refused(monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users run it
+    forecaster = build_forecaster(model({"name": "constant_velocity"}))
+    with pytest.raises(TypeError, match=r"predict takes an epo_lightning\.scene\.Scene, not a ndarray"):
+        forecaster.predict(numpy.zeros((1, 2, 5, 4)))
+    scene = random_scene(2, 2)
+    scene.size[1, 0] = 0.0
+    with pytest.raises(ValueError, match=r"scene\.size\[1, 0\] is \[0\.0, 0\.0\]; length and width must be positive"):
+        forecaster.predict(scene)

@@ -139,7 +139,7 @@ def test_an_agent_without_a_future_teaches_nothing():
     ("changes", "message"),
     [
         ({"goal": "all"}, "goal is 'all', but .* only 6 candidates"),
-        ({"candidates": 1}, "need reference, reference_speed, which this data does not give"),
+        ({"candidates": 1}, "need reference, reference_speed, which this data does not provide"),
         ({"forecaster": {**EPO, "initial": "zeros"}}, "unknown forecaster.initial 'zeros': did you mean 'zero'"),
         ({"forecaster": {**EPO, "own_start": {"val": 1.0}}}, "own_start.val: did you mean 'vel'"),
         ({"forecaster": {**EPO, "own_start": {"vel": 0.0}}}, "own_start must be positive, but vel would start at 0.0"),

@@ -1,4 +1,4 @@
-"""The definitions of the metrics: batched functions that return one value per scene."""
+"""Definitions of the metrics: batched functions that return one value per scene."""
 
 from epo_lightning.metrics.functional.displacement import (
     min_ade,

@@ -1,10 +1,10 @@
-"""How far the best of M predictions stays from what happened (Section 5, Metrics).
+"""Displacements of the best of M predictions from the observed future (Section 5, Metrics).
 
 With e[m,i,k] the distance [m] between the predicted and the observed position of agent i at step k, and mean_k the mean
 over the observed steps of an agent:
 
 ========  ==================================  ==================================================
-minADE    mean_i min_m mean_k e[m,i,k]        every agent chooses its own mode (marginal)
+minADE    mean_i min_m mean_k e[m,i,k]        each agent's own best mode (marginal)
 minFDE    mean_i min_m e[m,i,K]
 minSADE   min_m mean_i mean_k e[m,i,k]        one mode for all agents of the scene (joint)
 minSFDE   min_m mean_i e[m,i,K]
@@ -13,8 +13,20 @@ minSFDE   min_m mean_i e[m,i,K]
 Each metric takes its own best mode: the minSFDE need not belong to the mode of the minSADE.
 
 Agents without any observed step, and for the final displacements those whose last step was not observed, are left out
-of the mean over agents. A scene without any agent left is NaN. A prediction that is not finite where something was
-observed is infinitely far from it, so that a broken forecast cannot pass for an unobserved scene.
+of the mean over agents. A scene without any agent left is NaN. A non-finite prediction at an observed step has an infinite
+displacement, so that a broken forecast cannot pass for an unobserved scene.
+
+Example: two agents stand at the origin; mode 0 is right about the first one, mode 1 nearly right about the second one.
+
+    >>> import torch
+    >>> from epo_lightning.metrics.functional import min_ade, min_sade
+    >>> errors = torch.tensor([[0.0, 9.0], [5.0, 1.0]])  # [M, N]
+    >>> states = torch.stack((errors, torch.zeros(2, 2)), -1)[None, :, :, None]  # [B, M, N, K, 2]
+    >>> future, mask = torch.zeros(1, 2, 1, 2), torch.ones(1, 2, 1, dtype=torch.bool)
+    >>> min_ade(states, future, mask)  # (0 + 1) / 2
+    tensor([0.5000])
+    >>> min_sade(states, future, mask)  # (5 + 1) / 2
+    tensor([3.])
 """
 
 from __future__ import annotations
@@ -30,9 +42,12 @@ def min_ade(
     """Mean over agents of the average displacement of each agent's own best mode [m].
 
     Args:
-        states: predictions, x and y [m] first; further entries of a state are not looked at.
-        future: what happened, likewise.
+        states: predictions, x and y [m] first; further entries of a state are not read.
+        future: observed states, likewise.
         mask: True where an agent was observed.
+
+    Raises:
+        ValueError: shapes that do not agree.
     """
     return _marginal(*_average_errors(states, future, mask))
 
@@ -57,7 +72,7 @@ def min_sade_of_likely(
     future: Float[Tensor, "B N K _"],
     mask: Bool[Tensor, "B N K"],
 ) -> Float[Tensor, "B M"]:
-    """The minSADE among the k most likely joint modes, k = 1 .. M [m]; of equally likely ones the first count."""
+    """The minSADE among the k most likely joint modes, k = 1 .. M [m]; equally likely modes keep their order."""
     error, counted = _average_errors(states, future, mask)
     order = probabilities.argsort(dim=1, descending=True, stable=True)
     joint = (error.sum(-1) / counted.sum(-1, keepdim=True)).gather(1, order)
@@ -74,7 +89,7 @@ def min_sfde(
 def _distances(
     states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, "B M N K"]:
-    """e[m,i,k], zero where nothing was observed (also if a number behind the mask is not one)."""
+    """e[m,i,k], zero where nothing was observed, also if the value behind the mask is NaN."""
     offset = states[..., :2] - future[:, None, ..., :2]
     error = torch.linalg.vector_norm(offset, dim=-1)
     error = error.nan_to_num(nan=torch.inf, posinf=torch.inf)
@@ -84,7 +99,8 @@ def _distances(
 def _average_errors(
     states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
 ) -> tuple[Float[Tensor, "B M N"], Bool[Tensor, "B N"]]:
-    """Mean over the observed steps, and which agents have any."""
+    """Mean over the observed steps, and the agents that have any."""
+    _check_shapes(states, future, mask)
     steps = mask.sum(-1)
     return _distances(states, future, mask).sum(-1) / steps[:, None].clamp_min(1), steps > 0
 
@@ -92,13 +108,29 @@ def _average_errors(
 def _final_errors(
     states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
 ) -> tuple[Float[Tensor, "B M N"], Bool[Tensor, "B N"]]:
-    """Error at the last step, and which agents were observed there."""
+    """Error at the last step, and the agents observed there."""
+    _check_shapes(states, future, mask)
     last = mask[..., -1:]
     return _distances(states[..., -1:, :], future[..., -1:, :], last)[..., 0], last[..., 0]
 
 
+def _check_shapes(states: Tensor, future: Tensor, mask: Tensor) -> None:
+    """Refuse shapes that would be broadcast, such as a future of one step.
+
+    Raises:
+        ValueError: as said.
+    """
+    if states.dim() != 5 or future.dim() != 4 or states.shape[:1] + states.shape[2:4] != future.shape[:3]:
+        raise ValueError(
+            f"predictions have shape {list(states.shape)} and the observed future {list(future.shape)}; they take "
+            "[B, M, N, K, X] and [B, N, K, X] with the same numbers of scenes B, agents N and steps K"
+        )
+    if mask.shape != future.shape[:3]:
+        raise ValueError(f"the mask has shape {list(mask.shape)}; this future takes {list(future.shape[:3])}")
+
+
 def _marginal(error: Float[Tensor, "B M N"], counted: Bool[Tensor, "B N"]) -> Float[Tensor, " B"]:
-    """mean_i min_m; errors of agents that are not counted are zero already, 0 / 0 is the NaN of an empty scene."""
+    """mean_i min_m; errors of agents that are not counted are zero, and 0 / 0 is the NaN of an empty scene."""
     return error.amin(1).sum(-1) / counted.sum(-1)
 
 

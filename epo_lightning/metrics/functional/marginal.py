@@ -1,4 +1,4 @@
-"""From marginal predictions, one distribution per agent, to joint ones."""
+"""Joint predictions from marginal ones, which have one distribution per agent."""
 
 from __future__ import annotations
 
@@ -7,20 +7,30 @@ from torch import Tensor
 
 
 def marginal_to_joint(
-    states: Float[Tensor, "B M N K X"], agent_probabilities: Float[Tensor, "B M N"]
-) -> tuple[Float[Tensor, "B M N K X"], Float[Tensor, "B M N"]]:
-    """Order every agent's modes by decreasing probability: joint mode k is everyone's k-th most likely one.
+    states: Float[Tensor, "B M N K X"], agent_probabilities: Float[Tensor, "B M N"], *others: Float[Tensor, "B M N"]
+) -> tuple[Float[Tensor, "B M N K X"] | Float[Tensor, "B M N"], ...]:
+    """Every agent's modes by decreasing probability: joint mode k consists of every agent's k-th most likely one.
 
-    This is how the joint metrics of a marginal forecaster are defined (Section 5, Metrics). Equally likely modes keep
+    The joint metrics of a marginal forecaster are defined like this (Section 5, Metrics). Equally likely modes keep
     their order.
 
     Args:
-        states: the modes of each agent, not belonging together yet.
-        agent_probabilities: of each agent's own modes.
+        states: the modes of each agent, independent of those of the other agents.
+        agent_probabilities: each agent's probabilities of its own modes.
+        others: further values of the modes, such as logits.
 
     Returns:
-        The states and the probabilities in the new order.
+        The states, the probabilities and the other values in the new order.
+
+    Example:
+        >>> import torch
+        >>> states = torch.tensor([[1.0, 2.0], [3.0, 4.0]]).view(1, 2, 2, 1, 1)  # modes 1, 3 and 2, 4 of two agents
+        >>> probabilities = torch.tensor([[[0.9, 0.2], [0.1, 0.8]]])
+        >>> states, probabilities = marginal_to_joint(states, probabilities)
+        >>> states.flatten(1), probabilities
+        (tensor([[1., 4., 3., 2.]]), tensor([[[0.9000, 0.8000],
+                 [0.1000, 0.2000]]]))
     """
     order = agent_probabilities.argsort(dim=1, descending=True, stable=True)
     index = order[..., None, None].expand(-1, -1, -1, *states.shape[-2:])
-    return states.gather(1, index), agent_probabilities.gather(1, order)
+    return states.gather(1, index), *(values.gather(1, order) for values in (agent_probabilities, *others))

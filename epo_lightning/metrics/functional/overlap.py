@@ -1,6 +1,6 @@
-"""Whether the most likely joint prediction lets agents run into each other (Section 5, Metrics; OR in the tables).
+"""Overlaps of agents in the most likely joint prediction (Section 5, Metrics; OR in the tables).
 
-Two definitions are in use, both on the most likely joint mode only:
+Two definitions are in use, both for the most likely joint mode only:
 
 ``jfp``
     1 if any two agents overlap at any step, else 0 (JFP, MotionLM). A rate in [0, 1] when averaged over scenes.
@@ -38,22 +38,32 @@ def overlap_rate(
     definition: str = "jfp",
     shape: str = "disc",
 ) -> Float[Tensor, " B"]:
-    """Overlaps of the most likely joint mode of each scene.
+    """Overlap rate of the most likely joint mode of each scene.
 
     Args:
         states: predictions of all agents at all steps, observed later or not.
-        probabilities: of the joint modes; of equally likely ones the first counts.
+        probabilities: probabilities of the joint modes; of equally likely ones the first counts.
         size: length and width [m].
-        agent_mask: which agents exist.
+        agent_mask: agents that exist.
         definition: ``jfp`` or ``authors``, see the module.
         shape: ``disc`` or ``box``.
 
     Returns:
-        One value per scene; NaN for a scene without agents. Where the predicted state of an agent is not finite, nobody
-        can say who overlaps: the value is infinite, so that a broken forecast cannot pass for a consistent one.
+        One value per scene; NaN for a scene without agents. Where the predicted state of an agent is not finite, the value
+        is infinite, so that a broken forecast cannot pass for a consistent one.
 
     Raises:
         ConfigError: an unknown definition or shape.
+
+    Example:
+        Two discs of 2 m diameter, 1 m apart:
+
+        >>> states = torch.tensor([[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]).view(1, 1, 2, 1, 4)
+        >>> one, size, present = torch.ones(1, 1), torch.full((1, 2, 2), 2.0), torch.ones(1, 2, dtype=torch.bool)
+        >>> overlap_rate(states, one, size, present)
+        tensor([1.])
+        >>> overlap_rate(states, one, size, present, definition="authors")
+        tensor([0.5000])
     """
     check_choice("definition", definition, get_args(Definition))
     jfp, authors = overlap_rates(states, probabilities, size, agent_mask, shape)
@@ -67,7 +77,7 @@ def overlap_rates(
     agent_mask: Bool[Tensor, "B N"],
     shape: str = "disc",
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
-    """Both definitions, ``jfp`` and ``authors``, at the price of one; see :func:`overlap_rate`."""
+    """Overlap rates by both definitions, ``jfp`` and ``authors``; see :func:`overlap_rate`."""
     likely = probabilities.argmax(1)
     chosen = states[torch.arange(len(states), device=states.device), likely]
     pairs = overlapping_pairs(chosen, size, agent_mask, shape)
@@ -83,7 +93,7 @@ def overlap_rates(
 def overlapping_pairs(
     states: Float[Tensor, "B N K 4"], size: Float[Tensor, "B N 2"], agent_mask: Bool[Tensor, "B N"], shape: str = "disc"
 ) -> Bool[Tensor, "B P"]:
-    """Which pairs i < j, in the order of ``torch.triu_indices(N, N, 1)``, overlap at any step.
+    """Pairs i < j, in the order of ``torch.triu_indices(N, N, 1)``, that overlap at any step.
 
     Raises:
         ConfigError: an unknown shape.
@@ -101,7 +111,7 @@ def _discs_overlap(
     size_a: Float[Tensor, "B P 1 2"],
     size_b: Float[Tensor, "B P 1 2"],
 ) -> Bool[Tensor, "B P K"]:
-    """Centres nearer than the sum of the radii."""
+    """Overlaps of discs: centres nearer than the sum of the radii."""
     distance = torch.linalg.vector_norm(a[..., :2] - b[..., :2], dim=-1)
     return distance < (size_a[..., 0] + size_b[..., 0]) / 2 - TOUCH
 
@@ -112,14 +122,15 @@ def _boxes_overlap(
     size_a: Float[Tensor, "B P 1 2"],
     size_b: Float[Tensor, "B P 1 2"],
 ) -> Bool[Tensor, "B P K"]:
-    """Separating axes: two rectangles are apart exactly if their shadows on one of their four sides' directions are."""
+    """Overlaps of rectangles, by separating axes: they are apart if and only if their projections on the direction of one
+    of their sides are."""
     axes_a, axes_b = _axes(a[..., HEADING]), _axes(b[..., HEADING])
     directions = torch.cat([axes_a, axes_b], dim=-2)  # B P K 4 2
     offset = b[..., :2] - a[..., :2]
     between = torch.einsum("bpkdx,bpkx->bpkd", directions, offset).abs()
-    shadow_a = torch.einsum("bpkdx,bpkex,bpe->bpkde", directions, axes_a, size_a[:, :, 0] / 2).abs().sum(-1)
-    shadow_b = torch.einsum("bpkdx,bpkex,bpe->bpkde", directions, axes_b, size_b[:, :, 0] / 2).abs().sum(-1)
-    return (between < shadow_a + shadow_b - TOUCH).all(-1)
+    extent_a = torch.einsum("bpkdx,bpkex,bpe->bpkde", directions, axes_a, size_a[:, :, 0] / 2).abs().sum(-1)
+    extent_b = torch.einsum("bpkdx,bpkex,bpe->bpkde", directions, axes_b, size_b[:, :, 0] / 2).abs().sum(-1)
+    return (between < extent_a + extent_b - TOUCH).all(-1)
 
 
 def _axes(heading: Float[Tensor, "B P K"]) -> Float[Tensor, "B P K 2 2"]:
@@ -129,6 +140,10 @@ def _axes(heading: Float[Tensor, "B P K"]) -> Float[Tensor, "B P K 2 2"]:
 
 
 def check_choice(what: str, value: str, known: tuple[str, ...]) -> None:
-    """Refuse a value that is none of the known ones."""
+    """Refuse an unknown value.
+
+    Raises:
+        ConfigError: the message names the nearest known one.
+    """
     if value not in known:
         raise ConfigError(f"unknown {what} {value!r} of an overlap rate: {nearest(value, known)}")

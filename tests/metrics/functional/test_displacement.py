@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jaxtyping
 import pytest
 import torch
 from hypothesis import given, settings
@@ -47,6 +48,22 @@ def test_distance_is_euclidean_and_ignores_heading_and_speed() -> None:
     states = torch.tensor([3.0, 4.0, 100.0, 100.0]).view(1, 1, 1, 1, 4)
     arguments = states, torch.zeros(1, 1, 1, 4), torch.ones(1, 1, 1, dtype=torch.bool)
     assert [metric(*arguments).item() for metric in METRICS.values()] == [5.0] * 4
+
+
+@pytest.mark.parametrize("metric", METRICS.values())
+@pytest.mark.parametrize("wrong", ["one step", "one agent", "one scene", "mask of one step", "no modes"])
+def test_shapes_that_would_be_broadcast_are_refused(metric, wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users run it
+    states, future, mask = torch.zeros(3, 2, 4, 5, 2), torch.zeros(3, 4, 5, 2), torch.ones(3, 4, 5, dtype=torch.bool)
+    arguments = {
+        "one step": (states, future[:, :, :1], mask[:, :, :1]),
+        "one agent": (states, future[:, :1], mask[:, :1]),
+        "one scene": (states, future[:1], mask[:1]),
+        "mask of one step": (states, future, mask[:, :, :1]),
+        "no modes": (states[:, 0], future, mask),
+    }
+    with pytest.raises(ValueError, match="shape"):
+        metric(*arguments[wrong])
 
 
 @settings(max_examples=60, deadline=None)
