@@ -78,8 +78,20 @@ class TestEPO(ForecasterSuite):
 
     def test_a_scene_without_a_goal_is_refused(self):
         scene = Scene(**{**vars(random_scene(2, 2)), "goal_candidates": None, "goal_mask": None})
-        with pytest.raises(ValueError, match="goal_candidates is None"):
+        with pytest.raises(ValueError, match=r"scene\.goal_candidates \[B, N, 1, 2\] is None"):
             self.forecaster().predict(scene)
+
+    def test_a_given_goal_behind_its_mask_does_not_count(self):
+        """Neither its value nor the origin attracts the agent."""
+        forecaster, scene = self.forecaster(), random_scene(2, 2)
+        scene.goal_mask[0, 1] = False
+        forecasts = []
+        for filling in (0.0, 1e6, torch.nan):
+            scene.goal_candidates[0, 1] = filling
+            forecasts.append(forecaster.predict(scene))
+        assert torch.equal(forecasts[1].states, forecasts[0].states)
+        assert torch.equal(forecasts[2].states, forecasts[0].states)
+        assert (forecasts[0].parameters.own_weights["goal"][0, :, 1] == 0).all()
 
 
 EPO = TestEPO.config
