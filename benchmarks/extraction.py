@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from epo_lightning.data.recorded.scenes import RecordedScenes
-from epo_lightning.data.recorded.windows import Extract, Recipe, extract, joined
+from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, extract, joined
 from epo_lightning.registry import lookup
 
 Result = TypeVar("Result")
@@ -43,16 +43,16 @@ def main() -> None:
     recordings, reading = timed(lambda: [source.read() for source in sources])
     rows = sum(len(recording.tracks) for recording in recordings)
     print(f"reading     {rows / reading:>12,.0f} rows/s      ({rows:,} rows)")
-    found, extraction = timed(lambda: [extract(recording, Recipe()) for recording in recordings])
+    found, extraction = timed(lambda: [extract(recording, WindowConfig()) for recording in recordings])
     windows = sum(counts["windows"] for _, counts in found)
     print(f"extraction  {windows / extraction:>12,.0f} windows/s   ({windows:,} windows)")
     scenes = joined([scenes for scenes, _ in found if scenes is not None])
     tables = {
         field.name: torch.from_numpy(np.ascontiguousarray(getattr(scenes, field.name)))
-        for field in dataclasses.fields(Extract)
+        for field in dataclasses.fields(SceneTables)
     }
     for frame in ("fixed", "aligned"):
-        data = RecordedScenes(tables, Recipe.dt, frame, [recording.name for recording in recordings])
+        data = RecordedScenes(tables, WindowConfig.dt, frame, [recording.name for recording in recordings])
         order = torch.randint(0, len(data), (chosen.batches, 32))
         _, loading = timed(lambda data=data, order=order: [data[indices] for indices in order])  # type: ignore[misc]
         print(f"loading     {order.numel() / loading:>12,.0f} scenes/s    (batches of 32, {frame})")

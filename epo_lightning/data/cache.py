@@ -1,20 +1,22 @@
-"""Sets of records on disk: one folder per configuration, named by its hash, complete or not there at all.
+"""Data sets on disk: one folder per configuration, named by the hash of that configuration, complete or absent.
 
-A set is ``<kind>-<hash12>/`` with one ``.safetensors`` file per split and a ``manifest.json`` that names every file's size
-and SHA-256. It is assembled in a temporary folder beside it and renamed, so a reader never sees half of one. A folder that
-exists is never written into: what is broken is reported, and deleting it is the user's decision.
+A data set is a folder ``<kind>-<hash12>/`` with one ``.safetensors`` file per split and a ``manifest.json`` that records the
+configuration and every file's size and SHA-256. The folder is assembled under a hidden name beside its final place and then
+renamed, so a reader never sees an incomplete one. An existing folder is never written into: a broken one is reported, and
+the user decides whether to delete it.
 """
 
 from __future__ import annotations
 
+import errno
+import glob
 import hashlib
 import json
 import os
 import platform
 import shutil
 import sys
-import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -29,17 +31,18 @@ from torch import Tensor
 from epo_lightning.registry import ConfigError
 
 FORMAT = 1
-"""Version of the layout. A set of another version is refused."""
+"""Version of the layout. A data set of another version is refused."""
 MANIFEST = "manifest.json"
+SPLITS = ("train", "val", "test")
 PACKAGES = ("epo_lightning", "numba", "numpy", "safetensors", "torch")
 
 
 class CacheError(ConfigError):
-    """A set that is missing or broken: the message says what, where and what to do."""
+    """Error for a data set that is missing, broken or of another configuration; names the file and the remedy."""
 
 
 def default_root() -> Path:
-    """Where sets are kept unless a configuration says otherwise: $EPO_CACHE, or ``cache`` in the current folder."""
+    """Folder of the data sets unless a configuration names one: $EPO_CACHE, or ``cache`` in the current folder."""
     return Path(os.environ.get("EPO_CACHE") or "cache")
 
 
@@ -55,73 +58,121 @@ def file_digest(path: Path) -> str:
 
 
 def versions() -> dict[str, str]:
-    """What made a set: Python and the packages that computed or wrote it."""
+    """Versions of Python and of the packages that compute or write a data set."""
     return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Only one process at a time makes a folder; another waits, says so, and should look again whether it is there now.
+def locked(folder: Path) -> Iterator[None]:
+    """Lock on a folder, so that only one process at a time makes it.
 
-    The lock beside the folder goes with the process that holds it, however that ends.
+    Another process waits and says so; it must look again whether the folder exists now. The lock is a file beside the
+    folder, which the operating system releases however the process that holds it ends.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder.with_name(f".{folder.name}.lock"))
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        print(f"{folder} is being made by another process: waiting for it", file=sys.stderr)
-        lock.acquire()
+    with writing(folder.parent):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder.with_name(f".{folder.name}.lock"))
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            print(f"{folder} is being made by another process: waiting for it", file=sys.stderr, flush=True)
+            lock.acquire()
     try:
         yield
     finally:
         lock.release()
 
 
+def make_once(folder: Path, make: Callable[[], Any]) -> bool:
+    """Call ``make`` under the folder's lock, unless the folder exists; returns whether it was called.
+
+    An existing folder is not locked, so that a cache may be read-only once its data sets are made.
+    """
+    if folder.exists():
+        return False
+    with locked(folder):
+        if folder.exists():
+            return False
+        make()
+        return True
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Context in which a failed write, for instance on a full disk, becomes an OSError that names ``path``.
+
+    The operating system names no file when a disk is full, and safetensors does not even raise an OSError then.
+    """
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        reason = error.strerror if isinstance(error, OSError) else None
+        raise OSError(
+            (error.errno if isinstance(error, OSError) else None) or errno.EIO,
+            f"cannot write ({reason or error}): make room, or set data.root to another folder; finished work is kept",
+            str(path),
+        ) from error
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file so that it is complete or absent, whenever the process is killed.
+
+    Raises:
+        OSError: the disk is full or read-only; the message names the file.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    with writing(path):
+        try:
+            temporary.write_bytes(content)
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
 def write(
     folder: Path, splits: Mapping[str, Mapping[str, Tensor]], config: Mapping[str, Any], report: Mapping[str, Any]
 ) -> Path:
-    """Write a set, unless it is there already.
+    """Write a data set, unless it exists already. The caller holds the lock of the folder, see :func:`locked`.
 
     Args:
-        folder: where it shall be.
-        splits: tensors by name, records first, of every split by name.
-        config: what the set was made from; plain values.
-        report: what there is to say about it; plain values.
+        folder: final place of the data set.
+        splits: for every split its tensors by name, records first.
+        config: plain values from which the data set was made.
+        report: plain values that describe it.
 
     Raises:
-        CacheError: a folder is there, but not a sound set.
+        CacheError: the folder exists, but holds a broken data set or one of another configuration.
+        OSError: the disk is full or read-only.
     """
     if folder.exists():
-        verify(folder)
+        verify(folder, config=config)
         return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        files = {}
-        for split, tensors in splits.items():
-            path = temporary / f"{split}.safetensors"
-            save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
-            path.chmod(0o644)
-            files[path.name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
-        manifest = {
-            "format": FORMAT,
-            "hash": digest(config),
-            "config": config,
-            "files": files,
-            "packages": versions(),
-            "report": report,
-        }
-        (temporary / MANIFEST).write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
-        temporary.chmod(0o755)
+    work = folder.with_name(f".{folder.name}-unfinished")
+    with writing(folder):
+        shutil.rmtree(work, ignore_errors=True)  # the rest of a process that was killed
+        work.mkdir(parents=True)
         try:
-            temporary.replace(folder)
-        except OSError:
-            if not folder.exists():
-                raise
-            verify(folder)  # somebody else finished the same set first
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+            files = {}
+            for split, tensors in splits.items():
+                path = work / f"{split}.safetensors"
+                path.touch()
+                mode = path.stat().st_mode  # as the umask has it; safetensors would make the file private
+                save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
+                path.chmod(mode)
+                files[path.name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+            manifest = {
+                "format": FORMAT,
+                "hash": digest(config),
+                "config": config,
+                "files": files,
+                "packages": versions(),
+                "report": report,
+            }
+            (work / MANIFEST).write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
+            work.replace(folder)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
     return folder
 
 
@@ -131,15 +182,26 @@ def _broken(what: str, folder: Path, command: str) -> CacheError:
     )
 
 
-def manifest(folder: Path, command: str = "") -> dict[str, Any]:
-    """The manifest of a set.
+def differing(asked: Any, found: Any, key: str = "") -> list[str]:
+    """Descriptions of the entries in which two configurations differ, such as ``pool.seed (1 instead of 0)``."""
+    if isinstance(asked, Mapping) and isinstance(found, Mapping):
+        names = [name for name in sorted({*asked, *found}) if asked.get(name) != found.get(name)]
+        return [line for name in names for line in differing(asked.get(name), found.get(name), f"{key}.{name}")]
+    if isinstance(asked, Mapping | list | tuple) or isinstance(found, Mapping | list | tuple):
+        return [key.lstrip(".")]
+    return [f"{key.lstrip('.')} ({found!r} instead of {asked!r})"]
+
+
+def manifest(folder: Path, command: str = "", config: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The manifest of a data set.
 
     Args:
-        folder: of the set.
-        command: what makes the set, for error messages.
+        folder: of the data set.
+        command: makes the data set; for error messages.
+        config: configuration that the data set must have been made from; None accepts any.
 
     Raises:
-        CacheError: no set, an unreadable manifest, or one of another format.
+        CacheError: no data set, an unreadable manifest, one of another format, or of another configuration.
     """
     if not folder.is_dir():
         kind = folder.name.partition("-")[0].upper()
@@ -148,24 +210,47 @@ def manifest(folder: Path, command: str = "") -> dict[str, Any]:
     path = folder / MANIFEST
     try:
         content = json.loads(path.read_text())
-        found = content["format"]
+        found, name = content["format"], content["hash"]
         content["files"], content["config"]
     except FileNotFoundError:
-        raise _broken(f"{path} is missing, so the data beside it is not a complete set", folder, command) from None
+        raise _broken(f"{path} is missing, so the data beside it is not a complete data set", folder, command) from None
     except (ValueError, KeyError, TypeError) as error:
         raise _broken(f"{path} is not a readable manifest ({type(error).__name__}: {error})", folder, command) from None
     if found != FORMAT:
         raise _broken(f"{path} has format {found}, this version reads format {FORMAT}", folder, command)
+    if name != digest(content["config"]):
+        raise _broken(f"{path} was altered: its hash is not that of its configuration", folder, command)
+    if config is not None and name != digest(config):
+        keys = ", ".join(differing(json.loads(json.dumps(config)), content["config"])[:3])
+        raise _broken(f"{folder} holds the data set of another configuration: it differs in {keys}", folder, command)
     return content
 
 
-def verify_file(folder: Path, split: str, command: str = "") -> Path:
-    """The path of a split's file after a look at its size and checksum (a few tenths of a second per 100 MB at most).
+def is_set(folder: Path) -> bool:
+    """Whether a folder is a data set, broken or not."""
+    return (folder / MANIFEST).is_file() and (folder / f"{SPLITS[0]}.safetensors").is_file()
+
+
+def configs(root: Path, kind: str) -> list[tuple[Path, dict[str, Any]]]:
+    """Folders and configurations of the data sets of a kind in a cache, sorted by name; broken ones are left out."""
+    found = []
+    for folder in sorted(root.glob(f"{glob.escape(kind)}-*")):
+        try:
+            config = manifest(folder)["config"]
+        except CacheError:
+            continue
+        if folder.name == f"{kind}-{digest(config)[:12]}":
+            found.append((folder, config))
+    return found
+
+
+def verify_file(folder: Path, split: str, command: str = "", config: Mapping[str, Any] | None = None) -> Path:
+    """The path of a split's file after a check of its size and checksum (a few tenths of a second per 100 MB at most).
 
     Raises:
         CacheError: as :func:`manifest`, or a file that is missing, truncated or altered.
     """
-    files = manifest(folder, command)["files"]
+    files = manifest(folder, command, config)["files"]
     path = folder / f"{split}.safetensors"
     if path.name not in files:
         raise CacheError(f"{folder} has no split {split!r}; it has " + ", ".join(Path(name).stem for name in files))
@@ -181,23 +266,29 @@ def verify_file(folder: Path, split: str, command: str = "") -> Path:
     return path
 
 
-def verify(folder: Path, command: str = "") -> None:
-    """Check every file of a set.
+def verify(folder: Path, command: str = "", config: Mapping[str, Any] | None = None) -> None:
+    """Check every file of a data set.
 
     Raises:
         CacheError: as :func:`verify_file`.
     """
-    for name in manifest(folder, command)["files"]:
+    for name in manifest(folder, command, config)["files"]:
         verify_file(folder, Path(name).stem, command)
 
 
-def load(folder: Path, split: str, names: tuple[str, ...] | None = None, command: str = "") -> dict[str, Tensor]:
-    """Tensors of a split, all of them or those in ``names``, after checking the file and that all numbers are finite.
+def load(
+    folder: Path,
+    split: str,
+    names: tuple[str, ...] | None = None,
+    command: str = "",
+    config: Mapping[str, Any] | None = None,
+) -> dict[str, Tensor]:
+    """Tensors of a split, all of them or those in ``names``, after a check of the file and that all numbers are finite.
 
     Raises:
         CacheError: as :func:`verify_file`, or a number that is not finite.
     """
-    path = verify_file(folder, split, command)
+    path = verify_file(folder, split, command, config)
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in (names or file.keys())}

@@ -16,10 +16,11 @@ import torch
 from torch import Tensor
 
 from epo_lightning.data import cache
+from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
 from epo_lightning.data.recorded.routes import ACCELERATING, BEHIND, BEYOND, BRAKING, LINES, PER_LINE, POINTS
 from epo_lightning.data.recorded.scenes import RecordedScenes
-from epo_lightning.data.recorded.windows import MOST_AGENTS, SPACING, VECTORS, Recipe
+from epo_lightning.data.recorded.windows import MOST_AGENTS, SPACING, VECTORS, WindowConfig
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import KINDS
@@ -27,7 +28,6 @@ from epo_lightning.task import Task
 
 VERSION = 1
 """Of the draws: raised whenever the same seed would give other scenes."""
-PARTS = ("train", "val", "test")
 LANE_WIDTH, LANES = 3.5, 4
 """Width [m] and number of the road's lanes."""
 HEADWAY = 25.0
@@ -168,7 +168,7 @@ def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dic
         x = (now[:, :1] + ahead)[:, None].expand(-1, LINES, -1)
         return torch.stack((x, middle[..., None].expand_as(x)), -1).float()
 
-    pieces = Recipe.lanes // LANES
+    pieces = WindowConfig.lanes // LANES
     across = LANE_WIDTH * torch.arange(LANES, dtype=torch.float64).repeat_interleave(pieces)
     reach = SPACING * VECTORS * (torch.arange(pieces + 1) - pieces // 2 + 1.0)
     ends = torch.stack((reach[:-1], reach[1:]), 1).repeat(LANES, 1)
@@ -189,9 +189,9 @@ def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dic
 LIKE: Mapping[str, Kind] = {
     "rpi": Kind(RPIData.num_agents, 19, RPIData.task, _rpi),
     "highway": Kind(
-        Recipe.agents,
-        Recipe.history,
-        Task(Recipe.horizon, Recipe.dt, shape="box", candidates=LINES * PER_LINE, map=True, scale=20.0),
+        WindowConfig.agents,
+        WindowConfig.history,
+        Task(WindowConfig.horizon, WindowConfig.dt, shape="box", candidates=LINES * PER_LINE, map=True, scale=20.0),
         _highway,
     ),
     "pedestrians": Kind(4, 8, Task(12, 0.4, candidates=0, scale=5.0), _pedestrians),
@@ -244,7 +244,7 @@ class DrawnData(SceneDataModule):
 
     def open(self, split: str) -> SceneDataset:
         """The scenes of a split."""
-        draw = torch.Generator().manual_seed(len(PARTS) * self.seed + PARTS.index(split))
+        draw = torch.Generator().manual_seed(len(SPLITS) * self.seed + SPLITS.index(split))
         if self.like == "rpi":
             # Every record is two scenes, one for each of its modes.
             tables = self.kind.tables(-(-self.scenes // 2), self.num_agents, self.kind, draw)

@@ -1,4 +1,4 @@
-"""What is wrong with a recording."""
+"""The error for recordings that cannot be read."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ from epo_lightning.registry import ConfigError
 
 
 class RecordingError(ConfigError):
-    """A recording that cannot be read: the message names the file, the row or element, what was expected and what to do."""
+    """Error for a recording that cannot be read: names the file, the row or element, what was expected and the remedy."""
 
     def __init__(self, path: Path | str, problem: str, row: int | None = None) -> None:
-        super().__init__(f"{path}{'' if row is None else f', row {row}'}: {problem}")
+        # An exception is pickled as its class and its arguments, and workers send theirs that way.
+        super().__init__(path, problem, row)
+        self.path, self.problem, self.row = path, problem, row
+
+    def __str__(self) -> str:
+        return f"{self.path}{'' if self.row is None else f', row {self.row}'}: {self.problem}"

@@ -1,10 +1,13 @@
-"""Worker processes that make data, and a bar that shows how far they are."""
+"""Worker processes that make data, and the report of their progress."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import sys
 import threading
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -15,49 +18,105 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from epo_lightning.data.cache import CacheError
 
+Task = tuple[Any, ...]
+
 
 def default_workers() -> int:
-    """One worker per core that this process may use."""
+    """Number of worker processes: one per core that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Report:
+    """Progress on standard error: a bar on a terminal, elsewhere a line whenever a unit of work is done.
+
+    Args:
+        tasks: all that is still to do.
+        unit_of: from a task to the unit that it belongs to: the placements of a main game are tasks of their own.
+        unit: singular noun for the unit, such as ``game``.
+        doing, done: participles for the work, such as "solving" and "solved".
+        before: number of units that were finished earlier.
+        show: whether to report at all.
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[Task],
+        unit_of: Callable[[Task], Any],
+        unit: str,
+        doing: str,
+        done: str,
+        before: int,
+        show: bool,
+    ) -> None:
+        self.unit_of, self.unit, self.done = unit_of, unit, done
+        self.left = Counter(unit_of(task) for task in tasks)
+        self.sizes = dict(self.left)
+        self.tasks, self.units, self.total = 0, before, before + len(self.left)
+        self.progress = float(before)
+        console = Console(stderr=True)
+        self.lines = show and not console.is_terminal
+        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        self.bar = Progress(
+            TextColumn(f"{doing} {unit}s"),
+            *columns,
+            console=console,
+            refresh_per_second=1,
+            disable=not (show and console.is_terminal),
+        )
+        self.row = self.bar.add_task("", total=self.total, completed=before)
+        self.begin = self.first = time.monotonic()
+
+    def advance(self, task: Task) -> None:
+        """Count a finished task."""
+        unit, now = self.unit_of(task), time.monotonic()
+        self.left[unit] -= 1
+        self.tasks += 1
+        self.progress += 1 / self.sizes[unit]
+        self.bar.update(self.row, completed=round(self.progress, 6))
+        if self.tasks == 1:
+            self.first = now
+        if self.left[unit]:
+            return
+        self.units += 1
+        if self.lines:
+            line = f"{self.unit} {self.units} of {self.total} {self.done}, {now - self.begin:.0f} s"
+            left = self.left.total()
+            # The first task also starts workers or compiles, so its time says nothing about the others.
+            if left and self.tasks > 1:
+                line += f", about {left * (now - self.first) / (self.tasks - 1):.0f} s left"
+            print(line, file=sys.stderr, flush=True)
 
 
 def finished(
     function: Callable[..., Any],
-    tasks: Sequence[tuple[Any, ...]],
+    tasks: Sequence[Task],
     workers: int | None,
-    progress: bool,
-    doing: str,
-    unit: str,
-    before: int,
+    report: Report,
     kept: str,
     fresh: bool = False,
-) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Tasks and their results ``function(*task)``, as they are finished.
+    first_here: bool = False,
+) -> Iterator[tuple[Task, Any]]:
+    """Tasks and their results ``function(*task)``, in the order in which they are finished.
 
     Args:
         function: at module level, so that other processes find it.
         tasks: its arguments.
         workers: processes; None for one per core. A single one is this process.
-        progress: whether to show a bar on standard error.
-        doing, unit: what the bar says: "solving games", "placements".
-        before: tasks that were finished earlier.
-        kept: where finished work is kept, for error messages.
+        report: counts every task once its result has been taken.
+        kept: for error messages: where finished work is kept.
         fresh: whether each task needs a process of its own.
+        first_here: whether this process does the first task before workers start: it compiles what they then find on disk.
 
     Raises:
         CacheError: a worker was killed, for instance for lack of memory.
     """
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeElapsedColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    bar = Progress(TextColumn(doing), *columns, console=console, refresh_per_second=1, disable=not progress)
-    workers = min(workers or default_workers(), max(1, len(tasks)))
-    with bar:
-        row = bar.add_task("", total=before + len(tasks), completed=before)
-        if workers == 1 and not fresh:
-            for task in tasks:
-                result = function(*task)
-                bar.advance(row)
-                yield task, result
+    with report.bar:
+        workers = min(workers or default_workers(), max(1, len(tasks)))
+        here = len(tasks) if workers == 1 and not fresh else int(first_here)
+        for task in tasks[:here]:
+            yield task, function(*task)
+            report.advance(task)
+        if len(tasks) <= here:
             return
         with ProcessPoolExecutor(
             workers,
@@ -65,16 +124,15 @@ def finished(
             initializer=_watch_parent,
             max_tasks_per_child=1 if fresh else None,
         ) as pool:
-            running = {pool.submit(function, *task): task for task in tasks}
+            running = {pool.submit(function, *task): task for task in tasks[here:]}
             try:
                 for future in as_completed(running):
                     task, result = running.pop(future), future.result()
-                    bar.advance(row)
                     yield task, result
+                    report.advance(task)
             except BrokenProcessPool as error:
                 raise CacheError(
-                    f"a worker process was killed while {doing}; {kept}: run the same command again, with fewer workers "
-                    "if memory is short"
+                    f"a worker process was killed; {kept}: run the same command again, with fewer workers if memory is short"
                 ) from error
             except BaseException:
                 pool.shutdown(cancel_futures=True)

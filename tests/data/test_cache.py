@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+from subprocess import PIPE
 
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from epo_lightning.data import cache
 from epo_lightning.registry import ConfigError
@@ -32,7 +40,7 @@ def test_round_trip(folder):
 
 def test_a_sound_set_is_never_written_again(folder):
     before = (folder / "train.safetensors").stat().st_mtime_ns
-    cache.write(folder, {"train": {"a": torch.zeros(1)}}, {"seed": 2}, {})
+    cache.write(folder, {"train": {"a": torch.zeros(1)}}, {"seed": 1}, {})
     assert (folder / "train.safetensors").stat().st_mtime_ns == before
 
 
@@ -83,14 +91,29 @@ def of_another_format(folder):
     return "manifest.json has format 99, this version reads format 1"
 
 
+def with_another_configuration(folder):
+    path = folder / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "config": {"seed": 2}}))
+    return "manifest.json was altered"
+
+
 @pytest.mark.parametrize(
-    "damage", [truncated, altered, deleted, without_manifest, with_broken_manifest, of_another_format]
+    "damage",
+    [
+        truncated,
+        altered,
+        deleted,
+        without_manifest,
+        with_broken_manifest,
+        of_another_format,
+        with_another_configuration,
+    ],
 )
 def test_damage_is_named_and_not_overwritten(folder, damage):
     message = damage(folder)
     for use in (
         lambda: cache.load(folder, "train", command=COMMAND),
-        lambda: cache.write(folder, {"train": {"a": torch.zeros(1)}}, {}, {}),
+        lambda: cache.write(folder, {"train": {"a": torch.zeros(1)}}, {"seed": 1}, {}),
     ):
         with pytest.raises(cache.CacheError, match=message) as error:
             use()
@@ -118,3 +141,74 @@ def test_root_follows_the_environment(monkeypatch):
     assert str(cache.default_root()) == "elsewhere"
     monkeypatch.delenv("EPO_CACHE")
     assert str(cache.default_root()) == "cache"
+
+
+def test_a_data_set_of_another_configuration_is_refused(folder):
+    """A folder that was copied or renamed holds sound files, but not those that were asked for."""
+    asked = {"seed": 2, "sizes": [1]}
+    for use in (
+        lambda: cache.manifest(folder, config=asked),
+        lambda: cache.load(folder, "train", config=asked),
+        lambda: cache.verify(folder, config=asked),
+        lambda: cache.write(folder, {"train": {"a": torch.zeros(1)}}, asked, {}),
+    ):
+        with pytest.raises(
+            cache.CacheError, match=r"another configuration: it differs in seed \(1 instead of 2\), sizes;"
+        ):
+            use()
+    assert len(cache.load(folder, "train", config={"seed": 1})) == 2
+
+
+@pytest.mark.parametrize(("umask", "folders", "files"), [(0o077, 0o700, 0o600), (0o002, 0o775, 0o664)])
+def test_permissions_follow_the_umask(tmp_path, umask, folders, files):
+    before = os.umask(umask)
+    try:
+        with cache.locked(tmp_path / "rpi-1"):
+            made = cache.write(tmp_path / "rpi-1", {"train": {"a": torch.zeros(1)}}, {}, {})
+        cache.write_file(tmp_path / "part", b"1")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(made.stat().st_mode) == folders
+    for path in (*made.iterdir(), tmp_path / "part", tmp_path / ".rpi-1.lock"):
+        assert stat.S_IMODE(path.stat().st_mode) == files, path.name
+
+
+def test_the_rest_of_a_killed_process_is_removed(tmp_path):
+    (tmp_path / ".rpi-1-unfinished").mkdir()
+    (tmp_path / ".rpi-1-unfinished" / "train.safetensors").write_bytes(b"half")
+    cache.verify(cache.write(tmp_path / "rpi-1", {"val": {"a": torch.zeros(1)}}, {}, {}))
+    assert [path.name for path in tmp_path.iterdir()] == ["rpi-1"]
+
+
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as the operating system does, without a name
+
+    def full_too(*_):
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(cache, "save_file", full_too)
+    for use, name in (
+        (lambda: cache.write_file(tmp_path / "game", b"1"), "game"),
+        (lambda: cache.write(tmp_path / "rpi-1", {"val": {"a": torch.zeros(1)}}, {}, {}), "rpi-1"),
+    ):
+        with pytest.raises(OSError, match=r"No space left on device.*make room") as error:
+            use()
+        assert error.value.filename == str(tmp_path / name)
+        assert not list(tmp_path.iterdir())
+
+
+def test_a_process_waits_while_another_one_makes_the_folder(tmp_path):
+    code = (
+        "import pathlib\n"
+        "from epo_lightning.data import cache\n"
+        f"folder = pathlib.Path({str(tmp_path / 'set')!r})\n"
+        "print(cache.make_once(folder, folder.mkdir))\n"
+    )
+    with cache.locked(tmp_path / "set"):
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=PIPE, stderr=PIPE, text=True)
+        assert "set is being made by another process: waiting for it" in process.stderr.readline()
+        assert [path.name for path in tmp_path.iterdir()] == [".set.lock"]
+        (tmp_path / "set").mkdir()
+    assert process.communicate(timeout=60) == ("False\n", "")

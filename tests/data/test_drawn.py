@@ -36,7 +36,7 @@ def test_tasks_are_the_real_ones(like, tmp_path):
     pretended, genuine = DrawnData(like), real(like, tmp_path)
     assert (pretended.task, pretended.num_agents) == (genuine.task, genuine.num_agents)
     if like != "rpi":
-        assert pretended.kind.history == genuine.recipe.history
+        assert pretended.kind.history == genuine.windows.history
 
 
 @pytest.mark.parametrize("like", ["rpi", "highway"])

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +67,7 @@ def test_generation_goes_on_after_a_kill(data, tmp_path):
     assert all(path.stat().st_mtime_ns == when for path, when in parts.items()), "a finished main game was solved again"
 
 
-def test_a_broken_part_is_solved_again_and_a_made_set_is_left_alone(data, tmp_path):
+def test_a_broken_part_is_solved_again_and_a_made_set_is_left_alone(data, tmp_path, capfd):
     other = RPIData(root=str(tmp_path), **SMALL)
     pool = next(data.root.glob("rpi-pool-*"))
     (tmp_path / pool.name).mkdir()
@@ -72,11 +75,41 @@ def test_a_broken_part_is_solved_again_and_a_made_set_is_left_alone(data, tmp_pa
         (tmp_path / pool.name / path.name).write_bytes(path.read_bytes())
     broken = tmp_path / pool.name / "game-0001.safetensors"
     broken.write_bytes(broken.read_bytes()[:-100])
-    other.generate(workers=1, progress=False)
+    other.generate(workers=1, progress=True)
     assert contents(other.folder) == contents(data.folder)
+    assert re.fullmatch(r"game 3 of 3 solved, \d+ s\n", capfd.readouterr().err)
     before = {path: path.stat().st_mtime_ns for path in other.folder.iterdir()}
     other.generate(workers=1, progress=False)
     assert {path: path.stat().st_mtime_ns for path in other.folder.iterdir()} == before
+
+
+def test_the_data_set_of_another_seed_is_refused(data, tmp_path):
+    other = RPIData(root=str(tmp_path), **{**SMALL, "seed": 2})
+    shutil.copytree(data.folder, other.folder)
+    for use in (lambda: other.setup("fit"), lambda: other.generate(progress=False), other.report):
+        with pytest.raises(
+            cache.CacheError, match=r"another configuration: it differs in pool\.seed \(1 instead of 2\)"
+        ):
+            use()
+
+
+@pytest.mark.parametrize("busy", ["set", "pool"])
+def test_generation_waits_for_another_process(data, tmp_path, capsys, busy):
+    """What another process makes meanwhile, the set or its pool, is not made again."""
+    other = RPIData(root=str(tmp_path), **SMALL)
+    pool = next(data.root.glob("rpi-pool-*"))
+    making = {"set": data.folder, "pool": pool}[busy]
+    with ThreadPoolExecutor(1) as thread:
+        with cache.locked(tmp_path / making.name):
+            generated = thread.submit(other.generate, workers=1, progress=False)
+            said = ""
+            while "waiting for it" not in said:
+                assert not generated.done(), "it did not wait"
+                said += capsys.readouterr().err
+                time.sleep(0.01)
+            shutil.copytree(making, tmp_path / making.name)
+        assert contents(generated.result()) == contents(data.folder)
+    assert (tmp_path / pool.name).exists() == (busy == "pool")
 
 
 def test_splits_share_the_pool(data, monkeypatch):

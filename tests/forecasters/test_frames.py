@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from suites import highway_model
 
-from epo_lightning.data.recorded.windows import Recipe
+from epo_lightning.data.recorded.windows import WindowConfig
 from epo_lightning.forecasters import build_forecaster
 
 CONFIGS = {
@@ -33,7 +33,7 @@ CONFIGS = {
 
 def forecasts(name: str, backbone: str, place, frame: str) -> tuple[np.ndarray, torch.Tensor]:
     """Positions of all modes in the recording's own coordinates [B, M, N, K, 2], and the modes' probabilities."""
-    scene, data = scenes_of(recording(place, FOUR), Recipe(), frame)
+    scene, data = scenes_of(recording(place, FOUR), WindowConfig(), frame)
     of_data = {"horizon": 20, "dt": 0.2, "candidates": 60, "scale": 20.0}
     torch.manual_seed(3)
     model = build_forecaster(highway_model(CONFIGS[name], backbone={"name": backbone}, **of_data))

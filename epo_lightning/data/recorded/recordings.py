@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 import shutil
 import zlib
 from collections import Counter
@@ -19,26 +20,26 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from epo_lightning.data import cache
+from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
-from epo_lightning.data.recorded.tracks import Source
-from epo_lightning.data.recorded.windows import Extract, Recipe, extract, joined
-from epo_lightning.data.workers import finished
+from epo_lightning.data.recorded.tracks import Recording, RecordingSource
+from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, extract, joined
+from epo_lightning.data.workers import Report, finished
 from epo_lightning.registry import ConfigError, lookup, nearest, register
 from epo_lightning.task import Task
 
 VERSION = 2
 """Of the extraction: raised whenever the same recordings would give other scenes."""
-PARTS = ("train", "val", "test")
 PIECE, PIECES = 1 << 14, 64
 """Bytes of a piece of a file, and how many of them its checksum is made of: all of it up to 1 MB."""
 UNITS = ("recording", "group")
 
 
-def _recipe(windows: Mapping[str, Any]) -> Recipe:
+def _window_config(windows: Mapping[str, Any]) -> WindowConfig:
     """The recipe that a configuration spells out."""
-    known = {field.name: getattr(Recipe, field.name) for field in dataclasses.fields(Recipe)}
+    known = {field.name: getattr(WindowConfig, field.name) for field in dataclasses.fields(WindowConfig)}
     optional = {"radius": float, "smoothing": float}
     for key, value in windows.items():
         if key not in known:
@@ -50,7 +51,7 @@ def _recipe(windows: Mapping[str, Any]) -> Recipe:
         if not (number if kind is float else type(value) is kind):
             expected = {float: "a number", int: "a whole number", bool: "true or false"}[kind]
             raise ConfigError(f"data.windows.{key} must be {expected}, not {value!r}")
-    return Recipe(**windows)
+    return WindowConfig(**windows)
 
 
 @register("data", "recordings")
@@ -60,8 +61,9 @@ class RecordedData(SceneDataModule):
     Args:
         dataset: how tables and the cache call the data.
         format: name of a registered recording format.
-        folder: where the recordings are.
-        windows: what becomes a scene: fields of :class:`~epo_lightning.data.recorded.windows.Recipe`.
+        folder: of the recordings, or of a data set that was extracted from them. If it is absent, the data set that these
+            settings would give is looked for in the cache.
+        windows: what becomes a scene: fields of :class:`~epo_lightning.data.recorded.windows.WindowConfig`.
         map: whether there are lanes, and thus goal candidates.
         test: groups (maps, scenes, layouts) that are the test split; null to draw ``test_share`` of them.
         test_share: of the groups.
@@ -98,9 +100,9 @@ class RecordedData(SceneDataModule):
         super().__init__(batch_size, seed, share)
         self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
         self.list_sources = lookup("format", format)
-        self.recipe = _recipe(windows)
-        self.num_agents = self.recipe.agents
-        if self.recipe.lane_change and not map:
+        self.windows = _window_config(windows)
+        self.num_agents = self.windows.agents
+        if self.windows.lane_change and not map:
             raise ConfigError("data.windows.lane_change asks for lanes, but data.map is false: set it to false as well")
         self.test = None if test is None else [str(group) for group in test]
         for name, share in (("test_share", test_share), ("val_share", val_share)):
@@ -118,33 +120,33 @@ class RecordedData(SceneDataModule):
             raise ConfigError(f"data.scale must be positive, not {scale}: the metres that an input of one stands for")
         self.frame = frame
         candidates = LINES * PER_LINE if map else 0
-        self.task = Task(self.recipe.horizon, float(self.recipe.dt), (), shape, candidates, map=map, scale=float(scale))
+        self.task = Task(self.windows.horizon, float(self.windows.dt), (), shape, candidates, map=map, scale=float(scale))
         self.root = Path(root).expanduser() if root else cache.default_root()
 
-    def sources(self) -> list[Source]:
-        """The recordings, in the order of their names.
+    def sources(self) -> list[RecordingSource]:
+        """The recordings, sorted by name.
 
         Raises:
-            ConfigError: no folder, or nothing in it.
+            ConfigError: the folder is missing or holds no recording.
         """
         folder = self.folder_of_recordings
         if folder.is_file():
             raise ConfigError(f"{folder} is a file: data.folder takes the folder that it lies in")
         if not folder.is_dir():
             raise ConfigError(
-                f"no folder {folder} with {self.dataset_name} recordings: point data.folder at it, "
-                "or unpack the recordings there"
+                f"no folder {folder} with {self.dataset_name} recordings, and no data set that was extracted from such "
+                f"recordings in {self.root}: point data.folder at the recordings, or unpack them there"
             )
         found = sorted(self.list_sources(folder), key=lambda source: source.name)
         if not found:
             raise ConfigError(f"{folder} holds no recording in the format {self.format!r}: is it the right folder?")
         return found
 
-    def splits(self, sources: Sequence[Source]) -> dict[str, list[Source]]:
-        """Which recordings belong to which split.
+    def splits(self, sources: Sequence[RecordingSource]) -> dict[str, list[RecordingSource]]:
+        """The recordings of each split.
 
         Raises:
-            ConfigError: a group that does not exist, or too few recordings for three splits.
+            ConfigError: ``test`` names a group that does not exist, or there are too few recordings for three splits.
         """
         draw = np.random.default_rng([self.seed, 4])
         groups = sorted({source.group for source in sources})
@@ -165,7 +167,7 @@ class RecordedData(SceneDataModule):
             "val": [source for source in rest if getattr(source, unit) in held],
             "test": [source for source in sources if source.group in chosen],
         }
-        empty = [part for part in PARTS if not found[part]]
+        empty = [split for split in SPLITS if not found[split]]
         if empty:
             raise ConfigError(
                 f"{len(sources)} recording(s) in {len(groups)} group(s) leave none for {', '.join(empty)}: "
@@ -173,27 +175,76 @@ class RecordedData(SceneDataModule):
             )
         return found
 
-    def identity(self, sources: Sequence[Source]) -> Any:
-        """What tells these recordings from others: names, sizes and checksums of all files."""
+    def identity(self, sources: Sequence[RecordingSource]) -> Any:
+        """Plain values that tell these recordings from others: names, sizes and checksums of all files."""
         return [[source.name, source.group, [_fingerprint(file) for file in source.files]] for source in sources]
 
     @cached_property
     def config(self) -> dict[str, Any]:
-        """Everything that the set on disk depends on."""
+        """Configuration of the data set: all values that its files depend on.
+
+        Without the recordings it is that of the extracted data set in the cache that these settings would give.
+
+        Raises:
+            ConfigError: neither recordings nor an extracted data set, or several data sets that would do.
+        """
+        home = self.folder_of_recordings
+        if cache.is_set(home):
+            config: dict[str, Any] = cache.manifest(home)["config"]
+            if not self._gives(config):
+                known = {key: config.get(key) for key in self._settings()}
+                keys = ", ".join(cache.differing(self._settings(), known)[:3]) or "the splits"
+                raise ConfigError(
+                    f"data.folder={home} is a data set that was extracted with other settings: it differs in {keys}"
+                )
+            return config
+        extracted = [] if home.exists() else self._extracted()
+        if len(extracted) > 1:
+            names = ", ".join(
+                f"data.folder={folder} ({len(config['recordings'])} recordings)" for folder, config in extracted
+            )
+            raise ConfigError(
+                f"no folder {home} with {self.dataset_name} recordings, and several data sets were extracted with these "
+                f"settings; choose one of {names}"
+            )
+        if extracted:
+            return extracted[0][1]
         sources = self.sources()
+        return self._config_of(sources, self.identity(sources))
+
+    def _settings(self) -> dict[str, Any]:
+        """The part of the data set's configuration that does not depend on the recordings."""
         return {
             "version": VERSION,
             "dataset": self.dataset_name,
             "format": self.format,
-            "recordings": self.identity(sources),
-            "windows": dataclasses.asdict(self.recipe),
+            "windows": dataclasses.asdict(self.windows),
             "map": self.task.map,
-            "splits": {part: [source.name for source in held] for part, held in self.splits(sources).items()},
         }
+
+    def _config_of(self, sources: Sequence[RecordingSource], identity: Any) -> dict[str, Any]:
+        splits = {split: [source.name for source in held] for split, held in self.splits(sources).items()}
+        return {**self._settings(), "recordings": identity, "splits": splits}
+
+    def _extracted(self) -> list[tuple[Path, dict[str, Any]]]:
+        """Data sets of the cache, and their configurations, that these settings would make of the same recordings."""
+        return [
+            (folder, config) for folder, config in cache.configs(self.root, self.dataset_name) if self._gives(config)
+        ]
+
+    def _gives(self, config: Mapping[str, Any]) -> bool:
+        """Whether these settings make a data set of this configuration, given the recordings that it names."""
+        try:
+            sources = [RecordingSource(name, group, (), _absent) for name, group, _ in config["recordings"]]
+            return self._config_of(sources, config["recordings"]) == config
+        except (ConfigError, KeyError, TypeError, ValueError):
+            return False
 
     @property
     def folder(self) -> Path:
-        """Where the set lies, or will lie."""
+        """Folder of the data set, whether or not it exists."""
+        if cache.is_set(self.folder_of_recordings):
+            return self.folder_of_recordings
         return self.root / f"{self.dataset_name}-{cache.digest(self.config)[:12]}"
 
     @property
@@ -203,71 +254,74 @@ class RecordedData(SceneDataModule):
 
     @property
     def command(self) -> str:
-        """The command that makes this set, for error messages."""
-        return f"epo generate data={self.dataset_name}"
+        """The command that makes this data set, for error messages."""
+        words = [f"data={self.dataset_name}", f"data.folder={self.folder_of_recordings}"]
+        if self.root != cache.default_root():
+            words.append(f"data.root={self.root}")
+        return shlex.join(["epo", "generate", *words])
 
     def generate(self, workers: int | None = None, progress: bool = True) -> Path:
-        """Extract the scenes unless they are there already, and return the set's folder.
+        """Extract the scenes unless that was done before, and return the folder of the data set.
 
         Args:
             workers: processes; None for one per core. The bytes do not depend on it.
-            progress: whether to show a progress bar.
+            progress: whether to report progress.
 
         Raises:
             ConfigError: a recording that cannot be read, a split without scenes, or a killed worker.
+            OSError: the disk is full or read-only.
         """
-        with cache.alone(self.folder):
-            if not self.folder.exists():
-                return self._make(self.folder, workers, progress)
-        cache.verify(self.folder, self.command)
+        if not cache.make_once(self.folder, lambda: self._make(self.folder, workers, progress)):
+            cache.verify(self.folder, self.command, self.config)
         return self.folder
 
-    def recordings(self) -> list[Source]:
-        """What scenes are extracted from."""
+    def recordings(self) -> list[RecordingSource]:
+        """The recordings that scenes are extracted from."""
         return self.sources()
 
-    def _make(self, folder: Path, workers: int | None, progress: bool) -> Path:
-        parts = folder.with_name(f".{folder.name}-parts")
-        parts.mkdir(parents=True, exist_ok=True)
+    def _make(self, folder: Path, workers: int | None, progress: bool) -> None:
+        """Extract each recording into a file of its own, then gather the files of each split."""
+        work = folder.with_name(f".{folder.name}-parts")
+        with cache.writing(work):
+            work.mkdir(parents=True, exist_ok=True)
         recordings = {source.name: source for source in self.recordings()}
         splits = self.splits(list(recordings.values()))
-        files = {name: parts / f"{number:04d}.safetensors" for number, name in enumerate(recordings)}
-        done = [name for name, file in files.items() if _complete(file)]
+        files = {name: work / f"{number:04d}.safetensors" for number, name in enumerate(recordings)}
         tasks = [
-            (source, self.recipe, self.task.map, files[name]) for name, source in recordings.items() if name not in done
+            (source, self.windows, self.task.map, files[name])
+            for name, source in recordings.items()
+            if not _complete(files[name])
         ]
-        kept = "finished recordings are kept"
-        for _ in finished(
-            _extract_to_file, tasks, workers, progress, "extracting scenes", "recordings", len(done), kept
-        ):
+        before = len(recordings) - len(tasks)
+        report = Report(tasks, lambda task: task[0].name, "recording", "extracting", "extracted", before, progress)
+        for _ in finished(_extract_to_file, tasks, workers, report, f"finished recordings are kept in {work}"):
             pass
-        tensors, report = {}, {}
-        for part in PARTS:
-            tensors[part], report[part] = self._gather(part, [files[source.name] for source in splits[part]])
-        names = {part: [source.name for source in splits[part]] for part in PARTS}
-        made = cache.write(folder, tensors, self.config, {**report, "recordings": names})
-        shutil.rmtree(parts)
-        return made
+        tensors, about = {}, {}
+        for split in SPLITS:
+            tensors[split], about[split] = self._gather(split, [files[source.name] for source in splits[split]])
+        names = {split: [source.name for source in splits[split]] for split in SPLITS}
+        cache.write(folder, tensors, self.config, {**about, "recordings": names})
+        shutil.rmtree(work, ignore_errors=True)
 
-    def _gather(self, part: str, files: Sequence[Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """The scenes of a split, and what there is to say about them."""
+    def _gather(self, split: str, files: Sequence[Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """The scenes of a split, and a report about them."""
         counts: Counter[str] = Counter()
-        extracts = []
+        tables = []
         for file in files:
-            columns, counted = _read(file)
+            columns, counted = _read_tables(file)
             counts.update(counted)
             # A recording without scenes still has its place in the order of recordings.
-            extracts.append(Extract(**columns) if columns else None)
-        full = [found for found in extracts if found is not None]
+            tables.append(SceneTables(**columns) if columns else None)
+        full = [found for found in tables if found is not None]
         if not full:
             gone = ", ".join(f"{reason}: {count}" for reason, count in counts.items() if count) or "no window at all"
             raise ConfigError(
-                f"the split {part!r} of {self.dataset_name} has not a single scene ({gone}): relax data.windows, or give it "
-                "more recordings"
+                f"the split {split!r} of {self.dataset_name} has not a single scene ({gone}): relax data.windows, or give "
+                "it more recordings"
             )
         whole = joined(full)
-        index = np.array([number for number, found in enumerate(extracts) if found is not None])
-        columns = {field.name: getattr(whole, field.name) for field in dataclasses.fields(Extract)}
+        index = np.array([number for number, found in enumerate(tables) if found is not None])
+        columns = {field.name: getattr(whole, field.name) for field in dataclasses.fields(SceneTables)}
         origin = np.zeros((len(files), 2))
         origin[index] = whole.origin
         columns["recording"], columns["origin"] = index[whole.recording].astype(np.int32), origin
@@ -275,23 +329,26 @@ class RecordedData(SceneDataModule):
         return tensors, {**dict(counts), **_describe(whole)}
 
     def report(self) -> dict[str, Any]:
-        """The report that the set was made with.
+        """The report that was written with the data set.
 
         Raises:
-            cache.CacheError: the set is missing or broken.
+            cache.CacheError: the data set is missing, broken or of another configuration.
         """
-        return cache.manifest(self.folder, self.command)["report"]
+        return cache.manifest(self.folder, self.command, self.config)["report"]
 
     def open(self, split: str) -> SceneDataset:
         """The scenes of a split.
 
         Raises:
-            cache.CacheError: the set is missing, broken, of another format, or holds numbers that are not finite.
+            cache.CacheError: the data set is missing, broken, of another configuration, or holds numbers that are not
+                finite.
         """
-        folder = self.folder
-        tables = cache.load(folder, split, command=self.command)
-        names = cache.manifest(folder, self.command)["report"]["recordings"][split]
-        return RecordedScenes(tables, self.task.dt, self.frame, names)
+        tables = cache.load(self.folder, split, command=self.command, config=self.config)
+        return RecordedScenes(tables, self.task.dt, self.frame, self.report()["recordings"][split])
+
+
+def _absent() -> Recording:
+    raise ConfigError("the recordings are absent: only the data set that was extracted from them exists")
 
 
 def _fingerprint(file: Path) -> list[Any]:
@@ -304,37 +361,39 @@ def _fingerprint(file: Path) -> list[Any]:
     return [file.name, size, checksum]
 
 
-def _extract_to_file(source: Source, recipe: Recipe, has_map: bool, file: Path) -> None:
-    """Extract the scenes of one recording into a file, atomically."""
+def _extract_to_file(source: RecordingSource, windows: WindowConfig, has_map: bool, file: Path) -> None:
+    """Extract the scenes of one recording into a file."""
     recording = source.read()
     if has_map and recording.lanes is None:
         raise ConfigError(f"the recording {source.name} has no map: set data.map=false, or give it one")
     if not has_map:
         recording = dataclasses.replace(recording, lanes=None)
-    found, counts = extract(recording, recipe)
-    columns = {} if found is None else {field.name: getattr(found, field.name) for field in dataclasses.fields(Extract)}
-    # safetensors writes memory as it lies, so it must lie in the order of its indices.
-    ordered = {name: np.ascontiguousarray(values) for name, values in columns.items()}
-    temporary = file.with_suffix(".tmp")
-    temporary.write_bytes(save(ordered, {"counts": json.dumps(counts)}))
-    temporary.replace(file)
+    found, counts = extract(recording, windows)
+    columns = {}
+    if found is not None:
+        # safetensors writes the memory as it is, whatever the strides.
+        columns = {
+            field.name: np.ascontiguousarray(getattr(found, field.name)) for field in dataclasses.fields(SceneTables)
+        }
+    cache.write_file(file, save(columns, {"counts": json.dumps(counts)}))
 
 
-def _read(file: Path) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+def _read_tables(file: Path) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Columns and counts of one recording, as :func:`_extract_to_file` wrote them."""
     with safe_open(file, framework="np") as content:
         counts = json.loads(content.metadata()["counts"])
         return {name: content.get_tensor(name) for name in content.keys()}, counts  # noqa: SIM118 - not a mapping
 
 
 def _complete(file: Path) -> bool:
-    """Whether a part was written whole: it was renamed into place, so it is, unless somebody damaged it."""
+    """Whether the file of a recording exists and can be read. It is renamed into place when it is complete."""
     try:
-        return file.is_file() and bool(_read(file)[1])
+        return file.is_file() and bool(_read_tables(file)[1])
     except (SafetensorError, OSError, ValueError, KeyError, TypeError):
         return False
 
 
-def _describe(scenes: Extract) -> dict[str, Any]:
+def _describe(scenes: SceneTables) -> dict[str, Any]:
     """Numbers for people who want to know what they train on."""
     speed = scenes.history[:, -1, 3]
     found: dict[str, Any] = {

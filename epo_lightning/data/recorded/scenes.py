@@ -19,7 +19,7 @@ class RecordedScenes:
     """Scenes of one split, put together batch by batch.
 
     Args:
-        tables: the columns of an :class:`~epo_lightning.data.recorded.windows.Extract`.
+        tables: the columns of an :class:`~epo_lightning.data.recorded.windows.SceneTables`.
         dt: time step [s].
         frame: ``fixed`` (axes of the recording, origin amid the agents) or ``aligned`` (x where they head on average).
         names: of the recordings.

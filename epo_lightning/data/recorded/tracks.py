@@ -1,11 +1,11 @@
-"""Recordings: what agents did and on which lanes, in one record type for every format.
+"""Recordings: the tracks of agents and the lanes they move on, in one record type for every format.
 
-A format is one file in ``formats/``: a function from a folder to the :class:`Source` objects in it, registered by name::
+A format is one file in ``formats/``: a registered function that lists the recordings of a folder::
 
     @register("format", "exid")
-    def exid(folder: Path) -> list[Source]: ...
+    def exid(folder: Path) -> list[RecordingSource]: ...
 
-Listing must be cheap; a source reads its files when it is asked to.
+Listing must be cheap; a :class:`RecordingSource` reads its files when its ``read`` is called.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.lanes import FARTHEST, LaneGraph
 
-__all__ = ["Recording", "RecordingError", "Source", "TrackTable"]
+__all__ = ["Recording", "RecordingError", "RecordingSource", "TrackTable"]
 
 FASTEST = 120.0
 """Speeds [m/s] beyond this are a mistake of units."""
@@ -134,7 +134,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Source:
+class RecordingSource:
     """A recording that can be read.
 
     Attributes:

@@ -1,8 +1,8 @@
-"""From recordings to scenes: which agents, when, and what is known of them (Appendix C.2, "exiD").
+"""Extraction of scenes from recordings: the choice of agents and moments, and their data (Appendix C.2, "exiD").
 
-Scenes share agents: a vehicle at one moment may be the centre of one scene and a neighbour in others. What is known of it is
-kept once, in a table of agents; a scene is a row of indices into that table. :class:`Extract` holds both, in coordinates of
-the recording's own.
+Scenes share agents: a vehicle at one moment may be the centre of one scene and a neighbour in others. Its data are stored
+once, in a table of agents; a scene is a row of indices into that table. :class:`SceneTables` holds both, in coordinates
+relative to an origin of the recording.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CHUNK = 4_000_000
 
 
 @dataclass(frozen=True)
-class Recipe:
+class WindowConfig:
     """Which windows of a recording become scenes. The defaults are the paper's for exiD.
 
     Attributes:
@@ -97,7 +97,7 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Extract:
+class SceneTables:
     """The scenes of a recording, or of several.
 
     Attributes, by agent (A rows):
@@ -146,37 +146,37 @@ INDEX_OF = {"agents": "history", "lanes": "polylines", "recording": "origin"}
 """Fields that are indices, and whose rows they count."""
 
 
-def joined(parts: list[Extract]) -> Extract:
+def joined(parts: list[SceneTables]) -> SceneTables:
     """Several extracts as one: indices are moved to where the rows come to lie."""
     columns: dict[str, np.ndarray] = {}
-    for field in fields(Extract):
+    for field in fields(SceneTables):
         values = [getattr(part, field.name) for part in parts]
         if field.name in INDEX_OF:
             before = np.cumsum([0, *(len(getattr(part, INDEX_OF[field.name])) for part in parts)])
             values = [np.where(value < 0, -1, value + offset) for value, offset in zip(values, before, strict=False)]
         columns[field.name] = np.concatenate(values)
-    return Extract(**columns)
+    return SceneTables(**columns)
 
 
-def extract(recording: Recording, recipe: Recipe) -> tuple[Extract | None, dict[str, int]]:
+def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | None, dict[str, int]]:
     """The scenes of a recording.
 
     Returns:
         the scenes, None where there are none; and how many windows there were and where they went.
 
     Raises:
-        ConfigError: a recipe that needs lanes for a recording without, or a clock faster than the recording.
+        ConfigError: a config that needs lanes for a recording without, or a clock faster than the recording.
     """
-    if recipe.lane_change and recording.lanes is None:
+    if config.lane_change and recording.lanes is None:
         raise ConfigError(
             f"{recording.name} has no lanes, so nobody can change lane on them: use data.windows.lane_change=false"
         )
     counts: Counter[str] = Counter(recording.dropped)
-    shortest = recipe.history + recipe.horizon if recipe.complete else 2
-    clock, left_out = stretches(recording.tracks, recipe.dt, recipe.smoothing, shortest)
+    shortest = config.history + config.horizon if config.complete else 2
+    clock, left_out = stretches(recording.tracks, config.dt, config.smoothing, shortest)
     counts.update(left_out)
     located, changes = _on_lanes(clock, recording)
-    moments, members = _choose(clock, changes, recipe, counts)
+    moments, members = _choose(clock, changes, config, counts)
     if recording.lanes is not None:
         off = ((located.lane[_rows(clock, moments, members)] < 0) & (members >= 0)).any(1)
         counts["an agent on no lane"] = int(off.sum())
@@ -184,7 +184,7 @@ def extract(recording: Recording, recipe: Recipe) -> tuple[Extract | None, dict[
     counts["scenes"] = len(moments)
     if not len(moments):
         return None, dict(counts)
-    return _assemble(recording, recipe, clock, located, moments, members), dict(counts)
+    return _assemble(recording, config, clock, located, moments, members), dict(counts)
 
 
 def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.ndarray, " Z"]]:
@@ -214,24 +214,24 @@ def _rows(clock: Stretches, moments: Int[np.ndarray, " S"], members: Int[np.ndar
 
 
 def _choose(
-    clock: Stretches, changes: Int[np.ndarray, " Z"], recipe: Recipe, counts: Counter[str]
+    clock: Stretches, changes: Int[np.ndarray, " Z"], config: WindowConfig, counts: Counter[str]
 ) -> tuple[Int[np.ndarray, " S"], Int[np.ndarray, "S N"]]:
     """Moments and members (stretches) of all windows that pass, the focal agent first, then by distance."""
-    found_moments, found_members = [np.empty(0, dtype=int)], [np.empty((0, recipe.agents), dtype=int)]
-    for moment, stretch, focal in _crowds(clock, recipe):
+    found_moments, found_members = [np.empty(0, dtype=int)], [np.empty((0, config.agents), dtype=int)]
+    for moment, stretch, focal in _crowds(clock, config):
         position = clock.now[_rows(clock, moment, stretch), :2]
         distance = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
         distance[np.broadcast_to((stretch < 0)[:, None], distance.shape)] = np.inf
         everyone = np.arange(stretch.shape[1])
         distance[:, everyone, everyone] = -1.0
-        nearest = np.argsort(distance, axis=-1, kind="stable")[..., : recipe.agents]
+        nearest = np.argsort(distance, axis=-1, kind="stable")[..., : config.agents]
         reach = np.take_along_axis(distance, nearest, -1)
         members = np.take_along_axis(np.broadcast_to(stretch[:, None], distance.shape), nearest, -1)
-        members = np.where(reach <= (np.inf if recipe.radius is None else recipe.radius), members, -1)
-        members = np.pad(members, ((0, 0), (0, 0), (0, recipe.agents - members.shape[2])), constant_values=-1)
+        members = np.where(reach <= (np.inf if config.radius is None else config.radius), members, -1)
+        members = np.pad(members, ((0, 0), (0, 0), (0, config.agents - members.shape[2])), constant_values=-1)
         members, moments = members[focal], np.broadcast_to(moment[:, None], focal.shape)[focal]
         counts["windows"] += len(moments)
-        enough = (members >= 0).sum(1) >= recipe.least_agents
+        enough = (members >= 0).sum(1) >= config.least_agents
         counts["too few agents around"] += int((~enough).sum())
         members, moments = members[enough], moments[enough]
         _, once = np.unique(np.column_stack([moments, np.sort(members, 1)]), axis=0, return_index=True)
@@ -240,10 +240,10 @@ def _choose(
         found_moments.append(moments[once])
         found_members.append(members[once])
     moments, members = np.concatenate(found_moments), np.concatenate(found_members)
-    if recipe.lane_change:
+    if config.lane_change:
         first, last = clock.first[members], (clock.first + clock.count - 1)[members]
-        before = np.clip((moments - recipe.history + 1)[:, None], first, last)
-        after = np.clip((moments + recipe.horizon)[:, None], first, last)
+        before = np.clip((moments - config.history + 1)[:, None], first, last)
+        after = np.clip((moments + config.horizon)[:, None], first, last)
         offset = clock.start[members] - first
         changed = ((changes[offset + after] > changes[offset + before]) & (members >= 0)).any(1)
         counts["no lane change"] += int((~changed).sum())
@@ -251,15 +251,15 @@ def _choose(
     return moments, members
 
 
-def _crowds(clock: Stretches, recipe: Recipe) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _crowds(clock: Stretches, config: WindowConfig) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Moments, the stretches that are there at each (padded with -1), and which of them may be focal."""
-    before, after = (recipe.history - 1, recipe.horizon) if recipe.complete else (1, 0)
+    before, after = (config.history - 1, config.horizon) if config.complete else (1, 0)
     count = np.maximum(clock.count - before - after, 0)
     stretch = np.repeat(np.arange(len(count)), count)
     within = np.arange(count.sum()) - np.repeat(count.cumsum() - count, count) + before
     moment = clock.first[stretch] + within
-    focal = (within >= recipe.history - 1) & (within + recipe.horizon < clock.count[stretch])
-    kept = moment % recipe.every == 0
+    focal = (within >= config.history - 1) & (within + config.horizon < clock.count[stretch])
+    kept = moment % config.every == 0
     stretch, moment, focal = stretch[kept], moment[kept], focal[kept]
     order = np.argsort(moment, kind="stable")
     stretch, moment, focal = stretch[order], moment[order], focal[order]
@@ -276,12 +276,12 @@ def _crowds(clock: Stretches, recipe: Recipe) -> Iterator[tuple[np.ndarray, np.n
 
 def _assemble(
     recording: Recording,
-    recipe: Recipe,
+    config: WindowConfig,
     clock: Stretches,
     located: Located,
     moments: Int[np.ndarray, " S"],
     members: Int[np.ndarray, "S N"],
-) -> Extract:
+) -> SceneTables:
     """Gather what is known of the chosen agents at their moments."""
     rows = _rows(clock, moments, members)
     used, place = np.unique(rows, return_inverse=True)
@@ -304,8 +304,8 @@ def _assemble(
         found[..., 2] -= turns[:, None]
         return np.where(real[..., None], found, 0.0).astype(np.float32), real
 
-    history, history_mask = states(np.arange(1 - recipe.history, 1))
-    future, future_mask = states(np.arange(1, recipe.horizon + 1))
+    history, history_mask = states(np.arange(1 - config.history, 1))
+    future, future_mask = states(np.arange(1, config.horizon + 1))
     agent = clock.agent[owner]
     now = clock.now[used]
     at = now[place, :2]
@@ -320,12 +320,12 @@ def _assemble(
     speed, polylines = np.empty((len(used), 0)), np.empty((0, VECTORS + 1, 2))
     if recording.lanes is not None:
         here = Located(located.lane[used], located.along[used], located.offset[used])
-        route = Routes(recording.lanes).of(now[:, :2], now[:, 3], here, recipe.horizon * recipe.dt)
+        route = Routes(recording.lanes).of(now[:, :2], now[:, 3], here, config.horizon * config.dt)
         candidates, references = route.candidates - origin, route.references - origin
         limit = recording.lanes.speed_limit[here.lane]
-        speed = np.where(np.isnan(limit), recipe.speed_limit, limit)
+        speed = np.where(np.isnan(limit), config.speed_limit, limit)
         polylines = pieces(recording.lanes, VECTORS, SPACING)
-    return Extract(
+    return SceneTables(
         history=history,
         history_mask=history_mask,
         future=future,
@@ -338,11 +338,11 @@ def _assemble(
         reference_speed=speed.astype(np.float32),
         polylines=polylines - origin,
         agents=place.astype(np.int32),
-        lanes=_nearest(polylines, centre, recipe.lanes),
+        lanes=_nearest(polylines, centre, config.lanes),
         centre=centre - origin,
         direction=direction,
         recording=np.zeros(len(moments), dtype=np.int32),
-        frame=np.round(moments * recipe.dt * recording.tracks.rate).astype(np.int64),
+        frame=np.round(moments * config.dt * recording.tracks.rate).astype(np.int64),
         origin=origin[None],
     )
 

@@ -1,8 +1,8 @@
-"""Making the set: solve every main game at every placement, then cut the pool of records into splits.
+"""Generation of RPI data sets: every main game is solved at every placement, and the pool of records is cut into splits.
 
-The pool, one file per main game, depends on the games alone; sets with other splits or sizes share it. Every placement
-draws from its own random numbers, so the bytes do not depend on the number of workers, and a run that was killed goes on
-with the first main game that is not finished. The pool may be deleted once the sets are made.
+The pool has one file per main game and depends on the games alone; data sets with other splits or sizes share it. Every
+placement draws from its own random numbers, so the bytes do not depend on the number of workers, and a run that was killed
+continues with the first main game that is not finished. The pool may be deleted once the data sets are made.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,17 +25,18 @@ from epo_lightning.data.rpi.game import GameConstants, main_game
 from epo_lightning.data.rpi.solve import FeedbackSettings, PotentialSettings
 from epo_lightning.data.rpi.splits import assign
 from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, MAIN_STARTS, RANDOM_STARTS, Records, play
-from epo_lightning.data.workers import finished
+from epo_lightning.data.workers import Report, finished
 
 RECIPE = 1
-"""Version of the numerical recipe: raised whenever the same configuration would give other records."""
+"""Version of the numerical method: raised whenever the same configuration would give other records."""
 WHOLE = ("modes", "converged", "game", "placement", "executed", "step")
-"""Fields that are whole numbers; ``cost``, ``agent_cost``, ``weight`` and ``phi`` stay in double precision."""
+"""Integer fields of a record."""
 DOUBLE = ("cost", "agent_cost", "weight", "phi")
+"""Fields in double precision; all others are in single precision."""
 
 
 def pool_config(seed: int, games: int, placements: int, solver: str) -> dict[str, Any]:
-    """Everything that the pool depends on."""
+    """Configuration of a pool: all values that its records depend on."""
     settings = FeedbackSettings() if solver == "feedback" else PotentialSettings()
     return {
         "recipe": RECIPE,
@@ -53,17 +53,17 @@ def pool_config(seed: int, games: int, placements: int, solver: str) -> dict[str
 
 
 def set_config(pool: Mapping[str, Any], split: str, sizes: Sequence[int] | None) -> dict[str, Any]:
-    """Everything that a set depends on."""
+    """Configuration of a data set: all values that its records depend on."""
     return {"pool": dict(pool), "split": split, "sizes": None if sizes is None else list(sizes)}
 
 
 def set_folder(root: Path, config: Mapping[str, Any]) -> Path:
-    """Where the set of a configuration is kept."""
+    """Folder of the data set of a configuration."""
     return root / f"rpi-{cache.digest(config)[:12]}"
 
 
 def _play(seed: int, game: int, placement: int, placements: int, solver: str) -> tuple[Records, dict[str, int]]:
-    """Solve one placement of one main game."""
+    """Records of one placement of one main game, and what the solver counted."""
     constants = GameConstants()
     records, counts = play(seed, main_game(seed, game, placement, placements, constants), constants, solver)
     return {name: values.astype(_dtype(name)) for name, values in records.items()}, counts
@@ -80,21 +80,19 @@ def _checksum(records: Records) -> str:
     return total.hexdigest()
 
 
-def _write_part(path: Path, pool: str, results: Sequence[tuple[Records, dict[str, int]]]) -> None:
-    """Write the records of one main game, in the order of its placements, atomically."""
+def _write_game(path: Path, pool: str, results: Sequence[tuple[Records, dict[str, int]]]) -> None:
+    """Write the records of one main game, in the order of its placements."""
     full = [records for records, _ in results if records]
     names = full[0] if full else {}
-    # safetensors writes memory as it lies, so it must lie in the order of its indices.
+    # safetensors writes the memory as it is, whatever the strides.
     records = {name: np.ascontiguousarray(np.concatenate([part[name] for part in full])) for name in names}
     counts = {name: sum(counts[name] for _, counts in results) for name in results[0][1]}
     about = {"pool": pool, "counts": counts, "sha256": _checksum(records)}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_bytes(save(records, {"about": json.dumps(about, sort_keys=True)}))
-    temporary.replace(path)
+    cache.write_file(path, save(records, {"about": json.dumps(about, sort_keys=True)}))
 
 
-def _read_part(path: Path, pool: str) -> tuple[Records, dict[str, int]] | None:
-    """The records and counts of one main game, or None where the file is missing, broken or of another pool."""
+def _read_game(path: Path, pool: str) -> tuple[Records, dict[str, int]] | None:
+    """The records and counts of one main game; None if the file is missing, broken or of another pool."""
     if not path.is_file():
         return None
     try:
@@ -111,83 +109,103 @@ def _read_part(path: Path, pool: str) -> tuple[Records, dict[str, int]] | None:
 def make_pool(
     root: Path, config: Mapping[str, Any], workers: int | None, progress: bool
 ) -> tuple[Records, dict[str, int]]:
-    """All records of all main games, solving those that are not on disk yet.
+    """Records of all main games of a pool, after solving the games that are not on disk yet.
 
     Raises:
         cache.CacheError: a worker was killed, for instance for lack of memory.
+        OSError: the disk is full or read-only.
     """
     name = cache.digest(config)
     folder = root / f"rpi-pool-{name[:12]}"
-    folder.mkdir(parents=True, exist_ok=True)
-    games, placements = config["games"], config["placements"]
-    paths = [folder / f"game-{game:04d}.safetensors" for game in range(games)]
-    missing = [game for game in range(games) if _read_part(paths[game], name) is None]
-    done: dict[int, dict[int, tuple[Records, dict[str, int]]]] = {game: {} for game in missing}
-
-    def finish(task: tuple[Any, ...], result: tuple[Records, dict[str, int]]) -> None:
-        _, game, placement, _, _ = task
-        done[game][placement] = result
-        if len(done[game]) == placements:
-            _write_part(paths[game], name, [done[game][p] for p in range(placements)])
-            del done[game]
-
-    tasks = [(config["seed"], game, p, placements, config["solver"]) for game in missing for p in range(placements)]
-    before, kept = games * placements - len(tasks), f"finished main games are kept in {folder}"
-    if tasks:
-        # The first placement is solved here: it compiles the kernels, which the workers then find on disk.
-        finish(tasks[0], _play(*tasks[0]))
-    for task, result in finished(
-        _play, tasks[1:], workers, progress, "solving games", "placements", before + bool(tasks), kept
-    ):
-        finish(task, result)
-    parts = [_read_part(path, name) for path in paths]
-    broken = [path for path, part in zip(paths, parts, strict=True) if part is None]
+    paths = [folder / f"game-{game:04d}.safetensors" for game in range(config["games"])]
+    with cache.locked(folder):
+        with cache.writing(folder):
+            folder.mkdir(exist_ok=True)
+        _solve_missing(paths, config, workers, progress)
+    games = [_read_game(path, name) for path in paths]
+    broken = [path for path, game in zip(paths, games, strict=True) if game is None]
     if broken:
         raise cache.CacheError(
             f"{broken[0]} cannot be read back: is the disk full? Delete it and run the command again"
         )
-    full = [part[0] for part in parts if part is not None and part[0]]
+    full = [game[0] for game in games if game is not None and game[0]]
     if not full:
         raise cache.CacheError("no placement of any main game gave a record: use more placements or another seed")
-    records = {key: np.concatenate([part[key] for part in full]) for key in full[0]}
-    counts = [part[1] for part in parts if part is not None]
+    records = {key: np.concatenate([game[key] for game in full]) for key in full[0]}
+    counts = [game[1] for game in games if game is not None]
     return records, {key: sum(count[key] for count in counts) for key in counts[0]}
 
 
+def _solve_missing(paths: Sequence[Path], config: Mapping[str, Any], workers: int | None, progress: bool) -> None:
+    """Solve the main games whose files are missing or broken, and write each when its last placement is solved."""
+    name, placements = cache.digest(config), config["placements"]
+    missing = [game for game, path in enumerate(paths) if _read_game(path, name) is None]
+    tasks = [(config["seed"], game, p, placements, config["solver"]) for game in missing for p in range(placements)]
+    report = Report(tasks, lambda task: task[1], "game", "solving", "solved", len(paths) - len(missing), progress)
+    solved: dict[int, dict[int, tuple[Records, dict[str, int]]]] = {game: {} for game in missing}
+    kept = f"finished main games are kept in {paths[0].parent}"
+    # The first placement is solved by this process: it compiles the kernels, which the workers then find on disk.
+    for task, result in finished(_play, tasks, workers, report, kept, first_here=True):
+        game, placement = task[1:3]
+        solved[game][placement] = result
+        if len(solved[game]) == placements:
+            _write_game(paths[game], name, [solved[game][p] for p in range(placements)])
+            del solved[game]
+
+
 def make_set(
-    root: Path, pool: Mapping[str, Any], split: str, sizes: Sequence[int] | None, workers: int | None, progress: bool
+    root: Path,
+    pool: Mapping[str, Any],
+    split: str,
+    sizes: Sequence[int] | None,
+    workers: int | None,
+    progress: bool,
+    command: str = "",
 ) -> Path:
-    """The folder of a set, made now unless it is there already.
+    """The folder of a data set, made now unless it exists already.
+
+    Args:
+        root: folder of the cache.
+        pool: configuration of the pool, see :func:`pool_config`.
+        split: rule by which records are assigned to splits.
+        sizes: most records of training, validation and test; None for all.
+        workers: processes; None for one per core.
+        progress: whether to report progress.
+        command: makes this set; for error messages.
 
     Raises:
-        cache.CacheError: the folder is there but broken, a split would be empty, or a worker was killed.
+        cache.CacheError: the folder exists but is broken or of another configuration, a split would be empty, or a worker
+            was killed.
+        OSError: the disk is full or read-only.
     """
-    from epo_lightning.data.rpi.report import describe
-
     config = set_config(pool, split, sizes)
     folder = set_folder(root, config)
-    if folder.exists():
-        cache.verify(folder)
-        return folder
+    if not cache.make_once(folder, lambda: _make_set(folder, root, config, workers, progress)):
+        cache.verify(folder, command, config)
+    return folder
+
+
+def _make_set(folder: Path, root: Path, config: Mapping[str, Any], workers: int | None, progress: bool) -> None:
+    from epo_lightning.data.rpi.report import describe
+
+    pool, split = config["pool"], config["split"]
     records, counts = make_pool(root, pool, workers, progress)
     constants = GameConstants()
     weights = np.array([main_game(pool["seed"], game, 0, 1, constants).weight for game in range(pool["games"])])
-    parts = {
-        part: {name: values[index] for name, values in records.items()}
-        for part, index in assign(split, pool["seed"], weights, records["game"], records["phi"], sizes).items()
-    }
-    empty = [part for part, values in parts.items() if not len(values["step"])]
+    indices = assign(split, pool["seed"], weights, records["game"], records["phi"], config["sizes"])
+    splits = {name: {key: values[index] for key, values in records.items()} for name, index in indices.items()}
+    empty = [name for name, values in splits.items() if not len(values["step"])]
     if empty:
         raise cache.CacheError(
             f"split {split!r} leaves no records for {', '.join(empty)}: use more games or placements"
         )
-    report = describe(parts, counts, weights, pool)
-    tensors = {part: {name: torch.from_numpy(values) for name, values in rows.items()} for part, rows in parts.items()}
-    return cache.write(folder, tensors, config, rounded(report))
+    report = describe(splits, counts, weights, pool)
+    tensors = {name: {key: torch.from_numpy(values) for key, values in rows.items()} for name, rows in splits.items()}
+    cache.write(folder, tensors, config, rounded(report))
 
 
 def rounded(value: Any) -> Any:
-    """Plain numbers with six significant digits: a report is for reading."""
+    """A report's values as plain numbers with six significant digits; None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {str(key): rounded(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from epo_lightning.data import cache
+from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset, epoch_generator
-from epo_lightning.data.rpi.splits import PARTS, SPLITS
+from epo_lightning.data.rpi.splits import RULES
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import Scene
 from epo_lightning.task import Task
@@ -121,10 +122,10 @@ class RPIData(SceneDataModule):
         self.games = _whole("games", games, 3, "training, validation and test need main games of their own")
         self.placements = _whole("placements", placements, 1, "the pedestrian must start somewhere")
         self.solver = _one_of("solver", solver, SOLVERS)
-        self.split = _one_of("split", split, SPLITS)
+        self.split = _one_of("split", split, RULES)
         self.targets = _one_of("targets", targets, TARGETS)
-        if sizes is not None and (isinstance(sizes, str) or len(sizes) != len(PARTS)):
-            raise ConfigError(f"data.sizes is {sizes!r}, expected three numbers ({', '.join(PARTS)}) or null for all")
+        if sizes is not None and (isinstance(sizes, str) or len(sizes) != len(SPLITS)):
+            raise ConfigError(f"data.sizes is {sizes!r}, expected three numbers ({', '.join(SPLITS)}) or null for all")
         why = "an empty split is of no use"
         self.sizes = None if sizes is None else [_whole("sizes", size, 1, why) for size in sizes]
 
@@ -174,7 +175,7 @@ class RPIData(SceneDataModule):
 
         if workers is not None:
             _whole("workers", workers, 1, "somebody has to solve the games")
-        return make_set(self.root, self.config["pool"], self.split, self.sizes, workers, progress)
+        return make_set(self.root, self.config["pool"], self.split, self.sizes, workers, progress, self.command)
 
     def report(self) -> dict[str, Any]:
         """The report that the set was made with.
@@ -182,7 +183,7 @@ class RPIData(SceneDataModule):
         Raises:
             cache.CacheError: the set is missing or broken.
         """
-        return cache.manifest(self.folder, self.command)["report"]
+        return cache.manifest(self.folder, self.command, self.config)["report"]
 
     def open(self, split: str) -> SceneDataset:
         """The scenes of a split.
@@ -190,5 +191,5 @@ class RPIData(SceneDataModule):
         Raises:
             cache.CacheError: the set is missing, broken, of another format, or holds numbers that are not finite.
         """
-        records = cache.load(self.folder, split, ("history", "goals", "states", "modes"), self.command)
+        records = cache.load(self.folder, split, ("history", "goals", "states", "modes"), self.command, self.config)
         return RPIDataset(records, self.targets, self.seed)

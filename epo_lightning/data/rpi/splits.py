@@ -1,8 +1,8 @@
-"""Which record belongs to training, validation and test.
+"""Rules that assign records to training, validation and test.
 
-``paper``: validation and test are unseen main games. They differ from the training games only in w and in jitter.
-``hard``: the test holds what training never saw: the main games with the most extreme w, and of all games the placements
-where the pedestrian crosses about at right angles.
+``paper``: validation and test are unseen main games, which differ from the training games only in w and in jitter.
+``hard``: the test split holds situations without any counterpart in training: the main games with the most extreme w, and
+from all games the placements in which the pedestrian crosses at about a right angle.
 """
 
 from __future__ import annotations
@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from epo_lightning.data.rpi.game import generator
 
-SPLITS = ("paper", "hard")
-PARTS = ("train", "val", "test")
+RULES = ("paper", "hard")
 PAPER_SIZES = (47822, 6228, 6228)
 """Printed numbers of records of training, validation and test."""
 HARD_SECTOR = (75.0, 105.0)
-"""|phi| in degrees that ``hard`` keeps for the test."""
+"""Range of |phi| [degrees] whose records the rule ``hard`` assigns to the test split."""
 
 Index = NDArray[np.int64]
 
@@ -28,7 +27,7 @@ def games_of(split: str, weights: NDArray[np.float64]) -> dict[str, Index]:
     """Main games of training, validation and test; a tenth of them, at least one, for each of the last two.
 
     Args:
-        split: ``paper`` or ``hard``.
+        split: rule, ``paper`` or ``hard``.
         weights: w of every main game; there are at least three.
     """
     count = len(weights)
@@ -53,23 +52,23 @@ def assign(
     phi: NDArray[np.float64],
     sizes: Sequence[int] | None,
 ) -> dict[str, Index]:
-    """Indices of the records of each part, in the order of the pool.
+    """Indices of the records of each split, in the order of the pool.
 
     Args:
-        split: ``paper`` or ``hard``.
-        seed: of the subsampling.
+        split: rule, ``paper`` or ``hard``.
+        seed: of the random choice of records where a split has more than its size.
         weights: w of every main game.
         game, phi: main game and pedestrian's angle [rad] of every record.
-        sizes: most records of each part; None keeps all.
+        sizes: most records of each split; None keeps all.
     """
     angle = np.abs(np.degrees(phi))
     sector = (angle >= HARD_SECTOR[0]) & (angle <= HARD_SECTOR[1]) & (split == "hard")
     found = {}
-    for number, (part, games) in enumerate(games_of(split, weights).items()):
+    for number, (name, games) in enumerate(games_of(split, weights).items()):
         mine = np.isin(game, games)
-        mine = mine | sector if part == "test" else mine & ~sector
+        mine = mine | sector if name == "test" else mine & ~sector
         index = np.flatnonzero(mine)
         if sizes is not None and len(index) > sizes[number]:
             index = np.sort(generator(seed, 1_000_003, number).choice(index, sizes[number], replace=False))
-        found[part] = index
+        found[name] = index
     return found

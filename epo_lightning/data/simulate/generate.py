@@ -7,7 +7,6 @@ hidden folder beside the final one; a run that was killed continues there with t
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +18,7 @@ from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.data.simulate.motion import move
 from epo_lightning.data.simulate.traffic import RATE, WARM_UP, simulate, simulator
-from epo_lightning.data.workers import finished
+from epo_lightning.data.workers import Report, finished
 from epo_lightning.registry import ConfigError
 
 RECIPE = 2
@@ -111,9 +110,7 @@ def _done_path(work: Path, number: int) -> Path:
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    temporary = path.with_name(f"{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n")
-    temporary.replace(path)
+    cache.write_file(path, (json.dumps(content, indent=2, sort_keys=True) + "\n").encode())
 
 
 def _finished(work: Path, number: int, name: str) -> dict[str, Any] | None:
@@ -169,37 +166,39 @@ def make_recordings(folder: Path, config: Mapping[str, Any], workers: int | None
         ConfigError: SUMO is missing or fails, a recording without lane changes or with too many accidents.
         cache.CacheError: the folder is there but something else or broken, or a worker was killed.
     """
-    with cache.alone(folder):
-        if not folder.exists():
-            return _make(folder, config, workers, progress)
-    verify(folder, config)
+    if not cache.make_once(folder, lambda: _make(folder, config, workers, progress)):
+        verify(folder, config)
     return folder
 
 
-def _make(folder: Path, config: Mapping[str, Any], workers: int | None, progress: bool) -> Path:
+def _make(folder: Path, config: Mapping[str, Any], workers: int | None, progress: bool) -> None:
     simulator()
     name = cache.digest(config)
     work = folder.with_name(f".{folder.name}-{name[:12]}")
-    (work / "data").mkdir(parents=True, exist_ok=True)
+    with cache.writing(work):
+        (work / "data").mkdir(parents=True, exist_ok=True)
     numbers = dict(enumerate(layout for layout in config["layouts"] for _ in range(config["recordings"])))
     missing = [number for number in numbers if _finished(work, number, name) is None]
     seconds = config["minutes"] * 60.0
     tasks = [(work, name, number, LAYOUTS[numbers[number]], config["seed"], seconds) for number in missing]
-    before, kept = len(numbers) - len(missing), f"finished recordings are kept in {work}"
+    report = Report(
+        tasks, lambda task: task[2], "recording", "simulating", "simulated", len(numbers) - len(missing), progress
+    )
     # A process per recording: SUMO keeps its state in global variables.
-    for _ in finished(record, tasks, workers, progress, "simulating", "recordings", before, kept, fresh=True):
+    for _ in finished(record, tasks, workers, report, f"finished recordings are kept in {work}", fresh=True):
         pass
-    return _finish(folder, work, config, numbers)
+    _finish(folder, work, config, numbers)
 
 
-def _finish(folder: Path, work: Path, config: Mapping[str, Any], numbers: Mapping[int, int]) -> Path:
+def _finish(folder: Path, work: Path, config: Mapping[str, Any], numbers: Mapping[int, int]) -> None:
     """Add maps and manifest, and give the folder its name."""
     name = cache.digest(config)
     files: dict[str, Any] = {}
     report: dict[str, Any] = {}
     for layout in sorted(set(numbers.values())):
         path = work / map_path(LAYOUTS[layout])
-        write_map(LAYOUTS[layout], path)
+        with cache.writing(path):
+            write_map(LAYOUTS[layout], path)
         files[map_path(LAYOUTS[layout])] = {"bytes": path.stat().st_size, "sha256": cache.file_digest(path)}
     for number in numbers:
         done = _finished(work, number, name)
@@ -217,4 +216,3 @@ def _finish(folder: Path, work: Path, config: Mapping[str, Any], numbers: Mappin
         {"hash": name, "config": dict(config), "files": files, "recordings": report},
     )
     work.replace(folder)
-    return folder

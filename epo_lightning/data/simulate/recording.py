@@ -9,7 +9,6 @@ columns of OpenDRIVE ids that some copies of exiD have are absent, as there is n
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ import polars as pl
 from jaxtyping import Float, Int
 from pyproj import Transformer
 
+from epo_lightning.data import cache
 from epo_lightning.data.simulate.lanelets import lanelets
 from epo_lightning.data.simulate.layout import Layout
 from epo_lightning.data.simulate.motion import Motion
@@ -246,7 +246,6 @@ def write(motion: Motion, layout: Layout, number: int, folder: Path) -> list[Pat
     paths = []
     for name, table in tables.items():
         path = folder / f"{number:02d}_{name}.csv"
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        table.write_csv(temporary, null_value="", quote_style="never")
-        paths.append(temporary.replace(path))
+        cache.write_file(path, table.write_csv(null_value="", quote_style="never").encode())
+        paths.append(path)
     return paths

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from epo_lightning.data import cache, simulate
 from epo_lightning.data.recorded.recordings import RecordedData
-from epo_lightning.data.recorded.tracks import Recording, Source
+from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.registry import ConfigError, register
 
 
@@ -60,19 +62,37 @@ class SimulatedHighway(RecordedData):
             share=share,
         )
 
-    def sources(self) -> list[Source]:
+    def sources(self) -> list[RecordingSource]:
         """The recordings that the simulation makes, whether or not they are there already."""
         layouts = [str(layout) for layout in self.simulation["layouts"] for _ in range(self.simulation["recordings"])]
-        return [Source(f"{number:02d}", layout, (), self._not_yet) for number, layout in enumerate(layouts)]
+        return [RecordingSource(f"{number:02d}", layout, (), self._not_yet) for number, layout in enumerate(layouts)]
 
-    def recordings(self) -> list[Source]:
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """Configuration of the data set: all values that its files depend on. The recordings need not exist."""
+        sources = self.sources()
+        return self._config_of(sources, self.identity(sources))
+
+    @property
+    def command(self) -> str:
+        """The command that makes this data set, for error messages."""
+        defaults = {"recordings": 3, "minutes": 9.0, "layouts": [layout.id for layout in simulate.LAYOUTS], "seed": 0}
+        words = [f"data={self.dataset_name}"]
+        for name, value in defaults.items():
+            if self.simulation[name] != value:
+                words.append(f"data.{name}={self.simulation[name]}".replace(" ", ""))
+        if self.root != cache.default_root():
+            words.append(f"data.root={self.root}")
+        return shlex.join(["epo", "generate", *words])
+
+    def recordings(self) -> list[RecordingSource]:
         """The simulated recordings, as the reader of exiD's format finds them."""
         return super().sources()
 
     def _not_yet(self) -> Recording:
         raise ConfigError(f"this recording is not simulated yet: {self.command}")
 
-    def identity(self, sources: Sequence[Source]) -> Any:
+    def identity(self, sources: Sequence[RecordingSource]) -> Any:
         """The simulation: the same configuration makes the same recordings."""
         return self.simulation
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import torch
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.recordings import RecordedData, _fingerprint
-from epo_lightning.data.recorded.tracks import Source
+from epo_lightning.data.recorded.tracks import RecordingSource
 from epo_lightning.registry import ConfigError, register
 
 from .roads import FOUR, curve, recording
@@ -23,10 +25,10 @@ READ: list[str] = []
 
 
 @register("format", "roads")
-def roads(folder: Path) -> list[Source]:
+def roads(folder: Path) -> list[RecordingSource]:
     """Files ``<group>-<number>.road``; what is in them is how far the road is turned."""
 
-    def source(file: Path) -> Source:
+    def source(file: Path) -> RecordingSource:
         def read():
             READ.append(file.stem)
             if (folder / "stop").exists() and file.stem == "b-5":
@@ -36,7 +38,7 @@ def roads(folder: Path) -> list[Source]:
                 return recording(vehicles=FOUR[:2], name=file.stem)
             return recording(curve(800.0, float(text)), name=file.stem)
 
-        return Source(file.stem, file.stem.partition("-")[0], (file,), read)
+        return RecordingSource(file.stem, file.stem.partition("-")[0], (file,), read)
 
     return [source(file) for file in folder.glob("*.road")]
 
@@ -157,7 +159,7 @@ def test_missing_data_and_misspelt_keys_say_what_to_do(folder, tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             data(folder, **changes)
-    with pytest.raises(ConfigError, match=r"point data\.folder at it"):
+    with pytest.raises(ConfigError, match=r"no folder .*nowhere with roads .* point data\.folder at the recordings"):
         _ = RecordedData("roads", "roads", str(tmp_path / "nowhere"), WINDOWS).config
     with pytest.raises(ConfigError, match=r"which no recording has: .*known: a, b, c"):
         data(folder, test=["d"]).generate(progress=False)
@@ -176,3 +178,60 @@ def test_of_several_at_once_one_makes_the_set_and_the_others_wait(folder):
         made = list(pool.map(lambda _: data(folder).generate(workers=1, progress=False), range(3)))
     assert len(set(made)) == 1
     assert len(READ) == 9
+
+
+def test_training_needs_the_extracted_data_set_but_not_the_recordings(folder):
+    made = data(folder).generate(workers=1, progress=False)
+    before = data(folder).digest
+    shutil.rmtree(folder)
+    module = data(folder)
+    assert (module.folder, module.digest) == (made, before)
+    assert module.generate(workers=1, progress=False) == made
+    module.setup("fit")
+    assert next(iter(module.train_dataloader())).history.shape == (8, 4, 10, 4)
+    for other in ({"windows": {"dt": 0.2, "radius": 50.0}}, {"test": ["b"]}, {"test": ["d"]}, {"dataset": "streets"}):
+        with pytest.raises(ConfigError, match=r"no folder .*roads with (roads|streets) recordings, and no data set"):
+            data(folder, **other).setup("fit")
+    with pytest.raises(ConfigError, match="no data set that was extracted"):
+        data(folder, root=str(folder.parent / "elsewhere")).setup("fit")
+
+
+def test_of_several_extracted_data_sets_one_is_chosen_by_its_folder(folder):
+    one = data(folder)
+    one.generate(workers=1, progress=False)
+    (folder / "a-0.road").unlink()
+    two = data(folder)
+    two.generate(workers=1, progress=False)
+    shutil.rmtree(folder)
+    with pytest.raises(ConfigError, match="several data sets were extracted with these settings") as error:
+        data(folder).setup("fit")
+    for module, count in ((one, 9), (two, 8)):
+        assert f"data.folder={module.folder} ({count} recordings)" in str(error.value)
+        chosen = data(module.folder, root=str(folder.parent / "cache"))
+        chosen.setup("test")
+        assert (chosen.folder, chosen.digest) == (module.folder, module.digest)
+        moved = module.folder.rename(folder.parent / f"moved-{count}")
+        assert data(moved, root=str(folder.parent / "cache")).digest == module.digest
+    with pytest.raises(ConfigError, match=r"other settings: it differs in windows\.radius \(60\.0 instead of 50\.0\)"):
+        data(moved, windows={"dt": 0.2, "radius": 50.0}).setup("fit")
+
+
+def test_a_recording_is_reported_when_it_is_extracted(folder, capfd):
+    data(folder).generate(workers=1, progress=True)
+    lines = capfd.readouterr().err.splitlines()
+    assert len(lines) == 9
+    assert re.fullmatch(r"recording 3 of 9 extracted, \d+ s, about \d+ s left", lines[2])
+    assert re.fullmatch(r"recording 9 of 9 extracted, \d+ s", lines[8])
+    data(folder).generate(workers=1, progress=True)
+    assert not capfd.readouterr().err
+
+
+def test_a_broken_file_is_named_by_the_worker_that_reads_it(tmp_path):
+    for number in range(4):
+        file = tmp_path / "crowds" / f"place-{number}" / "obsmat.txt"
+        file.parent.mkdir(parents=True)
+        file.write_text("0 1 0.0 0.0 0.0 1.0 0.0 0.0\n10 1 0.4 0.0 0.0 1.0 0.0 0.0\n")
+    file.write_text("0 1 0.0 0.0 zero 1.0 0.0 0.0\n")
+    module = data(tmp_path / "crowds", format="ucy", map=False, windows={"lane_change": False}, test=["place-0"])
+    with pytest.raises(RecordingError, match=r"place-3/obsmat\.txt, row 1: y is 'zero'; a finite number"):
+        module.generate(workers=2, progress=False)

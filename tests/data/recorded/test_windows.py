@@ -14,19 +14,19 @@ from hypothesis import strategies as st
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.lanes import lane_changes
 from epo_lightning.data.recorded.scenes import RecordedScenes
-from epo_lightning.data.recorded.windows import Extract, Recipe, extract, joined
+from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, extract, joined
 from epo_lightning.registry import ConfigError
 
 from .roads import FOUR, WIDTH, curve, recording
 
 
-def tables(scenes: Extract) -> dict[str, torch.Tensor]:
+def tables(scenes: SceneTables) -> dict[str, torch.Tensor]:
     return {f.name: torch.from_numpy(np.ascontiguousarray(getattr(scenes, f.name))) for f in dataclasses.fields(scenes)}
 
 
-def scenes_of(of, recipe=Recipe(), frame="fixed"):  # noqa: B008 - frozen
-    found, _ = extract(of, recipe)
-    data = RecordedScenes(tables(found), recipe.dt, frame, [of.name])
+def scenes_of(of, config=WindowConfig(), frame="fixed"):  # noqa: B008 - frozen
+    found, _ = extract(of, config)
+    data = RecordedScenes(tables(found), config.dt, frame, [of.name])
     return data[torch.arange(len(data))], data
 
 
@@ -45,11 +45,11 @@ def crowd(seed: int, count: int = 9):
     ]
 
 
-def obvious(of, recipe: Recipe) -> set[tuple[int, frozenset[int]]]:
+def obvious(of, config: WindowConfig) -> set[tuple[int, frozenset[int]]]:
     """The windows of a recording, by frame and track ids, found one by one. Every track lasts the whole recording."""
     tracks = of.tracks
     found = of.lanes.locate(tracks.position, tracks.heading)
-    step = round(recipe.dt * tracks.rate)
+    step = round(config.dt * tracks.rate)
     agents = [tracks.agent == a for a in range(len(tracks.ids))]
     at = [tracks.position[rows][::step] for rows in agents]
     lane = [found.lane[rows][::step] for rows in agents]
@@ -61,16 +61,16 @@ def obvious(of, recipe: Recipe) -> set[tuple[int, frozenset[int]]]:
         )
         changed.append(np.flatnonzero(lane_changes(np.full(len(coarse), a), part, of.lanes)))
     windows = set()
-    for now in range(recipe.history - 1, len(at[0]) - recipe.horizon):
-        if now % recipe.every:
+    for now in range(config.history - 1, len(at[0]) - config.horizon):
+        if now % config.every:
             continue
         for focal in range(len(at)):
             distance = [(np.linalg.norm(at[focal][now] - at[other][now]), other) for other in range(len(at))]
-            limit = np.inf if recipe.radius is None else recipe.radius
-            chosen = [other for away, other in sorted(distance)[: recipe.agents] if away <= limit]
-            first, last = now - recipe.history + 1, now + recipe.horizon
+            limit = np.inf if config.radius is None else config.radius
+            chosen = [other for away, other in sorted(distance)[: config.agents] if away <= limit]
+            first, last = now - config.history + 1, now + config.horizon
             moving = any(((changed[a] > first) & (changed[a] <= last)).any() for a in chosen)
-            if len(chosen) < recipe.least_agents or (recipe.lane_change and not moving):
+            if len(chosen) < config.least_agents or (config.lane_change and not moving):
                 continue
             if any(lane[a][now] < 0 for a in chosen):
                 continue
@@ -82,24 +82,24 @@ def obvious(of, recipe: Recipe) -> set[tuple[int, frozenset[int]]]:
     st.integers(0, 10_000),
     st.sampled_from(
         [
-            Recipe(),
-            Recipe(lane_change=False, radius=30.0),
-            Recipe(agents=6, least_agents=2, radius=40.0, every=3),
-            Recipe(agents=1, least_agents=1),
-            Recipe(agents=32, least_agents=3, radius=None),
+            WindowConfig(),
+            WindowConfig(lane_change=False, radius=30.0),
+            WindowConfig(agents=6, least_agents=2, radius=40.0, every=3),
+            WindowConfig(agents=1, least_agents=1),
+            WindowConfig(agents=32, least_agents=3, radius=None),
         ]
     ),
 )
 @settings(max_examples=25, deadline=None)
-def test_windows_are_those_that_a_loop_finds(seed, recipe):
+def test_windows_are_those_that_a_loop_finds(seed, config):
     of = recording(vehicles=crowd(seed))
-    scenes, counts = extract(of, recipe)
-    expected = obvious(of, recipe)
+    scenes, counts = extract(of, config)
+    expected = obvious(of, config)
     assert counts["scenes"] == len(expected)
     if scenes is None:
         assert not expected
         return
-    data = RecordedScenes(tables(scenes), recipe.dt, "fixed", [of.name])
+    data = RecordedScenes(tables(scenes), config.dt, "fixed", [of.name])
     known = data.provenance(range(len(data)))
     assert {(entry["frame"], frozenset(entry["tracks"])) for entry in known} == expected
     dropped = sum(
@@ -131,7 +131,7 @@ def test_a_scene_holds_what_the_recording_says():
 
 def test_goals_lie_on_the_lanes_that_an_agent_may_take():
     of = recording(vehicles=((1, 30.0, 0, 20.0, 2.0), (2, 20.0, 1, 20.0, None), (3, 10.0, 2, 20.0, None)))
-    scene, _ = scenes_of(of, Recipe(agents=3, least_agents=3))
+    scene, _ = scenes_of(of, WindowConfig(agents=3, least_agents=3))
     goals = (scene.goal_candidates + scene.frame[:, None, None, :2])[0]
     now = (scene.current[..., :2] + scene.frame[:, None, :2])[0]
     line = scene.goal_reference[0, 0]
@@ -157,14 +157,14 @@ def test_goals_lie_on_the_lanes_that_an_agent_may_take():
 @settings(max_examples=15, deadline=None)
 def test_moving_the_world_moves_the_frame_and_nothing_else(seed, turn):
     vehicles = crowd(seed, 6)
-    recipe = Recipe(radius=None, lane_change=False)
-    here, _ = scenes_of(recording(curve(900.0), vehicles), recipe, "aligned")
-    there, _ = scenes_of(recording(curve(900.0, turn, (-7000.0, 2500.0)), vehicles), recipe, "aligned")
+    config = WindowConfig(radius=None, lane_change=False)
+    here, _ = scenes_of(recording(curve(900.0), vehicles), config, "aligned")
+    there, _ = scenes_of(recording(curve(900.0, turn, (-7000.0, 2500.0)), vehicles), config, "aligned")
     for name in ("history", "future", "goal_candidates", "references", "reference_speed", "lanes"):
         one, other = getattr(here, name), getattr(there, name)
         torch.testing.assert_close(one, other, rtol=0, atol=5e-3)
-    moved, _ = scenes_of(recording(curve(900.0, 0.0, (-7000.0, 2500.0)), vehicles), recipe)
-    still, _ = scenes_of(recording(curve(900.0), vehicles), recipe)
+    moved, _ = scenes_of(recording(curve(900.0, 0.0, (-7000.0, 2500.0)), vehicles), config)
+    still, _ = scenes_of(recording(curve(900.0), vehicles), config)
     for name in ("history", "future", "goal_candidates", "references", "lanes"):
         torch.testing.assert_close(getattr(moved, name), getattr(still, name), rtol=0, atol=5e-3)
 
@@ -177,7 +177,7 @@ def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
         heading=of.tracks.heading + np.where(away, np.pi, 0.0),
         velocity=of.tracks.velocity * np.where(away, -1.0, 1.0)[:, None],
     )
-    recipe = Recipe(agents=2, least_agents=2, lane_change=False)
+    config = WindowConfig(agents=2, least_agents=2, lane_change=False)
     for turn in (0.0, 1e-6, 1.0):
         cosine, sine = np.cos(turn), np.sin(turn)
         rotation = np.array([[cosine, -sine], [sine, cosine]])
@@ -187,7 +187,7 @@ def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
             heading=tracks.heading + turn,
             velocity=tracks.velocity @ rotation.T,
         )
-        scene, _ = scenes_of(dataclasses.replace(of, tracks=turned, lanes=None), recipe, "aligned")
+        scene, _ = scenes_of(dataclasses.replace(of, tracks=turned, lanes=None), config, "aligned")
         torch.testing.assert_close(scene.current[:, 0, 2], torch.zeros(len(scene.history)), rtol=0, atol=1e-5)
 
 
@@ -198,8 +198,8 @@ def test_tracks_may_begin_and_end_when_they_like():
     parts = {n: getattr(of.tracks, n)[kept] for n in ("agent", "frame", "position", "heading", "velocity")}
     of = dataclasses.replace(of, tracks=dataclasses.replace(of.tracks, **parts))
     for complete, lane_change in itertools.product((True, False), repeat=2):
-        recipe = Recipe(agents=5, least_agents=1, radius=None, lane_change=lane_change, complete=complete)
-        scene, data = scenes_of(of, recipe)
+        config = WindowConfig(agents=5, least_agents=1, radius=None, lane_change=lane_change, complete=complete)
+        scene, data = scenes_of(of, config)
         for index, entry in enumerate(data.provenance(range(len(data)))):
             present = scene.agent_mask[index].sum()
             assert present == len(entry["tracks"])
@@ -209,6 +209,25 @@ def test_tracks_may_begin_and_end_when_they_like():
         assert scene.finite.all()
 
 
+@pytest.mark.parametrize("complete", [True, False])
+def test_the_focal_agent_is_observed_in_the_whole_window_from_the_first_moment_to_the_last(complete):
+    of = recording(vehicles=(FOUR[0], FOUR[3]))  # 251 frames, every fifth is a step
+    late = of.tracks.frame >= np.where(of.tracks.agent == 1, 75, 0)
+    parts = {n: getattr(of.tracks, n)[late] for n in ("agent", "frame", "position", "heading", "velocity")}
+    of = dataclasses.replace(of, tracks=dataclasses.replace(of.tracks, **parts))
+    config = WindowConfig(agents=1, least_agents=1, radius=None, lane_change=False, complete=complete)
+    scene, data = scenes_of(of, config)
+    assert scene.history_mask.all()
+    assert scene.future_mask.all()
+    moments: dict[int, list[int]] = {}
+    for entry in data.provenance(range(len(data))):
+        moments.setdefault(entry["tracks"][0], []).append(entry["frame"] // 5)
+    assert {track: sorted(at) for track, at in moments.items()} == {
+        7: list(range(config.history - 1, 51 - config.horizon)),
+        4: list(range(15 + config.history - 1, 51 - config.horizon)),
+    }
+
+
 def test_neighbours_may_be_observed_in_part():
     of = recording()
     late = of.tracks.frame >= np.where(of.tracks.agent == 1, 125, 0)
@@ -216,9 +235,9 @@ def test_neighbours_may_be_observed_in_part():
         of.tracks, **{n: getattr(of.tracks, n)[late] for n in ("agent", "frame", "position", "heading", "velocity")}
     )
     of = dataclasses.replace(of, tracks=tracks)
-    whole, _ = scenes_of(of, Recipe(agents=4, least_agents=1))
+    whole, _ = scenes_of(of, WindowConfig(agents=4, least_agents=1))
     assert not (whole.agent_mask.all(1)).any()
-    part, data = scenes_of(of, Recipe(agents=4, least_agents=1, complete=False))
+    part, data = scenes_of(of, WindowConfig(agents=4, least_agents=1, complete=False))
     seen = part.agent_mask.all(1)
     assert seen.any()
     for index in seen.nonzero().flatten().tolist():
@@ -231,9 +250,9 @@ def test_neighbours_may_be_observed_in_part():
 
 def test_a_vehicle_on_no_lane_is_counted_and_left_out():
     of = recording(vehicles=[*FOUR, (11, 90.0, 3, 24.0, None)])  # beside the road
-    _, counts = extract(of, Recipe())
+    _, counts = extract(of, WindowConfig())
     assert counts["an agent on no lane"] > 0
-    _, fewer = extract(of, Recipe(agents=5, least_agents=5))
+    _, fewer = extract(of, WindowConfig(agents=5, least_agents=5))
     assert fewer["scenes"] == 0
 
 
@@ -241,7 +260,7 @@ def test_a_vehicle_on_no_lane_is_counted_and_left_out():
 @given(st.integers(0, 10_000))
 @settings(max_examples=10, deadline=None)
 def test_what_a_network_sees_does_not_know_the_future(smoothing, seed):
-    recipe = Recipe(radius=None, lane_change=False, smoothing=smoothing)
+    config = WindowConfig(radius=None, lane_change=False, smoothing=smoothing)
     of, frame = recording(vehicles=crowd(seed, 6)), 100
     random = np.random.default_rng(seed)
     later = of.tracks.frame > frame
@@ -251,7 +270,7 @@ def test_what_a_network_sees_does_not_know_the_future(smoothing, seed):
     other = dataclasses.replace(
         of, tracks=dataclasses.replace(of.tracks, position=position, heading=heading, velocity=velocity)
     )
-    now, then = scenes_of(of, recipe), scenes_of(other, recipe)
+    now, then = scenes_of(of, config), scenes_of(other, config)
     at = [
         [i for i, entry in enumerate(data.provenance(range(len(data)))) if entry["frame"] == frame]
         for _, data in (now, then)
@@ -267,12 +286,12 @@ def test_what_a_network_sees_does_not_know_the_future(smoothing, seed):
 def test_a_map_of_another_place_is_refused():
     of = recording()
     with pytest.raises(RecordingError, match="road: 100% of all positions lie on no lane"):
-        extract(dataclasses.replace(of, lanes=recording(curve(None, 0.0, (0.0, 500.0))).lanes), Recipe())
+        extract(dataclasses.replace(of, lanes=recording(curve(None, 0.0, (0.0, 500.0))).lanes), WindowConfig())
 
 
 def test_joined_scenes_are_the_same_scenes():
     one, two = (recording(curve(900.0, turn), name=f"{turn}") for turn in (0.0, 1.0))
-    parts = [extract(of, Recipe())[0] for of in (one, two)]
+    parts = [extract(of, WindowConfig())[0] for of in (one, two)]
     both = RecordedScenes(tables(joined(parts)), 0.2, "fixed", [one.name, two.name])
     first, second = (RecordedScenes(tables(part), 0.2, "fixed", ["?"]) for part in parts)
     assert len(both) == len(first) + len(second)
@@ -299,4 +318,4 @@ def test_joined_scenes_are_the_same_scenes():
 )
 def test_recipes_that_cannot_work_are_refused(key, value, message):
     with pytest.raises(ConfigError, match=message):
-        Recipe(**{key: value})
+        WindowConfig(**{key: value})

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,20 @@ def test_a_folder_that_is_there_is_not_made_again(tmp_path: Path):
     before = contents(folder)
     assert make_recordings(folder, SMALL) == folder
     assert contents(folder) == before
+
+
+def test_it_waits_for_another_process_that_makes_the_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = tmp_path / "there"
+    with ThreadPoolExecutor(1) as thread:
+        with cache.locked(folder):
+            making = thread.submit(make_recordings, folder, SMALL)
+            said = ""
+            while "waiting for it" not in said:
+                assert not making.done(), "it did not wait"
+                said += capsys.readouterr().err
+                time.sleep(0.01)
+            finished(folder, SMALL)
+        assert making.result() == folder
 
 
 def test_a_folder_that_is_something_else_is_left_alone(tmp_path: Path):

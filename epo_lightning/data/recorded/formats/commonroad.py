@@ -17,7 +17,7 @@ import numpy as np
 
 from epo_lightning.data.recorded.formats import xml
 from epo_lightning.data.recorded.lanes import LANE, SHOULDER, LaneGraph, Polyline
-from epo_lightning.data.recorded.tracks import FASTEST, Recording, RecordingError, Source, TrackTable
+from epo_lightning.data.recorded.tracks import FASTEST, Recording, RecordingError, RecordingSource, TrackTable
 from epo_lightning.registry import register
 from epo_lightning.scene import KINDS
 
@@ -41,7 +41,7 @@ ALIKE_BY_ID, ALIKE = 12, 40
 
 
 @register("format", "commonroad")
-def commonroad(folder: Path) -> list[Source]:
+def commonroad(folder: Path) -> list[RecordingSource]:
     """Every scenario below a folder.
 
     Scenarios are cut out of longer recordings, and some overlap. Those that show the same stretch of a vehicle's drive form
@@ -58,7 +58,7 @@ def commonroad(folder: Path) -> list[Source]:
         if first.setdefault(path.stem, path) != path:
             raise RecordingError(path, f"{first[path.stem]} has the same name: rename or remove one of the two")
     return [
-        Source(path.stem, paths[group].stem, (path,), partial(_read, path, paths[group].stem))
+        RecordingSource(path.stem, paths[group].stem, (path,), partial(_read, path, paths[group].stem))
         for path, group in zip(paths, _groups(paths), strict=True)
     ]
 

@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats import lanelet2
 from epo_lightning.data.recorded.lanes import LaneGraph
-from epo_lightning.data.recorded.tracks import FASTEST, Recording, Source, TrackTable
+from epo_lightning.data.recorded.tracks import FASTEST, Recording, RecordingSource, TrackTable
 from epo_lightning.registry import register
 from epo_lightning.scene import KINDS
 
@@ -83,7 +83,7 @@ SAMPLE = 5000
 
 
 @register("format", "exid")
-def exid(folder: Path) -> list[Source]:
+def exid(folder: Path) -> list[RecordingSource]:
     """The recordings in a folder of exiD files, or in its folder ``data``.
 
     Raises:
@@ -132,7 +132,7 @@ class _Setting(NamedTuple):
     origin: tuple[float, float]
 
 
-def _source(home: Path, name: str, roots: Sequence[Path]) -> Source:
+def _source(home: Path, name: str, roots: Sequence[Path]) -> RecordingSource:
     tracks, tracks_meta = home / f"{name}_tracks.csv", home / f"{name}_tracksMeta.csv"
     recording_meta = home / f"{name}_recordingMeta.csv"
     if not recording_meta.is_file() and (home / f"{name}_recordingsMeta.csv").is_file():
@@ -144,7 +144,7 @@ def _source(home: Path, name: str, roots: Sequence[Path]) -> Source:
             )
     setting = _setting(recording_meta)
     files = _Files(tracks, tracks_meta, recording_meta, _map_of(setting.location, roots, recording_meta))
-    return Source(name, str(setting.location), tuple(files), partial(_read, name, setting, files))
+    return RecordingSource(name, str(setting.location), tuple(files), partial(_read, name, setting, files))
 
 
 def _map_of(location: int, roots: Sequence[Path], path: Path) -> Path:

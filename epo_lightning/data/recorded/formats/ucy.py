@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from epo_lightning.data.recorded.tracks import Recording, RecordingError, Source, TrackTable
+from epo_lightning.data.recorded.tracks import Recording, RecordingError, RecordingSource, TrackTable
 from epo_lightning.registry import register
 from epo_lightning.scene import KINDS
 
@@ -26,7 +26,7 @@ DIAMETER = 0.5
 
 
 @register("format", "ucy")
-def ucy(folder: Path) -> list[Source]:
+def ucy(folder: Path) -> list[RecordingSource]:
     """Every ``obsmat.txt`` below a folder, named after the folder that it is in.
 
     Raises:
@@ -41,7 +41,7 @@ def ucy(folder: Path) -> list[Source]:
         if name in first:
             raise RecordingError(path, f"{first[name]} is in a folder of the same name: rename one of the two")
         first[name] = path
-    return [Source(name, name, (path,), partial(_read, path, name)) for name, path in first.items()]
+    return [RecordingSource(name, name, (path,), partial(_read, path, name)) for name, path in first.items()]
 
 
 def _read(path: Path, name: str) -> Recording:
