@@ -232,6 +232,8 @@ def test_a_broken_file_is_named_by_the_worker_that_reads_it(tmp_path):
         file.parent.mkdir(parents=True)
         file.write_text("0 1 0.0 0.0 0.0 1.0 0.0 0.0\n10 1 0.4 0.0 0.0 1.0 0.0 0.0\n")
     file.write_text("0 1 0.0 0.0 zero 1.0 0.0 0.0\n")
-    module = data(tmp_path / "crowds", format="ucy", map=False, windows={"lane_change": False}, test=["place-0"])
+    module = data(
+        tmp_path / "crowds", format="ucy", map=False, windows={"dt": 0.4, "lane_change": False}, test=["place-0"]
+    )
     with pytest.raises(RecordingError, match=r"place-3/obsmat\.txt, row 1: y is 'zero'; a finite number"):
         module.generate(workers=2, progress=False)
