@@ -33,8 +33,8 @@ class SceneDataset(Protocol):
         """Make the choices that differ from epoch to epoch."""
 
 
-class Part:
-    """A share of a data set, drawn once, in its order: every seed and every row of a table sees the same scenes.
+class Subset:
+    """A share of a data set in its original order, drawn once: every seed and every row of a table sees the same scenes.
 
     Args:
         whole: the data set.
@@ -51,7 +51,7 @@ class Part:
 
     @property
     def provenance(self) -> Any:
-        """As of the whole."""
+        """Provenance of the scenes of the underlying data set, if it has any."""
         return getattr(self.whole, "provenance", None)
 
     def __getitem__(self, indices: Tensor) -> Scene:
@@ -170,7 +170,7 @@ class SceneDataModule(LightningDataModule):
         for name in names.get(stage or "fit", ("train", "val")):
             if name not in self._opened:
                 whole = self.open(name)
-                self._opened[name] = whole if self.share == 1 else Part(whole, self.share)
+                self._opened[name] = whole if self.share == 1 else Subset(whole, self.share)
 
     def dataset(self, split: str) -> SceneDataset:
         """The opened data set of a split.

@@ -38,7 +38,7 @@ UNITS = ("recording", "group")
 
 
 def _window_config(windows: Mapping[str, Any]) -> WindowConfig:
-    """The recipe that a configuration spells out."""
+    """The window settings of a configuration, after a check of their names and types."""
     known = {field.name: getattr(WindowConfig, field.name) for field in dataclasses.fields(WindowConfig)}
     optional = {"radius": float, "smoothing": float}
     for key, value in windows.items():
@@ -120,7 +120,9 @@ class RecordedData(SceneDataModule):
             raise ConfigError(f"data.scale must be positive, not {scale}: the metres that an input of one stands for")
         self.frame = frame
         candidates = LINES * PER_LINE if map else 0
-        self.task = Task(self.windows.horizon, float(self.windows.dt), (), shape, candidates, map=map, scale=float(scale))
+        self.task = Task(
+            self.windows.horizon, float(self.windows.dt), (), shape, candidates, map=map, scale=float(scale)
+        )
         self.root = Path(root).expanduser() if root else cache.default_root()
 
     def sources(self) -> list[RecordingSource]:
