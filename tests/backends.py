@@ -10,7 +10,7 @@ import dataclasses
 
 import pytest
 import torch
-from games import ALL, BOUNDS, feet_held, leaves_of, pad, random_game, random_scene, widen
+from games import ALL, BOUNDS, leaves_of, nearest_points_held, pad, random_game, random_scene, widen
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -27,7 +27,7 @@ def reference(energy, scene, parameters, steps, step_size, damping):
     iterates = [parameters.initial_controls]
     for _ in range(steps):
         controls = iterates[-1]
-        with feet_held():
+        with nearest_points_held():
             jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
         jacobian = jacobian.permute(1, 2, 0, 3, 4, 5).flatten(3)
         residual = stacked(energy, scene, parameters, controls)[..., None]

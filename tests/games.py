@@ -7,11 +7,11 @@ from contextlib import contextmanager
 
 import torch
 
-from epo_lightning.game import features
+from epo_lightning.game import feature_derivatives
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.scene import GameParameters, Scene
-from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
+from epo_lightning.solvers.gauss_newton.expansion import expand
 
 BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}
 """Narrow enough for random controls to leave them."""
@@ -207,14 +207,14 @@ def pad(
 
 
 @contextmanager
-def feet_held() -> Iterator[None]:
+def nearest_points_held() -> Iterator[None]:
     """The nearest points of reference lines stay where they are under differentiation, as in the Gauss-Newton model."""
-    sliding = features.foot
-    features.foot = lambda position, line: tuple(part.detach() for part in sliding(position, line))
+    sliding = feature_derivatives.nearest_point
+    feature_derivatives.nearest_point = lambda position, line: tuple(part.detach() for part in sliding(position, line))
     try:
         yield
     finally:
-        features.foot = sliding
+        feature_derivatives.nearest_point = sliding
 
 
 def ahead(values: torch.Tensor) -> torch.Tensor:
@@ -227,47 +227,47 @@ def times(model, change, damping):
 
     Changes and results are [S, N, 2, K].
     """
-    nodes = model.dt * change.cumsum(-1)
-    moved = model._travel((model.moves * nodes[:, :, :, None]).sum(2))
-    control = (model.control_stiffness + damping[:, None, None, None]) * change
-    if model.rate_stiffness is not None:
-        rate = model.rate_stiffness * (ahead(change) - change) / model.dt**2
+    nodes = model.at.dt * change.cumsum(-1)
+    moved = model.at.to_positions((model.at.moves * nodes[:, :, :, None]).sum(2))
+    control = (model.control + damping[:, None, None, None]) * change
+    if model.rate is not None:
+        rate = model.rate * (ahead(change) - change) / model.at.dt**2
         control -= rate - torch.nn.functional.pad(rate[..., :-1], (1, 0))
-    node = model.node_stiffness * nodes
+    node = model.node * nodes
     if model.cross is not None:
         same, following = model.cross.unbind(2)
         node[:, :, 0] += same * nodes[:, :, 1] + following * ahead(nodes[:, :, 1])
         node[:, :, 1] += same * nodes[:, :, 0]
         node[:, :, 1, 1:] += (following * nodes[:, :, 0])[..., :-1]
     x, y = moved.unbind(2)
-    xx, xy, yy = model.pull[:, :, 2:].unbind(2)
+    xx, xy, yy = model.position.unbind(2)
     force = torch.stack((xx * x + xy * y, xy * x + yy * y), 2)
-    if model.pair_curvature is not None:
+    if model.pair_position is not None:
         first, second = model.edges.ends(moved)
-        xx, xy, yy = (-model.pair_curvature).unbind(1)
+        xx, xy, yy = (-model.pair_position).unbind(1)
         by_second, by_first = (
             torch.stack((xx * x + xy * y, xy * x + yy * y), 1) for x, y in (second.unbind(1), first.unbind(1))
         )
         model.edges.spread_(force, by_second, by_first)
-    node += (model.moves * model._after(force)[:, :, None]).sum(3)
+    node += (model.at.moves * model.at.to_velocities(force)[:, :, None]).sum(3)
     flat = nodes.flatten(2)[..., None]
     if model.blocks is not None:
         node += (model.blocks @ flat).view_as(node)
     if model.pair_blocks is not None:
         first, second = model.edges.ends(flat)
         by_second, by_first = model.pair_blocks @ second, model.pair_blocks.mT @ first
-        model.edges.spread_(node, *(part.view(-1, 2, model.steps) for part in (by_second, by_first)))
-    return control + model.dt * node.flip(-1).cumsum(-1).flip(-1)
+        model.edges.spread_(node, *(part.view(-1, 2, model.at.steps) for part in (by_second, by_first)))
+    return control + model.at.dt * node.flip(-1).cumsum(-1).flip(-1)
 
 
 def normal_equations(
     energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: torch.Tensor, exact=False
 ):
     """The model's gradient [B, M, N, K, 2] and matrix [B, M, n, n] in the controls, in the order of ``controls``."""
-    model = QuadraticModel(energy, scene, parameters, controls, every_pair=True, exact=exact)
-    none, steps, agents = controls.new_zeros(model.samples), model.steps, model.agents
+    model = expand(energy, scene, parameters, controls, every_pair=True, exact=exact)
+    none, steps, agents = controls.new_zeros(model.at.samples), model.at.steps, model.at.agents
     units = torch.eye(2 * steps * agents, dtype=controls.dtype).view(-1, agents, steps, 2).transpose(-1, -2)
-    columns = [times(model, unit.expand(model.samples, -1, -1, -1), none) for unit in units]
+    columns = [times(model, unit.expand(model.at.samples, -1, -1, -1), none) for unit in units]
     matrix = torch.stack([column.transpose(-1, -2).flatten(1) for column in columns], -1)
     shape = *controls.shape[:2], 2 * steps * agents, 2 * steps * agents
     return model.gradient.transpose(-1, -2).reshape(controls.shape), matrix.reshape(shape)

@@ -1,19 +1,19 @@
-"""What space agents take up, and how deep two of them overlap: as one disc each, or as a row of circles along the axis.
+"""The shape of agents and the overlap of two of them: as one disc each, or as rows of circles along the axis.
 
-A disc as wide as a car is long keeps cars a car length apart on all sides, so that neighbours in adjacent lanes overlap. A
-row of circles is about as long and as wide as the vehicle. By the rule of the INTERACTION data set's challenges, with length
-l and width w,
+A disc with the length of a car as diameter keeps cars a car length apart on all sides, so that neighbours in adjacent lanes
+overlap. A row of circles is about as long and as wide as the vehicle. By the rule of the INTERACTION data set's challenges,
+with length l and width w,
 
     l < 4 m          two, at +-(l - w) / 2 from the centre,
     4 m <= l < 8 m   three: one more in the centre,
     8 m <= l         five: two more, at +-(l - w) / 4,
 
-all of radius w / sqrt(2): each is drawn around a square of side w, and reaches 0.21 w beyond its sides. Together they cover
-the vehicle's box, corners and all, as long as these squares leave no gap: up to l = 2 w, 3 w and 5 w with two, three and
-five circles. Longer vehicles have notches in their flanks: 0.37 m deep in a car of 3.9 m x 1.7 m, 0.72 m in a truck of 16 m
-x 2.5 m; and a bicycle of 1.8 m x 0.6 m has nothing between its two circles.
+all of radius w / sqrt(2): each is the circumcircle of a square of side w, and reaches 0.21 w beyond its sides. Together
+they cover the vehicle's box including its corners, as long as these squares leave no gap: up to l = 2 w, 3 w and 5 w with
+two, three and five circles. Longer vehicles are not covered completely: notches in the sides are 0.37 m deep for a car of
+3.9 m x 1.7 m and 0.72 m for a truck of 16 m x 2.5 m; a bicycle of 1.8 m x 0.6 m has a gap between its two circles.
 
-Where other circles become the deepest in each other, the depth is continuous and has a kink.
+The overlap is continuous; it has a kink where another pair of circles becomes the deepest.
 """
 
 from __future__ import annotations
@@ -41,10 +41,9 @@ def length_of(vector: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
 def separation(
     first: Float[Tensor, "*batch K 2"], second: Float[Tensor, "*batch K 2"]
 ) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 2"]]:
-    """How far two agents are apart, and the unit vector from the second to the first.
+    """The distance of two agents, and the unit vector from the second to the first.
 
-    Agents at one and the same point have no direction between them: the vector is then zero, and so is every gradient,
-    instead of undefined.
+    Where both are at the same point, the vector is zero, and so is every gradient.
     """
     offset = first - second
     distance = length_of(offset)
@@ -53,7 +52,7 @@ def separation(
 
 
 def overlap(distance: Float[Tensor, "*shape"], reach: Float[Tensor, "*#shape"]) -> Float[Tensor, "*shape"]:
-    """How deep two discs overlap; touching is not overlapping."""
+    """The overlap of two discs, max(0, reach - distance); touching is no overlap."""
     return torch.relu(reach - distance)
 
 
@@ -63,15 +62,15 @@ def disc(size: Float[Tensor, "*agents 2"]) -> Float[Tensor, "*agents"]:
 
 
 def row_extent(size: Float[Tensor, "*agents 2"]) -> Float[Tensor, "*agents"]:
-    """How far an agent's outermost circles reach from its position [m]: farther than its ends."""
+    """The distance [m] from an agent's position to the far side of its outermost circles, which is beyond its ends."""
     length, width = size.unbind(-1)
     return (length - width).abs() / 2 + width / math.sqrt(2)
 
 
 def places(size: Float[Tensor, "*agents 2"]) -> Float[Tensor, "*agents 5"]:
-    """Where along its axis an agent's circles are [m], the central ones first.
+    """The centres of an agent's circles along its axis [m], the central ones first.
 
-    An agent with fewer than five has some twice, which changes no maximum.
+    Agents with fewer than five circles have some of them twice, which changes no maximum.
     """
     length, width = size.unbind(-1)
     end = (length - width) / 2
@@ -86,10 +85,10 @@ def row_overlap(
     first_size: Float[Tensor, "*#batch 1 2"],
     second_size: Float[Tensor, "*#batch 1 2"],
 ) -> Float[Tensor, "*batch K"]:
-    """How deep two rows of circles overlap, max(0, max_ab r_a + r_b - |c_a - c_b|) [m], at every step.
+    """The overlap of two rows of circles, max(0, max_ab r_a + r_b - |c_a - c_b|) [m], at every step.
 
-    Differentiable with respect to the states; which circles are deepest in each other is a constant, the first ones on a
-    tie. Where their centres coincide, the gradient is zero.
+    Differentiable with respect to the states; the choice of the deepest pair of circles is held constant (the first one on
+    a tie). Where their centres coincide, the gradient is zero.
     """
     apart = first[..., :2] - second[..., :2]
     places_of = [places(size).expand(*apart.shape[:-1], _SLOTS) for size in (first_size, second_size)]

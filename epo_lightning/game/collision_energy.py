@@ -1,4 +1,4 @@
-"""DSDNet's energy: a network's opinion of every trajectory, and a fixed price of every collision."""
+"""DSDNet's energy: a network's cost of every trajectory, and a constant cost of every collision."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from epo_lightning.game.checks import check_number, check_whole
 from epo_lightning.game.circles import disc, length_of, row_extent, row_overlap
 from epo_lightning.game.dynamics import Dynamics
-from epo_lightning.game.network_energy import NetworkEnergy, check_hidden
+from epo_lightning.game.network_energy import NetworkEnergy
 from epo_lightning.game.networks import MOTION, Layers, motion, squared_distances
 from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import ConfigError, nearest, register
@@ -19,18 +20,18 @@ from epo_lightning.scene import SPEED, GameParameters, Scene
 
 SHAPES = ("disc", "box")
 _AT_ONCE = 100_000
-"""Pairs of rows of circles that are looked at together: a bound on memory."""
+"""Number of pairs of rows of circles that are compared together, which bounds the memory."""
 
 
 @register("energy", "collision")
 class CollisionEnergy(NetworkEnergy):
     """E_i = v . layers([z_i, waypoints of i]), E_ij = gamma if i and j collide at any step, else 0 (Zeng et al., ECCV 2020).
 
-    At a few waypoints, evenly spread over the horizon, the network sees x, y, cos, sin of the heading, and the way so far,
-    in the agent's own frame at t0. The price of a collision has no useful gradient, so this energy offers values alone: it
-    is for minimisers that choose among candidates.
+    At a few waypoints, evenly spread over the horizon, the network takes x, y, cos, sin of the heading, and the distance
+    travelled, in the agent's own frame at t0. The cost of a collision has no useful gradient, so this energy offers values
+    alone: it is for minimisers that choose among candidates.
 
-    What differs from the original: the agents' features come from the backbone instead of a detector's regions of interest
+    Differences from the original: the agents' features come from the backbone instead of a detector's regions of interest
     and a map sampled at the waypoints; shapes are those of the task, discs or rows of circles
     (:mod:`~epo_lightning.game.circles`), instead of boxes, from which rows of circles differ by decimetres; a pair is
     counted once, not in both orders; the detection loss and the max-margin planning loss have no counterpart; gamma is
@@ -40,12 +41,12 @@ class CollisionEnergy(NetworkEnergy):
         dynamics, width, horizon, scale, own, pair, bounds, pair_stride: see
             :class:`~epo_lightning.game.network_energy.NetworkEnergy`.
         shape: ``disc``, of the agent's length as diameter, or ``box``, rows of circles.
-        gamma: price of a collision.
-        waypoints: number of steps that the network sees.
+        gamma: cost of a collision.
+        waypoints: number of waypoints.
         hidden: size of the hidden features.
 
     Raises:
-        ConfigError: an unknown shape, a gamma that is not positive, no waypoint, or no hidden feature.
+        ConfigError: an unknown shape, a gamma that is not positive and finite, or no waypoint or hidden feature.
     """
 
     offers = frozenset()
@@ -67,13 +68,11 @@ class CollisionEnergy(NetworkEnergy):
         hidden: int = 64,
     ) -> None:
         super().__init__(dynamics, width, horizon, scale, own, pair, bounds, pair_stride)
-        check_hidden(hidden)
+        check_whole("energy.hidden", hidden)
         if shape not in SHAPES:
             raise ConfigError(f"unknown shape {shape!r} of agents: {nearest(str(shape), SHAPES)}")
-        if not gamma > 0:
-            raise ConfigError(f"energy.gamma, the price of a collision, must be positive, not {gamma}")
-        if waypoints < 1:
-            raise ConfigError(f"energy.waypoints must be 1 or more, not {waypoints}")
+        check_number("energy.gamma", gamma)
+        check_whole("energy.waypoints", waypoints)
         self.shape, self.gamma = shape, gamma
         count = min(waypoints, horizon)
         self.waypoints = [(number + 1) * horizon // count - 1 for number in range(count)]
@@ -82,11 +81,11 @@ class CollisionEnergy(NetworkEnergy):
 
     @property
     def needs(self) -> set[str]:
-        """Besides those of every network, the agents' sizes."""
+        """Inputs of every network energy, and the agents' sizes."""
         return super().needs | {"size"}
 
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
-        """As :meth:`~epo_lightning.game.network_energy.NetworkEnergy.validate`; sizes must be known, too."""
+        """Check as :meth:`~epo_lightning.game.network_energy.NetworkEnergy.validate`, and that sizes are given."""
         super().validate(scene, parameters, controls)
         self.size(scene)
 
@@ -128,7 +127,7 @@ class CollisionEnergy(NetworkEnergy):
         first_size: Float[Tensor, "*#batch 2"],
         second_size: Float[Tensor, "*#batch 2"],
     ) -> Bool[Tensor, "*batch"]:
-        """Whether two agents overlap at any step; who only touches does not."""
+        """Whether two agents overlap at any step; touching is no overlap."""
         if self.shape == "disc":
             reach = (disc(first_size) + disc(second_size)).square()
             return reduce(torch.logical_or, (squared < reach for squared in squared_distances(first, second)))
@@ -143,11 +142,11 @@ def _rows_collide(
 ) -> Bool[Tensor, "*batch"]:
     """Whether two rows of circles overlap at any step.
 
-    Rows are compared where the discs around them overlap and no earlier step has settled it, which are few.
+    Rows are compared only where the discs around them overlap and no collision was found at an earlier step.
     """
     shape = torch.broadcast_shapes(first.shape[:-2], second.shape[:-2])
     reach = (row_extent(first_size) + row_extent(second_size)).expand(shape)
-    # A little more than the sum, so that no rounding error hides a collision.
+    # Slightly more than the sum, so that no rounding error hides a collision.
     squared_reach = (1.0001 * reach).square()
     hit = torch.zeros(shape, dtype=torch.bool, device=first.device)
     for k, squared in enumerate(squared_distances(first, second)):

@@ -1,13 +1,13 @@
-"""An energy that is convex in the controls, once it is given who goes first: one solution for every order (TGL).
+"""An energy that is convex in the controls given the order of the agents: one solution for every order (TGL).
 
-Geiger and Straehle (AAAI 2021) divide the strategies of two vehicles that merge into subspaces, one for each order in which
-they do so, such that the game has a single equilibrium in each. Here an order is a sign s_ij for every pair, and a decoder
-says which orders are likely (:mod:`epo_lightning.decoders.orders`). What differs from their game:
+Geiger and Straehle (AAAI 2021) divide the strategies of two merging vehicles into subspaces, one for each order of merging,
+such that the game has a single equilibrium in each. Here an order is a sign s_ij for every pair, and a decoder predicts the
+likely orders (:mod:`epo_lightning.decoders.orders`). Differences from their game:
 
 - Their order and forward motion are hard constraints, by a monotone parametrisation. Here the order is a penalty, a hinge
-  that is zero where the order is kept by a distance, and nothing forbids to drive backwards.
-- They have two vehicles in the frame of a lane; here are N agents in the plane, and the distance is measured along a
-  direction for every pair that the present states fix.
+  that is zero where the order is kept by a distance, and driving backwards is possible.
+- They have two vehicles in the frame of a lane. Here N agents move in the plane, and the distance of a pair is measured
+  along a direction that the present states fix.
 - Their distance term -alpha / (0.1 + d^2) and smooth maximum at the end of the lane are left out, their desired speed is the
   scene's reference speed, and their lane centre is the line through the goal along the present heading.
 - Their weights are made positive by elu(.) + 1 + 1e-5; here weights enter squared, accelerations across have a floor of
@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from epo_lightning.game.checks import check_number
 from epo_lightning.game.circles import disc
 from epo_lightning.game.double_integrator import DoubleIntegrator, rotate
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy, check_names
@@ -34,17 +35,17 @@ from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import HEADING, SPEED, GameParameters, Scene
 
 FLOOR = 1e-3
-"""What is added to the squared weight of accelerations across: a curvature in every control, large enough for float32."""
+"""Added to the squared weight of lateral accelerations, so that the Hessian is positive definite also in float32."""
 
 
 @dataclass(frozen=True)
 class _Motion:
-    """What residuals of agents are made of, along and across the heading at t0.
+    """Inputs of the own residuals, along and across the heading at t0.
 
     Attributes:
         controls, velocity: accelerations, and the velocities that they lead to.
-        to_goal: the way from the goal; None for energies that do not ask for goals.
-        reference_speed: how fast agents would like to be; None likewise.
+        to_goal: the offset from the goal; None without terms of goals.
+        reference_speed: desired speed; None without a term of it.
     """
 
     controls: Float[Tensor, "B C N K 2"]
@@ -79,12 +80,12 @@ _OWN: Mapping[str, tuple[Callable[[_Motion], Tensor], str | None]] = {
     "jerk": (lambda motion: motion.controls[..., 0].diff(dim=-1) / motion.dt, None),
     "lat_jerk": (lambda motion: motion.controls[..., 1].diff(dim=-1) / motion.dt, None),
 }
-"""Name to residuals [B, C, N, R], and what they refer to."""
+"""Residuals [B, C, N, R] by name, with the input that they need."""
 
 
 @dataclass(frozen=True)
 class _Moves:
-    """What K controls of one direction change at every step, as matrices: controls, their rates, velocities, positions."""
+    """Matrices from K controls of one direction to controls, their rates, velocities and positions at all steps."""
 
     control: Float[Tensor, "K K"]
     rate: Float[Tensor, "_ K"]
@@ -93,7 +94,7 @@ class _Moves:
 
     @staticmethod
     def of(dt: float, controls: Float[Tensor, "B M N K 2"]) -> _Moves:
-        """Those of :class:`~epo_lightning.game.double_integrator.DoubleIntegrator`."""
+        """The matrices of :class:`~epo_lightning.game.double_integrator.DoubleIntegrator`."""
         control = torch.eye(controls.shape[3], dtype=controls.dtype, device=controls.device)
         velocity = dt * control.cumsum(0)
         position = dt * (velocity.cumsum(0) - velocity)  # explicit Euler: a step's velocity moves the next one
@@ -103,7 +104,7 @@ class _Moves:
 def _curvature(
     ahead: Callable[[_Moves], Tensor] | None, aside: Callable[[_Moves], Tensor] | None
 ) -> Callable[[_Moves], Tensor]:
-    """Second derivatives [2, K, K] of half the squares of what controls along and across change, if anything."""
+    """Second derivatives [2, K, K] of half the squares of linear residuals, by controls along and across."""
 
     def both(moves: _Moves) -> Tensor:
         rows = [torch.zeros_like(moves.control[:1]) if of is None else of(moves) for of in (ahead, aside)]
@@ -122,18 +123,19 @@ _CURVATURE: Mapping[str, Callable[[_Moves], Tensor]] = {
     "jerk": _curvature(lambda moves: moves.rate, None),
     "lat_jerk": _curvature(None, lambda moves: moves.rate),
 }
-"""Name to second derivatives of an own term of weight one."""
+"""Second derivatives of own terms of weight one, by name."""
 
 
 @register("energy", "convex")
 @dataclass(frozen=True)
 class ConvexEnergy(Energy):
-    """Half the sum of squares of residuals that are linear in the controls, or hinges of such.
+    """Half the sum of squares of residuals that are linear in the controls, or hinges of linear residuals.
 
         E = 1/2 sum_i |w_i c(u_i)|^2 + 1/2 sum_{i<j} w_ij^2 sum_t a_t max(0, d_ij - s_ij n_ij . (p_i - p_j))^2
 
-    Own terms: ``goal``, the way from the goal at the end [m]; ``lateral``, the way from it across the heading at t0 at every
-    step [m]; ``velref``, what the speed along exceeds the reference speed by [m/s]; ``lat_vel``, the velocity across [m/s];
+    Own terms: ``goal``, the offset of the last position from the goal [m]; ``lateral``, the offset from the goal across the
+    heading at t0 at every step [m]; ``velref``, the speed along minus the reference speed [m/s]; ``lat_vel``, the velocity
+    across [m/s];
     ``acc`` and ``lat_acc``, the accelerations along and across [m/s^2]; ``jerk`` and ``lat_jerk``, their rates [m/s^3].
 
     The pair term ``order`` keeps a distance d_ij, half the sum of both lengths and a gap, on one side: s_ij = +1 where agent
@@ -142,10 +144,10 @@ class ConvexEnergy(Energy):
     nothing about agents that are far apart.
 
     Attributes:
-        own: names as above, of which ``acc`` (of weight 1, not decoded) and ``lat_acc`` must be two: they give every control
-            a curvature, without which there would be more than one solution.
-        pair: ``["order"]``, or nothing.
-        gap: distance [m] to be kept besides half the lengths.
+        own: names as above. ``acc`` (weight 1, not decoded) and ``lat_acc`` are mandatory: they make the energy strictly
+            convex in every control, so that there is one solution.
+        pair: ``["order"]``, or empty.
+        gap: distance [m] to be kept in addition to half the lengths.
         direction: ``along`` or ``across``, the meaning of an order.
         within: distance [m] up to which agents are near each other.
         dynamics: a :class:`~epo_lightning.game.double_integrator.DoubleIntegrator`.
@@ -158,23 +160,21 @@ class ConvexEnergy(Energy):
     gap: float = 1.0
     direction: str = ALONG
     within: float = 20.0
-    dynamics: Any = field(default_factory=DoubleIntegrator)  # what else is given is refused below, with a reason
+    dynamics: Any = field(default_factory=DoubleIntegrator)  # Any, so that others are refused below with a reason
 
     def __post_init__(self) -> None:
         check_names("own", self.own, _OWN, "term")
         check_names("pair", self.pair, ("order",), "term")
         if not {"acc", "lat_acc"} <= set(self.own):
             raise ConfigError(
-                "energy.own of a convex energy must name acc and lat_acc: without them controls have no single best value"
+                "energy.own of energy=convex must name acc and lat_acc: without them the solution is not unique"
             )
         if self.direction not in DIRECTIONS:
             raise ConfigError(
                 f"unknown energy.direction {self.direction!r}: {nearest(str(self.direction), DIRECTIONS)}"
             )
-        if not 0 <= self.gap < float("inf"):
-            raise ConfigError(f"energy.gap must be 0 or more, and finite [m], not {self.gap}")
-        if not self.within > 0:
-            raise ConfigError(f"energy.within must be positive [m], not {self.within}")
+        check_number("energy.gap [m]", self.gap, zero=True)
+        check_number("energy.within [m]", self.within, finite=False)
         if not isinstance(self.dynamics, DoubleIntegrator):
             raise ConfigError(
                 f"energy=convex is convex for linear dynamics: it goes with dynamics=double_integrator, "
@@ -223,13 +223,13 @@ class ConvexEnergy(Energy):
         """d2E/du2 in closed form, n = 2 N K, in the order of ``controls.flatten(2)``; zero for absent agents.
 
         Residuals are linear in the controls, so their second derivatives are constants of the scene, times squared weights:
-        of one direction of one agent for own terms, and for a pair, over the steps at which its hinge is active,
+        by the controls of one direction of one agent for own terms, and for a pair, over the steps with an active hinge,
 
             w_ij^2 sum_t g_a g_b P_t^T P_t,
 
-        with g, n_ij in the frames of both agents with opposite signs, and the row P_t of what controls move an agent by
-        until t. This is J^T J too. Differentiable with respect to weights; that hinges turn active is a jump, of which no
-        derivative knows.
+        with g, n_ij in the frames of both agents with opposite signs, and P_t, the derivative of a position at t by the
+        controls. This equals J^T J. Differentiable with respect to weights; the jumps where hinges turn active have no
+        derivative.
 
         Raises:
             ValueError: shapes or names of scene, parameters and controls that do not fit together.
@@ -262,7 +262,7 @@ class ConvexEnergy(Energy):
             matrix = controls.new_zeros(shape)
         matrix.diagonal(dim1=1, dim2=2).add_(own.flatten(2, 3).movedim(2, -1))
         matrix = matrix.unflatten(2, (agents, 2)).unflatten(1, (agents, 2)).permute(0, 5, 1, 6, 2, 3, 7, 4)
-        matrix = torch.stack(matrix.unbind(-1), -1)  # far faster than to reorder all at once
+        matrix = torch.stack(matrix.unbind(-1), -1)  # far faster than reordering all at once
         return matrix.view(batch, modes, 2 * agents * steps, 2 * agents * steps)
 
     def own_terms(
@@ -327,7 +327,7 @@ class ConvexEnergy(Energy):
     def _short(
         self, scene: Scene, parameters: GameParameters, first: Tensor, second: Tensor
     ) -> Float[Tensor, "B M P K"]:
-        """The hinges: what the distance falls short of [m], zero at steps that do not count and where an agent is absent."""
+        """The hinges: missing distance [m], zero at steps that do not count and where an agent is absent."""
         assert parameters.order is not None
         assert self.pair_order is not None
         exists = pair_mask(scene)[:, None]
@@ -338,16 +338,17 @@ class ConvexEnergy(Energy):
         return torch.where(counts, short, 0.0)
 
     def distance(self, scene: Scene) -> Float[Tensor, "B P"]:
-        """d_ij, what is to be kept: half of both lengths, as discs have them, and the gap."""
+        """Distances d_ij to be kept: the radii of both discs, which are half the lengths, and the gap."""
         radius = disc(self.size(scene))
         first, second = pairs(radius.shape[1], radius.device)
         return radius[:, first] + radius[:, second] + self.gap
 
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
-        """Refuse tensors that do not fit together, naming the one that does not and the shape it should have.
+        """Check that scene, parameters and controls fit together.
 
         Raises:
-            ValueError: a wrong shape, a missing weight, missing goals, orders, reference speeds or sizes.
+            ValueError: a wrong shape, a missing weight, missing goals, orders, reference speeds or sizes. The message names
+                the tensor and the expected shape.
         """
         super().validate(scene, parameters, controls)
         batch, agents = scene.agent_mask.shape
@@ -375,4 +376,4 @@ class ConvexEnergy(Energy):
         if "reference_speed" in self.needs and scene.reference_speed is None:
             raise ValueError("the energy has the term 'velref', but scene.reference_speed [B, N] is None")
         if self.pair and scene.size is None:
-            raise ValueError("orders keep distances, for which scene.size [B, N, 2] is needed, which is None")
+            raise ValueError("the pair term 'order' takes the agents' sizes from scene.size [B, N, 2], which is None")

@@ -1,6 +1,6 @@
-"""Dynamics that are linear: points that accelerate along and across the heading they have now.
+"""Linear dynamics: points that accelerate along and across their heading at t0.
 
-With them a squared linear residual of the motion is a convex function of the controls, so that a game can be convex.
+With them a squared linear residual of the motion is a convex function of the controls, so that games can be convex.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from epo_lightning.registry import register
 from epo_lightning.scene import HEADING, SPEED
 
 STANDING = 0.1
-"""Speed [m/s] below which an agent keeps the heading it has at t0: that of so small a velocity means nothing."""
+"""Speed [m/s] below which the heading at t0 is used instead of the direction of the velocity."""
 
 
 @register("dynamics", "double_integrator")
@@ -25,8 +25,8 @@ class DoubleIntegrator:
     """State x, y [m], heading [rad], speed [m/s]; controls are accelerations along and across the heading theta_0 [m/s^2].
 
     Explicit Euler, p_{k+1} = p_k + dt v_k and v_{k+1} = v_k + dt R(theta_0) u_k, with v_0 = speed e(theta_0). Positions and
-    velocities are linear in the controls. Heading and speed are those of the velocity: the heading within 180 degrees of
-    theta_0, and theta_0 itself where the speed is below 0.1 m/s. Nothing keeps an agent from moving sideways.
+    velocities are linear in the controls. Heading and speed are direction and length of the velocity: the heading within
+    180 degrees of theta_0, and theta_0 itself where the speed is below 0.1 m/s. Agents can move sideways.
     """
 
     def rollout(

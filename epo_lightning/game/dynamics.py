@@ -1,4 +1,4 @@
-"""How controls become states: the dynamically extended unicycle of Appendix C.2, without a loop over time.
+"""Dynamics, the map from controls to states: the dynamically extended unicycle of Appendix C.2, without a loop over time.
 
 Speed and heading are cumulative sums of the controls, and positions are cumulative sums of the velocities that follow, so a
 whole trajectory is three scans. The three integrators differ only in the velocity with which a position step is taken:
@@ -34,7 +34,7 @@ def _turn_left(vector: Float[Tensor, "... 2"]) -> Float[Tensor, "... 2"]:
 
 @runtime_checkable
 class Dynamics(Protocol):
-    """What turns controls into states; each agent's on its own."""
+    """The interface of dynamics: the map from controls to states, for every agent on its own."""
 
     def rollout(
         self, initial: Float[Tensor, "*#batch 4"], controls: Float[Tensor, "*batch K 2"], dt: float
@@ -45,7 +45,7 @@ class Dynamics(Protocol):
     def tangent(
         self, states: Float[Tensor, "*batch K 4"], direction: Float[Tensor, "D *batch K 2"], dt: float
     ) -> Float[Tensor, "D *batch K 4"]:
-        """How the states that :meth:`rollout` returned change along D directions of the controls."""
+        """The change of the states of :meth:`rollout` along D directions of the controls."""
         ...
 
 
@@ -62,11 +62,13 @@ class Unicycle:
 
     def __post_init__(self) -> None:
         if self.integrator not in _BETA:
-            raise ConfigError(f"unknown integrator {self.integrator!r}: {nearest(str(self.integrator), _BETA)}")
+            raise ConfigError(
+                f"unknown dynamics.integrator {self.integrator!r}: {nearest(str(self.integrator), _BETA)}"
+            )
 
     @property
     def beta(self) -> float:
-        """The share of the velocity before a step in the way that the step covers."""
+        """Weight of the velocity before a step in the displacement of that step."""
         return _BETA[self.integrator]
 
     def rollout(
@@ -86,7 +88,7 @@ class Unicycle:
     def tangent(
         self, states: Float[Tensor, "*batch K 4"], direction: Float[Tensor, "D *batch K 2"], dt: float
     ) -> Float[Tensor, "D *batch K 4"]:
-        """How the states that :meth:`rollout` returned change along D directions of the controls."""
+        """The change of the states of :meth:`rollout` along D directions of the controls."""
         scan = dt * direction.cumsum(-2)
         by_heading, by_speed = scan[..., TURN_RATE, None], scan[..., ACCELERATION, None]
         ahead = _direction(states[..., HEADING])
@@ -95,7 +97,7 @@ class Unicycle:
         return torch.cat((position, by_heading, by_speed), -1)
 
     def _travel(self, velocity: Float[Tensor, "*batch nodes 2"], dt: float) -> Float[Tensor, "*batch nodes-1 2"]:
-        """Way covered up to every step, from the velocities at the nodes."""
+        """Displacement up to every step, from the velocities at the nodes."""
         if self.beta == 1.0:
             return dt * velocity[..., :-1, :].cumsum(-2)
         return dt * (self.beta * velocity[..., :-1, :] + (1.0 - self.beta) * velocity[..., 1:, :]).cumsum(-2)

@@ -1,17 +1,17 @@
-"""What an energy is: a sum of terms of single agents and of pairs, and thereby the potential of a game (Eq. 7).
+"""The interface of energies: sums of terms of single agents and of pairs, and thereby potentials of games (Eq. 7).
 
     E(u; o) = sum_i E_i(u_i; o) + sum_{i<j} E_ij(u_i, u_j; o)
 
-Agent i's own objective is J_i = E_i + sum_j E_ij. Pair terms are symmetric, so dE/du_i = dJ_i/du_i: where no agent can gain
-by changing its strategy alone, the energy cannot fall by changing one agent's strategy, and the other way round (Theorem 1).
-Everything in this family of methods (the paper's Table 1) needs an energy for no more than its terms.
+Agent i's own objective is J_i = E_i + sum_j E_ij. Pair terms are symmetric, so dE/du_i = dJ_i/du_i: no agent can improve
+its objective by changing its strategy alone if and only if no such change lowers the energy (Theorem 1). The methods of this
+family (the paper's Table 1) need nothing of an energy but its terms.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
-from typing import ClassVar
+from collections.abc import Collection, Sequence
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -20,39 +20,43 @@ from torch import Tensor
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.pair_order import PairOrder
 from epo_lightning.game.pairs import pairs
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError, nearest, parts
 from epo_lightning.scene import GameParameters, Scene
 
 GRADIENT, RESIDUALS, FEATURES = "gradient", "residuals", "features"
-"""What an energy may offer besides values: a gradient by the controls, residuals of which it is half the sum of squares,
-named features whose structure a solver knows."""
+"""Optional properties of an energy: a gradient by the controls; residuals, of which it is half the sum of squares; named
+features, whose structure a solver knows."""
 
 _TABLE_ENTRIES = 2_000_000
-"""Steps of pairs of candidates that are looked at together: a bound on memory."""
+"""Number of steps of candidate pairs that are evaluated together, which bounds the memory."""
 
 
-def check_names(kind: str, names: Sequence[str], known: Iterable[str], what: str) -> None:
-    """Refuse a list of terms with an unknown name, or one twice.
+def check_names(kind: str, names: Any, known: Collection[str], what: str) -> None:
+    """Check a list of names of terms: all are known, and none stands there twice.
 
     Raises:
-        ConfigError: the message names the nearest known one.
+        ConfigError: an unknown name (the message suggests the nearest known one), a repeated name, or no list.
     """
-    if isinstance(names, str):
-        raise ConfigError(f"energy.{kind} takes a list of names, not the one name {names!r}")
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        raise ConfigError(f"energy.{kind} must be a list of names, not {names!r}")
+    if not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"energy.{kind} must be a list of names, not {list(names)}")
+    if not set(names) <= set(known):
+        parts("energy")  # loads third-party packages, which may register the missing names
     for name in names:
         if name not in known:
-            raise ConfigError(f"unknown {kind} {what} {name!r}: {nearest(str(name), known)}")
+            raise ConfigError(f"unknown {kind} {what} {name!r} in energy.{kind}: {nearest(name, known)}")
     if len(set(names)) < len(names):
         raise ConfigError(f"energy.{kind} names a {what} twice: {list(names)}")
 
 
 class Energy(ABC):
-    """The interface of all energies. A subclass says what its terms are; how they add up stands here.
+    """The interface of all energies. Subclasses define the terms; this class adds them up.
 
     Attributes:
         offers: some of :data:`GRADIENT`, :data:`RESIDUALS` and :data:`FEATURES`.
         own, pair: names of the terms of agents and of pairs.
-        dynamics: what turns controls into states.
+        dynamics: the map from controls to states.
     """
 
     offers: ClassVar[frozenset[str]] = frozenset()
@@ -62,17 +66,17 @@ class Energy(ABC):
 
     @property
     def weighted(self) -> tuple[Sequence[str], Sequence[str]]:
-        """Names of the own and pair terms that a decoded weight multiplies."""
+        """Names of the own and pair terms that have a decoded weight."""
         return self.own, self.pair
 
     @property
     def needs(self) -> set[str]:
-        """Of ``goals``, ``reference``, ``reference_speed``, ``size``, ``context`` and ``order``, what the terms refer to."""
+        """Inputs of the terms: some of ``goals``, ``reference``, ``reference_speed``, ``size``, ``context``, ``order``."""
         return set()
 
     @property
     def heading(self) -> set[str]:
-        """Names of the own terms that say where an agent is heading."""
+        """Names of the own terms that pull an agent to its goal or its line."""
         return set()
 
     @property
@@ -88,7 +92,7 @@ class Energy(ABC):
         states: Float[Tensor, "B C N K 4"],
         controls: Float[Tensor, "B C N K 2"],
     ) -> dict[str, Float[Tensor, "B C N"]]:
-        """E_i by name, zero for absent agents. The parameters hold C games, or one for all."""
+        """E_i by name, zero for absent agents. The parameters hold C games, or one game for all C candidates."""
 
     @abstractmethod
     def pair_terms(
@@ -98,13 +102,13 @@ class Energy(ABC):
         first: Float[Tensor, "B C P K 4"],
         second: Float[Tensor, "B C P K 4"],
     ) -> dict[str, Float[Tensor, "B C P"]]:
-        """E_ij by name for the states of both agents of every pair, zero where one is absent. Symmetric."""
+        """E_ij by name for the states of both agents of every pair, zero where one is absent. Symmetric in the agents."""
 
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
-        """Refuse tensors that do not fit together, naming the one that does not and the shape it should have.
+        """Check that scene, parameters and controls fit together.
 
         Raises:
-            ValueError: as said.
+            ValueError: they do not; the message names the tensor and the expected shape.
         """
         batch, agents = scene.agent_mask.shape
         if controls.dim() != 5 or controls.shape[0] != batch or controls.shape[2] != agents or controls.shape[4] != 2:
@@ -114,7 +118,7 @@ class Energy(ABC):
     def terms(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> dict[str, Float[Tensor, "B M _"]]:
-        """The energy by term and agent [B, M, N], or by term and pair [B, M, P]."""
+        """The values of all terms by name: [B, M, N] for agents, [B, M, P] for pairs."""
         self.validate(scene, parameters, controls)
         controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
         states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
@@ -127,15 +131,15 @@ class Energy(ABC):
     def __call__(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> Float[Tensor, "B M"]:
-        """The energy of every joint strategy."""
-        # One after the other: stacked, they would be added up differently in batches of other sizes.
+        """The energy E(u) of every joint strategy."""
+        # Added one by one: a sum over stacked terms would round differently in batches of other sizes.
         first, *others = (term.sum(-1) for term in self.terms(scene, parameters, controls).values())
         return sum(others, first)
 
     def objectives(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> Float[Tensor, "B M N"]:
-        """J_i, what every agent minimises: its own terms and those of the pairs it takes part in."""
+        """The agents' objectives J_i: own terms plus those of the pairs that the agent is part of."""
         terms = self.terms(scene, parameters, controls)
         objective = torch.stack([terms[name] for name in self.own]).sum(0) if self.own else 0.0 * controls[..., 0, 0]
         first, second = pairs(controls.shape[2], controls.device)
@@ -146,12 +150,12 @@ class Energy(ABC):
     def tables(
         self, scene: Scene, parameters: GameParameters, candidates: Float[Tensor, "B C N K 2"]
     ) -> tuple[Float[Tensor, "B N C"], Float[Tensor, "B P C C"]]:
-        """E_i of C candidate strategies of every agent, and E_ij of all pairs of them: (k, l) is i's k-th and j's l-th.
+        """Tables of E_i for C candidate strategies of every agent, and of E_ij for all pairs (k-th of i, l-th of j).
 
         Args:
             scene: the scene.
             parameters: one game, M = 1.
-            candidates: controls; agents' candidates of one number do not belong together.
+            candidates: controls; candidates of different agents are combined in all ways.
         """
         self.validate(scene, parameters, candidates)
         controls = torch.where(scene.agent_mask[:, None, :, None, None], candidates, 0.0)

@@ -1,8 +1,9 @@
-"""The paper's energy: a sum of squared, weighted, named residuals, nonlinear least squares."""
+"""The paper's energy: a sum of squared, weighted, named residuals (nonlinear least squares)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -11,22 +12,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.game.circles import disc, overlap, separation
+from epo_lightning.game.checks import check_whole, is_number
+from epo_lightning.game.circles import disc, separation
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, check_names
-from epo_lightning.game.features import (
-    OWN_FEATURES,
-    PAIR_FEATURES,
-    WHEELBASE,
-    OwnFeature,
-    PairFeature,
-    Source,
+from epo_lightning.game.feature_derivatives import (
     Surroundings,
-    signal,
-    signal_change,
-    slope,
-    violation,
+    own_derivatives,
+    pair_derivatives,
+    signal_and_change,
+    undeclared_change,
 )
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, WHEELBASE, OwnFeature, PairFeature
 from epo_lightning.game.pairs import pair_mask, pairs
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene
@@ -37,12 +34,12 @@ from epo_lightning.scene import GameParameters, Scene
 class FeatureEnergy(Energy):
     """The potential of Eqs. 10 and 11, E = 1/2 sum_i |w_i c(u_i, g_i)|^2 + 1/2 sum_{i<j} |w_ij d(u_i, u_j)|^2.
 
-    Every named feature is weighted on its own: a residual is w c, so weights enter the energy squared and their sign is of
-    no consequence. Because the pair terms are symmetric, a minimiser of E is an open-loop Nash equilibrium in which agent
-    i minimises its own terms plus the pair terms it takes part in (Theorem 1).
+    Every named feature has a weight of its own: a residual is w c, so weights enter the energy squared and their sign has
+    no effect. Because the pair terms are symmetric, a minimiser of E is an open-loop Nash equilibrium in which agent i
+    minimises its own terms plus the pair terms it takes part in (Theorem 1).
 
-    A pair whose weight is exactly zero is no edge of the game: it costs nothing to solve, and because weights enter squared
-    its weight has no gradient either. Setting weights to zero is thus how a game is told which pairs interact.
+    A pair with a weight of exactly zero is no edge of the game: it costs nothing to solve, and because weights enter squared
+    its weight has no gradient either. Weights of zero thus tell a game which pairs do not interact.
 
     Example::
 
@@ -51,13 +48,13 @@ class FeatureEnergy(Energy):
         energy.residuals(scene, parameters, controls)  # {"goal": [B, M, N, 2], ..., "proximity": [B, M, P, K]}
 
     Attributes:
-        own: names out of :data:`~epo_lightning.game.features.OWN_FEATURES`, where one's own are found too
+        own: names of :data:`~epo_lightning.game.features.OWN_FEATURES`, which includes custom features
             (:func:`~epo_lightning.game.features.own_feature`).
-        pair: names out of :data:`~epo_lightning.game.features.PAIR_FEATURES`. Discs have half an agent's length as radius;
-            for the rows of circles see :mod:`~epo_lightning.game.circles`.
+        pair: names of :data:`~epo_lightning.game.features.PAIR_FEATURES`. Discs have half an agent's length as radius; for
+            rows of circles see :mod:`~epo_lightning.game.circles`.
         bounds: lowest and highest value of a signal, for features whose name ends in ``b``: ``{"vel": (-0.05, 2.0)}``.
         dynamics: a :class:`~epo_lightning.game.dynamics.Unicycle`.
-        pair_stride: pairs are looked at in every step (1), every second step (2), ...: k = stride, 2 stride, ...
+        pair_stride: steps between evaluations of pair features: they are evaluated at k = stride, 2 stride, ...
     """
 
     offers = frozenset({GRADIENT, RESIDUALS, FEATURES})
@@ -65,7 +62,7 @@ class FeatureEnergy(Energy):
     own: Sequence[str]
     pair: Sequence[str] = ("proximity",)
     bounds: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    dynamics: Any = field(default_factory=Unicycle)  # what else is given is refused below, with a reason
+    dynamics: Any = field(default_factory=Unicycle)  # Any, so that other dynamics are refused below with a reason
     pair_stride: int = 1
 
     def __post_init__(self) -> None:
@@ -78,19 +75,13 @@ class FeatureEnergy(Energy):
                 "named features are those of a unicycle: they go with dynamics=unicycle, not with "
                 f"{type(self.dynamics).__name__}; energy=convex goes with dynamics=double_integrator"
             )
+        check_whole("energy.pair_stride", self.pair_stride)
+        for name, pair in self.pair_features.items():
+            _refuse_asymmetry(name, pair)
+        _check_bounds(self.bounds)
         for name, feature in self.own_features.items():
             if feature.bounded and feature.signal not in self.bounds:
                 raise ConfigError(f"feature {name!r} needs energy.bounds.{feature.signal}: [lowest, highest]")
-        if not isinstance(self.pair_stride, int) or self.pair_stride < 1:
-            raise ConfigError(f"energy.pair_stride must be a whole number, 1 or more, not {self.pair_stride}")
-        for name, pair in self.pair_features.items():
-            _refuse_asymmetry(name, pair)
-        signals = {feature.signal for feature in OWN_FEATURES.values() if feature.bounded}
-        for name, bound in self.bounds.items():
-            if name not in signals:
-                raise ConfigError(f"unknown signal energy.bounds.{name}: {nearest(name, signals)}")
-            if len(bound) != 2 or not bound[0] < bound[1]:
-                raise ConfigError(f"energy.bounds.{name} must be [lowest, highest], not {list(bound)}")
 
     @cached_property
     def own_features(self) -> dict[str, OwnFeature]:
@@ -104,7 +95,7 @@ class FeatureEnergy(Energy):
 
     @cached_property
     def needs(self) -> set[str]:
-        """What the own features refer to: some of ``goals``, ``reference``, ``reference_speed``, ``size``."""
+        """Inputs of the own features: some of ``goals``, ``reference``, ``reference_speed``, ``size``."""
         return {feature.needs for feature in self.own_features.values() if feature.needs}
 
     @property
@@ -114,18 +105,25 @@ class FeatureEnergy(Energy):
 
     @cached_property
     def needs_goals(self) -> bool:
-        """Whether a feature asks where agents are heading."""
+        """Whether a feature needs goals."""
         return "goals" in self.needs
 
     @cached_property
     def needs_reach(self) -> bool:
-        """Whether a pair feature asks for the agents' radii."""
-        return any(feature.source is Source.DISTANCE for feature in self.pair_features.values())
+        """Whether a pair feature needs the agents' radii."""
+        return any(feature.declared for feature in self.pair_features.values())
 
     @cached_property
     def needs_shape(self) -> bool:
-        """Whether a pair feature asks for the agents' lengths and widths."""
+        """Whether a pair feature needs the agents' lengths and widths."""
         return any(feature.needs == "size" for feature in self.pair_features.values())
+
+    @cached_property
+    def undeclared(self) -> FeatureEnergy | None:
+        """The part of the energy whose derivatives need automatic differentiation; None if all features are declared."""
+        own = [name for name, feature in self.own_features.items() if not feature.declared]
+        pair = [name for name, feature in self.pair_features.items() if not feature.declared]
+        return dataclasses.replace(self, own=own, pair=pair) if own or pair else None
 
     def residuals(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
@@ -133,7 +131,7 @@ class FeatureEnergy(Energy):
         """Weighted residuals w c by feature: [B, M, N, R] for own features and [B, M, P, R] for pairs.
 
         R is K, K - 1 for jerk and turnacc, 2 for the goal, 2 K for the lane, the number of evaluated steps for pairs, and
-        what the function returns for undeclared features. Absent agents have residuals of zero.
+        the number of values that an undeclared feature returns. Absent agents have residuals of zero.
 
         Raises:
             ValueError: shapes or names of scene, parameters and controls that do not fit together.
@@ -151,7 +149,7 @@ class FeatureEnergy(Energy):
     ) -> tuple[Float[Tensor, "B M R"], Float[Tensor, "D B M R"]]:
         """All residuals r in one row, and their change J v along D directions v of the controls.
 
-        Both are differentiable with respect to controls and parameters; hinges keep their side.
+        Both are differentiable with respect to controls and parameters; active hinges are held constant.
         """
         _, residuals, changes = zip(*self._features(scene, parameters, controls, directions), strict=True)
         return torch.cat([r.flatten(2) for r in residuals], -1), torch.cat([c.flatten(3) for c in changes], -1)
@@ -159,7 +157,7 @@ class FeatureEnergy(Energy):
     def _features(
         self, scene: Scene, parameters: GameParameters, controls: Tensor, directions: Tensor
     ) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Name, weighted residual and its change along every direction of one feature after the other."""
+        """Name, weighted residual and its change along every direction, feature by feature."""
         controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
         states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
         moved = self.dynamics.tangent(states, directions, scene.dt)
@@ -169,26 +167,49 @@ class FeatureEnergy(Energy):
         yield from self._of_pairs(scene, parameters, both, apart)
 
     def _of_agents(
-        self, scene: Scene, parameters: GameParameters, at: tuple[Tensor, Tensor], along_: tuple[Tensor, Tensor]
+        self, scene: Scene, parameters: GameParameters, at: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]
     ) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """The own features for states and controls, and their change along changes of both."""
+        """Weighted own features of states and controls, and their change along changes of both."""
         around = self.surroundings(scene, parameters)
-        for name, feature in self.own_features.items():
-            if feature.source is Source.TRAJECTORY:
-                assert feature.function is not None
-                value, change = along(feature.function, at, along_)
-                present = scene.agent_mask[:, None, :, None]
-                value, change = torch.where(present, value, 0.0), torch.where(present, change, 0.0)
-            else:
-                value, steepness = self.shape(feature, signal(feature, *at, around))
-                change = steepness * signal_change(feature, *at, *along_, around)
-            weight = self.own_weight(scene, parameters, name)[..., None]
-            yield name, weight * value, weight * change
+        for name in self.own:
+            yield name, *self.own_residual(name, scene, parameters, around, at, moved)
+
+    def own_residual(
+        self,
+        name: str,
+        scene: Scene,
+        parameters: GameParameters,
+        around: Surroundings,
+        at: tuple[Tensor, Tensor],
+        moved: tuple[Tensor, Tensor],
+        slide: bool = False,
+    ) -> tuple[Float[Tensor, "B C N R"], Float[Tensor, "D B C N R"]]:
+        """The weighted residual w c of one own feature, and its change along D changes of the trajectories.
+
+        Args:
+            name: the feature.
+            scene, parameters, around: the game.
+            at: states and controls.
+            moved: changes of both.
+            slide: see :func:`~epo_lightning.game.feature_derivatives.signal_and_change`.
+        """
+        feature = self.own_features[name]
+        if feature.declared:
+            signal, change = signal_and_change(feature, *at, *moved, around, slide)
+            value, first, _ = own_derivatives(feature, signal, self.bounds)
+            change = change if first is None else first * change
+        else:
+            assert feature.function is not None
+            value, change = undeclared_change(feature.function, at, moved)
+            present = scene.agent_mask[:, None, :, None]
+            value, change = torch.where(present, value, 0.0), torch.where(present, change, 0.0)
+        weight = self.own_weight(scene, parameters, name)[..., None]
+        return weight * value, weight * change
 
     def _of_pairs(
         self, scene: Scene, parameters: GameParameters, both: tuple[Tensor, Tensor], apart: tuple[Tensor, Tensor]
     ) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """The pair features for the states of both agents, and their change along changes of both."""
+        """Weighted pair features of the states of both agents, and their change along changes of both."""
         if not self.pair:
             return
         agents = scene.agent_mask.shape[1]
@@ -197,12 +218,12 @@ class FeatureEnergy(Energy):
         distance, normal = separation(both[0][..., :2], both[1][..., :2])
         closing = (normal * (apart[0] - apart[1])[..., :2]).sum(-1)
         for name, pair in self.pair_features.items():
-            if pair.source is Source.TRAJECTORY:
-                sizes = [self.size(scene)[:, None, members, None] for members in (first, second) if pair.needs]
-                value, change = along(pair.function, both, apart, *sizes)
+            if pair.declared:
+                value, slope, _ = pair_derivatives(pair, distance, self.reach(scene)[:, None, :, None])
+                change = slope * closing
             else:
-                value, steepness = self.pair_shape(pair, distance, self.reach(scene)[:, None, :, None])
-                change = steepness * closing
+                sizes = [self.size(scene)[:, None, members, None] for members in (first, second) if pair.needs]
+                value, change = undeclared_change(pair.function, both, apart, *sizes)
             exists = pair_mask(scene)[:, None, :, None]
             weight = self.pair_weight(scene, parameters, name)[..., None]
             yield name, weight * torch.where(exists, value, 0.0), weight * torch.where(exists, change, 0.0)
@@ -232,16 +253,22 @@ class FeatureEnergy(Energy):
         return {name: 0.5 * residual.square().sum(-1) for name, residual, _ in features}
 
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
-        """Refuse tensors that do not fit together, naming the one that does not and the shape it should have.
+        """Check that scene, parameters and controls fit together.
 
         Raises:
-            ValueError: a wrong shape, a missing weight, missing goals, references, reference speeds or sizes.
+            ValueError: a wrong shape, a missing weight, missing goals, references, reference speeds or sizes, or a
+                horizon shorter than ``pair_stride``. The message names the tensor and the expected shape.
         """
         super().validate(scene, parameters, controls)
         batch, agents = scene.agent_mask.shape
         modes, steps = controls.shape[1], controls.shape[3]
         if steps < 2:
             raise ValueError(f"controls span K = {steps} step(s); an energy needs at least 2")
+        if self.pair and self.pair_stride > steps:
+            raise ValueError(
+                f"energy.pair_stride={self.pair_stride} evaluates pairs at no step: controls span K = {steps} steps; "
+                f"choose 1 to {steps}"
+            )
         for kind, names, given, count in (
             ("own_weights", self.own, parameters.own_weights, agents),
             ("pair_weights", self.pair, parameters.pair_weights, agents * (agents - 1) // 2),
@@ -269,32 +296,32 @@ class FeatureEnergy(Energy):
                     )
         if "reference" in self.needs and parameters.reference.is_floating_point():  # type: ignore[union-attr]
             raise ValueError("parameters.reference holds indices of lines: it takes whole numbers, not floats")
-        if "reference" in self.needs and controls.device.type == "cpu":  # elsewhere, looking would make the host wait
+        if "reference" in self.needs and controls.device.type == "cpu":  # on a GPU, the check would make the host wait
             assert scene.references is not None
             assert parameters.reference is not None
             lines = scene.references.shape[2]
             index = torch.where(scene.agent_mask[:, None], parameters.reference, 0)
             if (scene.agent_mask[:, None] & ((index < 0) | (index >= lines))).any():
                 raise ValueError(
-                    f"parameters.reference chooses among the R = {lines} lines of scene.references by 0 .. R-1"
+                    f"parameters.reference must be indices 0 .. {lines - 1} of the R = {lines} lines of scene.references"
                 )
         if (self.needs_reach or self.needs_shape) and scene.size is None:
             what = "sizes" if self.needs_shape else "radii"
             raise ValueError(f"pair features take the agents' {what} from scene.size [B, N, 2], which is None")
 
-    def known(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
-        """Whose game is all finite numbers where nothing computed from it would tell otherwise.
+    def finite(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
+        """The games whose inputs are finite, checked where NaN or infinity would not reach the solution.
 
-        A pair that never touches hides its weight, an agent that no feature places hides where it is, and a reference line
-        hides all its points but the nearest.
+        The weight of a pair that never touches, the position of an agent that no feature refers to, and all points of a
+        reference line but the nearest have no effect on the solution.
         """
         present = scene.agent_mask
-        known = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)
+        finite = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)
         if self.needs_shape:
-            known = known & self.size(scene).isfinite().flatten(1).all(1)
+            finite = finite & self.size(scene).isfinite().flatten(1).all(1)
         elif self.needs_reach or "size" in self.needs:
-            known = known & self.size(scene)[..., 0].isfinite().all(1)
-        of_modes = known[:, None].expand(-1, parameters.initial_controls.shape[1])
+            finite = finite & self.size(scene)[..., 0].isfinite().all(1)
+        of_modes = finite[:, None].expand(-1, parameters.initial_controls.shape[1])
         for name in self.pair:
             of_modes = of_modes & self.pair_weight(scene, parameters, name).isfinite().all(-1)
         if "reference" in self.needs:
@@ -303,10 +330,10 @@ class FeatureEnergy(Energy):
             of_modes = of_modes & torch.where(present[:, None, :, None, None], line, 0.0).isfinite().flatten(2).all(2)
         return of_modes
 
-    # What solvers share with the residuals: absent agents are silenced here, once.
+    # Inputs of the residuals, for the solvers too. Absent agents are zeroed here and nowhere else.
 
     def surroundings(self, scene: Scene, parameters: GameParameters) -> Surroundings:
-        """What own features refer to besides the trajectory."""
+        """The inputs of own features besides the trajectory."""
         present, needs = scene.agent_mask, self.needs
         goals = line = reference_speed = wheelbase = None
         if "goals" in needs:
@@ -324,7 +351,7 @@ class FeatureEnergy(Energy):
         return Surroundings(self.initial(scene), scene.dt, goals, line, reference_speed, wheelbase)
 
     def _followed(self, scene: Scene, parameters: GameParameters) -> tuple[tuple[Tensor, ...], Bool[Tensor, "B M N"]]:
-        """Where in ``scene.references`` the lines are that agents follow, and which of them exist."""
+        """The indices of the followed lines in ``scene.references``, and a mask of those that exist."""
         assert scene.reference_mask is not None
         assert parameters.reference is not None
         present = scene.agent_mask[:, None]
@@ -336,7 +363,7 @@ class FeatureEnergy(Energy):
     def own_weight(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B M N"]:
         """Weights of an own feature, zero for absent agents and where the line to follow does not exist."""
         active = scene.agent_mask[:, None]
-        if OWN_FEATURES[name].source is Source.POSITION:
+        if self.own_features[name].needs == "reference":
             _, active = self._followed(scene, parameters)
         return torch.where(active, parameters.own_weights[name], 0.0)
 
@@ -345,42 +372,46 @@ class FeatureEnergy(Energy):
         return torch.where(pair_mask(scene)[:, None], parameters.pair_weights[name], 0.0)
 
     def extent(self, scene: Scene) -> Float[Tensor, "B N"] | None:
-        """How far from their positions agents can be felt by others; None where a pair feature knows no limit."""
+        """Largest distance [m] at which agents affect others; None if a pair feature has no limit."""
         extents = [feature.extent for feature in self.pair_features.values()]
-        known = [extent(self.size(scene)) for extent in extents if extent is not None]
-        return torch.stack(known).amax(0) if len(known) == len(extents) else None
+        finite = [extent(self.size(scene)) for extent in extents if extent is not None]
+        return torch.stack(finite).amax(0) if len(finite) == len(extents) else None
 
     def reach(self, scene: Scene) -> Float[Tensor, "B P"]:
-        """The distance at which the discs of two agents touch."""
+        """The distance [m] at which the discs of two agents touch, r_i + r_j."""
         radius = disc(self.size(scene))
         first, second = pairs(scene.agent_mask.shape[1], radius.device)
         return radius[:, first] + radius[:, second]
 
     def at_pair_steps(self, states: Float[Tensor, "*batch K X"]) -> Float[Tensor, "*batch L X"]:
-        """The steps k = stride, 2 stride, ... at which pairs are looked at."""
+        """The states at k = stride, 2 stride, ..., the steps at which pair features are evaluated."""
         return states[..., self.pair_stride - 1 :: self.pair_stride, :]
 
-    def shape(self, feature: OwnFeature, value: Float[Tensor, "*shape"]) -> tuple[Tensor, Tensor]:
-        """A declared own feature's value c(z) for its signal z, and the slope dc/dz."""
-        if feature.bounded:
-            lower, upper = self.bounds[feature.signal]
-            return violation(value, lower, upper)
-        if feature.function is not None:
-            return slope(feature.function, value)
-        return value, torch.ones_like(value)
 
-    def pair_shape(self, feature: PairFeature, distance: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """A declared pair feature's value for a distance, and its slope."""
-        if feature.function is overlap:
-            return overlap(distance, reach), -(distance < reach).to(distance.dtype)
-        return slope(feature.function, distance, reach)
+def _check_bounds(bounds: Any) -> None:
+    """Check the bounds of signals.
+
+    Raises:
+        ConfigError: no mapping, an unknown signal, or a value that is not [lowest, highest].
+    """
+    signals = {feature.signal for feature in OWN_FEATURES.values() if feature.bounded}
+    if not isinstance(bounds, Mapping):
+        raise ConfigError(f"energy.bounds must map signals to [lowest, highest], such as vel: [0, 30], not {bounds!r}")
+    for name, bound in bounds.items():
+        if name not in signals:
+            raise ConfigError(f"unknown signal energy.bounds.{name}: {nearest(str(name), signals)}")
+        pair = list(bound) if isinstance(bound, Sequence) and not isinstance(bound, str) else []
+        if len(pair) != 2 or not all(map(is_number, pair)) or not pair[0] < pair[1]:
+            raise ConfigError(
+                f"energy.bounds.{name} must be [lowest, highest], two numbers in rising order, not {bound!r}"
+            )
 
 
 def _refuse_asymmetry(name: str, feature: PairFeature) -> None:
-    """Two agents must share a pair's cost, or the game has no potential.
+    """Check that a pair feature costs both agents the same; otherwise the game has no potential.
 
     Raises:
-        ConfigError: a feature that depends on the order of the agents, or a function that fails on a trial.
+        ConfigError: a feature that depends on the order of the agents, or a function that fails on trial inputs.
     """
     try:
         costs = feature.asymmetry
@@ -391,29 +422,14 @@ def _refuse_asymmetry(name: str, feature: PairFeature) -> None:
             else "states [.., K, 4] of two agents"
         )
         raise ConfigError(
-            f"pair feature {name!r} fails on a trial: {type(error).__name__}: {error}. It takes the {takes} "
+            f"pair feature {name!r} fails on trial inputs: {type(error).__name__}: {error}. It takes the {takes} "
             "and returns residuals [.., R]"
         ) from error
     if costs is not None:
         raise ConfigError(
-            f"pair feature {name!r} is not symmetric: for some two agents 1/2 |r|^2 is {costs[0]:.4g}, and {costs[1]:.4g} "
-            "when they are swapped. Then this is not a potential game: no energy of this form has its equilibria as minima. "
-            "Make the feature symmetric, for instance by returning the residuals of both orders. If agents only mind it to "
-            "different degrees, a_i E_ij with a_i > 0, keep E_ij symmetric: that is the same as dividing the own terms of "
-            "every agent by its a_i, which decoded own weights can do already"
+            f"pair feature {name!r} is not symmetric: for two trial agents 1/2 |r|^2 is {costs[0]:.4g}, and {costs[1]:.4g} "
+            "when they are swapped. Such a game is no potential game: no energy of this form has its equilibria as minima. "
+            "Make the feature symmetric, for instance by returning the residuals of both orders. If agents only weigh it "
+            "differently, a_i E_ij with a_i > 0, keep E_ij symmetric: dividing the own terms of every agent by its a_i has "
+            "the same effect, and decoded own weights can learn it"
         )
-
-
-def along(
-    function: Callable[..., Tensor], at: tuple[Tensor, Tensor], directions: tuple[Tensor, Tensor], *others: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Value of an undeclared feature, and its change along every one of D directions (their first dimension).
-
-    What else the function takes stays as it is.
-    """
-    value = function(*at, *others)
-    if len(directions[0]) == 0:
-        return value, value.new_zeros(0, *value.shape)
-    return value, torch.func.vmap(
-        lambda *moved: torch.func.jvp(lambda *states: function(*states, *others), at, moved)[1]
-    )(*directions)

@@ -1,4 +1,4 @@
-"""What energies that are networks have in common: the agents' features as inputs, and named features beside them."""
+"""The base of energies that are networks: the agents' features as inputs, and named features as further terms."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from epo_lightning.scene import GameParameters, Scene
 
 
 class NetworkEnergy(nn.Module, Energy):
-    """One term of agents and one of pairs that networks make of ``parameters.context``, and any features besides.
+    """Network terms of agents and of pairs, computed from ``parameters.context``, and any named features.
 
-    The features are those of :class:`~epo_lightning.game.feature_energy.FeatureEnergy`, with decoded weights: an energy
-    term that works there works here.
+    The named features are those of :class:`~epo_lightning.game.feature_energy.FeatureEnergy`, with decoded weights: a
+    feature that works there works here.
 
     Args:
-        dynamics: what turns controls into states.
+        dynamics: the map from controls to states.
         width: size D of the agents' features ``context [B, N, D]``.
         horizon: number K of future steps.
-        scale: metres that an input of one stands for.
-        own, pair, bounds, pair_stride: of the features, see :class:`~epo_lightning.game.feature_energy.FeatureEnergy`.
+        scale: metres per unit of the network's inputs.
+        own, pair, bounds, pair_stride: the named features, see :class:`~epo_lightning.game.feature_energy.FeatureEnergy`.
 
     Attributes:
-        term, pair_term: names of the terms that are its own.
+        term, pair_term: names of the network's terms.
         features: the energy of the named features; None without any.
 
     Raises:
-        ConfigError: features that do not exist, or one whose name is that of a term.
+        ConfigError: an unknown feature, or one with the name of a network term.
     """
 
     term: ClassVar[str]
@@ -60,29 +60,31 @@ class NetworkEnergy(nn.Module, Energy):
             self.features = FeatureEnergy(own, pair, bounds or {}, dynamics, pair_stride)
         for name in (*own, *pair):
             if name in (self.term, self.pair_term):
-                raise ConfigError(f"a feature is called {name!r}, like a term of this energy: give it another name")
+                raise ConfigError(
+                    f"the feature {name!r} has the name of this energy's network term: rename the feature"
+                )
         self.own, self.pair = (*own, self.term), (*pair, self.pair_term)
 
     @property
     def weighted(self) -> tuple[Sequence[str], Sequence[str]]:
-        """The named features; networks weigh themselves."""
+        """The named features; network terms have no decoded weight."""
         return self.own[:-1], self.pair[:-1]
 
     @property
     def needs(self) -> set[str]:
-        """The agents' features, and what the named features refer to."""
+        """The agents' features, and the inputs of the named features."""
         return {"context"} | (self.features.needs if self.features else set())
 
     @property
     def heading(self) -> set[str]:
-        """Those of the named features."""
+        """Names of the named features of goals and lines."""
         return self.features.heading if self.features else set()
 
     @abstractmethod
     def network_own(
         self, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B C N K 4"]
     ) -> Float[Tensor, "B C N"]:
-        """E_i of the network; what it is for absent agents does not matter."""
+        """E_i of the network; values for absent agents are ignored."""
 
     @abstractmethod
     def network_pair(
@@ -92,13 +94,13 @@ class NetworkEnergy(nn.Module, Energy):
         first: Float[Tensor, "B C P K 4"],
         second: Float[Tensor, "B C P K 4"],
     ) -> Float[Tensor, "B C P"]:
-        """E_ij of the network; what it is for pairs with an absent agent does not matter. Symmetric."""
+        """E_ij of the network, symmetric; values for pairs with an absent agent are ignored."""
 
     @abstractmethod
     def network_tables(
         self, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B C N K 4"]
     ) -> tuple[Float[Tensor, "B C N"], Float[Tensor, "B P C C"]]:
-        """Both for C candidates of every agent and all pairs of them, at a lower price than pair by pair."""
+        """E_i and E_ij for C candidates of every agent and all pairs of them, faster than pair by pair."""
 
     def forward(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
@@ -149,10 +151,10 @@ class NetworkEnergy(nn.Module, Energy):
         return torch.where(scene.agent_mask[..., None], parameters.context, 0.0)[:, None]
 
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
-        """Refuse tensors that do not fit together, naming the one that does not and the shape it should have.
+        """Check that scene, parameters and controls fit together.
 
         Raises:
-            ValueError: a wrong shape, missing features of the agents, or what the named features lack.
+            ValueError: a wrong shape, missing features of the agents, or missing inputs of the named features.
         """
         super().validate(scene, parameters, controls)
         if controls.shape[3] != self.horizon:
@@ -165,13 +167,3 @@ class NetworkEnergy(nn.Module, Energy):
             raise ValueError(f"parameters.context has shape {shape}; this scene and energy take {expected}")
         if self.features is not None:
             self.features.validate(scene, parameters, controls)
-
-
-def check_hidden(hidden: int) -> None:
-    """Refuse networks without hidden features.
-
-    Raises:
-        ConfigError: as said.
-    """
-    if hidden < 1:
-        raise ConfigError(f"energy.hidden must be 1 or more, not {hidden}")

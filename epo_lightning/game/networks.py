@@ -1,7 +1,7 @@
-"""What energies that are networks are made of: trajectories as an agent itself sees them, encounters, and small networks.
+"""Building blocks of network energies: trajectories in an agent's own frame, encounters, and small networks.
 
-All of it is smooth in the states but for the step at which two agents are nearest, which is a constant: gradients exist
-where implicit differentiation needs second ones.
+All are smooth in the states, except for the step at which two agents are nearest, which is held constant: second
+derivatives exist, as implicit differentiation needs them.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from epo_lightning.game.circles import length_of
 from epo_lightning.scene import HEADING, SPEED
 
 MOTION, ENCOUNTER = 5, 6
-"""How many numbers say what an agent does at one step, and how two agents meet."""
+"""Number of values that describe an agent's state at one step, and the encounter of two agents."""
 
 
 def turned(vector: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch 2"]:
-    """R(-angle) times a vector: the vector as somebody sees it who looks along the angle."""
+    """R(-angle) times a vector: the vector in a frame whose x axis points along the angle."""
     cos, sin = angle.cos(), angle.sin()
     x, y = vector.unbind(-1)
     return torch.stack((cos * x + sin * y, cos * y - sin * x), -1)
@@ -29,14 +29,14 @@ def turned(vector: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) -
 def motion(
     states: Float[Tensor, "*batch K 4"], initial: Float[Tensor, "*#batch 4"], scale: float
 ) -> Float[Tensor, "*batch K 5"]:
-    """What an agent does, in its own frame at t0: place (x, y), cosine and sine of its heading, and speed.
+    """An agent's states in its own frame at t0: position (x, y), cosine and sine of the heading, and speed.
 
-    Explicit Euler's last position does not depend on the last controls, but heading and speed do.
+    Heading and speed are included because the last position does not depend on the last controls (explicit Euler).
 
     Args:
         states: x_1 .. x_K.
-        initial: x_0, whose place and heading are the frame.
-        scale: metres, and metres per second, that a value of one stands for.
+        initial: x_0, whose position and heading define the frame.
+        scale: metres, and metres per second, per unit of the values.
     """
     start = initial[..., None, :]
     place = turned(states[..., :2] - start[..., :2], start[..., HEADING]) / scale
@@ -48,9 +48,9 @@ def motion(
 def squared_distances(
     first: Float[Tensor, "*#batch K 4"], second: Float[Tensor, "*#batch K 4"]
 ) -> Iterator[Float[Tensor, "..."]]:
-    """How far two agents are apart at one step after the other, squared [m^2].
+    """Squared distances of two agents [m^2], step by step, without a gradient.
 
-    Step by step, so that of many pairs of candidates no more is in memory than one number each. Constants.
+    They are computed one step at a time, so that many pairs of candidates take one number each of memory.
     """
     (ours_x, ours_y), (theirs_x, theirs_y) = (states[..., :2].unbind(-1) for states in (first, second))
     for k in range(first.shape[-2]):
@@ -60,7 +60,7 @@ def squared_distances(
 
 @torch.no_grad()
 def nearest(first: Float[Tensor, "*#batch K 4"], second: Float[Tensor, "*#batch K 4"]) -> Int[Tensor, "*batch"]:
-    """The step at which two agents are nearest to each other, the first one on a tie. A constant."""
+    """The step at which two agents are nearest to each other, the first one on a tie, without a gradient."""
     distances = squared_distances(first, second)
     least = next(distances)
     step = torch.zeros_like(least, dtype=torch.int64)
@@ -72,10 +72,11 @@ def nearest(first: Float[Tensor, "*#batch K 4"], second: Float[Tensor, "*#batch 
 def encounter(
     first: Float[Tensor, "*#batch K 4"], second: Float[Tensor, "*#batch K 4"], scale: float
 ) -> Float[Tensor, "*batch 6"]:
-    """How the first agent meets the second, g_ij: their least distance, its time as a share of the horizon, and where the
-    second is and looks in the end (x, y, cosine, sine), as the first then sees it.
+    """The encounter g_ij of two agents, in the frame of the first agent's last state.
 
-    Where they coincide, the distance has a gradient of zero.
+    Its entries are x and y of the second agent's last position, the least distance, the time of the least distance as a
+    fraction of the horizon, and cosine and sine of the second agent's last heading. Where the agents coincide, the distance
+    has a gradient of zero.
     """
     step = nearest(first, second)
     shape = step.shape
@@ -95,8 +96,8 @@ def encounter(
 class Layers(nn.Module):
     """Two linear layers, each followed by SiLU; the first takes several inputs.
 
-    Every input is mapped by itself before they are broadcast and added: what belongs to many rows is mapped once. A layer
-    on top needs no bias, because adding a constant to an energy changes nothing.
+    Every input is mapped on its own before the results are broadcast and added, so that an input shared by many rows is
+    mapped once. The layer on top needs no bias, because adding a constant to an energy has no effect.
 
     Args:
         inputs: sizes of the inputs.

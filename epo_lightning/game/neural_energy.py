@@ -1,4 +1,4 @@
-"""Energies that are networks: those of JFP, and, with features beside them, EBIOC's."""
+"""The energies of JFP (networks) and of EBIOC (networks and named features)."""
 
 from __future__ import annotations
 
@@ -8,34 +8,34 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from epo_lightning.game.checks import check_whole
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.energy import GRADIENT
-from epo_lightning.game.network_energy import NetworkEnergy, check_hidden
+from epo_lightning.game.network_energy import NetworkEnergy
 from epo_lightning.game.networks import ENCOUNTER, MOTION, Layers, encounter, motion
 from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import register
 from epo_lightning.scene import GameParameters, Scene
 
 _TABLE_ENTRIES = 50_000
-"""Pairs of candidates that are looked at together: a bound on memory where nothing is learned."""
+"""Number of candidate pairs that are evaluated together, which bounds the memory where no gradient is recorded."""
 
 
 @register("energy", "neural")
 class NeuralEnergy(NetworkEnergy):
-    """What a network thinks of every agent's trajectory, and of every two agents' (Table 1, "NN").
+    """A network's cost of every agent's trajectory, and of the trajectories of every two agents (Table 1, "NN").
 
-        e_i = layers([z_i, trajectory of i as i sees it]),    E_i = v . e_i,
+        e_i = layers([z_i, trajectory of i in its own frame]),    E_i = v . e_i,
         E_ij = (V(e_i, e_j, g_ij) + V(e_j, e_i, g_ji)) / 2,
 
-    with g_ij how i meets j (:func:`~epo_lightning.game.networks.encounter`). Averaging both orders makes pair terms
-    symmetric, without which there would be no potential. The energy depends on where agents are relative to each other and
-    to themselves at t0, not on the frame.
+    with the encounter g_ij of i with j (:func:`~epo_lightning.game.networks.encounter`). Averaging both orders makes pair
+    terms symmetric, which a potential needs. The energy is invariant to the frame: it depends on positions relative to
+    other agents and to the agent's own state at t0.
 
-    Without named features this stands for JFP (Luo et al., CoRL 2022, Section 3.3), whose body says less than this: its
-    own terms are the logits of the marginal decoder, here they are read from the trajectory; what its pair network sees is
-    not published. With named features it stands for EBIOC (Xu et al., 2019), "features augmented by a network": there the
-    network's cost is that of one agent among others whose trajectories are given; here others move too, so that pairs have
-    a term.
+    Without named features this is JFP (Luo et al., CoRL 2022, Section 3.3) as far as published: JFP's own terms are the
+    logits of the marginal decoder, here they are functions of the trajectory; the inputs of its pair network are not
+    published. With named features it is EBIOC (Xu et al., 2019), "features augmented by a network": EBIOC has a cost of one
+    agent among others with given trajectories; here all agents move, so that pairs have a term too.
 
     Args:
         dynamics, width, horizon, scale, own, pair, bounds, pair_stride: see
@@ -62,20 +62,20 @@ class NeuralEnergy(NetworkEnergy):
         hidden: int = 64,
     ) -> None:
         super().__init__(dynamics, width, horizon, scale, own, pair, bounds, pair_stride)
-        check_hidden(hidden)
+        check_whole("energy.hidden", hidden)
         self.embedding = Layers((width, MOTION * horizon), hidden)
         self.own_value = nn.Linear(hidden, 1, bias=False)
         self.interaction = Layers((hidden, hidden, ENCOUNTER), hidden)
         self.pair_value = nn.Linear(hidden, 1, bias=False)
 
     def embed(self, context: Tensor, states: Tensor, initial: Tensor) -> Float[Tensor, "... hidden"]:
-        """e of agents [B, 1, A, D] with states [B, C, A, K, 4] that follow x_0 [B, 1, A, 4]."""
+        """Embeddings e of agents with features [B, 1, A, D], states [B, C, A, K, 4] and x_0 [B, 1, A, 4]."""
         return self.embedding(context, motion(states, initial, self.scale).flatten(-2))
 
     def interact(
         self, ours: Tensor, theirs: Tensor, first: Float[Tensor, "*#batch K 4"], second: Float[Tensor, "*#batch K 4"]
     ) -> Float[Tensor, "*batch"]:
-        """E_ij of embeddings and states of two agents, which broadcast."""
+        """E_ij from embeddings and states of two agents, which broadcast."""
         one = self.interaction(ours, theirs, encounter(first, second, self.scale))
         other = self.interaction(theirs, ours, encounter(second, first, self.scale))
         return self.pair_value(0.5 * (one + other))[..., 0]
@@ -103,7 +103,7 @@ class NeuralEnergy(NetworkEnergy):
     def network_tables(
         self, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B C N K 4"]
     ) -> tuple[Float[Tensor, "B C N"], Float[Tensor, "B P C C"]]:
-        """Agents' candidates are embedded once each; of pairs there are only encounters and the last layers."""
+        """E_i and E_ij with every candidate embedded once; only encounters and the last layers are evaluated per pair."""
         features = self.embed(self.context(scene, parameters), states, self.initial(scene))
         first, second = pairs(states.shape[2], states.device)
         ours, theirs, left, right = (

@@ -1,4 +1,4 @@
-"""Some of a batch's games on their own, so that what is wrong with the others stays out of every graph."""
+"""Selection of some games of a batch, so that NaN in the others stays out of every autograd graph."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Function = Callable[[Scene, GameParameters, Tensor], tuple[Tensor, ...]]
 
 
 def games(parameters: GameParameters, scenes: Int[Tensor, " S"], modes: Int[Tensor, " S"]) -> GameParameters:
-    """S games of a batch, each as that of a scene with one mode: [B, M, ...] becomes [S, 1, ...].
+    """S games of a batch, each as a scene with one mode: [B, M, ...] becomes [S, 1, ...].
 
-    Where one game serves all modes, that one is taken.
+    A tensor that is shared by all modes is taken for each of them.
     """
     context = parameters.context
     chosen = dataclasses.replace(parameters, context=None).map(
@@ -33,10 +33,10 @@ def evaluated(
     controls: Float[Tensor, "B M N K 2"],
     chosen: Bool[Tensor, "B M"],
 ) -> tuple[Tensor, ...]:
-    """What a function returns for the chosen games, and zero for the others.
+    """A function's results for the chosen games, and zero for the others.
 
-    Masking a value that is no number is not enough where it is differentiated: zero times NaN is NaN. Games that are not
-    chosen are therefore not looked at.
+    Masking a NaN is not enough where it is differentiated, because zero times NaN is NaN. The function is therefore not
+    evaluated for the other games.
     """
     scenes, modes = chosen.nonzero(as_tuple=True)
     some = function(scene[scenes], games(parameters, scenes, modes), controls[scenes, modes][:, None])

@@ -1,8 +1,7 @@
-"""Whether a pair feature costs both agents the same, without which there is no potential (Theorem 1).
+"""Test of whether a pair feature costs both agents the same, as a potential requires (Theorem 1).
 
-A function of the states of two agents can be anything, so it is tried on some: agents of all sizes, from 10 cm to 100 m
-apart, slow and fast, in all directions. What is symmetric passes for certain; what is not is found unless it is symmetric
-on all of them.
+A function of the states of two agents is evaluated on trial agents of all sizes, 10 cm to 100 m apart, slow and fast, in all
+directions. A symmetric function always passes; an asymmetric one is found unless it is symmetric on all trial agents.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ _TOLERANCE = 1e-6
 
 @cache
 def _agents() -> tuple[tuple[Float[Tensor, "*batch K 4"], Float[Tensor, "*batch 1 2"]], ...]:
-    """States and sizes of the first and of the second agents, always the same."""
+    """States and sizes of the first and of the second trial agents, the same at every call."""
     generator = torch.Generator().manual_seed(0)
 
     def drawn(*shape: int) -> Tensor:
@@ -40,14 +39,14 @@ def _agents() -> tuple[tuple[Float[Tensor, "*batch K 4"], Float[Tensor, "*batch 
 
 @torch.no_grad()
 def difference(function: Callable[..., Tensor], sizes: bool) -> tuple[float, float] | None:
-    """1/2 |r|^2 of a pair of agents and of the same two in the other order, where they differ most; None where they do not.
+    """The costs 1/2 |r|^2 of the two orders of the trial pair with the largest difference; None for a symmetric function.
 
-    What is not a finite number in either order is left out.
+    Pairs whose cost is not finite are left out.
 
     Args:
-        function: of the states of the first and of the second agent [.., K, 4], and where ``sizes`` of their sizes
-            [.., 1, 2], that returns residuals [.., R].
-        sizes: whether it takes sizes.
+        function: takes the states of the first and of the second agent [.., K, 4], and with ``sizes`` their sizes
+            [.., 1, 2]; returns residuals [.., R].
+        sizes: whether the function takes sizes.
     """
 
     def cost(*agents: tuple[Tensor, Tensor]) -> Tensor:

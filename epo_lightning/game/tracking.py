@@ -1,12 +1,13 @@
-"""The controls behind observed motion, which nobody observed: what demonstrations are to energies.
+"""Controls that reproduce an observed motion: the demonstrations from which energies learn.
 
-Where controls change speed and heading, their first guess are differences of the recorded ones. Rolled out, these drift away
-from the recorded positions, because recordings do not keep to the dynamics. A few Gauss-Newton steps take the drift out:
+Recordings have no controls. Where controls change speed and heading, the first guess are differences of the recorded ones.
+Their rollout drifts away from the recorded positions, because recordings do not obey the dynamics. A few Gauss-Newton steps
+remove the drift:
 
     min_c sum_k |p_k(u + c) - p_k|^2 + mu |D c|^2,
 
-D being differences in time. What is smooth is the correction c, not the controls: the recording's own detail stays, and
-where the rollout of the guess u already is where the agent was, nothing is corrected.
+with differences D in time. The correction c is smooth, not the controls: the recording keeps its detail, and where the
+rollout of the guess u already matches the recording, c is zero.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.scene import HEADING, SPEED, Scene
 
 _SMOOTHNESS = 1e-2
-"""mu as a share of the mean of a channel's stiffness, the diagonal of J^T J, so that it has no unit."""
+"""mu relative to the mean of a channel's stiffness, the diagonal of J^T J, so that it has no unit."""
 
 
 @runtime_checkable
 class Rollout(Protocol):
-    """All that is asked of dynamics."""
+    """The part of dynamics that tracking needs."""
 
     def rollout(
         self, initial: Float[Tensor, "*#batch 4"], controls: Float[Tensor, "*batch K 2"], dt: float
@@ -40,18 +41,18 @@ def observed_controls(
 ) -> tuple[Float[Tensor, "B N K 2"], Float[Tensor, "B N"]]:
     """Controls whose rollout follows the observed future, and the mean distance [m] to it that remains.
 
-    Exact for futures that a unicycle of the same integrator made. For other dynamics the guess is zero. Steps that were not
-    observed weigh nothing; controls after an agent's last observed step (:func:`demonstrated`), and those of absent agents,
-    are zero. Not differentiable.
+    Exact for futures that a unicycle with the same integrator made. For other dynamics the first guess is zero. Steps that
+    were not observed have no weight; controls after an agent's last observed step (:func:`demonstrated`) and those of absent
+    agents are zero. Not differentiable.
 
     Args:
-        steps: number of Gauss-Newton steps; an agent takes only those that bring it closer.
+        steps: number of Gauss-Newton steps; for every agent, only steps that reduce its distance are kept.
 
     Raises:
         ValueError: the scene has no future.
     """
     if scene.future is None or scene.future_mask is None:
-        raise ValueError("controls are found by following scene.future, which is None")
+        raise ValueError("controls are derived from scene.future [B, N, K, 4], which is None")
     with torch.no_grad():
         present, dt = scene.agent_mask, scene.dt
         seen = scene.future_mask & present[..., None]
@@ -80,13 +81,13 @@ def observed_controls(
 
 
 def demonstrated(scene: Scene) -> Bool[Tensor, "B N K"]:
-    """Which controls an observation tells of: those up to an agent's last observed step.
+    """Mask of the controls that an observation determines: those up to an agent's last observed step.
 
     Raises:
         ValueError: the scene has no future.
     """
     if scene.future_mask is None:
-        raise ValueError("controls are found by following scene.future, which is None")
+        raise ValueError("controls are derived from scene.future [B, N, K, 4], which is None")
     seen = scene.future_mask & scene.agent_mask[..., None]
     return seen.flip(-1).cumsum(-1).flip(-1) > 0
 
@@ -94,7 +95,7 @@ def demonstrated(scene: Scene) -> Bool[Tensor, "B N K"]:
 def _differences(
     start: Float[Tensor, "B N 4"], future: Float[Tensor, "B N K 4"], seen: Bool[Tensor, "B N K"], dt: float
 ) -> Float[Tensor, "B N K 2"]:
-    """Changes of speed and heading per second; between observed steps that are not neighbours they are constant."""
+    """Changes of speed and heading per second, constant between observed steps that are not neighbours."""
     steps = seen.shape[-1]
     node = torch.arange(steps + 1, device=seen.device)
     known = torch.cat((torch.ones_like(seen[..., :1]), seen), -1)  # x_0 .. x_K
@@ -119,7 +120,7 @@ def _reach(
     states: Float[Tensor, "B N K 4"],
     dt: float,
 ) -> Float[Tensor, "D B N K 2"]:
-    """How positions change with each of an agent's D = 2 K controls."""
+    """Derivatives of the positions by each of an agent's D = 2 K controls."""
     steps = controls.shape[-2]
     unit = torch.eye(2 * steps, dtype=controls.dtype, device=controls.device).view(-1, 1, 1, steps, 2)
     directions = unit.expand(-1, *controls.shape)
@@ -139,13 +140,13 @@ def _step(
     seen: Bool[Tensor, "B N K"],
     told: Bool[Tensor, "B N K"],
 ) -> Float[Tensor, "B N K 2"]:
-    """One Gauss-Newton step towards positions that the rollout missed, after what was corrected so far."""
+    """One Gauss-Newton step: ``missed`` are the remaining offsets, ``corrected`` the correction so far."""
     batch, agents, steps = seen.shape
     jacobian = torch.where(seen[..., None], moved, 0.0).flatten(3).permute(1, 2, 0, 3)  # [B, N, 2 K, 2 K]
     matrix = jacobian @ jacobian.mT
     stiffness = matrix.diagonal(dim1=-2, dim2=-1).unflatten(-1, (steps, 2))
     mean = stiffness.sum(-2) / told.sum(-1, keepdim=True).clamp_min(1)  # [B, N, 2]
-    # Neighbours that both were told of hold on to each other.
+    # The smoothness term couples neighbouring controls that are both determined.
     link = told[..., 1:].to(missed)
     difference = torch.eye(steps, dtype=missed.dtype, device=missed.device).diff(dim=0)
     smooth = difference.mT @ (link[..., None] * difference)  # [B, N, K, K]
@@ -155,7 +156,7 @@ def _step(
         bond = _SMOOTHNESS * mean[..., channel, None, None] * smooth
         block[..., channel, :, channel] += bond
         force[..., channel] -= (bond @ corrected[..., channel, None])[..., 0]
-    # What no position shows (the turn rate of who stands still) stays as it is.
+    # Controls without effect on any position (the turn rate of a standing agent) keep their value.
     most = mean.amax(-1)
     least = 10.0 * torch.finfo(most.dtype).eps * most + (most == 0)
     matrix.diagonal(dim1=-2, dim2=-1).add_(least[..., None])

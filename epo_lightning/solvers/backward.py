@@ -1,13 +1,13 @@
-"""What is learned through the solution of a game: the derivative that a minimiser's result is given (Table 1, column 3).
+"""Derivatives of solutions: what is backpropagated through the solution of a game (Table 1, column 3).
 
-- ``unrolled``, the paper's: the derivative of what was computed, all S steps of it, also by the initial strategies.
-- ``truncated``: that of the last few steps, the iterate before them taken as given.
-- ``implicit``: that of the minimum which the steps approach (implicit function theorem), whatever led there. It is right
-  only where the solution is a minimum, so take many steps: a warning is given, once, where most of a batch are none. A
-  sample whose Hessian is not positive definite is no minimum and gets a gradient of zero and the status STOPPED. A minimum
-  does not move when all weights of a game are scaled together, so the gradient has no component along them, w . dL/dw = 0:
-  their overall scale is not learned and drifts. Fix one weight, or normalise.
-- ``detached``: none, for objectives that compare energies instead of solutions.
+- ``unrolled`` (the paper's): through all S steps of the computation, also to the initial strategies.
+- ``truncated``: through the last few steps, with the iterate before them held constant.
+- ``implicit``: the derivative of the minimum that the steps approach (implicit function theorem), independent of the path.
+  It is right only where the solution is a minimum, so take many steps; a warning is given once if most of a batch are no
+  minima. A sample whose Hessian is not positive definite is no minimum: its gradient is zero and its status STOPPED. A
+  minimum does not move when all weights of a game are scaled together, so w . dL/dw = 0: the overall scale of the weights
+  is not learned and drifts. Fix one weight, or normalise.
+- ``detached``: no derivative, for objectives that compare energies instead of solutions.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import ClassVar
 
 import torch
 
+from epo_lightning.game.checks import check_whole
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
@@ -31,12 +32,12 @@ HESSIANS = ("exact", "gauss_newton")
 
 
 class Backward(ABC):
-    """The interface: runs a minimiser and gives its solution a derivative.
+    """The interface of derivatives: runs a minimiser and attaches a derivative to its solution.
 
     Attributes:
-        needs: of what a minimiser may provide, any one is enough; nothing if empty.
-        teaches: whether anything is learned through the solution.
-        teaches_start: whether initial strategies are.
+        needs: properties of a minimiser, of which it must provide at least one; empty for none.
+        teaches: whether gradients flow through the solution.
+        teaches_start: whether gradients flow to the initial strategies.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset()
@@ -45,12 +46,12 @@ class Backward(ABC):
 
     @property
     def of_energy(self) -> frozenset[str]:
-        """What an energy has to offer."""
+        """Properties that an energy must offer."""
         return frozenset()
 
     @abstractmethod
     def __call__(self, minimiser: Minimiser, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
-        """The minimiser's solution, with a derivative."""
+        """The minimiser's solution, with this derivative."""
 
 
 @register("backward", "unrolled")
@@ -71,7 +72,7 @@ class Truncated(Backward):
     """Differentiate the last steps.
 
     Attributes:
-        steps: how many.
+        steps: number of differentiated steps.
     """
 
     needs = frozenset({STEPS})
@@ -79,12 +80,13 @@ class Truncated(Backward):
     steps: int = 1
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ConfigError(f"backward.steps must be 1 or more, not {self.steps}")
+        check_whole("backward.steps", self.steps)
 
     def __call__(self, minimiser: Minimiser, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         if not isinstance(minimiser, Stepwise):
-            raise ValueError(f"{type(minimiser).__name__} takes no steps that could be truncated")
+            raise ValueError(
+                f"backward=truncated needs a solver with steps that can be continued, not {type(minimiser).__name__}"
+            )
         taught = min(self.steps, minimiser.steps)
         with torch.no_grad():
             first, memory = minimiser.run(energy, scene, parameters, minimiser.steps - taught)
@@ -93,7 +95,7 @@ class Truncated(Backward):
         return dataclasses.replace(
             last,
             initial_energy=first.initial_energy,
-            # Who could take no step at first and went on later was held up, not stopped.
+            # A sample that was STOPPED at first but moved later is reported as DAMPED.
             status=torch.maximum(first.status.clamp_max(Status.DAMPED), last.status),
             iterates=(*first.iterates, *last.iterates[1:]) if first.iterates and last.iterates else None,
         )
@@ -118,7 +120,7 @@ class Implicit(Backward):
 
     @property
     def of_energy(self) -> frozenset[str]:
-        """Gauss-Newton matrices are made of residuals."""
+        """A gradient, and residuals for a Gauss-Newton matrix."""
         return frozenset({GRADIENT} if self.hessian == "exact" else {GRADIENT, RESIDUALS})
 
     def __call__(self, minimiser: Minimiser, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
@@ -139,7 +141,7 @@ class Implicit(Backward):
 @register("backward", "detached")
 @dataclass(frozen=True)
 class Detached(Backward):
-    """Learn nothing through the solution."""
+    """Hold the solution constant: no gradient flows through it."""
 
     teaches = False
 

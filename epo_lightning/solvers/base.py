@@ -1,7 +1,8 @@
-"""What a minimiser is: it takes an energy and where to start, and returns joint strategies (the paper's Table 1, column 2).
+"""The interface of minimisers: maps from an energy and initial strategies to joint strategies (Table 1, column 2).
 
-Minimisers differ in what they need of an energy and in what they provide for learning. Both are declared, so that what
-cannot work together is refused before anything runs (:mod:`epo_lightning.forecasters.combination`).
+Minimisers differ in the properties of the energy that they need and in those of the solution that they provide for
+learning. Both are declared, so that combinations that cannot work are refused before anything runs
+(:mod:`epo_lightning.forecasters.combination`).
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from epo_lightning.game.energy import Energy
 from epo_lightning.scene import GameParameters, Scene, Solution
 
 PATH, STEPS, STATIONARY, SAMPLES, TABLES = "path", "steps", "stationary", "samples", "tables"
-"""What a minimiser may provide: a path that can be differentiated; steps of which it can take some and go on; strategies
-at which the gradient vanishes; draws from exp(-E); or energies of candidates, with their normalised log-probabilities."""
+"""Properties of a minimiser's solution: a path that can be differentiated; steps that can be interrupted and continued;
+strategies with a vanishing gradient; samples of exp(-E); or tables of candidates' energies and log-probabilities."""
 
 
 class Minimiser(ABC):
     """The interface of all minimisers: callable on an energy, a scene and a game for every mode.
 
-    Called while gradients are recorded, a minimiser that provides a path returns controls that are differentiable by
-    unrolling; others return constants. :mod:`~epo_lightning.solvers.backward` makes of that what is learned.
+    While gradients are recorded, a minimiser that provides a path returns controls that are differentiable by unrolling;
+    others return constants. :mod:`~epo_lightning.solvers.backward` defines the derivative that is used for learning.
 
     Attributes:
-        needs: what an energy has to offer (:mod:`epo_lightning.game.energy`).
+        needs: properties that an energy must offer (:mod:`epo_lightning.game.energy`).
         provides: some of :data:`PATH`, :data:`STEPS`, :data:`STATIONARY`, :data:`SAMPLES` and :data:`TABLES`.
     """
 
@@ -45,7 +46,7 @@ class Minimiser(ABC):
         return self
 
     def starts(self, modes: int) -> int:
-        """How many initial strategies of every agent it takes for M modes."""
+        """Number of initial strategies per agent for M modes."""
         return modes
 
     def for_modes(self, modes: int) -> Minimiser:
@@ -53,12 +54,12 @@ class Minimiser(ABC):
         return self
 
     def games(self, modes: int) -> int:
-        """How many games it takes for M modes: one each, or one for all of them."""
+        """Number of games for M modes: one per mode, or one for all of them."""
         return modes
 
 
 class Stepwise(Minimiser):
-    """A minimiser that takes S differentiable steps, and can go on where it stopped: it provides PATH and STEPS."""
+    """A minimiser with S differentiable steps that can be continued: it provides PATH and STEPS."""
 
     steps: int
 
@@ -66,10 +67,10 @@ class Stepwise(Minimiser):
     def run(
         self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Any = None
     ) -> tuple[Solution, Any]:
-        """Take a number of steps; returns the solution, and the memory with which one would go on.
+        """Take a number of steps; returns the solution, and the memory to continue with.
 
         Args:
-            memory: what an earlier call returned; None at the start.
+            memory: the memory that an earlier call returned; None at the start.
         """
 
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
@@ -77,5 +78,5 @@ class Stepwise(Minimiser):
         return self.run(energy, scene, parameters, self.steps)[0]
 
     def with_steps(self, steps: int) -> Stepwise:
-        """The same with another S."""
+        """This minimiser with another number of steps."""
         return dataclasses.replace(self, steps=steps)  # type: ignore[type-var]  # minimisers are dataclasses

@@ -21,8 +21,8 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Status
 from epo_lightning.solvers.backward import Implicit, Unrolled
 from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
-from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
 OWN = ("goal", "velref", "acc", "turnr", "jerk")
 SIZES = ((1.8, 0.6), (0.5, 0.5), (3.9, 1.7), (4.0, 1.8), (4.7, 1.9), (7.9, 2.2), (8.0, 2.3), (16.0, 2.5), (0.4, 0.7))
@@ -274,7 +274,7 @@ def test_pairs_that_only_outer_circles_reach_are_edges():
     found = {}
     for pair in (["circles"], ["proximity"], ["proximity", "circles"]):
         energy = FeatureEnergy(["acc", "turnr"], pair)
-        model = QuadraticModel(energy, scene, game, game.initial_controls, every_pair=False)
+        model = expand(energy, scene, game, game.initial_controls, every_pair=False)
         found[tuple(pair)] = len(model.edges.pair)
         torch.testing.assert_close(
             model.value, energy(scene, game, game.initial_controls).flatten(), rtol=0, atol=1e-12

@@ -143,9 +143,10 @@ def test_a_hundred_candidates_of_four_agents_take_less_than_a_second_each_scene(
 def test_bad_settings_are_refused():
     for settings_, message in (
         ({"shape": "bxo"}, "unknown shape 'bxo' of agents: did you mean 'box'"),
-        ({"shape": "box", "gamma": 0.0}, "must be positive, not 0.0"),
-        ({"shape": "box", "waypoints": 0}, "waypoints must be 1 or more, not 0"),
-        ({"shape": "box", "hidden": 0}, "energy.hidden must be 1 or more, not 0"),
+        ({"shape": "box", "gamma": 0.0}, "energy.gamma must be a number, positive, and finite, not 0.0"),
+        ({"shape": "box", "gamma": float("nan")}, "energy.gamma must be a number, positive, and finite, not nan"),
+        ({"shape": "box", "waypoints": 0}, "waypoints must be a whole number, 1 or more, not 0"),
+        ({"shape": "box", "hidden": 0}, "energy.hidden must be a whole number, 1 or more, not 0"),
     ):
         with pytest.raises(ConfigError, match=message):
             CollisionEnergy(Unicycle(), WIDTH, HORIZON, 1.0, **settings_)

@@ -289,12 +289,14 @@ def test_configurations_can_be_built(name):
     [
         ({"own": ["acc", "lat_acc", "gaol"]}, "did you mean 'goal'"),
         ({"own": ["acc", "goal"]}, "must name acc and lat_acc"),
-        ({"own": "acc"}, "takes a list"),
+        ({"own": "acc"}, "energy.own must be a list of names"),
         ({"own": ["acc", "lat_acc", "acc"]}, "twice"),
         ({"pair": ["proximity"]}, "unknown pair term 'proximity'"),
         ({"direction": "accross"}, "did you mean 'across'"),
-        ({"gap": -1.0}, "energy.gap"),
-        ({"within": 0.0}, "energy.within"),
+        ({"gap": -1.0}, r"energy.gap \[m\] must be a number, 0 or more"),
+        ({"gap": float("nan")}, r"energy.gap \[m\] must be a number, 0 or more, and finite, not nan"),
+        ({"within": 0.0}, r"energy.within \[m\] must be a number, positive, not 0.0"),
+        ({"within": float("nan")}, r"energy.within \[m\] must be a number, positive, not nan"),
         ({"dynamics": Unicycle()}, "dynamics=double_integrator, not with Unicycle"),
     ],
 )

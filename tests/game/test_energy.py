@@ -4,27 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
+import subprocess
+import sys
 from itertools import pairwise
+from pathlib import Path
 
 import jaxtyping
 import pytest
 import torch
-from games import ALL, BOUNDS, feet_held, leaves_of, normal_equations, pad, random_game, random_scene, widen
+from games import ALL, BOUNDS, leaves_of, nearest_points_held, normal_equations, pad, random_game, random_scene, widen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import epo_lightning
 from epo_lightning.game.circles import overlap, separation
 from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.feature_derivatives import nearest_point, pair_derivatives
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import (
     OWN_FEATURES,
     PAIR_FEATURES,
     Source,
-    foot,
     own_feature,
     pair_feature,
 )
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, build
 
 
 def stacked(energy, scene, parameters, controls):
@@ -33,7 +38,7 @@ def stacked(energy, scene, parameters, controls):
 
 def dense_jacobian(energy, scene, parameters, controls):
     """[B, M, R, n] by forward-mode automatic differentiation; samples are independent, so one sum serves all."""
-    with feet_held():
+    with nearest_points_held():
         jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
     return jacobian.permute(1, 2, 0, 3, 4, 5).flatten(3)
 
@@ -155,21 +160,21 @@ def test_coincident_agents_have_a_finite_energy_and_a_gradient_of_zero():
 
 
 def test_touching_is_not_active():
-    energy, touching = FeatureEnergy(["goal"]), torch.tensor([0.5])
-    depth, slope = energy.pair_shape(PAIR_FEATURES["proximity"], touching, touching)
+    touching = torch.tensor([0.5])
+    depth, slope, _ = pair_derivatives(PAIR_FEATURES["proximity"], touching, touching)
     assert depth.item() == slope.item() == 0
 
 
-def test_the_foot_is_the_nearest_point_and_slides_along_its_segment():
+def test_the_nearest_point_slides_along_its_segment():
     line = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
     points = torch.tensor([[1.0, 1.0], [-1.0, 1.0], [3.0, 1.5], [0.5, -1.0]], dtype=torch.float64)
-    nearest, tangent = foot(points, line)
+    nearest, tangent = nearest_point(points, line)
     # The first point is as near to the first segment as to the last one, and the first one counts.
     expected = torch.tensor([[1.0, 0.0], [0.0, 0.0], [2.0, 1.5], [0.5, 0.0]], dtype=torch.float64)
     torch.testing.assert_close(nearest, expected, rtol=0, atol=0)
     slides = torch.tensor([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0], [1.0, 0.0]], dtype=torch.float64)
     torch.testing.assert_close(tangent, slides, rtol=0, atol=0)
-    jacobian = torch.func.jacfwd(lambda p: foot(p, line)[0].sum(0))(points).transpose(0, 1)
+    jacobian = torch.func.jacfwd(lambda p: nearest_point(p, line)[0].sum(0))(points).transpose(0, 1)
     torch.testing.assert_close(jacobian, slides[..., :, None] * slides[..., None, :], rtol=0, atol=1e-15)
 
 
@@ -290,18 +295,67 @@ def test_the_potential_is_each_agents_own_cost_up_to_what_the_agent_cannot_chang
     [
         ({"own": ["gaol"]}, "did you mean 'goal'"),
         ({"own": ["goal"], "pair": ["proximty"]}, "did you mean 'proximity'"),
-        ({"own": "goal"}, "takes a list"),
+        ({"own": "goal"}, "energy.own must be a list of names, not 'goal'"),
+        ({"own": 3}, "energy.own must be a list of names, not 3"),
+        ({"own": ["goal", None]}, "energy.own must be a list of names"),
+        ({"own": ["goal"], "pair": [["proximity"]]}, "energy.pair must be a list of names"),
         ({"own": ["goal", "goal"]}, "twice"),
         ({"own": [], "pair": []}, "at least one feature"),
         ({"own": ["velb"]}, "needs energy.bounds.vel"),
         ({"own": ["vel"], "bounds": {"velocity": (0.0, 1.0)}}, "unknown signal energy.bounds.velocity"),
         ({"own": ["acc"], "pair_stride": 0}, "energy.pair_stride must be a whole number"),
-        ({"own": ["velb"], "bounds": {"vel": (1.0, 0.0)}}, r"must be \[lowest, highest\]"),
+        ({"own": ["acc"], "pair_stride": 1.5}, "energy.pair_stride must be a whole number, 1 or more, not 1.5"),
+        ({"own": ["acc"], "pair_stride": True}, "energy.pair_stride must be a whole number"),
+        ({"own": ["velb"], "bounds": {"vel": (1.0, 0.0)}}, r"energy.bounds.vel must be \[lowest, highest\]"),
+        ({"own": ["velb"], "bounds": {"vel": (float("nan"), 1.0)}}, r"energy.bounds.vel must be \[lowest, highest\]"),
+        ({"own": ["velb"], "bounds": {"vel": ("0", 1.0)}}, r"energy.bounds.vel must be \[lowest, highest\]"),
+        ({"own": ["velb"], "bounds": {"vel": 2.0}}, r"energy.bounds.vel must be \[lowest, highest\], .*, not 2.0"),
+        ({"own": ["velb"], "bounds": {"vel": (0.0, 1.0, 2.0)}}, r"energy.bounds.vel must be \[lowest, highest\]"),
+        ({"own": ["velb"], "bounds": [0.0, 1.0]}, "energy.bounds must map signals"),
     ],
 )
-def test_bad_energies_are_refused(arguments, message):
+def test_bad_energies_are_refused(arguments, message, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checks would come first
     with pytest.raises(ConfigError, match=message):
         FeatureEnergy(**arguments)
+    with pytest.raises(ConfigError, match=message):
+        build("energy", {"name": "features", **arguments})
+
+
+def test_a_stride_beyond_the_horizon_is_refused():
+    scene = random_scene(1, 2)
+    parameters = random_game(scene, horizon=20)
+    FeatureEnergy(["acc"], pair_stride=20).validate(scene, parameters, parameters.initial_controls)
+    with pytest.raises(ValueError, match=r"energy.pair_stride=21 evaluates pairs at no step: .* K = 20"):
+        FeatureEnergy(["acc"], pair_stride=21).validate(scene, parameters, parameters.initial_controls)
+
+
+def test_features_of_installed_packages_are_found_in_plain_python(tmp_path):
+    (tmp_path / "third_party.py").write_text(
+        "from epo_lightning.game.features import own_feature\n"
+        "@own_feature('curvature')\n"
+        "def curvature(states, controls):\n"
+        "    return controls[..., 1] / states[..., 3].clamp_min(1.0)\n"
+    )
+    metadata = tmp_path / "third_party-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: third-party\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[epo_lightning.parts]\nthird_party = third_party\n")
+    script = (
+        "from epo_lightning.game.feature_energy import FeatureEnergy\n"
+        "print(FeatureEnergy(own=['goal', 'curvature']).own)\n"
+        "FeatureEnergy(own=['curvatur'])\n"
+    )
+    path = os.pathsep.join([str(tmp_path), str(Path(epo_lightning.__file__).parents[1])])
+    result = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.stdout == "['goal', 'curvature']\n", result.stderr
+    assert "did you mean 'curvature'?" in result.stderr
 
 
 def replaced(parameters, **changes):

@@ -177,5 +177,5 @@ def test_the_first_of_equally_near_steps_counts():
 
 @pytest.mark.parametrize("hidden", [0, -3])
 def test_networks_without_hidden_features_are_refused(hidden):
-    with pytest.raises(ConfigError, match=f"energy.hidden must be 1 or more, not {hidden}"):
+    with pytest.raises(ConfigError, match=f"energy.hidden must be a whole number, 1 or more, not {hidden}"):
         NeuralEnergy(Unicycle(), WIDTH, HORIZON, SCALE, hidden=hidden)

@@ -34,8 +34,8 @@ from epo_lightning.game.pairs import pairs
 from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scene, Solution, Status, Tables
 from epo_lightning.solvers.diagnostics import quasi_newton
 from epo_lightning.solvers.gauss_newton import structured
+from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LEAST_DAMPING, MOST_DAMPING, Backend, backend
-from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
 _GAUSS_NEWTON, _NEWTON = 20, 60
 """Steps at most. The first kind is cheap and never looks back; the second one arrives where residuals stay large."""
@@ -186,7 +186,7 @@ def _newton(
     """The same with the exact Hessian. Where that has no factor, nothing has become better: more damping will be tried."""
     controls = game.initial_controls
     split = controls.device.type == "cpu"
-    model = QuadraticModel(energy, scene, game, controls, not split, exact=True)
+    model = expand(energy, scene, game, controls, not split, exact=True)
     factors = structured.factorise(model, damping.flatten(0, 1), split, retry=False)
     moved = controls + factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
     there = solve(energy, scene, dataclasses.replace(game, initial_controls=moved), 0, 1.0, damping, False)

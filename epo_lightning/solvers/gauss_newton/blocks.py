@@ -1,13 +1,13 @@
-"""The damped Gauss-Newton matrix, factorised a few nodes at a time: dynamic programming in blocks.
+"""Factorisation of the damped Gauss-Newton matrix, a few nodes at a time: dynamic programming in blocks.
 
-Seen from node s, all that earlier nodes do to later costs goes through three things: how far the next position was moved,
-and where nodes s and s - 1 were moved to (differences of nodes are controls, and differences of those their rates). With
-that state x = (dp_{s+1}, dz_{s-1}, dz_s) and the nodes Z = (dz_{s+1} .. dz_e) of a block, the block is eliminated by
+At node s, earlier nodes affect later costs through three quantities only: the displacement of the next position, and the
+changes of nodes s and s - 1 (differences of nodes are controls, and differences of those their rates). With this state
+x = (dp_{s+1}, dz_{s-1}, dz_s) and the nodes Z = (dz_{s+1} .. dz_e) of a block, the block is eliminated by
 
     L L^T = H_ZZ,   G = L^-1 H_Zx,   P = H_xx - G^T G,
 
-P being what the block before sees of everything that follows. Blocks of some forty unknowns keep the operations few and
-large; the whole costs O(K N^3), and nothing is divided by more than what the block itself needs.
+where P is the cost-to-go that the block before takes over. Blocks of about forty unknowns keep the operations few and
+large; the total cost is O(K N^3).
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from epo_lightning.solvers.gauss_newton.edges import Group
 from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
 _UNKNOWNS = 32
-"""Aimed at in every block: fewer are more operations, more are more arithmetic."""
+"""Target number of unknowns per block: smaller blocks take more operations, larger ones more arithmetic."""
 _ALIGNED = 16
-"""Unknowns are filled up to a multiple of this. Libraries round differently where a matrix starts in the middle of a cache
-line, and a sample must not depend on its place in a batch."""
+"""Unknowns are padded to a multiple of this. Libraries round differently for matrices that are not aligned to cache lines,
+and the result of a sample must not depend on its position in a batch."""
 
 
 def bounds(steps: int, agents: int) -> list[tuple[int, int]]:
@@ -41,8 +41,8 @@ class Block:
     """One block's part of the factors, for C sets of m agents, F = 2 m unknowns at each of its nodes.
 
     Attributes:
-        unknowns: how many there are; what is beyond them, up to n, fills up the arrays.
-        moves: how the nodes move later positions, dt M, component and agent by axis and agent.
+        unknowns: number of unknowns; entries beyond them, up to n, are padding.
+        moves: derivative dt M of later positions by the nodes, component and agent by axis and agent.
         factor: L.
         gain: G^T; None for the first block, whose state is given.
     """
@@ -60,7 +60,7 @@ class Factors:
     blocks: list[Block]
 
     def put(self, where: Int[Tensor, " D"], others: Factors, chosen: Bool[Tensor, " D"]) -> None:
-        """Take over, at ``where``, the chosen ones of other factors."""
+        """Overwrite the factors at ``where`` with the chosen ones of ``others``, in place."""
         for mine, theirs in zip(self.blocks, others.blocks, strict=True):
             mine.factor[where[chosen]] = theirs.factor[chosen]
             if mine.gain is not None and theirs.gain is not None:
@@ -98,18 +98,19 @@ class Factors:
 
 
 def _times(matrix: Float[Tensor, "C a b"], vector: Float[Tensor, "C b 1"]) -> Float[Tensor, "C a 1"]:
-    # Products of rows with vectors round differently in a batch of one: libraries have a routine of its own for it.
+    # Matrix-vector products round differently in a batch of one, for which libraries have a separate routine.
     return (matrix * vector.mT).sum(-1, keepdim=True)
 
 
 def factorise(
     model: QuadraticModel, damping: Float[Tensor, "S *agents"], group: Group
 ) -> tuple[Factors, Bool[Tensor, " C"]]:
-    """Factors of a group's matrices, and which of them have none.
+    """Factors of a group's matrices, and a mask of those that are not positive definite.
 
     Args:
-        model: the energy around an iterate.
-        damping: lambda of every sample or of every agent, a multiple of the identity in their controls.
+        model: the quadratic model of the energy.
+        damping: lambda of every sample or of every agent, added to the diagonal of the controls.
+        group: the sets of agents.
     """
     parts = _Parts(model, damping, group)
     failed = torch.zeros(group.count, dtype=torch.bool, device=damping.device)
@@ -117,7 +118,7 @@ def factorise(
     cost: Tensor | None = None
     # Undeclared features may couple any two steps: then there is one block of all.
     whole = model.blocks is not None or model.pair_blocks is not None
-    for start, end in reversed([(0, model.steps)] if whole else bounds(model.steps, group.size)):
+    for start, end in reversed([(0, model.at.steps)] if whole else bounds(model.at.steps, group.size)):
         block, cost, info = parts.eliminate(start, end, cost)
         blocks.insert(0, block)
         failed |= info != 0
@@ -125,53 +126,55 @@ def factorise(
 
 
 class _Parts:
-    """A model's stiffnesses for one group, laid out [C, .., nodes, .., m]."""
+    """The stiffness of a model for one group, laid out [C, .., nodes, .., m]."""
 
     def __init__(self, model: QuadraticModel, damping: Float[Tensor, "S *agents"], group: Group) -> None:
         self.model, self.group, self.size = model, group, group.size
 
-        # In double precision: nodes see rates of controls divided by dt^4, for which single precision has no digits.
+        # Double precision is needed: rates of controls enter the nodes divided by dt^4.
         def exact(values: Tensor) -> Tensor:
             return values.to(torch.float64)
 
         # Absent agents get unit matrices of their own, so that they are regular even without damping.
-        control = exact(model.control_stiffness) + damping.reshape(len(damping), -1, 1, 1)
-        control = torch.where(model.present[..., None, None], control, 1.0)
-        moves, node, pull = exact(model.moves), exact(model.node_stiffness), exact(model.pull[:, :, 2:])
-        rows = [model.dt * moves.flatten(2, 3), control / model.dt**2, node, pull]
+        control = exact(model.control) + damping.reshape(len(damping), -1, 1, 1)
+        control = torch.where(model.at.present[..., None, None], control, 1.0)
+        moves, node, pull = exact(model.at.moves), exact(model.node), exact(model.position)
+        rows = [model.at.dt * moves.flatten(2, 3), control / model.at.dt**2, node, pull]
         sizes = [4, 2, 2, 3]
-        for optional, scale in ((model.rate_stiffness, model.dt**-4), (model.cross, 1.0)):
+        for optional, scale in ((model.rate, model.at.dt**-4), (model.cross, 1.0)):
             if optional is not None:
                 rows.append(exact(optional) * scale)
             sizes.append(2 * (optional is not None))
         packed = torch.cat(rows, 2).flatten(0, 1)
         if group.agents is not None:
             packed = packed.index_select(0, group.agents.flatten())
-        packed = packed.view(group.count, group.size, -1, model.steps).permute(0, 3, 2, 1).contiguous()  # [C, K, f, m]
+        packed = (
+            packed.view(group.count, group.size, -1, model.at.steps).permute(0, 3, 2, 1).contiguous()
+        )  # [C, K, f, m]
         moves, self.control, self.node, pull, self.rate, self.cross = packed.split(sizes, 2)
         self.moves = moves.unflatten(2, (2, 2))  # [C, K, component, axis, m]
-        # All curvatures in positions, [C, K, axis m, axis m].
-        shared = None if model.pair_curvature is None else exact(model.pair_curvature)
+        # Stiffness of the positions, [C, K, axis m, axis m].
+        shared = None if model.pair_position is None else exact(model.pair_position)
         xx, xy, yy = group.coupled(pull.transpose(1, 2), shared).movedim(3, 1).unbind(2)  # [C, K, m, m]
-        self.curvature = torch.stack((torch.stack((xx, xy), -2), torch.stack((xy, yy), -2)), 2).view(
-            group.count, model.steps, 2 * group.size, 2 * group.size
+        self.position = torch.stack((torch.stack((xx, xy), -2), torch.stack((xy, yy), -2)), 2).view(
+            group.count, model.at.steps, 2 * group.size, 2 * group.size
         )
 
     def eliminate(self, start: int, end: int, cost: Tensor | None) -> tuple[Block, Tensor | None, Tensor]:
-        """The block of nodes start + 1 .. end, given what follows costs; and what it costs itself, seen from before."""
+        """The block of nodes start + 1 .. end, the cost-to-go P, and LAPACK's info; ``cost`` is P of the block after."""
         width, count = 2 * self.size, end - start
         batch = len(self.moves)
         moves = self.moves[:, start:end]
-        # The state moves all positions of the block, start + 1 .. end, and node l those after l, and all that follow.
-        ahead = self.curvature.new_zeros(batch, count + 1, width, width)
-        ahead[:, :-1] = self.curvature[:, start:end].flip(1).cumsum(1).flip(1)
+        # The state moves all positions of the block and after it; node l moves those after l.
+        ahead = self.position.new_zeros(batch, count + 1, width, width)
+        ahead[:, :-1] = self.position[:, start:end].flip(1).cumsum(1).flip(1)
         if cost is not None:
             ahead += cost[:, None, :width, :width]
-        beta = self.model.beta
+        beta = self.model.at.beta
         later = ahead[:, 1:]
         if beta != 1.0:
-            # Position l itself moves with 1 - beta of node l, which counts twice on the diagonal.
-            later = later + (1.0 - beta) * self.curvature[:, start:end]
+            # Position l also moves with 1 - beta of node l, which enters the diagonal twice.
+            later = later + (1.0 - beta) * self.position[:, start:end]
         by_axis = later.view(batch, count, 2, self.size, width)
         unknowns = count * width
         filled = -(-unknowns // _ALIGNED) * _ALIGNED
@@ -181,7 +184,7 @@ class _Parts:
         product.addcmul_(moves[:, :, :, 1, :, None], by_axis[:, :, None, 1])
         apart = right[:, :unknowns].view(batch, count, 2, self.size, 2, self.size)
         apart.diagonal(dim1=3, dim2=5).copy_(moves)
-        # Column by column, as factorisations and triangular solves in place take them.
+        # Column-major, for in-place factorisations and triangular solves.
         matrix = torch.bmm(right, left.mT).mT
         if cost is not None:
             tail = slice(unknowns - 2 * width, unknowns)
@@ -202,9 +205,9 @@ class _Parts:
         if beta not in (0.0, 1.0):
             diagonal = nodes.unflatten(1, (count, width)).unflatten(3, (count, width)).diagonal(0, 1, 3)
             by_node = apart.view(batch, count, width, width)
-            at_node = by_node @ (self.curvature[:, start:end] @ by_node.mT)
+            at_node = by_node @ (self.position[:, start:end] @ by_node.mT)
             diagonal -= beta * (1.0 - beta) * at_node.permute(0, 2, 3, 1)
-        if start == 0 and end == self.model.steps:
+        if start == 0 and end == self.model.at.steps:
             self._add_undeclared(nodes)
         info = torch.empty(batch, dtype=torch.int32, device=matrix.device)
         torch.linalg.cholesky_ex(matrix, out=(matrix, info))
@@ -271,8 +274,8 @@ class _Parts:
         return own
 
     def _add_undeclared(self, matrix: Tensor) -> None:
-        """Add the dense curvatures of undeclared features to the matrix of all nodes."""
-        steps, size = self.model.steps, self.size
+        """Add the dense stiffness of undeclared features to the matrix of all nodes."""
+        steps, size = self.model.at.steps, self.size
         nodes = matrix.unflatten(1, (steps, 2, size)).unflatten(4, (steps, 2, size))
         if self.model.blocks is not None:
             blocks = self.model.blocks

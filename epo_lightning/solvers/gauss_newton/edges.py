@@ -1,4 +1,4 @@
-"""Which pairs of agents matter, and which agents belong together because of them."""
+"""Edges and groups: pairs of agents that may interact, and sets of agents whose matrices are factorised together."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Edges:
     """Pairs of agents, through all samples.
 
     Attributes:
-        first, second: the agents i and j as s N + i and s N + j.
-        pair: the pair as s P + p.
+        first, second: numbers s N + i and s N + j of the agents.
+        pair: number s P + p of the pair.
         samples, agents: S and N.
         every: whether these are all pairs, in order.
     """
@@ -49,7 +49,7 @@ class Edges:
     def near(
         cls, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B M N K 4"]
     ) -> Edges:
-        """The pairs that may matter: both agents exist, a weight is not zero, and their ways' boxes come within reach."""
+        """The pairs that may interact: both agents are present, a weight is not zero, and their bounding boxes overlap."""
         batch, modes, agents = states.shape[:3]
         weights = torch.stack([energy.pair_weight(scene, parameters, name) for name in energy.pair])
         matters = (weights != 0).any(0)
@@ -68,21 +68,25 @@ class Edges:
         start = agents * sample
         return cls(start + first[within], start + second[within], pair, batch * modes, agents, every=False)
 
+    def of_pairs(self, values: Float[Tensor, " pairs"]) -> Float[Tensor, " E"]:
+        """The values of these edges, from those of all pairs of all samples."""
+        return values if self.every else values.index_select(0, self.pair)
+
     def ends(self, values: Float[Tensor, "S N *rest"]) -> tuple[Float[Tensor, "E *rest"], Float[Tensor, "E *rest"]]:
-        """What both agents of every pair hold."""
+        """The values of the first and of the second agent of every edge."""
         flat = values.flatten(0, 1)
         return flat.index_select(0, self.first), flat.index_select(0, self.second)
 
     def difference(self, values: Float[Tensor, "S N *rest"]) -> Float[Tensor, "E *rest"]:
-        """How the first agent's value exceeds the second's."""
+        """The first agent's value minus the second's."""
         first, second = self.ends(values)
         return first.sub_(second)
 
     def spread_(self, onto: Float[Tensor, "S N *rest"], first: Tensor, second: Tensor) -> None:
-        """Add to every agent what its pairs have for it.
+        """Add values of edges to their first and second agents, in place.
 
-        On a CPU one pair after the other, so that sums do not depend on what else is in the batch; elsewhere, where the
-        pairs are complete, as a product with the incidence matrix, which has an order, unlike additions in parallel.
+        On a CPU edge by edge, so that sums do not depend on the rest of the batch; on other devices with complete edges as a
+        product with the incidence matrix, which is deterministic, unlike parallel additions.
         """
         if onto.device.type == "cpu" or not self.every:
             onto.flatten(0, 1).index_add_(0, self.first, first).index_add_(0, self.second, second)
@@ -98,10 +102,10 @@ class Group:
     """C sets of m agents whose matrices are assembled together.
 
     Attributes:
-        agents: their numbers s N + i; None for all agents of all samples, in order.
+        agents: numbers s N + i of the agents; None for all agents of all samples, in order.
         count, size: C and m.
-        edges: the edges between them; None for all edges.
-        component, first, second: for each of these edges, the set and the places of both agents in it.
+        edges: indices of the edges within the sets; None for all edges.
+        component, first, second: for each of these edges, its set and the positions of both agents in the set.
     """
 
     agents: Int[Tensor, "C m"] | None
@@ -120,7 +124,7 @@ class Group:
         return cls(None, edges.samples, edges.agents, None, sample, edges.first - start, edges.second - start)
 
     def subset(self, chosen: Int[Tensor, " D"]) -> Group:
-        """Some of these sets alone."""
+        """The group of some of these sets."""
         agents = self.agents
         if agents is None:
             agents = torch.arange(self.count * self.size, device=chosen.device).view(self.count, self.size)
@@ -138,13 +142,13 @@ class Group:
         )
 
     def of_edges(self, values: Float[Tensor, "E *rest"]) -> Float[Tensor, "e *rest"]:
-        """What the edges of this group hold."""
+        """The values of this group's edges."""
         return values if self.edges is None else values.index_select(0, self.edges)
 
     def coupled(
         self, own: Float[Tensor, "C 3 K m"], shared: Float[Tensor, "E 3 K"] | None
     ) -> Float[Tensor, "C 3 m K m"]:
-        """Curvatures between all agents: what they hold themselves, and minus what their pairs share."""
+        """Stiffness between all agents: ``own`` on the diagonal, and minus ``shared`` between the agents of an edge."""
         full = own.new_zeros(self.count, 3, self.size, own.shape[2], self.size)
         full.diagonal(dim1=2, dim2=4).copy_(own)
         if shared is not None:

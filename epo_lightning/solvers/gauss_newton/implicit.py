@@ -1,8 +1,8 @@
-"""Differentiation of a minimiser by the implicit function theorem: what a change of the game does to the solution.
+"""Implicit differentiation of a minimum: the derivative of the solution by the game's parameters.
 
 At a minimum, grad E(u, p) = 0 for every p near by, so du/dp = -H^-1 d(grad E)/dp with the Hessian H of E. For a cotangent v
-of the solution, H mu = v, and the gradient is that of -<mu, grad E(u, p)> by p with u and mu held constant. No step of the
-minimisation counts, and none of what it started from: initial controls have no gradient.
+of the solution, H mu = v, and the gradient is that of -<mu, grad E(u, p)> by p with u and mu held constant. It does not
+depend on the path of the minimisation: initial controls have no gradient.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Status
-from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
+from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.structured import Game, factorise, planar
 from epo_lightning.solvers.general import descent
 
@@ -23,7 +23,7 @@ from epo_lightning.solvers.general import descent
 def attach(
     energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
 ) -> tuple[Tensor, Tensor]:
-    """The controls of a solution with the gradient that the implicit function theorem gives them, and a status.
+    """The controls of a solution with their implicit derivative, and a status.
 
     Args:
         energy, scene, parameters: the game.
@@ -31,8 +31,8 @@ def attach(
         exact: whether H is the Hessian or its Gauss-Newton approximation.
 
     Returns:
-        controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H has no Cholesky factor, that is, where the
-        controls are no minimum; such a sample has a gradient of zero.
+        controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H is not positive definite, so that the controls
+        are no minimum; such a sample has a gradient of zero.
     """
     none = controls.new_zeros(controls.shape[:2]).flatten()
     game = Game(energy, scene, parameters, 1.0, none, controls.device.type == "cpu")
@@ -43,11 +43,11 @@ def attach(
 class _Attach(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, game: Game, exact: bool, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        model = QuadraticModel(game.energy, game.scene, game.with_tensors(tensors), controls, not game.split, exact)
+        model = expand(game.energy, game.scene, game.with_tensors(tensors), controls, not game.split, exact)
         ctx.factors = factorise(model, game.damping, game.split, retry=False)
         slope = model.gradient
         left = ctx.factors.solve(slope).flatten(1)
-        descent.say_if_far(model.value, slope.flatten(1), left, ctx.factors.status != Status.STOPPED)
+        descent.warn_if_far(model.value, slope.flatten(1), left, ctx.factors.status != Status.STOPPED)
         ctx.game = game
         ctx.save_for_backward(*tensors)
         status = ctx.factors.status.view(controls.shape[:2])
@@ -58,8 +58,8 @@ class _Attach(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         factors, tensors = ctx.factors, ctx.saved_tensors
-        sound = factors.status != Status.STOPPED
-        adjoint = torch.where(sound[:, None, None, None], factors.solve(planar(cotangent)), 0.0)
+        definite = factors.status != Status.STOPPED
+        adjoint = torch.where(definite[:, None, None, None], factors.solve(planar(cotangent)), 0.0)
         _, by = ctx.game.pullback(factors.model, tensors, adjoint, torch.zeros_like(adjoint))
-        by = [torch.where(sound.view(*g.shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
+        by = [torch.where(definite.view(*g.shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
         return None, None, None, *by

@@ -1,10 +1,10 @@
 """The energy-based potential game layer (Section 4.3): S damped Gauss-Newton steps, differentiable.
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
-modes are solved at once and none of them can disturb another: where a factorisation fails, that sample alone is tried again
-with more damping, and where that fails too it keeps its last good iterate. Two backends compute a step
+modes are solved at once and independently of each other: where a factorisation fails, that sample alone is tried again with
+more damping, and if that fails too it keeps its last good iterate. Two backends compute the steps
 (:mod:`~epo_lightning.solvers.gauss_newton.compiled` and :mod:`~epo_lightning.solvers.gauss_newton.structured`); this module
-decides what is done with the steps.
+chooses the backend and, with adaptive damping, accepts or rejects steps.
 """
 
 from __future__ import annotations
@@ -16,20 +16,22 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from epo_lightning.game.checks import check_number, check_whole, is_number
 from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
 from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.general import descent
 
 Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool], Solution]
 """(energy, scene, parameters, steps, step size, damping [B, M] or [B, M, N], keep iterates) -> solution.
 
-An agent whose damping is infinite stays exactly where it is, and the others move as if it were part of the scenery."""
+An agent with infinite damping keeps its controls exactly; the others are solved with its trajectory held fixed."""
 
 LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e7
-"""Between which adaptive damping stays."""
+"""Range of the adaptive damping."""
 BACKENDS = ("auto", "pytorch", "compiled")
 
 
@@ -38,8 +40,8 @@ BACKENDS = ("auto", "pytorch", "compiled")
 class LevenbergMarquardt(Stepwise):
     """S steps of damped Gauss-Newton from the initial strategies (Section 4.3, "Differentiable Optimization").
 
-    What is learned through the solution is said by a :class:`~epo_lightning.solvers.backward.Backward`; called by itself,
-    the solver unrolls.
+    The derivative of the solution is chosen by a :class:`~epo_lightning.solvers.backward.Backward`; called on its own, the
+    solver unrolls.
 
     Example::
 
@@ -52,10 +54,10 @@ class LevenbergMarquardt(Stepwise):
         step_size: alpha, 0 < alpha <= 1.
         damping: lambda >= 0, added to the diagonal of J^T J.
         keep_iterates: whether the solution carries u_0 .. u_S.
-        adaptive: whether every sample rejects steps that do not lower its energy and multiplies its damping by 10 then (at
-            most 1e7), and accepts the others and divides it by 10 (at least 1e-7). Decisions are constants to the gradient.
-        test_steps: the number of steps that forecasters take outside training; None for the same.
-        backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it can serve.
+        adaptive: whether every sample rejects steps that do not lower its energy and then multiplies its damping by 10 (up
+            to 1e7), and divides it by 10 after other steps (down to 1e-7). The decisions have no gradient.
+        test_steps: number of steps outside training; None for the same number.
+        backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it supports the game.
     """
 
     needs = frozenset({FEATURES})
@@ -70,14 +72,12 @@ class LevenbergMarquardt(Stepwise):
     backend: str = "auto"
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ConfigError(f"solver.steps must be 0 or more, not {self.steps}")
-        if self.test_steps is not None and self.test_steps < 0:
-            raise ConfigError(f"solver.test_steps must be 0 or more, not {self.test_steps}")
-        if not 0 < self.step_size <= 1:
-            raise ConfigError(f"solver.step_size must be in (0, 1], not {self.step_size}")
-        if not 0 <= self.damping < float("inf"):
-            raise ConfigError(f"solver.damping must be 0 or more, and finite, not {self.damping}")
+        check_whole("solver.steps", self.steps, least=0)
+        if self.test_steps is not None:
+            check_whole("solver.test_steps", self.test_steps, least=0)
+        if not is_number(self.step_size) or not 0 < self.step_size <= 1:
+            raise ConfigError(f"solver.step_size must be a number in (0, 1], not {self.step_size!r}")
+        check_number("solver.damping", self.damping, zero=True)
         if self.backend not in BACKENDS:
             raise ConfigError(f"unknown solver.backend {self.backend!r}: {nearest(str(self.backend), BACKENDS)}")
 
@@ -88,14 +88,16 @@ class LevenbergMarquardt(Stepwise):
     def run(
         self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Tensor | None = None
     ) -> tuple[Solution, Tensor]:
-        """Take a number of steps; returns the solution and the damping with which one would go on.
+        """Take a number of steps; returns the solution and the damping to continue with.
 
         Raises:
             ValueError: scene and parameters do not fit together (the message names the tensor and its expected shape), or
-                the backend asked for cannot solve this game.
+                the chosen backend cannot solve this game.
         """
         if not isinstance(energy, FeatureEnergy):
-            raise ValueError(f"the solver takes energies made of features, not {type(energy).__name__}")
+            raise ValueError(
+                f"solver=levenberg_marquardt takes energy=features, not {type(energy).__name__}; choose a general solver"
+            )
         start = parameters.initial_controls
         energy.validate(scene, parameters, start)
         parameters = parameters.for_modes(start.shape[1])
@@ -105,7 +107,7 @@ class LevenbergMarquardt(Stepwise):
             scene = scene.to(start.dtype)
         damping = start.new_full(start.shape[:2], self.damping) if memory is None else memory
         if start.numel() == 0:
-            return _nothing(start), damping
+            return descent.nothing(start), damping
         solve = backend(self.backend, energy, scene, parameters)
         if not self.adaptive:
             return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates), damping
@@ -122,10 +124,10 @@ class LevenbergMarquardt(Stepwise):
 
 
 def backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Backend:
-    """What computes the steps of a game.
+    """The function that computes the steps of a game.
 
     Raises:
-        ValueError: the backend asked for cannot solve this game.
+        ValueError: the chosen backend cannot solve this game.
     """
     if name == "pytorch":
         return structured.solve
@@ -139,15 +141,8 @@ def backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GamePara
     return structured.solve
 
 
-def _nothing(controls: Tensor) -> Solution:
-    """The solution of no game at all: no scene, no mode or no agent."""
-    none = controls.new_zeros(controls.shape[:2])
-    states = controls.new_zeros(*controls.shape[:-1], 4)
-    return Solution(controls, states, none, none, none, none.long(), None)
-
-
 def _chosen(better: Tensor, trial: Solution, before: Solution, keep_iterates: bool) -> Solution:
-    """The trial where it is better, and what was before elsewhere."""
+    """The trial solution where it is better, and the solution before it elsewhere."""
     keep = better[..., None, None, None]
     controls = torch.where(keep, trial.controls, before.controls)
     accepted = torch.where(better, trial.status, Status.SOLVED)
@@ -158,7 +153,7 @@ def _chosen(better: Tensor, trial: Solution, before: Solution, keep_iterates: bo
         initial_energy=before.initial_energy,
         energy=torch.where(better, trial.energy, before.energy),
         gradient_norm=torch.where(better, trial.gradient_norm, before.gradient_norm),
-        # A step without a factor is one more that is rejected; a sample whose energy is no number has no steps at all.
+        # A step without a factor counts as rejected; a sample with a NaN or infinite energy takes no step at all.
         status=torch.where(before.energy.isfinite(), before.status.maximum(accepted), Status.STOPPED),
         iterates=(*before.iterates, controls) if keep_iterates else before.iterates,
     )

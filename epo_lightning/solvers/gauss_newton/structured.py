@@ -2,19 +2,17 @@
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Two things happen around it.
 
-*Splitting.* Agents that no active pair connects do not know of each other: on a CPU every sample falls apart into the
-connected components of its active pairs, and components of one size are factorised together. What is solved for an agent
-then depends on nothing but its component, to the last bit, and a scene with few active pairs costs little more than its
-agents alone. Other devices would have to wait for the host to learn the components; there every sample is one matrix, and
-no operation asks the device for a number.
+*Splitting.* Agents that no active pair connects are independent: on a CPU every sample is split into the connected
+components of its active pairs, and components of one size are factorised together. The solution of an agent then depends on
+its component alone, to the last bit, and a scene with few active pairs costs little more than its agents alone. On other
+devices finding the components would make the host wait; there every sample is one matrix, and no operation synchronises.
 
 *Differentiation* does not tape the factorisation. For a cotangent v of u + alpha d, one more solve with the same factor
 gives mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
 
     phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
 
-in closed form (:meth:`~epo_lightning.solvers.gauss_newton.quadratic_model.QuadraticModel.pullback`), to which v itself is
-added for u.
+in closed form (:mod:`~epo_lightning.solvers.gauss_newton.pullback`), to which v itself is added for u.
 """
 
 from __future__ import annotations
@@ -30,18 +28,19 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.game.features import Source
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.gauss_newton import blocks
 from epo_lightning.solvers.gauss_newton.edges import Group
+from epo_lightning.solvers.gauss_newton.expansion import expand
+from epo_lightning.solvers.gauss_newton.pullback import pullback
 from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
 _RETRIES = 4
-"""How often the damping of a sample that cannot be factorised is raised tenfold."""
+"""Number of times that the damping of a sample without a Cholesky factor is raised tenfold."""
 _LEAST_RAISED_DAMPING = 1e-3
-"""Where raising starts from when the damping is smaller."""
+"""Smallest damping from which raising starts."""
 _HOLDING = 1e30
-"""Stands for an infinite damping in the matrices: beside it no curvature is seen, and nobody else is disturbed by it."""
+"""Finite stand-in for infinite damping in the matrices, which avoids inf - inf."""
 
 
 def solve(
@@ -60,18 +59,18 @@ def solve(
     unrolling.
 
     Args:
-        energy, scene, parameters: what to minimise; they fit together.
+        energy, scene, parameters: the game, already validated.
         steps: number S of steps.
         step_size: alpha.
-        damping: lambda of every sample, or of every agent; an infinite one holds the agent exactly where it is.
+        damping: lambda of every sample, or of every agent; infinite damping keeps the agent's controls exactly.
         keep_iterates: whether the solution carries u_0 .. u_S.
-        split: whether samples fall apart into components; by default, on a CPU.
+        split: whether samples are split into components; by default, on a CPU.
     """
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
     split = controls.device.type == "cpu" if split is None else split
     game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(0, 1), split)
     tensors = game.tensors(parameters)
-    status = torch.where(game.known, Status.SOLVED, Status.STOPPED)
+    status = torch.where(game.finite, Status.SOLVED, Status.STOPPED)
     iterates = [controls]
     initial_energy = None
     for _ in range(steps):
@@ -80,14 +79,14 @@ def solve(
         status = torch.maximum(status, outcome)
         iterates.append(controls)
     with torch.no_grad():
-        last = QuadraticModel(energy, scene, parameters, controls, not split)
+        last = expand(energy, scene, parameters, controls, not split)
         gradient_norm = last.gradient.square().flatten(2).sum(-1).cumsum(1)[:, -1].sqrt().view_as(status)
         final_energy = last.value.view_as(status)
     return Solution(
         controls=controls,
         states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
         if controls.requires_grad
-        else last.states,
+        else last.at.states,
         initial_energy=final_energy if initial_energy is None else initial_energy,
         energy=final_energy,
         gradient_norm=gradient_norm,
@@ -98,7 +97,7 @@ def solve(
 
 @dataclasses.dataclass(frozen=True)
 class Game:
-    """What stays the same from step to step."""
+    """A game with the settings that are the same in every step."""
 
     energy: FeatureEnergy
     scene: Scene
@@ -108,12 +107,12 @@ class Game:
     split: bool
 
     @cached_property
-    def known(self) -> Bool[Tensor, "B M"]:
-        """See :meth:`~epo_lightning.game.energy.Energy.known`."""
-        return self.energy.known(self.scene, self.parameters)
+    def finite(self) -> Bool[Tensor, "B M"]:
+        """See :meth:`~epo_lightning.game.feature_energy.FeatureEnergy.finite`."""
+        return self.energy.finite(self.scene, self.parameters)
 
     def tensors(self, parameters: GameParameters) -> list[Tensor]:
-        """The tensors of a game that an iterate is differentiated by."""
+        """The tensors of a game that have a gradient: weights, and goals if a feature needs them."""
         tensors = [parameters.own_weights[name] for name in self.energy.own]
         tensors += [parameters.pair_weights[name] for name in self.energy.pair]
         if self.energy.needs_goals:
@@ -122,7 +121,7 @@ class Game:
         return tensors
 
     def with_tensors(self, tensors: Sequence[Tensor]) -> GameParameters:
-        """The game with these tensors instead."""
+        """The game's parameters with these tensors."""
         own, pair = list(self.energy.own), list(self.energy.pair)
         goals = tensors[len(own) + len(pair) :]
         return dataclasses.replace(
@@ -135,39 +134,33 @@ class Game:
     def pullback(
         self, model: QuadraticModel, tensors: Sequence[Tensor], adjoint: Tensor, step: Tensor
     ) -> tuple[Tensor, list[Tensor]]:
-        """phi's gradient by the controls and by the game's tensors."""
-        shape = model.controls.shape
-        by_controls, own, pair, goals = model.pullback(adjoint, step)
-        by_controls = by_controls.transpose(-1, -2).reshape(shape)
-        gradients = [own.get(name) for name in self.energy.own] + [pair.get(name) for name in self.energy.pair]
+        """The gradient of phi by the controls and by the game's tensors."""
+        shape = model.at.controls.shape
+        found = pullback(model, adjoint, step)
+        by_controls = found.controls.transpose(-1, -2).reshape(shape)
+        gradients = [found.own.get(name) for name in self.energy.own]
+        gradients += [found.pair.get(name) for name in self.energy.pair]
         if self.energy.needs_goals:
-            gradients.append(goals)
+            gradients.append(found.goals)
         by = [
             torch.zeros_like(tensor) if gradient is None else gradient.reshape(tensor.shape)
             for tensor, gradient in zip(tensors, gradients, strict=True)
         ]
-        if self.undeclared is not None:
+        if self.energy.undeclared is not None:
             directions = torch.stack([change.transpose(-1, -2).reshape(shape) for change in (adjoint, step)])
-            extra, rest = _undeclared(self, model.controls, tensors, directions)
+            extra, rest = _pullback_undeclared(self, self.energy.undeclared, model.at.controls, tensors, directions)
             by_controls = by_controls + extra
             by = [one + other for one, other in zip(by, rest, strict=True)]
         return by_controls, by
 
-    @property
-    def undeclared(self) -> FeatureEnergy | None:
-        """The features that only automatic differentiation knows about."""
-        own = [name for name, feature in self.energy.own_features.items() if feature.source is Source.TRAJECTORY]
-        pair = [name for name, feature in self.energy.pair_features.items() if feature.source is Source.TRAJECTORY]
-        return dataclasses.replace(self.energy, own=own, pair=pair) if own or pair else None
-
 
 def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) -> list[Group]:
-    """The agents of every sample, grouped by the active pairs that connect them; the absent and the held are in no group."""
-    edges, mask = model.edges, model.scene.agent_mask
+    """The connected components of active pairs in every sample; absent and held agents are in no group."""
+    edges = model.edges
     samples, agents = edges.samples, edges.agents
-    moving = mask[:, None].expand(-1, samples // len(mask), -1).flatten()
+    moving = model.at.present.flatten()
     links = model.linked
-    if held is not None:  # a pair of which one is held pulls at the other, and that is all
+    if held is not None:  # a pair with a held agent acts on the other agent only, and connects nothing
         moving = moving & ~held.flatten()
         links = links & moving[edges.first] & moving[edges.second]
     linked = bool(links.all())
@@ -177,7 +170,7 @@ def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) 
     first, second = edges.first, edges.second
     if chosen is not None:
         first, second = first[chosen], second[chosen]
-    # Every agent takes the lowest number among those that it is connected with.
+    # Label propagation: every agent takes the lowest label among the agents it is connected with.
     label = torch.arange(samples * agents)
     while True:
         lowest = torch.minimum(label[first], label[second])
@@ -217,14 +210,14 @@ def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) 
 
 @dataclasses.dataclass(frozen=True)
 class Factors:
-    """J^T J + lambda I of every sample, factorised.
+    """The factorised matrices J^T J + lambda I of all samples.
 
     Attributes:
-        model: whose matrices these are.
-        groups: the agents that were factorised together.
-        factors: of each group.
+        model: the quadratic model.
+        groups: the sets of agents that were factorised together.
+        factors: one per group.
         status: a :class:`Status` per sample.
-        held: the agents that stay where they are, where agents have a damping each.
+        held: mask of the agents with infinite damping; None where damping is given per sample.
     """
 
     model: QuadraticModel
@@ -235,9 +228,9 @@ class Factors:
 
     def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
         """(J^T J + lambda I)^-1 times a covector of the controls."""
-        exact = self.model.to_nodes(right.to(torch.float64))
+        exact = self.model.at.to_nodes(right.to(torch.float64))
         parts = [f.solve(_gather(group, exact)) for f, group in zip(self.factors, self.groups, strict=True)]
-        solved = self.model.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
+        solved = self.model.at.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
         return solved if self.held is None else torch.where(self.held[..., None, None], 0.0, solved)
 
 
@@ -246,21 +239,21 @@ def factorise(
 ) -> Factors:
     """Factorise the matrices of all samples, of each component on its own where they are split.
 
-    Where retrying is allowed, a matrix without a factor gets ten, a hundred, ... times the damping, and the others keep
-    every bit. What comes out for one that has no factor at any damping is of no meaning.
+    With ``retry``, a matrix that is not positive definite gets ten, a hundred, ... times the damping, and the others are not
+    affected. Solutions with a matrix that has no factor at any damping (status STOPPED) are meaningless.
 
     Args:
-        model: the energy around an iterate.
+        model: the quadratic model of the energy.
         damping: lambda of every sample, or of every agent.
-        split: whether samples fall apart into components.
-        retry: whether what has no factor is tried again with more damping; by default, where samples are split.
+        split: whether samples are split into components.
+        retry: whether to try again with more damping; by default, where samples are split.
     """
     held = damping.isinf() if damping.dim() == 2 else None
     if held is not None:
         damping = damping.clamp_max(_HOLDING)
     groups = _components(model, held) if split else [Group.whole(model.edges)]
     factors = []
-    status = torch.zeros(model.samples, dtype=torch.long, device=damping.device)
+    status = torch.zeros(model.at.samples, dtype=torch.long, device=damping.device)
     for group in groups:
         found, failed = blocks.factorise(model, damping, group)
         outcome = torch.where(failed, Status.STOPPED, Status.SOLVED)
@@ -269,8 +262,8 @@ def factorise(
         factors.append(found)
         if group.agents is None:
             status = outcome
-        else:  # of a sample, the worst one of its components
-            status = status.scatter_reduce(0, group.agents[:, 0] // model.agents, outcome, "amax")
+        else:  # a sample has the worst status of its components
+            status = status.scatter_reduce(0, group.agents[:, 0] // model.at.agents, outcome, "amax")
     return Factors(model, groups, factors, status, held)
 
 
@@ -281,7 +274,7 @@ def _retry(
     factors: blocks.Factors,
     outcome: Int[Tensor, " C"],
 ) -> None:
-    """Factorise again, with more and more damping, what has no factor; writes factors and outcome."""
+    """Factorise matrices without a factor again with increasing damping; writes ``factors`` and ``outcome`` in place."""
     raised = damping.clamp_min(_LEAST_RAISED_DAMPING)
     for _ in range(_RETRIES):
         raised = 10.0 * raised
@@ -294,12 +287,12 @@ def _retry(
 
 
 def planar(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "S N 2 K"]:
-    """Controls as models lay them out."""
+    """Controls in the layout of the quadratic model."""
     return controls.flatten(0, 1).transpose(-1, -2).contiguous()
 
 
 def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tensor, "S N 2 K"]) -> Tensor:
-    """Vectors [C, n] of groups back in their samples, zero for agents that are in no group."""
+    """Vectors [C, n] of groups in the layout of samples, zero for agents that are in no group."""
     steps = like.shape[-1]
     rows = torch.zeros_like(like).flatten(0, 1)
     for group, part in zip(groups, parts, strict=True):
@@ -311,7 +304,7 @@ def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tenso
 
 
 def _gather(group: Group, values: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "C n"]:
-    """Vectors of samples as a group orders its unknowns."""
+    """Vectors of samples in the order of a group's unknowns."""
     by_agent = values if group.agents is None else values.flatten(0, 1)[group.agents]
     return by_agent.permute(0, 3, 2, 1).reshape(group.count, -1)
 
@@ -322,18 +315,18 @@ class _Step(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, game: Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parameters = game.with_tensors(tensors)
-        model = QuadraticModel(game.energy, game.scene, parameters, controls, not game.split)
+        model = expand(game.energy, game.scene, parameters, controls, not game.split)
         factors = factorise(model, game.damping, game.split)
         step = factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
         status = factors.status.view(controls.shape[:2])
         moved = controls + game.step_size * step
-        sound = game.known & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
-        keep = sound[..., None, None, None]
-        status = torch.where(sound, status, Status.STOPPED)
+        solved = game.finite & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
+        keep = solved[..., None, None, None]
+        status = torch.where(solved, status, Status.STOPPED)
         value = model.value.view(controls.shape[:2])
         if any(ctx.needs_input_grad):
             ctx.game, ctx.factors = game, factors
-            ctx.save_for_backward(torch.where(keep, step, 0.0), sound, *tensors)
+            ctx.save_for_backward(torch.where(keep, step, 0.0), solved, *tensors)
         ctx.mark_non_differentiable(status, value)
         return torch.where(keep, moved, controls), status, value
 
@@ -342,25 +335,24 @@ class _Step(torch.autograd.Function):
     def backward(ctx: Any, cotangent: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         game, factors = ctx.game, ctx.factors
         model = factors.model
-        step, sound, *tensors = ctx.saved_tensors
+        step, solved, *tensors = ctx.saved_tensors
         shape = cotangent.shape
         adjoint = factors.solve(game.step_size * planar(cotangent))
-        adjoint = torch.where(sound.flatten()[:, None, None, None], adjoint, 0.0)
+        adjoint = torch.where(solved.flatten()[:, None, None, None], adjoint, 0.0)
         by_controls, by = game.pullback(model, tensors, adjoint, planar(step))
-        by_controls = torch.where(sound[..., None, None, None], by_controls, 0.0)
-        by = [torch.where(sound.view(*shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
+        by_controls = torch.where(solved[..., None, None, None], by_controls, 0.0)
+        by = [torch.where(solved.view(*shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
         return None, cotangent + by_controls, *by
 
 
-def _undeclared(
-    game: Game, controls: Tensor, tensors: Sequence[Tensor], directions: Tensor
+def _pullback_undeclared(
+    game: Game, undeclared: FeatureEnergy, controls: Tensor, tensors: Sequence[Tensor], directions: Tensor
 ) -> tuple[Tensor, list[Tensor]]:
-    """phi's gradient for undeclared features, by automatic differentiation."""
-    assert game.undeclared is not None
+    """The gradient of phi for the undeclared features, by automatic differentiation."""
     with torch.enable_grad():
         controls = controls.detach().requires_grad_()
         leaves = [tensor.detach().requires_grad_() for tensor in tensors]
-        residuals, (along_adjoint, along_step) = game.undeclared.linearisation(
+        residuals, (along_adjoint, along_step) = undeclared.linearisation(
             game.scene, game.with_tensors(leaves), controls, directions
         )
         phi = -(along_adjoint * (residuals + along_step)).sum()

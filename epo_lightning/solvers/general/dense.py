@@ -1,8 +1,8 @@
-"""Derivatives of any energy as dense arrays, by automatic differentiation: for energies whose structure no solver knows.
+"""Derivatives of any energy as dense arrays, by automatic differentiation, for energies of unknown structure.
 
 Samples are independent of each other, so one product of Hessians and vectors serves all of them: a Hessian of n controls
 takes n products, whatever the batch. Rows and columns follow ``controls.flatten(2)``. Absent agents have a 1 on the diagonal
-and zeros elsewhere: they change no factorisation and no solution.
+and zeros elsewhere, so that they affect no factorisation and no solution.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from epo_lightning.scene import GameParameters, Scene, Status
 from epo_lightning.solvers.general import descent
 
 _PRODUCTS = 64
-"""Products of matrices and vectors that are computed together: a bound on memory."""
+"""Number of matrix-vector products that are computed together, which bounds the memory."""
 
 
 @runtime_checkable
 class PiecewiseQuadratic(Protocol):
-    """An energy of residuals that are linear by pieces, and which knows its curvature without automatic differentiation."""
+    """An energy with piecewise linear residuals, whose Hessian is available in closed form."""
 
     def hessian(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> Float[Tensor, "B M n n"]:
-        """d2E/du2, which is J^T J of the residuals too, n = 2 N K; zero for absent agents."""
+        """The Hessian d2E/du2, equal to J^T J of the residuals, n = 2 N K; zero for absent agents."""
 
 
 def gradient(
     energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
 ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M N K 2"]]:
-    """E and dE/du, both differentiable if gradients are recorded; zero for absent agents."""
+    """The energy E and its gradient dE/du, differentiable if gradients are recorded; zero for absent agents."""
     taped = torch.is_grad_enabled()
     with torch.enable_grad():
         if not controls.requires_grad:
@@ -48,9 +48,9 @@ def gradient(
 def hessian(
     energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
 ) -> Float[Tensor, "B M n n"]:
-    """d2E/du2, n = 2 N K; differentiable if gradients are recorded.
+    """The Hessian d2E/du2, n = 2 N K; differentiable if gradients are recorded.
 
-    By n reverse passes through the gradient, or by the energy itself if it is :class:`PiecewiseQuadratic`.
+    It is computed by n reverse passes through the gradient, or by the energy itself if it is :class:`PiecewiseQuadratic`.
     """
     if isinstance(energy, PiecewiseQuadratic):
         return _closed_form(energy, scene, parameters, controls)
@@ -79,7 +79,7 @@ def hessian(
 def gauss_newton(
     energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
 ) -> Float[Tensor, "B M n n"]:
-    """J^T J of the residuals' Jacobian J, the Hessian without second derivatives of residuals, n = 2 N K.
+    """The Gauss-Newton matrix J^T J, the Hessian without second derivatives of residuals, n = 2 N K.
 
     Differentiable with respect to controls and parameters if gradients are recorded.
 
@@ -88,7 +88,7 @@ def gauss_newton(
     """
     if RESIDUALS not in energy.offers:
         raise ValueError(
-            f"{type(energy).__name__} has no residuals, of which Gauss-Newton matrices are made; take the exact Hessian"
+            f"{type(energy).__name__} has no residuals, which a Gauss-Newton matrix needs; choose backward.hessian=exact"
         )
     if isinstance(energy, PiecewiseQuadratic):
         return _closed_form(energy, scene, parameters, controls)
@@ -110,15 +110,14 @@ def gauss_newton(
 def attach(
     energy: Energy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"], exact: bool
 ) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
-    """The controls of a solution with the gradient that the implicit function theorem gives them, and a status.
+    """The controls of a solution with their implicit derivative, and a status.
 
     At a minimum g(u, p) = dE/du = 0 for every game p near by, so du/dp = -H^-1 dg/dp. With u and H held constant,
 
         u - H^-1 (g(u, p) - g(u, p) held constant)
 
-    has the value u and this derivative, with respect to whatever g is made of: the parameters, the scene, and the weights of
-    energies that are networks. The same as
-    :func:`epo_lightning.solvers.gauss_newton.implicit.attach` for energies of any kind.
+    has the value u and this derivative by all inputs of g: the parameters, the scene, and the weights of energies that are
+    networks. :func:`epo_lightning.solvers.gauss_newton.implicit.attach` is the faster version for feature energies.
 
     Args:
         energy, scene, parameters: the game.
@@ -126,35 +125,34 @@ def attach(
         exact: whether H is the Hessian or its Gauss-Newton approximation.
 
     Returns:
-        controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H has no Cholesky factor, that is, where the
-        controls are no minimum; such a sample has a gradient of zero.
+        controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H is not positive definite, so that the controls
+        are no minimum; such a sample has a gradient of zero.
     """
     controls = controls.detach()
     if scene.history.dtype != controls.dtype:
         scene = scene.to(controls.dtype)
     with torch.no_grad():
         matrix = (hessian if exact else gauss_newton)(energy, scene, parameters, controls)
-        factor, sound = factorise(matrix)
-    scene, parameters = _silenced(scene, parameters, sound)
+        factor, definite = factorise(matrix)
+    scene, parameters = _silenced(scene, parameters, definite)
     with torch.enable_grad():
-        value, slope = gradient(energy, scene, parameters, torch.where(_wide(sound, controls), controls, 0.0))
+        value, slope = gradient(energy, scene, parameters, torch.where(_wide(definite, controls), controls, 0.0))
         flat = slope.detach().flatten(2)
-        descent.say_if_far(value, flat, torch.cholesky_solve(flat[..., None], factor)[..., 0], sound)
+        descent.warn_if_far(value, flat, torch.cholesky_solve(flat[..., None], factor)[..., 0], definite)
         move = torch.cholesky_solve((slope - slope.detach()).flatten(2)[..., None], factor).view_as(controls)
-        return controls - torch.where(_wide(sound, move), move, 0.0), torch.where(
-            sound, Status.SOLVED, Status.STOPPED
-        ).long()
+        attached = controls - torch.where(_wide(definite, move), move, 0.0)
+        return attached, torch.where(definite, Status.SOLVED, Status.STOPPED).long()
 
 
 def factorise(matrix: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
-    """Lower Cholesky factors and which matrices have one; the identity in place of the others."""
+    """Lower Cholesky factors (the identity where there is none), and a mask of the positive definite matrices."""
     factor, failed = torch.linalg.cholesky_ex(matrix)
-    # What is no number in the lower triangle reaches the diagonal of its row: what is above is never looked at.
-    sound = (failed == 0) & factor.diagonal(dim1=-2, dim2=-1).isfinite().all(-1)
-    if sound.device.type == "cpu" and sound.all():
-        return factor, sound
+    # A NaN in the lower triangle reaches the diagonal of its row; the upper triangle is never read.
+    definite = (failed == 0) & factor.diagonal(dim1=-2, dim2=-1).isfinite().all(-1)
+    if definite.device.type == "cpu" and definite.all():
+        return factor, definite
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    return torch.where(sound[..., None, None], factor, identity), sound
+    return torch.where(definite[..., None, None], factor, identity), definite
 
 
 def _units(controls: Tensor) -> Float[Tensor, "n B M N K 2"]:
@@ -167,7 +165,7 @@ def _units(controls: Tensor) -> Float[Tensor, "n B M N K 2"]:
 def _closed_form(
     energy: PiecewiseQuadratic, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
 ) -> Float[Tensor, "B M n n"]:
-    """What the energy knows, with ones on the diagonal for absent agents."""
+    """The energy's Hessian in closed form, with ones on the diagonal for absent agents."""
     matrix = energy.hessian(scene, parameters, controls)
     absent = ~scene.agent_mask.repeat_interleave(2 * controls.shape[3], 1)
     matrix.diagonal(dim1=-2, dim2=-1).add_(absent[:, None])
@@ -182,17 +180,17 @@ def _of_present(scene: Scene, matrix: Float[Tensor, "B M n n"]) -> Float[Tensor,
     return torch.where(both, matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device))
 
 
-def _wide(sound: Bool[Tensor, "B M"], like: Tensor) -> Tensor:
-    return sound.view(*sound.shape, *[1] * (like.dim() - 2))
+def _wide(mask: Bool[Tensor, "B M"], like: Tensor) -> Tensor:
+    return mask.view(*mask.shape, *[1] * (like.dim() - 2))
 
 
-def _silenced(scene: Scene, parameters: GameParameters, sound: Bool[Tensor, "B M"]) -> tuple[Scene, GameParameters]:
-    """The games that have a solution, and zeros in place of the others, so that what is wrong there reaches no gradient."""
+def _silenced(scene: Scene, parameters: GameParameters, kept: Bool[Tensor, "B M"]) -> tuple[Scene, GameParameters]:
+    """The kept games, and zeros in place of the others, so that NaN in them reaches no gradient."""
 
     def silence(tensor: Tensor) -> Tensor:
-        return torch.where(_wide(sound, tensor), tensor, torch.zeros_like(tensor))
+        return torch.where(_wide(kept, tensor), tensor, torch.zeros_like(tensor))
 
-    context, some = parameters.context, sound.any(1)
+    context, some = parameters.context, kept.any(1)
     silent = dataclasses.replace(parameters, context=None).map(silence)
     if context is not None:
         context = torch.where(some[:, None, None], context, 0.0)

@@ -1,7 +1,7 @@
-"""What minimisers by descent have in common: where they begin, which steps they accept, and what they return.
+"""Functions shared by the descent methods: initial controls, acceptance of steps, and the solution.
 
-Every scene and mode goes its own way: it accepts its own steps and has its own memory. Once it has converged, its controls
-stay bit for bit as they are. On CPUs the loop ends with the last of them; elsewhere the host would have to wait to know.
+Every scene and mode accepts its own steps and has its own memory. Once a sample has converged, its controls stay the same
+bit for bit. On CPUs the loop ends when all have converged; on other devices this test would make the host wait.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from epo_lightning.game.energy import Energy
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 
 _FAR, _TINY = 1e-3, 1e-6
-"""Share of the energy, and energy, that a minimum's Newton decrement stays below."""
-_said = False
+"""Largest Newton decrement of a minimum: relative to the energy, and absolute."""
+_warned = False
 _ROUNDING = 8.0
-"""Roundings by which an energy may seem to rise over a step that lowers its gradient."""
+"""Largest rise of an energy, in units of its rounding error, that is accepted if the gradient becomes smaller."""
 
 
 def begin(energy: Energy, scene: Scene, parameters: GameParameters) -> tuple[Scene, Float[Tensor, "B M N K 2"]]:
@@ -44,7 +44,7 @@ def largest(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "B M"]:
 
 
 def finite(value: Float[Tensor, "B M"], slope: Float[Tensor, "B M N K 2"]) -> Bool[Tensor, "B M"]:
-    """Whose energy and gradient are numbers."""
+    """Mask of the samples with finite energy and gradient."""
     return value.isfinite() & slope.flatten(2).isfinite().all(-1)
 
 
@@ -54,27 +54,27 @@ def level(
     trial_value: Float[Tensor, "B M"],
     trial_slope: Float[Tensor, "B M N K 2"],
 ) -> Bool[Tensor, "B M"]:
-    """Whose energy is the same up to rounding, and whose gradient is smaller.
+    """Mask of the samples whose energy is equal up to rounding and whose gradient is smaller.
 
-    Close to a minimum, energies tell points apart that are the root of the machine's precision away from each other, and
-    gradients tell apart what is nearer (Hager and Zhang 2005, approximate Wolfe conditions).
+    Close to a minimum, energies resolve only distances of the square root of the machine precision; gradients resolve
+    smaller ones (Hager and Zhang 2005, approximate Wolfe conditions).
     """
     flatter = trial_slope.flatten(2).norm(dim=-1) < slope.flatten(2).norm(dim=-1)
     return (trial_value <= value + rounding(value)) & flatter
 
 
 def rounding(value: Float[Tensor, "B M"]) -> Float[Tensor, "B M"]:
-    """Differences of energies that mean nothing."""
+    """Differences of energies below rounding error."""
     return _ROUNDING * torch.finfo(value.dtype).eps * value.abs()
 
 
 def ended(done: Bool[Tensor, "B M"]) -> bool:
-    """Whether every sample has converged, where looking costs nothing."""
+    """Whether every sample has converged; False on devices where the test would make the host wait."""
     return done.device.type == "cpu" and bool(done.all())
 
 
 def nothing(controls: Float[Tensor, "B M N K 2"]) -> Solution:
-    """The solution of no game at all: no scene, no mode, no agent or no step."""
+    """The solution of an empty game: no scene, mode, agent or step."""
     none = controls.new_zeros(controls.shape[:2])
     return Solution(controls, controls.new_zeros(*controls.shape[:-1], 4), none, none, none, none.long())
 
@@ -87,7 +87,7 @@ def solution(
     slope: Float[Tensor, "B M N K 2"],
     status: Tensor,
 ) -> Solution:
-    """The solution with these controls, of these energies before and after."""
+    """The solution with these controls, and the energies before and after the minimisation."""
     return Solution(
         controls=controls,
         states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt),
@@ -98,40 +98,40 @@ def solution(
     )
 
 
-def first_status(sound: Bool[Tensor, "B M"]) -> Tensor:
-    """STOPPED where there is no number to begin with."""
-    return torch.where(sound, int(Status.SOLVED), int(Status.STOPPED))
+def first_status(is_finite: Bool[Tensor, "B M"]) -> Tensor:
+    """The initial status: SOLVED, or STOPPED where energy or gradient are not finite at the start."""
+    return torch.where(is_finite, int(Status.SOLVED), int(Status.STOPPED))
 
 
-def say_if_far(
+def warn_if_far(
     value: Float[Tensor, "*batch"],
     slope: Float[Tensor, "*batch n"],
     step: Float[Tensor, "*batch n"],
-    sound: Bool[Tensor, "*batch"],
+    definite: Bool[Tensor, "*batch"],
 ) -> None:
-    """Warn, once per process, if more than half of the solutions that are differentiated as minima are none.
+    """Warn, once per process, if more than half of the implicitly differentiated solutions are no minima.
 
-    The Newton decrement 1/2 g . H^-1 g is what a quadratic model says is left to gain. Looked at on CPUs only: elsewhere the
-    host would have to wait.
+    The Newton decrement 1/2 g . H^-1 g is the decrease that a quadratic model still predicts. The test runs on CPUs only;
+    on other devices it would make the host wait.
 
     Args:
         value: E at the solutions.
         slope: its gradient g.
         step: H^-1 g.
-        sound: whether H is positive definite.
+        definite: whether H is positive definite.
     """
-    global _said
-    if _said or not sound.numel() or sound.device.type != "cpu":
+    global _warned
+    if _warned or not definite.numel() or definite.device.type != "cpu":
         return
     with torch.no_grad():
         left = 0.5 * (slope * step).sum(-1)
-        far = ~(sound & (left <= _FAR * value.abs() + _TINY))
+        far = ~(definite & (left <= _FAR * value.abs() + _TINY))
         share = far.double().mean().item()
     if share > 0.5:
-        _said = True
+        _warned = True
         warnings.warn(
             f"backward=implicit: {100 * share:.0f} % of the solutions of a batch are no minima (a Newton decrement of more "
-            f"than {100 * _FAR:g} % of the energy, or a Hessian that is not positive definite). What is learned through "
-            "them is not right: take more solver.steps, solver.adaptive=true where the solver has it, or backward=unrolled",
+            f"than {100 * _FAR:g} % of the energy, or a Hessian that is not positive definite), so their gradients are "
+            "wrong: increase solver.steps, set solver.adaptive=true where the solver has it, or choose backward=unrolled",
             stacklevel=2,
         )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from backends import stacked
-from games import ALL, BOUNDS, feet_held, leaves_of, pad, random_game, random_scene, widen
+from games import ALL, BOUNDS, leaves_of, nearest_points_held, pad, random_game, random_scene, widen
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
@@ -413,7 +413,7 @@ def reduced(energy, scene, parameters, steps, step_size, damping, held):
     controls = parameters.initial_controls
     free = ~held[..., None, None].expand(controls.shape)
     for _ in range(steps):
-        with feet_held():
+        with nearest_points_held():
             jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
         jacobian = jacobian.permute(1, 2, 0, 3, 4, 5).flatten(3)
         residual = stacked(energy, scene, parameters, controls)

@@ -10,7 +10,7 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.solvers.gauss_newton import blocks
 from epo_lightning.solvers.gauss_newton.edges import Group
-from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
+from epo_lightning.solvers.gauss_newton.expansion import expand
 
 
 @pytest.mark.parametrize("integrator", ["euler", "semi_implicit", "heun"])
@@ -22,13 +22,13 @@ def test_solutions_are_those_of_the_dense_matrix(integrator, agents, horizon, ow
     energy = FeatureEnergy(own, bounds=BOUNDS, dynamics=Unicycle(integrator), pair_stride=1 + horizon % 2)
     controls = parameters.initial_controls
     damping = torch.tensor([1.0, 20.0], dtype=torch.float64)
-    model = QuadraticModel(energy, scene, parameters, controls, every_pair=True)
+    model = expand(energy, scene, parameters, controls, every_pair=True)
     factors, failed = blocks.factorise(model, damping, Group.whole(model.edges))
     assert not failed.any()
     # From covectors of the controls [S, N, 2, K] to those of the nodes, in the order node, component, agent, and back.
     right = torch.randn(2, agents, 2, horizon, dtype=torch.float64)
-    nodes = factors.solve(model.to_nodes(right).permute(0, 3, 2, 1).flatten(1))
-    found = model.to_controls(nodes.view(2, horizon, 2, agents).permute(0, 3, 2, 1))
+    nodes = factors.solve(model.at.to_nodes(right).permute(0, 3, 2, 1).flatten(1))
+    found = model.at.to_controls(nodes.view(2, horizon, 2, agents).permute(0, 3, 2, 1))
 
     _, matrix = normal_equations(energy, scene, parameters, controls)
     matrix = matrix[:, 0] + damping[:, None, None] * torch.eye(matrix.shape[-1], dtype=torch.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from itertools import pairwise
 
+import jaxtyping
 import pytest
 import torch
 from games import ALL, BOUNDS, leaves_of, random_game, random_scene
@@ -104,22 +105,25 @@ def test_many_steps_reach_an_equilibrium():
     ("arguments", "message"),
     [
         ({"steps": -1}, "solver.steps"),
-        ({"step_size": 0.0}, r"solver.step_size must be in \(0, 1\]"),
+        ({"steps": 1.5}, "solver.steps must be a whole number, 0 or more, not 1.5"),
+        ({"step_size": 0.0}, r"solver.step_size must be a number in \(0, 1\]"),
+        ({"step_size": "0.3"}, r"solver.step_size must be a number in \(0, 1\], not '0.3'"),
         ({"step_size": 1.5}, "solver.step_size"),
         ({"damping": -1.0}, "solver.damping"),
-        ({"damping": float("nan")}, "solver.damping"),
+        ({"damping": float("nan")}, "solver.damping must be a number, 0 or more, and finite, not nan"),
         ({"damping": float("inf")}, "solver.damping"),
         ({"test_steps": -1}, "solver.test_steps"),
         ({"backend": "cuda"}, "unknown solver.backend"),
     ],
 )
-def test_bad_settings_are_refused(arguments, message):
+def test_bad_settings_are_refused(arguments, message, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checks would come first
     with pytest.raises(ConfigError, match=message):
         LevenbergMarquardt(**arguments)
 
 
 def test_bad_settings_of_derivatives_are_refused():
-    with pytest.raises(ConfigError, match=r"backward\.steps must be 1 or more"):
+    with pytest.raises(ConfigError, match=r"backward\.steps must be a whole number, 1 or more"):
         Truncated(0)
     with pytest.raises(ConfigError, match=r"unknown backward\.hessian 'newton'"):
         Implicit("newton")

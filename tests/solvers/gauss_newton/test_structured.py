@@ -15,12 +15,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, SPEED, TURN_RATE, Source, own_feature, pair_feature
-from epo_lightning.scene import Status
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
+from epo_lightning.scene import SPEED, TURN_RATE, Status
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.gauss_newton import structured
+from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
-from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
 
 def solve(energy, scene, parameters, steps=2, damping=10.0, **options):
@@ -147,7 +147,7 @@ def test_components_are_those_of_the_active_pairs():
     parameters = random_game(scene, 2, 5)
     parameters.pair_weights["proximity"][:, 1] = 0.0  # no weight, no edge
     energy = FeatureEnergy(["goal"], ["proximity"])
-    model = QuadraticModel(energy, scene, parameters, parameters.initial_controls, every_pair=False)
+    model = expand(energy, scene, parameters, parameters.initial_controls, every_pair=False)
     groups = structured._components(model)
     residuals = energy.residuals(scene, parameters, parameters.initial_controls)["proximity"].flatten(0, 1)
     pairs = torch.triu_indices(6, 6, 1).T.tolist()

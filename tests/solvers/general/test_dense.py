@@ -342,7 +342,7 @@ def test_padding_and_batches_do_not_change_gradients():
 def test_solutions_that_are_no_minima_are_told_of_once(kind, monkeypatch):
     energy, (scene, game) = (convex_energy(), convex_game()) if kind == "convex" else (FEATURES, feature_game())
     teach = Implicit("gauss_newton" if kind == "gauss_newton" else "exact")
-    monkeypatch.setattr(descent, "_said", False)
+    monkeypatch.setattr(descent, "_warned", False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         teach(NEWTON, energy, scene, leaves_of(game))
@@ -360,10 +360,10 @@ def test_solutions_that_are_no_minima_are_told_of_once(kind, monkeypatch):
     ("shares", "told"), [((2e-3, 2e-3, 5e-4), "67 %"), ((2e-3, 5e-4, 5e-4), None), ((0.0, 0.0, 0.0), None)]
 )
 def test_only_most_of_a_batch_makes_a_warning(shares, told, monkeypatch):
-    monkeypatch.setattr(descent, "_said", False)
+    monkeypatch.setattr(descent, "_warned", False)
     left = torch.tensor(shares, dtype=torch.float64)[:, None]
     slope, value = (2.0 * left).sqrt()[..., None], torch.ones_like(left)  # with a Hessian of 1
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        descent.say_if_far(value, slope, slope, left.isfinite())
+        descent.warn_if_far(value, slope, slope, left.isfinite())
     assert [told in str(warning.message) for warning in caught] == ([True] if told else [])

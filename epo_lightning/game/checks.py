@@ -1,0 +1,42 @@
+"""Checks of configured numbers, with errors that name the key, the expected value and the given one."""
+
+from __future__ import annotations
+
+import math
+from numbers import Real
+from typing import Any
+
+from epo_lightning.registry import ConfigError
+
+
+def is_number(value: Any) -> bool:
+    """Whether a configured value is a number; bool and text are none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def check_whole(key: str, value: Any, least: int = 1) -> None:
+    """Check that a configured value is a whole number, ``least`` or more.
+
+    Raises:
+        ConfigError: another value; the message names the key.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise ConfigError(f"{key} must be a whole number, {least} or more, not {value!r}")
+
+
+def check_number(key: str, value: Any, zero: bool = False, finite: bool = True) -> None:
+    """Check that a configured value is a positive number.
+
+    Args:
+        key: name of the configuration key.
+        value: its value.
+        zero: whether 0 is allowed.
+        finite: whether infinity is refused.
+
+    Raises:
+        ConfigError: another value; the message names the key.
+    """
+    allowed = is_number(value) and (value > 0 or (zero and value == 0)) and not (finite and value == math.inf)
+    if not allowed:
+        wanted = ("0 or more" if zero else "positive") + (", and finite" if finite else "")
+        raise ConfigError(f"{key} must be a number, {wanted}, not {value!r}")

@@ -1,0 +1,307 @@
+"""Derivatives of named features: signals, their Jacobian along directions, and elementwise first and second derivatives.
+
+A declared feature is c(z(u)) with a signal z whose Jacobian is known in closed form (:func:`signal_and_change`) and an
+elementwise function c (:func:`own_derivatives`, :func:`pair_derivatives`). An undeclared one is any differentiable function
+of the trajectory, which forward-mode automatic differentiation takes (:func:`undeclared_change`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from epo_lightning.game.circles import overlap
+from epo_lightning.game.features import SLOWEST_STEERING, OwnFeature, PairFeature, Source
+from epo_lightning.scene import SPEED, TURN_RATE
+
+
+class Derivatives(NamedTuple):
+    """An elementwise function c(z) and its derivatives, entry by entry.
+
+    Attributes:
+        value: c(z).
+        first: dc/dz; None where it is 1 everywhere.
+        second: d2c/dz2; None where it is 0 everywhere, or was not asked for.
+    """
+
+    value: Tensor
+    first: Tensor | None = None
+    second: Tensor | None = None
+
+
+def differentiate(function: Callable[..., Tensor], value: Tensor, *others: Tensor, second: bool = False) -> Derivatives:
+    """An elementwise function with its first and, on demand, second derivative by its first argument.
+
+    The derivatives are differentiable themselves.
+    """
+
+    def first(argument: Tensor) -> Tensor:
+        return _jvp(lambda z: function(z, *others), argument)[1]
+
+    if second:
+        return Derivatives(function(value, *others), *_jvp(first, value))
+    return Derivatives(*_jvp(lambda z: function(z, *others), value))
+
+
+def _jvp(function: Callable[[Tensor], Tensor], value: Tensor) -> tuple[Tensor, Tensor]:
+    primal, tangent = torch.func.jvp(function, (value,), (torch.ones_like(value),))[:2]
+    return primal, tangent
+
+
+def own_derivatives(
+    feature: OwnFeature, signal: Float[Tensor, "*shape"], bounds: Mapping[str, Sequence[float]], second: bool = False
+) -> Derivatives:
+    """A declared own feature c(z) of its signal z, with its derivatives.
+
+    Args:
+        feature, signal: the feature, and the values z.
+        bounds: lowest and highest value by signal, for bounded features.
+        second: whether second derivatives of functions are computed.
+    """
+    if feature.bounded:
+        lower, upper = bounds[feature.signal]
+        return violation(signal, lower, upper)
+    if feature.function is not None:
+        return differentiate(feature.function, signal, second=second)
+    return Derivatives(signal)
+
+
+def pair_derivatives(feature: PairFeature, distance: Tensor, reach: Tensor, second: bool = False) -> Derivatives:
+    """A declared pair feature of the distance, with its derivatives by the distance."""
+    if feature.function is overlap:
+        return Derivatives(overlap(distance, reach), -(distance < reach).to(distance.dtype))
+    return differentiate(feature.function, distance, reach, second=second)
+
+
+def violation(value: Float[Tensor, "*shape"], lower: float, upper: float) -> Derivatives:
+    """The amount by which a signal leaves [lower, upper]; its derivative is 1 above, -1 below and 0 within."""
+    excess = (value - upper).clamp_min(0.0) + (lower - value).clamp_min(0.0)
+    return Derivatives(excess, (value > upper).to(value.dtype) - (value < lower).to(value.dtype))
+
+
+# --- Signals ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What own features refer to besides the trajectory; zero for absent agents, None where no feature needs it.
+
+    Attributes:
+        initial: the states x_0.
+        dt: time step [s].
+        goals: goal positions.
+        line: points of the followed reference lines.
+        reference_speed: desired speeds [m/s].
+        wheelbase: distances between the axles [m].
+    """
+
+    initial: Float[Tensor, "B 1 N 4"]
+    dt: float
+    goals: Float[Tensor, "B M N 2"] | None = None
+    line: Float[Tensor, "B M N Q 2"] | None = None
+    reference_speed: Float[Tensor, "B 1 N"] | None = None
+    wheelbase: Float[Tensor, "B 1 N"] | None = None
+
+
+def linear_signal(
+    feature: OwnFeature, controls: Tensor, speed: Float[Tensor, "*batch K"], dt: float, channels: int = -1
+) -> Float[Tensor, "*batch R"]:
+    """A control, its rate or the speed; the same for changes of controls and speed, because the signal is linear in them.
+
+    Args:
+        feature: one with the source CONTROL, RATE or SPEED.
+        controls: accelerations and turn rates.
+        speed: speeds at the nodes 1 .. K.
+        dt: time step [s].
+        channels: the dimension of ``controls`` that holds accelerations and turn rates.
+    """
+    if feature.source is Source.SPEED:
+        return speed
+    control = controls.select(channels, feature.channel)
+    return control if feature.source is Source.CONTROL else control.diff(dim=-1) / dt
+
+
+def add_linear_force(
+    feature: OwnFeature,
+    force: Float[Tensor, "*batch R"],
+    control: Float[Tensor, "*batch 2 K"],
+    node: Float[Tensor, "*batch 2 K"],
+    dt: float,
+) -> None:
+    """Add a force on a linear signal to the forces on the controls, or to those on the nodes (speed, heading), in place.
+
+    This is the adjoint of :func:`linear_signal`.
+    """
+    match feature.source:
+        case Source.CONTROL:
+            control[..., feature.channel, :] += force
+        case Source.RATE:
+            force = force / dt
+            control[..., feature.channel, 1:] += force
+            control[..., feature.channel, :-1] -= force
+        case _:
+            node[..., 0, :] += force
+
+
+def signal_and_change(
+    feature: OwnFeature,
+    states: Float[Tensor, "*batch K 4"],
+    controls: Float[Tensor, "*batch K 2"],
+    moved: Float[Tensor, "D *batch K 4"],
+    directions: Float[Tensor, "D *batch K 2"],
+    around: Surroundings,
+    slide: bool = False,
+) -> tuple[Float[Tensor, "*batch R"], Float[Tensor, "D *batch R"]]:
+    """The signal of a declared feature over time, and its change along D directions of the controls.
+
+    R is K, K - 1 for rates, 2 K (x and y) for lines, and 2 for goals.
+
+    Args:
+        feature: the feature, with any source but TRAJECTORY.
+        states, controls: the trajectories.
+        moved, directions: the changes of states and controls.
+        around: what the signal refers to.
+        slide: whether the nearest point of a line slides along as an agent moves, which is the exact derivative. Otherwise
+            it is held (Gauss-Newton): a line pulls as stiffly along as across, steps are shorter and solutions the same.
+    """
+    match feature.source:
+        case Source.CONTROL | Source.RATE | Source.SPEED:
+            signal = linear_signal(feature, controls, states[..., SPEED], around.dt)
+            if feature.needs:
+                assert around.reference_speed is not None
+                signal = signal - around.reference_speed[..., None]
+            return signal, linear_signal(feature, directions, moved[..., SPEED], around.dt)
+        case Source.STEERING:
+            assert around.wheelbase is not None
+            before, wheelbase = speed_before(states, around.initial), around.wheelbase[..., None]
+            angle, by_turn_rate, by_speed = steering(controls[..., TURN_RATE], before, wheelbase)
+            faster = speed_before(moved, torch.zeros_like(around.initial))
+            return angle, by_turn_rate * directions[..., TURN_RATE] + by_speed * faster
+        case Source.POSITION:
+            assert around.line is not None
+            position, change = states[..., :2], moved[..., :2]
+            nearest, tangent = nearest_point(position, around.line)
+            if slide:
+                change = change - (change * tangent).sum(-1, keepdim=True) * tangent
+            return (position - nearest).flatten(-2), change.flatten(-2)
+        case Source.FINAL_POSITION:
+            assert around.goals is not None
+            return states[..., -1, :2] - around.goals, moved[..., -1, :2]
+    raise AssertionError(feature)
+
+
+def nearest_point(
+    position: Float[Tensor, "*batch K 2"], line: Float[Tensor, "*#batch Q 2"]
+) -> tuple[Float[Tensor, "*batch K 2"], Float[Tensor, "*batch K 2"]]:
+    """The nearest point of a polyline, and the unit tangent of its segment, zero where the point is the end of a segment.
+
+    Differentiable with respect to the position; the choice of the segment is held constant (the first one on a tie).
+    """
+    x, y = position.unbind(-1)
+    start_x, start_y = (line[..., :-1, axis].contiguous() for axis in range(2))  # [.. Q-1]
+    along_x, along_y = (line[..., axis].diff(dim=-1) for axis in range(2))
+    squared = along_x.square() + along_y.square()
+    inverse = torch.where(squared > 0, 1.0 / squared, 0.0)
+    with torch.no_grad():
+        off_x = x.detach()[..., None, :] - start_x[..., None]  # [.. Q-1 K]
+        off_y = y.detach()[..., None, :] - start_y[..., None]
+        share = (off_x * along_x[..., None]).addcmul_(off_y, along_y[..., None])
+        share = share.mul_(inverse[..., None]).clamp_(0.0, 1.0)
+        off_x = off_x - share * along_x[..., None]
+        off_y = off_y - share * along_y[..., None]
+        segment = off_x.square().add_(off_y.square()).min(-2).indices  # [.. K], the first one on a tie
+    start_x, start_y, along_x, along_y, inverse = (
+        values.expand(*segment.shape[:-1], -1).gather(-1, segment)
+        for values in (start_x, start_y, along_x, along_y, inverse)
+    )
+    share = ((x - start_x) * along_x + (y - start_y) * along_y) * inverse
+    length = torch.where((share > 0) & (share < 1), inverse.sqrt(), 0.0)
+    share = share.clamp(0.0, 1.0)
+    nearest = torch.stack((start_x + share * along_x, start_y + share * along_y), -1)
+    return nearest, torch.stack((length * along_x, length * along_y), -1)
+
+
+def steering(
+    turn_rate: Float[Tensor, "*batch K"], speed: Float[Tensor, "*batch K"], wheelbase: Float[Tensor, "*#batch 1"]
+) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K"], Float[Tensor, "*batch K"]]:
+    """The steering angle atan(L omega / max(v, 1 m/s)) [rad], and its first derivatives by omega and v."""
+    floored = speed.clamp_min(SLOWEST_STEERING)
+    curvature = wheelbase / floored
+    tangent = curvature * turn_rate
+    by_turn_rate = curvature / (1.0 + tangent.square())
+    by_speed = torch.where(speed < SLOWEST_STEERING, 0.0, -by_turn_rate * turn_rate / floored)
+    return tangent.atan(), by_turn_rate, by_speed
+
+
+def steering_second_derivatives(
+    turn_rate: Float[Tensor, "*batch K"], speed: Float[Tensor, "*batch K"], wheelbase: Float[Tensor, "*#batch 1"]
+) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K"], Float[Tensor, "*batch K"]]:
+    """Second derivatives of the steering angle: by omega twice, by omega and v, by v twice."""
+    floored = speed.clamp_min(SLOWEST_STEERING)
+    curvature = wheelbase / floored
+    tangent = curvature * turn_rate
+    square = (1.0 + tangent.square()).square()
+    slow = speed < SLOWEST_STEERING
+    twice = -2.0 * curvature.square() * tangent / square
+    mixed = torch.where(slow, 0.0, curvature * (tangent.square() - 1.0) / (floored * square))
+    by_speed = torch.where(slow, 0.0, 2.0 * tangent / (floored.square() * square))
+    return twice, mixed, by_speed
+
+
+def speed_before(states: Float[Tensor, "*batch K 4"], initial: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*batch K"]:
+    """The speeds v_0 .. v_{K-1} at which the controls of every step begin to act."""
+    start = initial[..., SPEED, None].expand(*states.shape[:-2], 1)
+    return torch.cat((start, states[..., :-1, SPEED]), -1)
+
+
+# --- Undeclared features ----------------------------------------------------------------------------------------------
+
+
+def undeclared_change(
+    function: Callable[..., Tensor], at: tuple[Tensor, Tensor], directions: tuple[Tensor, Tensor], *others: Tensor
+) -> tuple[Float[Tensor, "*batch R"], Float[Tensor, "D *batch R"]]:
+    """Value of a function, and its change along D directions (their first dimension), by forward-mode differentiation.
+
+    Args:
+        function: takes two tensors that vary and ``others`` that do not.
+        at: the two tensors.
+        directions: D changes of both.
+        others: further arguments, held constant.
+    """
+    value = function(*at, *others)
+    if len(directions[0]) == 0:
+        return value, value.new_zeros(0, *value.shape)
+    return value, torch.func.vmap(
+        lambda *moved: torch.func.jvp(lambda *states: function(*states, *others), at, moved)[1]
+    )(*directions)
+
+
+def undeclared_change_by_agent(
+    feature: PairFeature, both: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor], *sizes: Tensor
+) -> tuple[Float[Tensor, "*batch R"], Float[Tensor, "D *batch R"], Float[Tensor, "D *batch R"]]:
+    """Value of an undeclared pair feature, and its change along D directions of the first and of the second agent.
+
+    Args:
+        feature: the feature.
+        both: states [.., L, 4] of the first and second agents.
+        moved: changes [D, .., L, 4] of both.
+        sizes: lengths and widths of both, for features that need them.
+    """
+    if feature.stepwise:  # eight derivatives per step, by the states of both, instead of D changes of each agent
+        unit = torch.eye(8, dtype=both[0].dtype, device=both[0].device)
+        unit = unit.view(8, *[1] * (both[0].dim() - 1), 8).expand(-1, *both[0].shape[:-1], -1)
+        value, by_state = undeclared_change(feature.function, both, (unit[..., :4], unit[..., 4:]), *sizes)
+        by_first, by_second = (
+            (one.movedim(0, -1) * side).sum(-1) for one, side in zip(by_state.split(4), moved, strict=True)
+        )
+        return value, by_first, by_second
+    first, second = moved
+    still = torch.zeros_like(first)
+    value, by_first = undeclared_change(feature.function, both, (first, still), *sizes)
+    _, by_second = undeclared_change(feature.function, both, (still, second), *sizes)
+    return value, by_first, by_second

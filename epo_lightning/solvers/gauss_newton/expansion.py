@@ -1,0 +1,362 @@
+"""Expansion of an energy to second order around joint strategies: the contributions of every feature to the model."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning.game.feature_derivatives import (
+    add_linear_force,
+    linear_signal,
+    nearest_point,
+    own_derivatives,
+    pair_derivatives,
+    steering,
+    steering_second_derivatives,
+    undeclared_change_by_agent,
+)
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.features import OwnFeature, PairFeature, Source
+from epo_lightning.game.pairs import pair_mask
+from epo_lightning.scene import TURN_RATE, GameParameters, Scene
+from epo_lightning.solvers.gauss_newton.edges import Edges
+from epo_lightning.solvers.gauss_newton.iterate import Iterate, suffix_sums
+from epo_lightning.solvers.gauss_newton.quadratic_model import (
+    GoalTerm,
+    LaneTerm,
+    OwnTerm,
+    PairTerm,
+    QuadraticModel,
+    Separation,
+    SignalTerm,
+    SteeringTerm,
+)
+
+
+@torch.no_grad()
+def expand(
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    controls: Float[Tensor, "B M N K 2"],
+    every_pair: bool,
+    exact: bool = False,
+) -> QuadraticModel:
+    """The quadratic model of an energy around joint strategies.
+
+    Args:
+        energy, scene, parameters, controls: the game and where to expand it.
+        every_pair: whether all pairs are evaluated, or those alone that may interact.
+        exact: whether the matrix is the Hessian, or its Gauss-Newton approximation without second derivatives of residuals.
+    """
+    at = Iterate.of(energy, scene, parameters, controls)
+    sums = _Sums.zeros(at, exact)
+    own = {}
+    for name, feature in energy.own_features.items():
+        if feature.declared:
+            own[name] = _add_own(sums, feature, at.by_sample(energy.own_weight(scene, parameters, name)))
+        else:
+            _add_undeclared(sums, name)
+    if not energy.pair or at.agents < 2:
+        edges = Edges.none(at.samples, at.agents, at.u.device)
+    elif every_pair:
+        edges = Edges.all(at.samples, at.agents, at.u.device)
+    else:
+        edges = Edges.near(energy, scene, parameters, at.states)
+    separation = Separation.of(at, edges) if len(edges.pair) else None
+    linked = torch.zeros(len(edges.pair), dtype=torch.bool, device=at.u.device)
+    pair = {}
+    if separation is not None:
+        for name, pair_feature in energy.pair_features.items():
+            if not pair_feature.declared:
+                linked |= _add_undeclared_pair(sums, edges, pair_feature, _edge_weight(at, edges, name))
+        pair = _pair_terms(at, edges, separation)
+        if pair:
+            linked |= _add_pairs(sums, edges, separation, pair)
+    if exact:
+        _set_undeclared_hessian(sums, edges)
+    force = at.to_velocities(sums.pull[:, :, :2])
+    if exact:
+        # The unit vector of a heading has the second derivative e'' = -e.
+        sums.node[:, :, 1] -= at.speed * (at.unit * force).sum(2)
+        sums.crossed()[:, :, 0] += (at.left * force).sum(2)
+    sums.node_force += (at.moves * force[:, :, None]).sum(3)
+    return QuadraticModel(
+        at=at,
+        value=sums.agent_value.cumsum(1)[:, -1],  # agent by agent, so that absent agents add an exact zero
+        gradient=sums.control_force + at.dt * suffix_sums(sums.node_force),
+        control=sums.control,
+        rate=sums.rate,
+        node=sums.node,
+        cross=sums.cross,
+        position=sums.pull[:, :, 2:],
+        blocks=sums.blocks,
+        edges=edges,
+        linked=linked,
+        pair_position=sums.pair_position,
+        pair_blocks=sums.pair_blocks,
+        own=own,
+        pair=pair,
+        separation=separation,
+    )
+
+
+@dataclass
+class _Sums:
+    """Running sums over features, which the functions below add to.
+
+    Attributes:
+        at, exact: as for :func:`expand`.
+        agent_value: energy by agent; that of a pair is added to the first agent of the sample.
+        control_force, node_force: gradients by controls and by nodes, without the part by positions.
+        pull: gradient x, y and stiffness xx, xy, yy at positions.
+        control, rate, node, cross, blocks, pair_position, pair_blocks: see :class:`QuadraticModel`.
+    """
+
+    at: Iterate
+    exact: bool
+    agent_value: Tensor
+    control_force: Tensor
+    node_force: Tensor
+    pull: Tensor
+    control: Tensor
+    node: Tensor
+    rate: Tensor | None = None
+    cross: Tensor | None = None
+    blocks: Tensor | None = None
+    pair_position: Tensor | None = None
+    pair_blocks: Tensor | None = None
+
+    @classmethod
+    def zeros(cls, at: Iterate, exact: bool) -> _Sums:
+        """Sums over no feature."""
+
+        def zeros(*size: int) -> Tensor:
+            return at.u.new_zeros(at.samples, at.agents, *size)
+
+        return cls(at, exact, zeros(), *(zeros(count, at.steps) for count in (2, 2, 5, 2, 2)))
+
+    def crossed(self) -> Tensor:
+        """``cross``, made at first use."""
+        if self.cross is None:
+            self.cross = torch.zeros_like(self.node)
+        return self.cross
+
+    def add_value(self, force: Tensor, value: Tensor) -> None:
+        """Add the energy of a feature, 1/2 w^2 c^2, with ``force`` = w^2 c."""
+        self.agent_value += 0.5 * (force * value).flatten(2).sum(-1)
+
+
+def _add_own(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> OwnTerm:
+    """Add a declared own feature."""
+    match feature.source:
+        case Source.STEERING:
+            return _add_steering(sums, weight)
+        case Source.POSITION:
+            return _add_lane(sums, weight)
+        case Source.FINAL_POSITION:
+            return _add_goal(sums, weight)
+        case _:
+            return _add_signal(sums, feature, weight)
+
+
+def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> SignalTerm:
+    at, square = sums.at, weight.square()
+    signal = linear_signal(feature, at.u, at.speed, at.dt, channels=-2)
+    if feature.needs:
+        signal = signal - at.by_sample(at.around.reference_speed)
+    c = own_derivatives(feature, signal, at.energy.bounds, second=True)
+    force = square * c.value
+    sums.add_value(force, c.value)
+    stiffness = square if c.first is None else square * c.first.square()
+    if sums.exact and c.second is not None:
+        stiffness = stiffness + force * c.second
+    add_linear_force(feature, force if c.first is None else force * c.first, sums.control_force, sums.node_force, at.dt)
+    match feature.source:
+        case Source.CONTROL:
+            sums.control[:, :, feature.channel] += stiffness
+        case Source.RATE:
+            if sums.rate is None:
+                sums.rate = torch.zeros_like(sums.control)
+            sums.rate[:, :, feature.channel, :-1] += stiffness
+        case _:
+            sums.node[:, :, 0] += stiffness
+    return SignalTerm(feature, weight, c)
+
+
+def _add_steering(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
+    at, square = sums.at, weight.square()
+    angle, by_turn_rate, by_speed = steering(*at.steered())
+    force = square * angle
+    sums.add_value(force, angle)
+    stiffness = [square * by_turn_rate.square(), square * by_turn_rate * by_speed, square * by_speed.square()]
+    if sums.exact:
+        second = steering_second_derivatives(*at.steered())
+        stiffness = [part + force * by for part, by in zip(stiffness, second, strict=True)]
+    sums.control_force[:, :, TURN_RATE] += force * by_turn_rate
+    sums.control[:, :, TURN_RATE] += stiffness[0]
+    # The initial speed is no unknown; the speed of node l acts together with the turn rate between nodes l and l + 1.
+    sums.node_force[:, :, 0, :-1] += (force * by_speed)[..., 1:]
+    sums.node[:, :, 0, :-1] += stiffness[2][..., 1:]
+    cross = stiffness[1][..., 1:] / at.dt
+    sums.crossed()[:, :, 0, :-1] -= cross
+    sums.crossed()[:, :, 1, :-1] += cross
+    return SteeringTerm(weight, angle, by_turn_rate, by_speed)
+
+
+def _add_lane(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
+    at = sums.at
+    assert at.around.line is not None
+    position = at.states[..., :2]
+    nearest, tangent = nearest_point(position, at.around.line)
+    offset, tangent = (rows.flatten(0, 1).transpose(-1, -2).contiguous() for rows in (position - nearest, tangent))
+    square = weight.square()[..., None]
+    force = square * offset
+    sums.pull[:, :, :2] += force
+    sums.pull[:, :, 2::2] += square
+    if sums.exact:
+        sums.pull[:, :, 2:] -= square * _outer(tangent, 2)
+    sums.add_value(force, offset)
+    return LaneTerm(weight, offset, tangent)
+
+
+def _add_goal(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
+    at, square = sums.at, weight.square()
+    assert at.around.goals is not None
+    offset = at.x[:, :, :2, -1] - at.around.goals.flatten(0, 1)
+    force = square * offset
+    sums.pull[:, :, :2, -1] += force
+    sums.pull[:, :, 2::2, -1] += square
+    sums.add_value(force, offset)
+    return GoalTerm(weight, offset)
+
+
+def _add_undeclared(sums: _Sums, name: str) -> None:
+    at = sums.at
+    directions = at.node_directions()
+    moved = at.energy.dynamics.tangent(at.states, directions, at.dt), directions
+    value, change = at.energy.own_residual(
+        name, at.scene, at.parameters, at.around, (at.states, at.controls), moved
+    )  # [B, M, N, R], [2 K, B, M, N, R]
+    value, jacobian = value.flatten(0, 1), change.flatten(1, 2).permute(1, 2, 0, 3)
+    sums.add_value(value, value)
+    sums.node_force += (jacobian @ value[..., None]).view_as(sums.node_force)
+    if not sums.exact:
+        block = jacobian @ jacobian.mT
+        sums.blocks = block if sums.blocks is None else sums.blocks + block
+
+
+def _edge_weight(at: Iterate, edges: Edges, name: str) -> Float[Tensor, "E 1"]:
+    return edges.of_pairs(at.energy.pair_weight(at.scene, at.parameters, name).flatten())[:, None]
+
+
+def _pair_terms(at: Iterate, edges: Edges, separation: Separation) -> dict[str, PairTerm]:
+    """The declared pair features with their derivatives by the distance."""
+    terms = {}
+    for name, feature in at.energy.pair_features.items():
+        if feature.declared:
+            reach = at.energy.reach(at.scene)[:, None].expand(-1, at.modes, -1).flatten()
+            d = pair_derivatives(feature, separation.distance, edges.of_pairs(reach)[:, None], second=True)
+            terms[name] = PairTerm(_edge_weight(at, edges, name), d)
+    return terms
+
+
+def _add_pairs(sums: _Sums, edges: Edges, separation: Separation, terms: dict[str, PairTerm]) -> Bool[Tensor, " E"]:
+    """Add the declared pair features; returns the edges that couple their agents."""
+    at, normal = sums.at, separation.normal
+    force = torch.zeros_like(separation.distance)
+    stiffness, value = torch.zeros_like(force), torch.zeros_like(force)
+    for term in terms.values():
+        d = term.d
+        assert d.first is not None
+        square = term.weight.square()
+        pull = square * d.value
+        value += pull * d.value
+        if sums.exact and d.second is not None:
+            stiffness += pull * d.second
+        force += pull * d.first
+        stiffness += square * d.first.square()
+    pulled = force[:, None] * normal
+    position = stiffness[:, None] * _outer(normal, 1)
+    if sums.exact:
+        turning = force * separation.inverse
+        position -= turning[:, None] * _outer(normal, 1)
+        position[:, ::2] += turning[:, None]
+    pulled, position = at.at_every_step(pulled), at.at_every_step(position)
+    edges.spread_(sums.pull, torch.cat((pulled, position), 1), torch.cat((-pulled, position), 1))
+    sums.pair_position = position
+    _add_pair_value(sums, edges, value)
+    return (stiffness != 0).any(1)
+
+
+def _add_undeclared_pair(
+    sums: _Sums, edges: Edges, feature: PairFeature, weight: Float[Tensor, "E 1"]
+) -> Bool[Tensor, " E"]:
+    """Add an undeclared pair feature; returns the edges that couple their agents."""
+    at, energy = sums.at, sums.at.energy
+    both = edges.ends(energy.at_pair_steps(at.states.flatten(0, 1)))
+    moved = energy.dynamics.tangent(at.states, at.node_directions(), at.dt).flatten(1, 2)
+    moved = energy.at_pair_steps(moved).permute(1, 2, 0, 3, 4)  # [S, N, 2 K, L, 4]
+    first, second = (side.transpose(0, 1) for side in edges.ends(moved))
+    sizes: tuple[Tensor, ...] = ()
+    if feature.needs:
+        sizes = edges.ends(energy.size(at.scene).repeat_interleave(at.modes, 0)[:, :, None])
+    exists = pair_mask(at.scene)[:, None].expand(-1, at.modes, -1).flatten().index_select(0, edges.pair)[:, None]
+    found = undeclared_change_by_agent(feature, both, (first, second), *sizes)
+    value, by_first, by_second = (weight * torch.where(exists, part, 0.0) for part in found)
+    jacobians = by_first.permute(1, 0, 2), by_second.permute(1, 0, 2)  # [E, 2 K, R]
+    forces = (side @ value[..., None] for side in jacobians)
+    edges.spread_(sums.node_force, *(force.view(-1, 2, at.steps) for force in forces))
+    _add_pair_value(sums, edges, value.square())
+    if not sums.exact:
+        if sums.blocks is None:
+            sums.blocks = value.new_zeros(at.samples, at.agents, 2 * at.steps, 2 * at.steps)
+        edges.spread_(sums.blocks, *(side @ side.mT for side in jacobians))
+        shared = jacobians[0] @ jacobians[1].mT
+        sums.pair_blocks = shared if sums.pair_blocks is None else sums.pair_blocks + shared
+    return ((by_first != 0).any(-1).any(0)) & exists[:, 0]
+
+
+def _add_pair_value(sums: _Sums, edges: Edges, value: Float[Tensor, "E L"]) -> None:
+    first_of_sample = edges.first // sums.at.agents * sums.at.agents
+    sums.agent_value.flatten().index_add_(0, first_of_sample, 0.5 * value.sum(-1))
+
+
+def _set_undeclared_hessian(sums: _Sums, edges: Edges) -> None:
+    """Set the second derivatives of undeclared features, by automatic differentiation of their gradient, row by row."""
+    at, part = sums.at, sums.at.energy.undeclared
+    if part is not None and not len(edges.pair):
+        part = dataclasses.replace(part, pair=()) if part.own else None
+    if part is None:
+        return
+    with torch.enable_grad():
+        controls = at.controls.detach().requires_grad_()
+        energy = part(at.scene, at.parameters.map(Tensor.detach), controls).sum()
+        (gradient,) = torch.autograd.grad(energy, controls, create_graph=True)
+        rows = []
+        for unit in torch.eye(controls[0, 0].numel(), dtype=controls.dtype, device=controls.device):
+            along_unit = (gradient * unit.view(controls.shape[2:])).sum()
+            rows.append(
+                torch.autograd.grad(along_unit, controls, retain_graph=True, allow_unused=True)[0]
+                if along_unit.requires_grad
+                else None
+            )
+    hessian = torch.stack([torch.zeros_like(controls) if row is None else row for row in rows])
+    hessian = hessian.flatten(1, 2).view(at.agents, at.steps, 2, at.samples, at.agents, at.steps, 2)
+    at_nodes = at.to_nodes(at.to_nodes(hessian.permute(3, 0, 2, 4, 6, 5, 1)).transpose(-1, -2))  # [S i c j d k l]
+    at_nodes = at_nodes.permute(0, 1, 3, 2, 5, 4, 6)
+    at_nodes = at_nodes.reshape(at.samples, at.agents, at.agents, 2 * at.steps, 2 * at.steps)
+    sums.blocks = at_nodes.diagonal(dim1=1, dim2=2).movedim(-1, 1)
+    if part.pair:
+        rows_of = edges.first * at.agents + edges.second % at.agents
+        sums.pair_blocks = at_nodes.flatten(0, 2)[rows_of]
+
+
+def _outer(vector: Tensor, dim: int) -> Tensor:
+    """The entries xx, xy and yy of v v^T."""
+    x, y = vector.unbind(dim)
+    return torch.stack((x * x, x * y, y * y), dim)

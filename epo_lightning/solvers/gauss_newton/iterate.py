@@ -1,0 +1,158 @@
+"""An iterate of a Gauss-Newton solver: joint strategies, their trajectories, and the maps between controls and nodes.
+
+Unknowns are not the controls u but the speeds and headings z_l = z_0 + dt sum_{j<l} u_j at the nodes l = 1 .. K, because in
+them the model is nearly local. With e_l the heading's unit vector and e'_l the one to its left, a position changes as
+
+    dp_k = dt sum_{l<k} M_l dz_l,   M_l = [e_l, v_l e'_l]     (explicit Euler; other integrators weigh l = k as well).
+
+Arrays are laid out [S, N, component, K] with S = B M samples; components of z and u are speed and heading, acceleration and
+turn rate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning.game.feature_derivatives import Surroundings
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import HEADING, SPEED, TURN_RATE, GameParameters, Scene
+
+
+def suffix_sums(values: Float[Tensor, "*rest K"]) -> Float[Tensor, "*rest K"]:
+    """Sums over this entry of the last dimension and all after it."""
+    return values.flip(-1).cumsum(-1).flip(-1)
+
+
+def following(values: Float[Tensor, "*rest K"]) -> Float[Tensor, "*rest K"]:
+    """The next entry of the last dimension, zero after the last one."""
+    return torch.nn.functional.pad(values[..., 1:], (0, 1))
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Joint strategies of a game, with their trajectories in the layout of the solver.
+
+    Attributes:
+        energy, scene, parameters: the game.
+        controls, states: joint strategies and trajectories, as the energy takes them.
+        around: inputs of the own features besides the trajectory.
+        u, x: controls and states, by sample.
+        unit, left: unit vectors of the headings, and those to their left.
+        moves: M_l, the change of velocities with speed and heading: [S, N, component, xy, K].
+    """
+
+    energy: FeatureEnergy
+    scene: Scene
+    parameters: GameParameters
+    controls: Float[Tensor, "B M N K 2"]
+    states: Float[Tensor, "B M N K 4"]
+    around: Surroundings
+    u: Float[Tensor, "S N 2 K"]
+    x: Float[Tensor, "S N 4 K"]
+    unit: Float[Tensor, "S N 2 K"]
+    left: Float[Tensor, "S N 2 K"]
+    moves: Float[Tensor, "S N 2 2 K"]
+
+    @classmethod
+    def of(cls, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor) -> Iterate:
+        """The iterate at joint strategies u, which are zero for absent agents."""
+        around = energy.surroundings(scene, parameters)
+        states = energy.dynamics.rollout(around.initial, controls, scene.dt)
+        u = controls.flatten(0, 1).transpose(-1, -2).contiguous()
+        x = states.flatten(0, 1).transpose(-1, -2).contiguous()
+        heading, speed = x[:, :, HEADING], x[:, :, SPEED]
+        unit = torch.stack((heading.cos(), heading.sin()), 2)
+        left = torch.stack((-unit[:, :, 1], unit[:, :, 0]), 2)
+        moves = torch.stack((unit, speed[:, :, None] * left), 2)
+        return cls(energy, scene, parameters, controls, states, around, u, x, unit, left, moves)
+
+    @property
+    def samples(self) -> int:
+        """Number S = B M of samples."""
+        return len(self.u)
+
+    @property
+    def agents(self) -> int:
+        """Number N of agents."""
+        return self.u.shape[1]
+
+    @property
+    def steps(self) -> int:
+        """Number K of steps."""
+        return self.u.shape[3]
+
+    @property
+    def modes(self) -> int:
+        """Number M of modes."""
+        return self.controls.shape[1]
+
+    @property
+    def dt(self) -> float:
+        """Time step [s]."""
+        return self.scene.dt
+
+    @property
+    def beta(self) -> float:
+        """Weight of the velocity before a step in the position after it (:class:`~epo_lightning.game.dynamics.Unicycle`)."""
+        return self.energy.dynamics.beta
+
+    @property
+    def speed(self) -> Float[Tensor, "S N K"]:
+        """Speeds at the nodes 1 .. K."""
+        return self.x[:, :, SPEED]
+
+    @property
+    def present(self) -> Bool[Tensor, "S N"]:
+        """Mask of the present agents."""
+        return self.by_sample(self.scene.agent_mask[:, None])[..., 0]
+
+    def by_sample(self, values: Tensor | None) -> Float[Tensor, "S N 1"] | Bool[Tensor, "S N 1"]:
+        """Values [B, 1 or M, N] of agents, by sample."""
+        assert values is not None
+        return values.expand(values.shape[0], self.modes, self.agents).reshape(self.samples, self.agents, 1)
+
+    def steered(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Turn rates, the speeds before them, and wheelbases: the arguments of a steering angle."""
+        start = self.by_sample(self.around.initial[..., SPEED])
+        before = torch.cat((start, self.x[:, :, SPEED, :-1]), -1)
+        return self.u[:, :, TURN_RATE], before, self.by_sample(self.around.wheelbase)
+
+    def to_nodes(self, covector: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
+        """A gradient by the nodes, from one by the controls: u_l = (z_{l+1} - z_l) / dt."""
+        return (covector - following(covector)) / self.dt
+
+    def to_controls(self, change: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
+        """The change of the controls that makes a change of the nodes."""
+        return torch.diff(change, dim=-1, prepend=torch.zeros_like(change[..., :1])) / self.dt
+
+    def to_positions(self, velocity: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
+        """The change of positions with a change of the velocities at the nodes."""
+        sums = velocity.cumsum(-1)
+        before = torch.nn.functional.pad(sums[..., :-1], (1, 0))
+        return self.dt * (before if self.beta == 1.0 else self.beta * before + (1.0 - self.beta) * sums)
+
+    def to_velocities(self, force: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
+        """A gradient by the velocities at the nodes, from one by positions: the adjoint of :meth:`to_positions`."""
+        sums = suffix_sums(force)
+        if self.beta == 1.0:
+            return self.dt * following(sums)
+        return self.dt * (self.beta * following(sums) + (1.0 - self.beta) * sums)
+
+    def node_directions(self) -> Float[Tensor, "D B M N K 2"]:
+        """The D = 2 K changes of controls that move one node alone, component after component."""
+        unit = torch.eye(2 * self.steps, dtype=self.u.dtype, device=self.u.device)
+        unit = self.to_controls(unit.view(-1, 1, 1, 1, 2, self.steps)).transpose(-1, -2)
+        return unit.expand(-1, *self.controls.shape)
+
+    def at_every_step(self, values: Float[Tensor, "E c L"]) -> Float[Tensor, "E c K"]:
+        """Values at the steps at which pairs are evaluated, and zeros in between."""
+        stride = self.energy.pair_stride
+        if stride == 1:
+            return values
+        every = values.new_zeros(*values.shape[:2], self.steps)
+        every[..., stride - 1 :: stride] = values
+        return every

@@ -1,0 +1,208 @@
+"""The adjoint of a Gauss-Newton step: derivatives of a quadratic model by everything it depends on, in closed form.
+
+For constant changes mu (``adjoint``) and d (``step``) of the controls,
+
+    phi(u, p) = -<J mu, r + J d>
+
+is differentiated by the controls u and by the weights and goals p. Every residual r = w c(z(u)) contributes by its own
+first and second derivatives, which the model holds; forces on controls, nodes and positions are collected and carried back
+to the controls at the end, as for the gradient of an energy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from epo_lightning.game.feature_derivatives import add_linear_force, linear_signal, steering_second_derivatives
+from epo_lightning.scene import TURN_RATE
+from epo_lightning.solvers.gauss_newton.iterate import following, suffix_sums
+from epo_lightning.solvers.gauss_newton.quadratic_model import (
+    GoalTerm,
+    LaneTerm,
+    QuadraticModel,
+    SignalTerm,
+    SteeringTerm,
+)
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """The gradient of phi, without the parts of undeclared features, which need automatic differentiation.
+
+    Attributes:
+        controls: by the controls.
+        own, pair: by the weights, by name of the feature.
+        goals: by the goals; None without a feature of goals.
+    """
+
+    controls: Float[Tensor, "S N 2 K"]
+    own: dict[str, Float[Tensor, "S N"]]
+    pair: dict[str, Float[Tensor, "S P"]]
+    goals: Float[Tensor, "S N 2"] | None
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """Changes along mu and d, stacked in the first dimension: of controls, nodes and positions."""
+
+    controls: Float[Tensor, "2 S N 2 K"]
+    nodes: Float[Tensor, "2 S N 2 K"]
+    positions: Float[Tensor, "2 S N 2 K"]
+
+
+@dataclass(frozen=True)
+class _Forces:
+    """Forces that phi exerts, which the functions below add to in place.
+
+    Attributes:
+        controls, nodes: on controls and nodes.
+        positions: on positions, on their change along mu, and on that along d.
+    """
+
+    controls: Float[Tensor, "S N 2 K"]
+    nodes: Float[Tensor, "S N 2 K"]
+    positions: Float[Tensor, "S N 3 2 K"]
+
+
+def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Float[Tensor, "S N 2 K"]) -> Gradients:
+    """The gradient of phi = -<J mu, r + J d> for constant changes mu (``adjoint``) and d (``step``) of the controls."""
+    at, dt = model.at, model.at.dt
+    controls = torch.stack((adjoint, step))
+    nodes = dt * controls.cumsum(-1)
+    changes = _Changes(controls, nodes, at.to_positions((at.moves * nodes[:, :, :, :, None]).sum(3)))
+    forces = _forces_along_mu(model, changes)
+    own: dict[str, Tensor] = {}
+    goals = None
+    for name, term in model.own.items():
+        match term:
+            case SignalTerm():
+                along_mu, ahead = _pull_signal(term, changes, forces, dt)
+            case SteeringTerm():
+                along_mu, ahead = _pull_steering(model, term, changes, forces)
+            case LaneTerm():
+                along_mu, ahead = _pull_lane(term, changes, forces)
+            case GoalTerm():
+                along_mu, ahead = _pull_goal(term, changes, forces)
+                goals = term.weight.square() * along_mu
+        own[name] = -2.0 * term.weight[..., 0] * (along_mu * ahead).flatten(2).sum(-1)
+    pair = _pull_pairs(model, changes, forces)
+    after = at.to_velocities(forces.positions)
+    along_e, along_left = ((direction[:, :, None] * after).sum(3) for direction in (at.unit, at.left))  # [S, N, 3, K]
+    faster, turned = nodes.movedim(0, 2).unbind(3)  # [S, N, 2, K]
+    node = forces.nodes
+    node[:, :, 0] += along_e[:, :, 0] + (turned * along_left[:, :, 1:]).sum(2)
+    node[:, :, 1] += at.speed * (along_left[:, :, 0] - (turned * along_e[:, :, 1:]).sum(2))
+    node[:, :, 1] += (faster * along_left[:, :, 1:]).sum(2)
+    return Gradients(forces.controls + dt * suffix_sums(node), own, pair, goals)
+
+
+def _forces_along_mu(model: QuadraticModel, changes: _Changes) -> _Forces:
+    """Minus the diagonal stiffness times mu, and no force on positions."""
+    mu = changes.controls[0]
+    control = -model.control * mu
+    node = -model.node * changes.nodes[0]
+    if model.rate is not None:
+        rate = -model.rate * (following(mu) - mu) / model.at.dt**2
+        control -= rate - torch.nn.functional.pad(rate[..., :-1], (1, 0))
+    samples, agents, _, steps = mu.shape
+    return _Forces(control, node, mu.new_zeros(samples, agents, 3, 2, steps))
+
+
+# Each of the following returns J mu and r + J d of one feature, both without its weight.
+
+
+def _pull_signal(term: SignalTerm, changes: _Changes, forces: _Forces, dt: float) -> tuple[Tensor, Tensor]:
+    along_mu, along_d = linear_signal(term.feature, changes.controls, changes.nodes[:, :, :, 0], dt, channels=-2)
+    value, first, second = term.c
+    if first is None:
+        return along_mu, value + along_d
+    ahead = value + first * along_d
+    if second is not None:
+        force = -term.weight.square() * second * (along_mu * ahead + first * along_mu * along_d)
+        add_linear_force(term.feature, force, forces.controls, forces.nodes, dt)
+    return first * along_mu, ahead
+
+
+def _pull_steering(
+    model: QuadraticModel, term: SteeringTerm, changes: _Changes, forces: _Forces
+) -> tuple[Tensor, Tensor]:
+    """Adds the forces beyond the diagonal stiffness."""
+    square = term.weight.square()
+    turned = changes.controls[:, :, :, TURN_RATE]
+    faster = torch.nn.functional.pad(changes.nodes[:, :, :, 0, :-1], (1, 0))
+    along_mu, along_d = term.by_turn_rate * turned + term.by_speed * faster
+    ahead = term.angle + along_d
+    twice, mixed, by_speeds = steering_second_derivatives(*model.at.steered())
+    by_turn_rate = twice * turned + mixed * faster
+    by_speed = mixed * turned + by_speeds * faster
+    cross = square * term.by_turn_rate * term.by_speed
+    forces.controls[:, :, TURN_RATE] -= (
+        square * (ahead * by_turn_rate[0] + along_mu * by_turn_rate[1]) + cross * faster[0]
+    )
+    by_node = square * (ahead * by_speed[0] + along_mu * by_speed[1]) + cross * turned[0]
+    forces.nodes[:, :, 0, :-1] -= by_node[..., 1:]
+    return along_mu, ahead
+
+
+def _pull_lane(term: LaneTerm, changes: _Changes, forces: _Forces) -> tuple[Tensor, Tensor]:
+    square = term.weight.square()[..., None]
+    along_mu, along_d = changes.positions
+    ahead = term.offset + along_d
+    across = along_mu - term.tangent * (term.tangent * along_mu).sum(2, keepdim=True)
+    forces.positions[:, :, 0] -= square * across
+    forces.positions[:, :, 1] -= square * ahead
+    forces.positions[:, :, 2] -= square * along_mu
+    return along_mu, ahead
+
+
+def _pull_goal(term: GoalTerm, changes: _Changes, forces: _Forces) -> tuple[Tensor, Tensor]:
+    square = term.weight.square()
+    along_mu, along_d = changes.positions[..., -1]
+    ahead = term.offset + along_d
+    pull = square * along_mu
+    forces.positions[:, :, 0, :, -1] -= pull
+    forces.positions[:, :, 1, :, -1] -= square * ahead
+    forces.positions[:, :, 2, :, -1] -= pull
+    return along_mu, ahead
+
+
+def _pull_pairs(model: QuadraticModel, changes: _Changes, forces: _Forces) -> dict[str, Float[Tensor, "S P"]]:
+    """Adds the forces of the declared pair features; returns the gradient by their weights."""
+    by_weight: dict[str, Tensor] = {}
+    if not model.pair:
+        return by_weight
+    at, edges, separation = model.at, model.edges, model.separation
+    assert separation is not None
+    normal = separation.normal
+    at_steps = at.energy.at_pair_steps(changes.positions.movedim(0, 2).transpose(-1, -2)).transpose(-1, -2)
+    apart = edges.difference(at_steps)  # [E, 2, xy, L]
+    closing = (normal[:, None] * apart).sum(2)
+    along_mu, along_d = closing.unbind(1)
+    outward, with_mu, with_d = (torch.zeros_like(separation.distance) for _ in range(3))
+    for name, term in model.pair.items():
+        value, first, second = term.d
+        assert first is not None
+        square = term.weight.square()
+        ahead = value + first * along_d
+        slid = first * along_mu
+        gain = first * slid
+        if second is not None:
+            outward -= square * second * (along_mu * ahead + slid * along_d)
+        outward -= square * gain
+        with_mu -= square * first * ahead
+        with_d -= square * gain
+        weighed = -2.0 * term.weight[:, 0] * (slid * ahead).sum(-1)
+        if not edges.every:
+            rows = weighed.new_zeros(at.samples * at.agents * (at.agents - 1) // 2)
+            weighed = rows.index_copy_(0, edges.pair, weighed)
+        by_weight[name] = weighed.view(at.samples, -1)
+    turning = (apart - closing[:, :, None] * normal[:, None]) * separation.inverse[:, None, None]
+    force = outward[:, None] * normal + with_mu[:, None] * turning[:, 0] + with_d[:, None] * turning[:, 1]
+    force = torch.stack((force, with_mu[:, None] * normal, with_d[:, None] * normal), 1)
+    force = at.at_every_step(force.flatten(1, 2)).view(-1, 3, 2, at.steps)
+    edges.spread_(forces.positions, force, -force)
+    return by_weight
