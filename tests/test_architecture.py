@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import epo_lightning
@@ -67,3 +69,43 @@ def test_no_room_imports_from_a_higher_floor():
 def test_every_room_has_its_floor():
     rooms = {path.stem for path in ROOT.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
     assert rooms - {"__init__", "cli", "experiment", "conf", "sweeps"} == set(FLOORS)
+
+
+def modules() -> dict[str, Path]:
+    """All modules of the package by name; a package is its ``__init__``."""
+    found = {}
+    for path in ROOT.rglob("*.py"):
+        words = path.relative_to(ROOT.parent).with_suffix("").parts
+        found[".".join(words[:-1] if words[-1] == "__init__" else words)] = path
+    return found
+
+
+def imports(tree: ast.AST) -> Iterator[str]:
+    """Everything that a module imports of this package, also inside functions; not what only type checkers see."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(node, ast.ImportFrom) and node.module:
+            yield from (f"{node.module}.{name.name}" for name in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        yield from imports(node)
+
+
+def import_graph(known: dict[str, Path]) -> dict[str, set[str]]:
+    """The modules that each module imports."""
+    graph = {}
+    for module, path in known.items():
+        names = set(imports(ast.parse(path.read_text())))
+        # `from a.b import c` is the module a.b.c where there is one, and else the module a.b.
+        graph[module] = {name if name in known else name.rpartition(".")[0] for name in names} & known.keys() - {module}
+    return graph
+
+
+def test_no_circle_of_imports_also_inside_functions():
+    graph = import_graph(modules())
+    assert "epo_lightning.experiment.train" in graph["epo_lightning.experiment.verbs"], "imports inside functions count"
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        raise AssertionError(" -> ".join(reversed(error.args[1]))) from None

@@ -13,18 +13,21 @@ from typing import Any
 import torch
 from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins import DoublePrecision
 from lightning.pytorch.strategies import Strategy
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from epo_lightning import registry
 from epo_lightning.data.datamodule import check_share
-from epo_lightning.experiment import debugging, gpus, logs
+from epo_lightning.experiment import debugging
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
-from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings, check_part, check_types
-from epo_lightning.forecasters import build_forecaster, check_model
-from epo_lightning.registry import ConfigError, build
+from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings, check_part
+from epo_lightning.experiment.dashboards import mlflow
+from epo_lightning.forecasters import SUPPLIED, build_forecaster
+from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.task import Task
 
@@ -36,7 +39,7 @@ def build_data(section: Mapping[str, Any]) -> Any:
         ConfigError: an unknown part or key, or a value that it refuses.
     """
     check_part("data", section)
-    data = build("data", section)
+    data = registry.build("data", section)
     if not isinstance(getattr(data, "task", None), Task):
         raise ConfigError(
             f"data {section['name']!r} declares no task: set {type(data).__name__}.task to an epo_lightning.task.Task"
@@ -50,50 +53,54 @@ def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
     return {**sections, "goal": settings.goal, **data.task.to_config()}
 
 
-def build_model(settings: Settings, data: Any) -> LightningModule:
-    """The forecaster of a configuration, with weights drawn from the global random state.
+def build(settings: Settings) -> tuple[Any, LightningModule]:
+    """The data module and the forecaster of a run, the weights drawn from the global random state. Reads no data.
 
     Raises:
-        ConfigError: an unknown part or key, or sizes that do not fit together.
+        ConfigError: a part, key or value that cannot work, or sizes that do not fit together, in one sentence.
     """
-    model = build_forecaster(describe_model(settings, data))
-    # Lightning converts it too, but only after it has read a checkpoint into it.
-    return model.double() if settings.trainer.precision == "64-true" else model
-
-
-def parameters(model: torch.nn.Module) -> int:
-    """How many numbers are learned."""
-    return sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
-
-
-def check(settings: Settings) -> tuple[Any, LightningModule]:
-    """Build data and forecaster once, only to see that they can be built; touches no file.
-
-    Raises:
-        ConfigError: what is wrong, in one sentence.
-    """
-    logs.check(settings.logger)
+    if settings.logger.mlflow is not None:
+        mlflow.check()
     data = build_data(settings.data)
-    devices = settings.trainer.devices
-    check_share(getattr(data, "batch_size", devices), devices)
+    data.order_seed = settings.seed
+    check_share(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)
+    return data, build_model(settings, data)
+
+
+def build_model(settings: Settings, data: Any) -> LightningModule:
+    """The forecaster of a configuration for the task of ``data``, see :func:`build`."""
     model = describe_model(settings, data)
-    check_model(model)
     for kind in PARTS[1:]:
-        check_types(kind, model[kind])
+        check_part(kind, model[kind], SUPPLIED[kind])
     try:
-        with torch.random.fork_rng(devices=[]), warnings.catch_warnings(action="ignore"):
-            forecaster = build_forecaster(model)
+        forecaster = build_forecaster(model)
     except ConfigError:
         raise
     except (TypeError, ValueError, RuntimeError, ArithmeticError) as error:
         raise ConfigError(
             f"the forecaster cannot be built{_suspects(model)}: {' '.join(str(error).split())}"
         ) from error
-    return data, forecaster
+    # Lightning converts it too, but only after it has read a checkpoint into it.
+    return forecaster.double() if settings.trainer.precision == "64-true" else forecaster
+
+
+def parameters(model: torch.nn.Module) -> int:
+    """Number of learned parameters."""
+    return sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
+
+
+def check(settings: Settings) -> tuple[Any, LightningModule]:
+    """Build data module and forecaster only to see that they can be built: random states and warnings stay as they are.
+
+    Raises:
+        ConfigError: as :func:`build`.
+    """
+    with torch.random.fork_rng(devices=[]), warnings.catch_warnings(action="ignore"):
+        return build(settings)
 
 
 def _suspects(model: Mapping[str, Any]) -> str:
-    """Sizes below one, which constructors rarely mention in their complaints."""
+    """Settings below one, which constructors rarely name in their messages."""
     sections = ((kind, model[kind]) for kind in PARTS[1:])
     small = [
         f"{kind}.{key}={value}"
@@ -133,11 +140,19 @@ def build_trainer(
     settings: TrainerSettings,
     run: RunFolder,
     callbacks: Sequence[Callback],
-    loggers: Sequence[Logger],
-    bar: bool,
+    loggers: Sequence[Logger] = (),
+    devices: int | list[int] = 1,
     strategy: Strategy | None = None,
 ) -> Trainer:
-    """Lightning's trainer for one run, on one device unless a ``strategy`` says how to train on several.
+    """Lightning's trainer for one run.
+
+    Args:
+        settings: the section ``trainer``.
+        run: where Lightning may write.
+        callbacks: of the run, among them the progress bar if there is one; those of debugging are added.
+        loggers: of the run.
+        devices: as :func:`.gpus.placed` yields them.
+        strategy: how to train on several devices.
 
     Raises:
         ConfigError: a device or precision that this machine does not have.
@@ -148,7 +163,7 @@ def build_trainer(
         return Trainer(
             default_root_dir=run.path,
             accelerator=settings.accelerator,
-            devices=gpus.devices(settings) if strategy or settings.devices == 1 else 1,
+            devices=devices,
             strategy=strategy or "auto",
             # Lightning's own idea of a Slurm job is one that catches its signals and counts its tasks.
             plugins=[
@@ -167,7 +182,7 @@ def build_trainer(
             deterministic=settings.deterministic,
             callbacks=[*callbacks, *debugging.watchers(settings, run)],
             logger=list(loggers),
-            enable_progress_bar=bar,
+            enable_progress_bar=any(isinstance(callback, TQDMProgressBar) for callback in callbacks),
             enable_model_summary=False,
             num_sanity_val_steps=0,
             inference_mode=False,  # the layer differentiates its energy also when it only forecasts
@@ -176,7 +191,7 @@ def build_trainer(
 
 @contextmanager
 def naming(settings: TrainerSettings, run: RunFolder) -> Iterator[None]:
-    """Around the making of Lightning's trainer, whose complaints do not say which setting they are about.
+    """Context in which Lightning's trainer is made: its messages do not name the setting that they are about.
 
     Raises:
         ConfigError: a device or precision that this machine does not have.
@@ -221,9 +236,3 @@ def signals() -> Iterator[None]:
             signal.signal(number, handler or signal.SIG_DFL)
     if told:
         raise SystemExit(128 + signal.SIGTERM)
-
-
-def as_data(data: Any, overfit_batches: int = 0) -> LightningDataModule:
-    """The data module for Lightning: all of it, or only the first batches of the training split."""
-    assert isinstance(data, LightningDataModule)
-    return debugging.FewBatches(data, overfit_batches) if overfit_batches else data

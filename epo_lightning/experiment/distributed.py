@@ -27,8 +27,6 @@ from typing import IO, Any
 import torch
 import torch.distributed as dist
 from lightning.fabric.plugins import ClusterEnvironment
-from lightning.pytorch import seed_everything
-from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.strategies.launchers.launcher import _Launcher
 from lightning.pytorch.utilities.exceptions import SIGTERMException
@@ -90,59 +88,6 @@ def strategy(devices: int, run: RunFolder, config: Mapping[str, Any], last: Path
         return None
     task = {"run": str(run.path.resolve()), "config": dict(config), "last": str(last.resolve()) if last else None}
     return DDP(here(devices), task=json.dumps(task))
-
-
-def followed(devices: int, run: RunFolder) -> bool:
-    """Whether this process is one of the followers that Slurm has started, and has now done its part of the run.
-
-    Raises:
-        ConfigError: see :func:`here` and :func:`follow`.
-    """
-    place = here(devices)
-    if not place.leads:
-        follow(place, run)
-    return not place.leads
-
-
-def follow(place: Place, run: RunFolder | None = None) -> None:
-    """Train what the leader trains.
-
-    Args:
-        run: where the leader may also turn out to have nothing to do.
-
-    Raises:
-        ConfigError: there is no leader.
-    """
-    store = _find(place, run)
-    if store is None:
-        return
-    from epo_lightning.experiment import assembly, callbacks, train
-    from epo_lightning.experiment.config.settings import Settings, read
-
-    task = json.loads(store.get("task"))
-    settings, run = read(Settings, task["config"]), RunFolder(Path(task["run"]))
-    assembly.quiet()
-    seed_everything(settings.seed, workers=True, verbose=False)
-    data = train.ready(settings)
-    model = assembly.build_model(settings, data)
-    watchers = callbacks.watchers(settings.callbacks, run, settings.title)
-    # Those that decide, or belong to the checkpoint; none that writes or prints.
-    deciding = [w for w in watchers if isinstance(w, Checkpoint | EarlyStopping | callbacks.RandomStates)]
-    trainer = assembly.build_trainer(settings.trainer, run, deciding, [], bar=False, strategy=DDP(place, store))
-    trainer.fit(model, assembly.as_data(data), ckpt_path=task["last"], weights_only=True)
-
-
-def _find(place: Place, run: RunFolder | None) -> dist.TCPStore | None:
-    """The leader's store; None if the run is over without one."""
-    deadline = time.monotonic() + PATIENCE
-    while True:
-        try:
-            return dist.TCPStore(HOST, place.port, is_master=False, timeout=timedelta(seconds=GRACE))
-        except (dist.DistNetworkError, dist.DistStoreError) as error:
-            if run is not None and run.finished:
-                return None
-            if time.monotonic() > deadline:
-                raise ConfigError(f"process {place.rank} of {place.world} finds no leader: {error}") from error
 
 
 class DDP(DDPStrategy):
@@ -276,7 +221,7 @@ class _Processes(_Launcher):
             errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
             words = [str(rank), str(self._place.world), str(self._store.port)]
             process = subprocess.Popen(
-                [sys.executable, "-m", "epo_lightning.experiment.distributed", *words],
+                [sys.executable, "-m", "epo_lightning.experiment.follower", *words],
                 # Lightning and W&B look at LOCAL_RANK for who may speak. The path finds what was found here.
                 env={**os.environ, "LOCAL_RANK": str(rank), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
                 stdin=subprocess.PIPE,  # it ends when this is closed, as it is when this process dies
@@ -327,19 +272,3 @@ class _Processes(_Launcher):
         if dist.is_initialized():
             dist.destroy_process_group()
         self._store = None
-
-
-def _end_with(leader: int) -> None:
-    """End this process when the other end of the pipe ``leader`` is closed."""
-
-    def wait() -> None:
-        while os.read(leader, 1):
-            pass
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True, name="epo-leader").start()
-
-
-if __name__ == "__main__":
-    _end_with(sys.stdin.fileno())
-    follow(Place(*map(int, sys.argv[1:])))

@@ -8,14 +8,11 @@ from typing import Any
 import torch
 from lightning.pytorch import Trainer, seed_everything
 
-import epo_lightning
-from epo_lightning.experiment import assembly, gpus, logs
+from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings, read
+from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, write_json
-
-ARCHITECTURE = ("forecaster", "backbone", "energy", "dynamics", "solver", "backward")
-"""Sections that a checkpoint has to share with its run."""
 
 
 def evaluate(config: dict[str, Any]) -> list[tuple[RunFolder, dict[str, float]]]:
@@ -43,13 +40,19 @@ def _chosen(settings: EvaluateSettings) -> list[RunFolder]:
     return finished
 
 
-def score(run: RunFolder, settings: EvaluateSettings, machine: TrainerSettings | None = None) -> dict[str, float]:
+def score(
+    run: RunFolder,
+    settings: EvaluateSettings,
+    machine: TrainerSettings | None = None,
+    devices: int | list[int] = 1,
+) -> dict[str, float]:
     """Score one run and write its metrics file.
 
     Args:
         run: a finished run.
         settings: the split, the checkpoint and the batch size.
         machine: the accelerator and the threads to compute with; by default those that the run began with.
+        devices: the device to compute on, as :func:`.gpus.placed` yields it.
 
     Raises:
         ConfigError: see :func:`evaluate`.
@@ -68,7 +71,7 @@ def score(run: RunFolder, settings: EvaluateSettings, machine: TrainerSettings |
     with assembly.naming(machine, run):
         trainer = Trainer(
             accelerator=machine.accelerator,
-            devices=gpus.devices(machine) if machine.devices == 1 else 1,
+            devices=devices if machine.devices == 1 else 1,
             precision=None if double else of_run.trainer.precision,  # type: ignore[arg-type]
             plugins=[assembly.Double()] if double else None,
             deterministic=of_run.trainer.deterministic,
@@ -93,49 +96,3 @@ def score(run: RunFolder, settings: EvaluateSettings, machine: TrainerSettings |
     if settings.split == "test":
         logs.publish(run)
     return metrics
-
-
-def open_checkpoint(settings: Settings, path: Path) -> Any:
-    """The forecaster in a checkpoint, which must be of the architecture that ``settings`` describe.
-
-    Raises:
-        ConfigError: the file is missing, no checkpoint, or of another architecture; the message names the difference.
-    """
-    forecaster = epo_lightning.load(path)
-    expected = assembly.describe_model(settings, assembly.build_data(settings.data))
-    found = forecaster.configuration
-    for section in (*ARCHITECTURE, "goal", "horizon", "dt"):
-        if found.get(section) != expected[section]:
-            raise ConfigError(
-                f"{path} holds another architecture than this run: {section} is {found.get(section)} in the checkpoint "
-                f"and {expected[section]} in the run's config.yaml"
-            )
-    return forecaster
-
-
-def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None) -> Any:
-    """The run's data, which must be what it was trained on.
-
-    Raises:
-        ConfigError: the data is missing or has changed.
-    """
-    section = dict(settings.data)
-    if batch_size is not None and "batch_size" in section:
-        section["batch_size"] = batch_size
-    data = assembly.build_data(section)
-    data.setup("test")
-    began_with = run.record.get("data_digest")
-    if began_with != data.digest:
-        raise ConfigError(
-            f"the data has changed since {run.path} was trained (digest {began_with}, now {data.digest}): bring it back, "
-            "or train again"
-        )
-    return data
-
-
-def split_of(data: Any, split: str) -> Any:
-    """The loader of a split, in a fixed order."""
-    if split == "test":
-        return data.test_dataloader()
-    data.setup("validate")
-    return data.val_dataloader()

@@ -17,30 +17,22 @@ import torch
 
 from epo_lightning.experiment.config.settings import TrainerSettings
 
-_chosen: int | None = None
-
-
-def devices(settings: TrainerSettings) -> int | list[int]:
-    """What to tell Lightning: the GPU that this process has a place on, or how many devices."""
-    return settings.devices if _chosen is None else [_chosen]
-
 
 @contextmanager
-def placed(settings: TrainerSettings) -> Iterator[None]:
-    """Hold a place on a GPU, if the run wants just one; waits until there is one."""
-    global _chosen
+def placed(settings: TrainerSettings) -> Iterator[int | list[int]]:
+    """Hold a place on a GPU if the run wants just one, and wait until there is one.
+
+    Yields:
+        the argument ``devices`` of Lightning's trainer: the GPU with the place, or a number of devices.
+    """
     if settings.accelerator == "cpu" or settings.devices > 1 or not torch.cuda.is_available():
-        yield
+        yield settings.devices
         return
     count = torch.cuda.device_count()
     # By their own names: two jobs of a cluster may both see their GPU as number 0.
     names = [str(torch.cuda.get_device_properties(number).uuid) for number in range(count)]
     with place(names, settings.share) as number:
-        _chosen = number
-        try:
-            yield
-        finally:
-            _chosen = None
+        yield [number]
 
 
 @contextmanager

@@ -15,14 +15,16 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
-from epo_lightning.experiment.config.settings import DashboardSettings, LoggerSettings, Settings, read
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.settings import DashboardSettings, PredictSettings, Settings, read
 from epo_lightning.experiment.csv_log import CSVLog
-from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.experiment.dashboards.aside import Aside
 from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
 from epo_lightning.experiment.dashboards.mlflow import MLflow
 from epo_lightning.experiment.dashboards.tensorboard import TensorBoard
 from epo_lightning.experiment.dashboards.wandb import WandB
+from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.experiment.pictures import choose, draw, forecast_of
 from epo_lightning.identity import SECTIONS, identity
 from epo_lightning.run_folder import RunFolder, read_json, read_log
 
@@ -43,16 +45,6 @@ def scores(run: RunFolder, monitor: str) -> dict[str, float]:
     if run.metrics_file().is_file():
         found |= {f"test/{name}": float(value) for name, value in read_json(run.metrics_file())["metrics"].items()}
     return found
-
-
-def check(settings: LoggerSettings) -> None:
-    """Whether the chosen dashboards are installed.
-
-    Raises:
-        ConfigError: what is missing.
-    """
-    if settings.mlflow is not None:
-        mlflow.check()
 
 
 @contextmanager
@@ -138,11 +130,6 @@ def _close(dashboards: Sequence[Aside], settings: Settings, run: RunFolder, fail
 
 def _pictures(settings: Settings, run: RunFolder, count: int) -> list[Path]:
     """Forecasts of the best checkpoint on the validation split, in ``logs/figures``; drawn once."""
-    from epo_lightning.experiment import assembly
-    from epo_lightning.experiment.config.settings import PredictSettings
-    from epo_lightning.experiment.evaluate import open_checkpoint
-    from epo_lightning.experiment.predict import choose, draw, forecast_of
-
     if drawn := sorted((run.logs / "figures").glob("*.png")):
         return drawn
     try:

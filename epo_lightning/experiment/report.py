@@ -11,8 +11,8 @@ from typing import Any
 
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import ReportSettings, Settings, read
-from epo_lightning.experiment.evaluate import open_checkpoint, open_data
-from epo_lightning.experiment.predict import choose, eventful, forecast_of, is_traffic, pairs, spread
+from epo_lightning.experiment.opening import open_checkpoint, open_data
+from epo_lightning.experiment.pictures import choose, eventful, forecast_of, is_traffic, pairs, spread
 from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError

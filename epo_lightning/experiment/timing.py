@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.evaluate import open_checkpoint, open_data
+from epo_lightning.experiment.opening import open_checkpoint, open_data
 from epo_lightning.run_folder import RunFolder, write_json
 
 SAMPLES, WARM_UP = 100, 10

@@ -1,4 +1,4 @@
-"""One training run: check, make the folder, fit, and say what to do next."""
+"""One training run: check it, make its folder, fit, measure."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ import shlex
 import shutil
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import Timer
 
-from epo_lightning.experiment import assembly, callbacks, distributed, gpus, logs
+from epo_lightning.experiment import assembly, callbacks, debugging, distributed, follower, gpus, logs
 from epo_lightning.experiment.config.compose import PACKAGE
-from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, read
+from epo_lightning.experiment.config.settings import EvaluateSettings, Measured, Settings, read
 from epo_lightning.experiment.evaluate import score
+from epo_lightning.experiment.opening import refuse_changed
+from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import differences, identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
@@ -44,12 +45,13 @@ def folder_for(settings: Settings) -> RunFolder:
     return RunFolder(Path(settings.runs).expanduser() / group / name)
 
 
-def train(config: dict[str, Any], overrides: Sequence[str] = ()) -> RunFolder:
+def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolder | None = None) -> RunFolder:
     """Train what ``config`` describes, and score it if the configuration says so.
 
     Args:
         config: the resolved configuration of ``epo train``.
         overrides: what the user changed; written to run.json.
+        begun: a run to continue, whose own configuration ``config`` is.
 
     Raises:
         ConfigError: the configuration cannot work, its data is missing, the folder holds a run already, or another process
@@ -57,23 +59,31 @@ def train(config: dict[str, Any], overrides: Sequence[str] = ()) -> RunFolder:
     """
     assembly.quiet()
     settings = read(Settings, config)
-    assembly.check(settings)
-    run = folder_for(settings)
-    if distributed.followed(settings.trainer.devices, run):
+    seed_everything(settings.seed, workers=True, verbose=False)
+    data, forecaster = assembly.build(settings)
+    run = begun or folder_for(settings)
+    if settings.trainer.devices > 1 and follower.followed(settings.trainer.devices, run):
         return run
-    refuse_occupied(settings, run)
-    data = None if run.record_file.is_file() else ready(settings)  # missing data is said before a folder is made
-    # In a sweep, whoever has the run already may finish it for us.
-    with run.lock(wait=None if settings.sweep else 2.0), gpus.placed(settings.trainer):
-        if not run.record_file.is_file():
-            refuse_occupied(settings, run)
-            run.begin(config, _record(settings, config, data or ready(settings), overrides))
-            _fit(settings, config, run)
-        elif run.finished:
-            refuse_other(run, config)
+    if begun is None:
+        refuse_occupied(settings, run)
+    if not run.finished:
+        data.setup("fit")  # missing data is said before a folder is made
+    # In a sweep, another process that works on the run may finish it.
+    patience = None if settings.sweep and begun is None else 2.0
+    with run.lock(wait=patience), gpus.placed(settings.trainer) as devices:
+        if run.record_file.is_file():
+            refuse_other(run, config, data.digest)
+            if not run.finished:
+                run.update(status=TRAINING, error=None)
         else:
-            _continue(run, config)
-        _score(settings, run)
+            refuse_occupied(settings, run)
+            run.begin(config, _record(settings, config, data.digest, overrides))
+        if not run.finished:
+            with _errors_recorded(run), assembly.signals():
+                fit(settings, config, run, data, forecaster, devices)
+        for which in settings.measures:
+            if not run.metrics_file(which).is_file():
+                measure(run, settings, which, devices)
     return run
 
 
@@ -84,27 +94,76 @@ def resume(run: RunFolder) -> None:
         ConfigError: the run is finished, its checkpoint or data is not the one that it began with, or another process works
             on it.
     """
-    assembly.quiet()
-    if distributed.followed(read(Settings, run.config()).trainer.devices, run):
-        return
-    if run.finished:
-        raise ConfigError(f"{run.path} is finished: score it with `epo evaluate run={run.path}`")
     config = run.config()
-    settings = read(Settings, config)
-    with run.lock(), gpus.placed(settings.trainer):
-        _continue(run, config)
-        _score(settings, run)
+    if run.finished and distributed.here(read(Settings, config).trainer.devices).leads:
+        raise ConfigError(f"{run.path} is finished: score it with `epo evaluate run={run.path}`")
+    train(config, begun=run)
 
 
-def _continue(run: RunFolder, config: dict[str, Any]) -> None:
-    """Train on from the last finished epoch. ``config`` must be the run's own, wherever it may write and log now."""
-    refuse_other(run, config)
-    last = run.checkpoint("last")
-    run.update(status=TRAINING, error=None)
-    _fit(read(Settings, config), config, run, last if last.is_file() else None)
+def fit(
+    settings: Settings,
+    config: dict[str, Any],
+    run: RunFolder,
+    data: Any,
+    forecaster: LightningModule,
+    devices: int | list[int],
+) -> None:
+    """Train from the beginning, or from the last finished epoch of the run, and record how it ended in run.json."""
+    started = time.monotonic()
+    last = run.checkpoint("last") if run.checkpoint("last").is_file() else None
+    step = _steps_in(last, forecaster) if last else 0
+    learned = assembly.parameters(forecaster)
+    learns = learned > 0 and settings.trainer.max_steps != 0
+    timer = Timer()  # it is kept in the checkpoint: the time of a killed process counts
+    watchers = [*callbacks.watchers(settings.callbacks, run, f"{settings.title}, seed {settings.seed}"), timer]
+    strategy = None
+    if settings.trainer.devices > 1:
+        strategy = distributed.strategy(settings.trainer.devices, run, config, last) if learns else None
+        devices = devices if learns else 1
+    run.update(parameters=learned)
+    with logs.open_logs(settings, config, run, step) as loggers:
+        trainer = assembly.build_trainer(settings.trainer, run, watchers, loggers, devices, strategy)
+        if not learns:
+            _keep_unlearned(trainer, forecaster, data, run)
+        else:
+            few = settings.trainer.overfit_batches
+            batches = debugging.FewBatches(data, few) if few else data
+            trainer.fit(forecaster, batches, ckpt_path=last, weights_only=True)
+        best = _best_score(run, trainer, settings.callbacks.monitor)
+    run.update(
+        status=FINISHED,
+        epochs=trainer.fit_loop.epoch_progress.current.ready,  # current_epoch lags where there was no step left to make
+        steps=trainer.global_step,
+        best={settings.callbacks.monitor: best},
+        seconds=round(timer.time_elapsed() if learns else time.monotonic() - started, 3),
+    )
 
 
-def refuse_other(run: RunFolder, config: dict[str, Any]) -> None:
+@contextlib.contextmanager
+def _errors_recorded(run: RunFolder) -> Iterator[None]:
+    """Context of a training, whose error is also left in run.json."""
+    try:
+        yield
+    except Exception as error:
+        with contextlib.suppress(OSError, ConfigError):  # the disk may be what failed
+            run.update(status=FAILED, error=f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
+        raise
+    finally:
+        with contextlib.suppress(OSError):
+            run.progress_file.unlink(missing_ok=True)
+
+
+def measure(run: RunFolder, settings: Settings, which: Measured, devices: int | list[int]) -> None:
+    """Measure the scores of a finished run on a split, or the time of its forecasts."""
+    if which == "time":
+        from epo_lightning.experiment import timing
+
+        timing.measure(run, settings)
+    else:
+        score(run, EvaluateSettings(run=str(run.path), split=which), settings.trainer, devices)
+
+
+def refuse_other(run: RunFolder, config: dict[str, Any], data_digest: str) -> None:
     """A run goes on with the configuration and the data that it began with.
 
     Raises:
@@ -116,74 +175,12 @@ def refuse_other(run: RunFolder, config: dict[str, Any]) -> None:
             f"{run.path} was begun with another configuration ({shown}): "
             f"continue it as it is with `epo train resume={run.path}`, or choose another run_dir"
         )
-    began_with, digest = run.record.get("data_digest"), assembly.build_data(config["data"]).digest
-    if began_with != digest:
-        raise ConfigError(
-            f"the data of {run.path} has changed since the run began (digest {began_with}, now {digest}): "
-            "bring back the data, or begin a new run"
-        )
-
-
-def _score(settings: Settings, run: RunFolder) -> None:
-    """Measure what the configuration asks for, except what was measured already."""
-    for which in settings.measures:
-        if run.metrics_file(which).is_file():
-            continue
-        if which == "time":
-            from epo_lightning.experiment.timing import measure
-
-            measure(run, settings)
-        else:
-            score(run, EvaluateSettings(run=str(run.path), split=which), settings.trainer)
-
-
-def _fit(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None = None) -> None:
-    """Train from the beginning, or from the checkpoint ``last``; an error is also left in run.json."""
-    try:
-        with assembly.signals():
-            _train(settings, config, run, last)
-    except Exception as error:
-        with contextlib.suppress(OSError, ConfigError):  # the disk may be what failed
-            run.update(status=FAILED, error=f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
-        raise
-    finally:
-        with contextlib.suppress(OSError):
-            run.progress_file.unlink(missing_ok=True)
-
-
-def _train(settings: Settings, config: dict[str, Any], run: RunFolder, last: Path | None) -> None:
-    started = time.monotonic()
-    timer = Timer()  # it is kept in the checkpoint: what a killed process had done counts
-    seed_everything(settings.seed, workers=True, verbose=False)
-    data = ready(settings)
-    model = assembly.build_model(settings, data)
-    step = _steps_in(last, model) if last else 0
-    with logs.open_logs(settings, config, run, step) as loggers:
-        watchers = [*callbacks.watchers(settings.callbacks, run, f"{settings.title}, seed {settings.seed}"), timer]
-        bar = any(isinstance(watcher, callbacks.TQDMProgressBar) for watcher in watchers)
-        learns = assembly.parameters(model) > 0 and settings.trainer.max_steps != 0
-        strategy = distributed.strategy(settings.trainer.devices, run, config, last) if learns else None
-        trainer = assembly.build_trainer(settings.trainer, run, watchers, loggers, bar, strategy)
-        run.update(parameters=assembly.parameters(model))
-        if learns:
-            trainer.fit(
-                model, assembly.as_data(data, settings.trainer.overfit_batches), ckpt_path=last, weights_only=True
-            )
-        else:
-            _keep_unlearned(trainer, model, data, run)
-        best = _best_score(run, trainer, settings.callbacks.monitor)
-    run.update(
-        status=FINISHED,
-        epochs=trainer.fit_loop.epoch_progress.current.ready,  # current_epoch lags where there was no step left to make
-        steps=trainer.global_step,
-        best={settings.callbacks.monitor: best},
-        seconds=round(timer.time_elapsed() if learns else time.monotonic() - started, 3),
-    )
+    refuse_changed(run, data_digest)
 
 
 def _keep_unlearned(trainer: Trainer, model: LightningModule, data: Any, run: RunFolder) -> None:
-    """What does not learn, for lack of parameters or of steps, is validated once and kept like any other."""
-    trainer.validate(model, assembly.as_data(data), verbose=False)
+    """Validate a forecaster without parameters or without steps once, and keep it like any other."""
+    trainer.validate(model, data, verbose=False)
     run.checkpoints.mkdir(parents=True, exist_ok=True)
     trainer.save_checkpoint(run.checkpoint("last"))
     shutil.copyfile(run.checkpoint("last"), run.checkpoint("best"))
@@ -207,33 +204,8 @@ def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:
     return score
 
 
-def ready(settings: Settings) -> Any:
-    """The data module with its training data found and verified."""
-    data = assembly.build_data(settings.data)
-    data.order_seed = settings.seed
-    data.setup("fit")
-    return data
-
-
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's contents: tensors and plain values only, no code is run.
-
-    Raises:
-        ConfigError: the file is missing, or is not a checkpoint.
-    """
-    if not path.is_file():
-        raise ConfigError(f"no checkpoint {path}: the file does not exist; train first")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises half a dozen kinds for damaged files
-        raise ConfigError(f"{path} is not a checkpoint, or is damaged: {str(error).splitlines()[0]}") from error
-    if not isinstance(content, dict) or "state_dict" not in content:
-        raise ConfigError(f"{path} is not a checkpoint of this project: it holds no state_dict")
-    return content
-
-
 def _steps_in(path: Path, model: LightningModule) -> int:
-    content = load_checkpoint(path)
+    content = read_checkpoint(path)
     shapes = {key: tuple(value.shape) for key, value in content["state_dict"].items()}
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     for key in sorted({*shapes, *expected}):
@@ -269,11 +241,11 @@ def _occupied(run: RunFolder) -> str:
     )
 
 
-def _record(settings: Settings, config: dict[str, Any], data: Any, overrides: Sequence[str]) -> dict[str, Any]:
+def _record(settings: Settings, config: dict[str, Any], data_digest: str, overrides: Sequence[str]) -> dict[str, Any]:
     words = [word for word in overrides if not word.startswith(NOT_IN_COMMAND)]
     return {
-        "identity": identity(config, data.digest),
-        "row": row_identity(config, data.digest),
+        "identity": identity(config, data_digest),
+        "row": row_identity(config, data_digest),
         "title": settings.title,
         "experiment": settings.experiment,
         "forecaster": settings.forecaster["name"],
@@ -281,7 +253,7 @@ def _record(settings: Settings, config: dict[str, Any], data: Any, overrides: Se
         "seed": settings.seed,
         "budget": settings.budget.name,
         "data": settings.data.get("dataset", settings.data["name"]),
-        "data_digest": data.digest,
+        "data_digest": data_digest,
         "command": shlex.join(["epo", "train", *words]),
         "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},

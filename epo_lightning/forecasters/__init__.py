@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from epo_lightning.forecasters.base import Forecaster
+from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.registry import ConfigError, build, check, nearest, parameters
 from epo_lightning.task import TASK_KEYS, Task
 
@@ -101,23 +99,15 @@ def load(checkpoint: str | Path) -> Forecaster:
     """A trained forecaster from a checkpoint alone, in evaluation mode: no configuration tree, no pickled code.
 
     Raises:
-        ConfigError: the file is missing, is not a checkpoint of this project, or belongs to another architecture.
+        ConfigError: as :func:`~epo_lightning.forecasters.checkpoint.read_checkpoint`, or weights of another architecture.
     """
-    path = Path(checkpoint)
-    if not path.is_file():
-        raise ConfigError(f"no checkpoint at {path}: give the path of a .ckpt file, such as RUN/checkpoints/best.ckpt")
+    content = read_checkpoint(checkpoint)
+    forecaster = build_forecaster(content["configuration"])
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        configuration, weights = content["configuration"], content["state_dict"]
-    except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ConfigError(f"{path} is not a checkpoint that epo_lightning wrote, or is damaged ({reason})") from error
-    forecaster = build_forecaster(configuration)
-    try:
-        forecaster.load_state_dict(weights)
+        forecaster.load_state_dict(content["state_dict"])
     except RuntimeError as error:
         raise ConfigError(
-            f"{path} does not fit the architecture that its own configuration describes; it was written by another "
+            f"{checkpoint} does not fit the architecture that its own configuration describes; it was written by another "
             f"version or for another model: {' '.join(str(error).split())[:300]}"
         ) from error
     return forecaster.eval()

@@ -66,7 +66,7 @@ def followers(of: int | None = None) -> list[int]:
             parent = int((process / "stat").read_text().rpartition(")")[2].split()[1])
         except (OSError, ValueError, IndexError):
             continue
-        if b"epo_lightning.experiment.distributed" in words and parent == (of or os.getpid()):
+        if b"epo_lightning.experiment.follower" in words and parent == (of or os.getpid()):
             found.append(int(process.name))
     return found
 

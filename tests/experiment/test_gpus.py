@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from epo_lightning.experiment.config.settings import TrainerSettings
-from epo_lightning.experiment.gpus import devices, place, placed
+from epo_lightning.experiment.gpus import place, placed
 
 
 def test_empty_gpus_come_first_and_then_those_with_company(tmp_path: Path) -> None:
@@ -35,5 +35,5 @@ def test_who_finds_no_place_waits_for_one(tmp_path: Path) -> None:
 
 def test_cpus_are_not_handed_out() -> None:
     settings = TrainerSettings(accelerator="cpu", devices=3)
-    with placed(settings):
-        assert devices(settings) == 3
+    with placed(settings) as devices:
+        assert devices == 3

@@ -14,7 +14,8 @@ from PIL import Image
 from torch import Tensor
 
 from epo_lightning.data.datamodule import SceneDataModule
-from epo_lightning.experiment.predict import MEANING, choose, even, eventful
+from epo_lightning.experiment.pictures import choose, even, eventful
+from epo_lightning.experiment.predict import MEANING
 from epo_lightning.registry import register
 from epo_lightning.scene import KINDS, JointForecast, Scene
 from epo_lightning.task import Task

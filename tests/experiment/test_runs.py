@@ -18,8 +18,8 @@ from experiment import tiny
 from experiment.conftest import TINY, Epo
 
 import epo_lightning
-from epo_lightning.experiment import train as training
 from epo_lightning.experiment.callbacks import RandomStates
+from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json
 
@@ -190,5 +190,5 @@ def test_files_are_replaced_as_a_whole(tmp_path: Path) -> None:
 
 
 def test_missing_checkpoints_are_said_to_be_missing(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="does not exist"):
-        training.load_checkpoint(tmp_path / "no.ckpt")
+    with pytest.raises(ConfigError, match="no checkpoint at"):
+        read_checkpoint(tmp_path / "no.ckpt")

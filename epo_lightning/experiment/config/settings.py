@@ -345,15 +345,6 @@ def check_part(kind: str, values: Any, supplied: Sequence[str] = ()) -> None:
     if not isinstance(values, Mapping):
         raise ConfigError(f"{kind} must be a mapping with a name, not {values!r}")
     check(kind, values, supplied)
-    check_types(kind, values)
-
-
-def check_types(kind: str, values: Mapping[str, Any]) -> None:
-    """Compare the values of a part's section with the annotations of its constructor.
-
-    Raises:
-        ConfigError: a value of another type.
-    """
     part = lookup(kind, values["name"])
     function = part.__init__ if isinstance(part, type) else part  # type: ignore[misc]
     try:

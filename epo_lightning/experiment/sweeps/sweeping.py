@@ -86,7 +86,7 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Jo
         config = compose.compose("train", overrides, extra)
         job = Job.of(config, overrides)
         if job.run.record_file.is_file():
-            training.refuse_other(job.run, config)
+            training.refuse_other(job.run, config, assembly.build_data(config["data"]).digest)
         elif job.run.exists:
             raise ConfigError(
                 f"{job.run.path} exists and is not a run folder: move it away, or choose another runs=<folder>"
@@ -95,7 +95,7 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Jo
             _set_aside(job.run, read(Settings, config).trainer)
         data = json.dumps(config["data"], sort_keys=True)
         if data not in ready and sweep.state(job) != "done":
-            training.ready(read(Settings, config))
+            assembly.build_data(config["data"]).setup("fit")
             ready.add(data)
         jobs.setdefault(job.run.path, job)
     return list(jobs.values())

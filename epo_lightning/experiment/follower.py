@@ -1,0 +1,88 @@
+"""A follower of a training on several devices: a process that computes what the leader (:mod:`.distributed`) tells it."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from datetime import timedelta
+from pathlib import Path
+
+import torch.distributed as dist
+from lightning.pytorch import seed_everything
+from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
+
+from epo_lightning.experiment import assembly, callbacks
+from epo_lightning.experiment.config.settings import Settings, read
+from epo_lightning.experiment.distributed import DDP, GRACE, HOST, PATIENCE, Place, here
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
+
+
+def followed(devices: int, run: RunFolder) -> bool:
+    """Whether this process is one of the followers that Slurm has started, and has now done its part of the run.
+
+    Raises:
+        ConfigError: see :func:`here` and :func:`follow`.
+    """
+    place = here(devices)
+    if not place.leads:
+        follow(place, run)
+    return not place.leads
+
+
+def follow(place: Place, run: RunFolder | None = None) -> None:
+    """Train what the leader trains.
+
+    Args:
+        run: where the leader may also turn out to have nothing to do.
+
+    Raises:
+        ConfigError: there is no leader.
+    """
+    store = _find(place, run)
+    if store is None:
+        return
+    task = json.loads(store.get("task"))
+    settings, run = read(Settings, task["config"]), RunFolder(Path(task["run"]))
+    assembly.quiet()
+    seed_everything(settings.seed, workers=True, verbose=False)
+    data, model = assembly.build(settings)
+    watchers = callbacks.watchers(settings.callbacks, run, settings.title)
+    # Those that decide, or belong to the checkpoint; none that writes or prints.
+    deciding = [w for w in watchers if isinstance(w, Checkpoint | EarlyStopping | callbacks.RandomStates)]
+    trainer = assembly.build_trainer(
+        settings.trainer, run, deciding, devices=settings.trainer.devices, strategy=DDP(place, store)
+    )
+    trainer.fit(model, data, ckpt_path=task["last"], weights_only=True)
+
+
+def _find(place: Place, run: RunFolder | None) -> dist.TCPStore | None:
+    """The leader's store; None if the run is over without one."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return dist.TCPStore(HOST, place.port, is_master=False, timeout=timedelta(seconds=GRACE))
+        except (dist.DistNetworkError, dist.DistStoreError) as error:
+            if run is not None and run.finished:
+                return None
+            if time.monotonic() > deadline:
+                raise ConfigError(f"process {place.rank} of {place.world} finds no leader: {error}") from error
+
+
+def _end_with(leader: int) -> None:
+    """End this process when the other end of the pipe ``leader`` is closed."""
+
+    def wait() -> None:
+        while os.read(leader, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True, name="epo-leader").start()
+
+
+if __name__ == "__main__":
+    _end_with(sys.stdin.fileno())
+    follow(Place(*map(int, sys.argv[1:])))

@@ -1,0 +1,70 @@
+"""What a run has left behind, opened again: its forecaster and its data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import epo_lightning
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
+
+ARCHITECTURE = ("forecaster", "backbone", "energy", "dynamics", "solver", "backward")
+"""Sections that a checkpoint has to share with its run."""
+
+
+def open_checkpoint(settings: Settings, path: Path) -> Any:
+    """The forecaster in a checkpoint, which must be of the architecture that ``settings`` describe.
+
+    Raises:
+        ConfigError: the file is missing, no checkpoint, or of another architecture; the message names the difference.
+    """
+    forecaster = epo_lightning.load(path)
+    expected = assembly.describe_model(settings, assembly.build_data(settings.data))
+    found = forecaster.configuration
+    for section in (*ARCHITECTURE, "goal", "horizon", "dt"):
+        if found.get(section) != expected[section]:
+            raise ConfigError(
+                f"{path} holds another architecture than this run: {section} is {found.get(section)} in the checkpoint "
+                f"and {expected[section]} in the run's config.yaml"
+            )
+    return forecaster
+
+
+def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None) -> Any:
+    """The run's data, which must be what it was trained on.
+
+    Raises:
+        ConfigError: the data is missing or has changed.
+    """
+    section = dict(settings.data)
+    if batch_size is not None and "batch_size" in section:
+        section["batch_size"] = batch_size
+    data = assembly.build_data(section)
+    data.setup("test")
+    refuse_changed(run, data.digest)
+    return data
+
+
+def refuse_changed(run: RunFolder, digest: str) -> None:
+    """A run is continued and scored with the data that it began with.
+
+    Raises:
+        ConfigError: the data has another digest now.
+    """
+    began_with = run.record.get("data_digest")
+    if began_with != digest:
+        raise ConfigError(
+            f"the data of {run.path} has changed since the run began (digest {began_with}, now {digest}): "
+            "bring back the data, or train a new run"
+        )
+
+
+def split_of(data: Any, split: str) -> Any:
+    """The loader of the split ``test`` or ``val``, in a fixed order."""
+    if split == "test":
+        return data.test_dataloader()
+    data.setup("validate")
+    return data.val_dataloader()

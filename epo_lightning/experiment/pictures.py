@@ -1,0 +1,153 @@
+"""Scenes of a split to forecast, their forecasts, and pictures of both."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from epo_lightning.data.datamodule import SceneDataModule
+from epo_lightning.experiment.config.settings import PredictSettings
+from epo_lightning.experiment.opening import split_of
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import HEADING, JointForecast, Scene, X, Y
+
+
+def choose(data: Any, split: str, count: int | None) -> tuple[Scene, list[dict[str, Any]] | None]:
+    """``count`` scenes at even distances, and which piece of which recording each one is, where the data set knows."""
+    loader = split_of(data, split)
+    if not isinstance(data, SceneDataModule):
+        return spread(gather(loader), count), None
+    dataset = data.dataset(split)
+    scenes = dataset[even(len(dataset), count)]
+    provenance = getattr(dataset, "provenance", None)
+    return scenes, provenance(scenes.id.tolist()) if provenance and scenes.id is not None else None
+
+
+def draw(
+    settings: PredictSettings, title: str, forecaster: Any, scenes: Scene, forecast: JointForecast
+) -> list[tuple[Path, list[int]]]:
+    """Pictures and animations below ``out``, each with the rows of the scenes that it shows.
+
+    Vehicles, and agents that are said to be something, are drawn one scene at a time; where all are equal discs (RPI), a
+    few scenes share a picture.
+    """
+    folder = Path(settings.out).expanduser() / "figures"
+    ids = list(range(len(scenes.history))) if scenes.id is None else scenes.id.tolist()
+    if len(set(ids)) < len(ids):  # a record with two futures, say
+        ids = list(range(len(ids)))
+    drawn: list[tuple[Path, list[int]]] = []
+    if settings.figures and is_traffic(scenes, forecaster.configuration.get("shape", "disc")):
+        from epo_lightning.report.scenes import highway_scene
+
+        for row in eventful(scenes, settings.figures):
+            path, name = folder / f"scene_{ids[row]}.png", f"{title}, scene {ids[row]}"
+            drawn.append((highway_scene(scenes[row], forecast[row], path, name), [row]))
+    elif settings.figures and scenes.future is not None:
+        from epo_lightning.report.figures import joint_predictions
+
+        rows, others = pairs(scenes, settings.figures)
+        other = None if others is None else scenes.future[others]
+        forecasts = {title: forecast_of(forecaster, scenes[rows])}
+        path = joint_predictions(scenes[rows], forecasts, folder / "joint_predictions.png", other)
+        drawn.append((path, rows.tolist()))
+    if settings.animate:
+        from epo_lightning.report.scenes import animate
+
+        for row in eventful(scenes, settings.animate):
+            path, name = folder / f"scene_{ids[row]}.gif", f"{title}, scene {ids[row]}"
+            drawn.append((animate(scenes[row], forecast[row], path, name), [row]))
+    return drawn
+
+
+def is_traffic(scenes: Scene, shape: str) -> bool:
+    """Whether scenes have lanes, boxes, or agents of which something is known."""
+    return scenes.lanes is not None or scenes.kind is not None or shape == "box"
+
+
+def eventful(scenes: Scene, count: int) -> list[int]:
+    """Rows of ``count`` scenes spread over all, of their neighbours those in which agents' sideways motions differ most.
+
+    Differ, because in a bend everyone moves sideways, but few at a time change lane.
+    """
+    steps, mask = scenes.history, scenes.history_mask
+    if scenes.future is not None:
+        assert scenes.future_mask is not None
+        steps, mask = scenes.future, scenes.future_mask
+    heading, moved = scenes.current[..., None, HEADING], steps[..., :2] - scenes.current[..., None, :2]
+    sideways = moved[..., Y] * heading.cos() - moved[..., X] * heading.sin()
+    known = scenes.agent_mask[..., None] & mask & sideways.isfinite()
+    infinity = torch.full_like(sideways, torch.inf)
+    spans = torch.where(known, sideways, -infinity).amax(1) - torch.where(known, sideways, infinity).amin(1)
+    spans = spans.amax(1)
+    parts = torch.arange(len(spans), device=spans.device).tensor_split(min(count, len(spans)))
+    return [int(part[spans[part].argmax()]) for part in parts]
+
+
+def gather(loader: Iterable[Scene]) -> Scene:
+    """All scenes of a loader as one batch."""
+    batches = list(loader)
+    if not batches:
+        raise ConfigError("the split is empty: there is nothing to forecast")
+
+    def join(name: str) -> Any:
+        values = [getattr(batch, name) for batch in batches]
+        return torch.cat(values) if isinstance(values[0], Tensor) else values[0]
+
+    return Scene(**{entry.name: join(entry.name) for entry in dataclasses.fields(Scene)})
+
+
+def even(total: int, count: int | None) -> Tensor:
+    """Indices of ``count`` of ``total`` at even distances; all where there are fewer."""
+    if count is None or count >= total:
+        return torch.arange(total)
+    return torch.linspace(0, total - 1, count).round().long()
+
+
+def spread(scenes: Scene, count: int | None) -> Scene:
+    """``count`` scenes at even distances; all where there are fewer."""
+    return scenes[even(len(scenes.history), count)]
+
+
+def pairs(scenes: Scene, count: int) -> tuple[Tensor, Tensor | None]:
+    """Rows of scenes worth drawing, those with two known futures first, and the rows of the other futures."""
+    total = len(scenes.history)
+    if scenes.id is None or scenes.subset is None:
+        return even(total, count), None
+    first: dict[int, int] = {}
+    both: list[tuple[int, int]] = []
+    for index, (record, subset) in enumerate(zip(scenes.id.tolist(), scenes.subset.tolist(), strict=True)):
+        if record in first and subset != int(scenes.subset[first[record]]):
+            one, other = sorted((first[record], index), key=lambda i: int(scenes.subset[i]))  # type: ignore[index]
+            both.append((one, other))
+        first.setdefault(record, index)
+    if not both:
+        return even(total, count), None
+    chosen = [both[int(i)] for i in torch.linspace(0, len(both) - 1, min(count, len(both))).round()]
+    ones, others = (torch.tensor(indices) for indices in zip(*chosen, strict=True))
+    return ones, others
+
+
+def forecast_of(forecaster: Any, scenes: Scene, batch_size: int = 256) -> JointForecast:
+    """The forecasts of many scenes, batch by batch."""
+    parts = [forecaster.predict(scenes[slice(i, i + batch_size)]) for i in range(0, len(scenes.history), batch_size)]
+    return _join(parts)
+
+
+def _join(parts: list[Any]) -> Any:
+    """Concatenate equal structures of tensors along their first dimension."""
+    first = parts[0]
+    if isinstance(first, Tensor):
+        return torch.cat(parts)
+    if isinstance(first, Mapping):
+        return {key: _join([part[key] for part in parts]) for key in first}
+    if isinstance(first, tuple):
+        return tuple(_join(list(entries)) for entries in zip(*parts, strict=True))
+    if dataclasses.is_dataclass(first) and not isinstance(first, type):
+        names = [entry.name for entry in dataclasses.fields(first)]
+        return type(first)(**{name: _join([getattr(part, name) for part in parts]) for name in names})
+    return first

@@ -1,0 +1,44 @@
+"""Checkpoints as files: read without running code from them, and refused where they are damaged."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from epo_lightning.registry import ConfigError
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """The contents of a checkpoint: tensors and plain values.
+
+    A checkpoint is a zip archive, in which PyTorch writes a CRC-32 beside every entry; PyTorch itself does not compare them
+    when it reads.
+
+    Raises:
+        ConfigError: the file is missing, is not a checkpoint of this project, differs from what was written, or holds
+            weights that are not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ConfigError(f"no checkpoint at {path}: give the path of a .ckpt file, such as RUN/checkpoints/best.ckpt")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise zipfile.BadZipFile(f"{damaged} differs from its checksum")
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # zipfile, zlib, pickle and torch raise half a dozen kinds for damaged files
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigError(f"{path} is not a checkpoint that epo_lightning wrote, or is damaged ({reason})") from error
+    if not isinstance(content, dict) or not {"state_dict", "configuration"} <= set(content):
+        raise ConfigError(f"{path} is not a checkpoint that epo_lightning wrote: it lacks state_dict or configuration")
+    for name, value in content["state_dict"].items():
+        if value.is_floating_point() and not value.isfinite().all():
+            raise ConfigError(
+                f"{path} holds weights that are not finite ({name}): its training diverged; use checkpoint=best, or train "
+                "again with a smaller optimizer.lr or with optimizer.clip=1"
+            )
+    return content
