@@ -51,7 +51,7 @@ def passed(epo: Epo, monkeypatch: pytest.MonkeyPatch, *words: str) -> set[tuple[
 
 
 def named(file: str, qualname: str) -> bool:
-    """Whether a function is called by its name: no constructor or other special method, attribute, class or inner function."""
+    """Whether a function is called by its name: not a special method, a property, a class or an inner function."""
     *home, name = qualname.split(".")
     if name.startswith(("__", "<")) or "<locals>" in home:
         return False
