@@ -1,1 +1,1 @@
-"""What the layer costs, measured: ``python -m benchmarks.epo_layer`` and ``python -m benchmarks.training_step``."""
+"""Benchmarks of the layer, a training step, dashboards and extraction: see docs/benchmarks.md."""

@@ -1,4 +1,4 @@
-"""Several implementations on one game: checked against each other, then measured in turns."""
+"""Comparison of implementations on one game: they are checked against the reference, then measured in turns."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from benchmarks.implementations import Implementation, Missing, disagreement, pr
 
 @dataclass(frozen=True)
 class Measurement:
-    """One line of the JSON file: how one implementation did in one setting.
+    """One line of the JSON file: times and memory of one implementation in one setting.
 
-    Times are CPU time of the process on one thread of a CPU, and wall time otherwise.
+    Times are CPU times of the process for one thread of a CPU, and wall times otherwise.
     """
 
     setting: str
@@ -40,11 +40,14 @@ class Measurement:
 def measurements(
     game: Game, names: Sequence[str], repeats: int, threads: int, console: Console, thorough: bool = True
 ) -> list[Measurement]:
-    """Measure those implementations of a game that can run here.
+    """Measurements of the implementations of a game that can run here.
 
     Args:
-        thorough: refuse what does not agree with the reference, time the peer with all its linear solvers (the
-            fastest counts), and measure memory as well.
+        thorough: check against the reference, time the peer with all its linear solvers (the fastest counts), and
+            measure memory as well.
+
+    Raises:
+        SystemExit: an implementation differs from the reference.
     """
     ready: dict[str, Implementation] = {}
     for name in names:
@@ -54,7 +57,7 @@ def measurements(
             console.print(f"{name}: left out, {reason}")
             continue
         if thorough and (trouble := disagreement(implementation)):
-            raise SystemExit(f"no times of different things are compared: {trouble}")
+            raise SystemExit(f"nothing was measured: {trouble}; times of different results cannot be compared")
         ready[name] = implementation
     candidates = dict(ready)
     if "peer" in ready and thorough:
@@ -89,7 +92,7 @@ def measurements(
 
 
 def _peak(setting: str, sizes: dict[str, int], name: str, threads: int) -> float | None:
-    """Peak memory [MB] of forward and backward, in a process that has done nothing but the same for one scene."""
+    """Peak memory [MB] of forward and backward, in a process that has only done the same for one scene."""
     warnings.simplefilter("ignore")
     torch.set_num_threads(threads)
     prepare(name, make(setting, **{**sizes, "B": 1, "M": 1})).forward_backward()

@@ -1,4 +1,4 @@
-"""The layer against its peer: ``python -m benchmarks.epo_layer``; see docs/benchmarks.md for how to read what it prints."""
+"""Comparison of the layer with its peer: ``python -m benchmarks.epo_layer``; docs/benchmarks.md explains the output."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from benchmarks import measure, scaling
 from benchmarks.comparison import Measurement, measurements
 from benchmarks.games import LANE_POINTS, SETTINGS, Game, activity, make
 from benchmarks.implementations import NAMES, Missing, prepare
+from epo_lightning.registry import ConfigError
 
 GOALS = {
     ("exid", "pytorch"): (18, 28, 30),
@@ -25,11 +26,11 @@ GOALS = {
     ("rpi", "pytorch"): (12, 18, 30),
     ("rpi", "compiled"): (400, 350, 100),
 }
-"""How many times faster than the peer we want to be, forward and with backward, and how many times smaller."""
+"""Goals by setting and implementation: speed-up over the peer, forward and with backward, and reduction of memory."""
 
 
 def table(game: Game, found: Sequence[Measurement], machine: measure.Machine) -> Table:
-    """What was measured, against the peer, our goals and the machine's floor."""
+    """Table of the measurements beside the peer's, our goals and the machine's floor."""
     sizes = game.sizes
     forward, adjoint = operations = measure.operations(
         sizes["N"], sizes["K"], LANE_POINTS if "lane" in game.energy.own else 0
@@ -92,10 +93,10 @@ def _arguments(given: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.epo_layer", description=__doc__)
     parser.add_argument("--settings", nargs="+", default=["exid", "rpi"], choices=SETTINGS)
     parser.add_argument("--implementations", nargs="+", default=list(NAMES), choices=NAMES)
-    parser.add_argument("--repeats", type=int, default=7, help="rounds; the median counts")
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--repeats", type=measure.positive, default=7, help="rounds; the median counts")
+    parser.add_argument("--threads", type=measure.positive, default=1, help="threads of PyTorch and of the kernel")
     for name, meaning in zip("BMNKS", ("scenes", "modes", "agents", "time steps", "solver steps"), strict=True):
-        parser.add_argument(f"--{name}", type=int, help=f"{meaning}, instead of the setting's own number")
+        parser.add_argument(f"--{name}", type=measure.positive, help=f"{meaning}, instead of the setting's own number")
     parser.add_argument("--json", type=Path, help="append a line per measurement to this file")
     parser.add_argument("--scaling", action="store_true", help="grow N, M and K instead of comparing at one size")
     parser.add_argument("--plot", type=Path, help="where --scaling draws its curves (PNG)")
@@ -110,6 +111,13 @@ def main(given: Sequence[str] | None = None) -> None:
     warnings.filterwarnings("ignore", message=".*sparse.*|.*cholmod.*|.*baspacho.*")
     console = Console(width=max(Console().width, 128))
     sizes: dict[str, Any] = {name: getattr(arguments, name) for name in "BMNKS"}
+    try:
+        _measure(arguments, sizes, console)
+    except ConfigError as error:
+        raise SystemExit(str(error)) from error
+
+
+def _measure(arguments: argparse.Namespace, sizes: dict[str, Any], console: Console) -> None:
     if arguments.scaling:
         lines = scaling.run(arguments.implementations, sizes, arguments.repeats, arguments.threads, console)
         if arguments.json:

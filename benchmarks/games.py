@@ -1,9 +1,9 @@
-"""The games that are timed: random, from a fixed seed, in three families.
+"""Random games for the timings, from a fixed seed, in three families.
 
-``exid``    merging vehicles on a highway. **Every pair overlaps at some steps of every problem**: solvers that skip pairs
-            which are apart gain nothing here, so that no ratio profits from it.
-``rpi``     a robot and a pedestrian who meet, with the features of ``conf/energy/rpi.yaml``; the pair overlaps as well.
-``sparse``  vehicles spread along a road in couples: about one active neighbour each, however many there are.
+``exid``    merging vehicles on a highway. **Every pair overlaps at some steps of every problem**, so that no ratio profits
+            from solvers that skip pairs which are apart.
+``rpi``     a robot and a pedestrian that meet, with the features of ``conf/energy/rpi.yaml``; the pair overlaps as well.
+``sparse``  vehicles spread along a road in couples: about one active neighbour each, for any number of vehicles.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import GameParameters, Scene
 
 SETTINGS = ("exid", "rpi", "sparse")
@@ -26,14 +27,14 @@ SIZES = {
     "rpi": {"B": 32, "M": 2, "N": 2, "K": 40, "S": 2},
     "sparse": {"B": 32, "M": 2, "N": 8, "K": 20, "S": 2},
 }
-"""Scenes, modes, agents, steps of time and steps of the solver of every setting, unless told otherwise."""
+"""Default numbers of scenes B, modes M, agents N, time steps K and solver steps S of every setting."""
 LANE_WIDTH = 3.5
 LANE_POINTS = 30
 
 
 @dataclass(frozen=True)
 class Game:
-    """A batch of problems and how they are to be solved.
+    """A batch of problems with the settings of the solver.
 
     Attributes:
         setting: one of :data:`SETTINGS`.
@@ -56,7 +57,7 @@ class Game:
         return {"B": batch, "M": modes, "N": agents, "K": horizon, "S": self.steps}
 
     def to(self, target: torch.dtype | torch.device | str) -> Game:
-        """On a device, or in another precision."""
+        """The same game on a device, or in another precision."""
         return dataclasses.replace(self, scene=self.scene.to(target), parameters=self.parameters.to(target))
 
 
@@ -66,11 +67,15 @@ def make(setting: str, seed: int = 0, **sizes: int | None) -> Game:
     All numbers are drawn in float64 and from ``seed`` alone.
 
     Raises:
-        ValueError: an unknown setting.
+        ConfigError: an unknown setting or size, or a size that is too small.
     """
     if setting not in SETTINGS:
-        raise ValueError(f"unknown setting {setting!r}: it takes one of {', '.join(SETTINGS)}")
+        raise ConfigError(f"unknown setting {setting!r}: {nearest(setting, SETTINGS)}")
     chosen = {**SIZES[setting], **{name: size for name, size in sizes.items() if size is not None}}
+    for name, size in chosen.items():
+        least = 2 if name == "K" else 1
+        if name not in SIZES[setting] or size < least:
+            raise ConfigError(f"{name} = {size}: a game takes B, M, N and S of at least 1, and K of at least 2")
     draw = torch.Generator().manual_seed(seed)
     batch, modes, agents, horizon, steps = (chosen[name] for name in "BMNKS")
     scene = (_walkers if setting == "rpi" else _vehicles)(batch, agents, horizon, setting == "sparse", draw)
@@ -80,7 +85,7 @@ def make(setting: str, seed: int = 0, **sizes: int | None) -> Game:
 
 
 def activity(game: Game) -> tuple[float, float]:
-    """Share of pairs that overlap at some step of a problem, and of steps at which a pair overlaps."""
+    """Share of pairs that overlap at some step of a problem, and share of steps at which a pair overlaps."""
     parameters = game.parameters
     overlaps = game.energy.residuals(game.scene, parameters, parameters.initial_controls)["proximity"] != 0
     return overlaps.any(-1).float().mean().item(), overlaps.float().mean().item()
@@ -97,7 +102,7 @@ def _between(low: float, high: float, *shape: int, draw: torch.Generator) -> Ten
 
 
 def _vehicles(batch: int, agents: int, horizon: int, sparse: bool, draw: torch.Generator) -> Scene:
-    """Vehicles at 20 to 30 m/s that all meet at one place, or in ``sparse`` scenes two by two at places 60 m apart."""
+    """Vehicles at 20 to 30 m/s that all meet at one place; in ``sparse`` scenes, pairs of them at places 60 m apart."""
     dt = 0.2
     meeting = _between(0.4, 0.6, batch, 1, draw=draw) * horizon * dt
     if sparse:
@@ -128,7 +133,7 @@ def _vehicles(batch: int, agents: int, horizon: int, sparse: bool, draw: torch.G
 
 
 def _walkers(batch: int, agents: int, horizon: int, _: bool, draw: torch.Generator) -> Scene:
-    """Agents who walk at about 1 m/s and would meet about halfway."""
+    """Pedestrians at about 1 m/s that would meet about halfway."""
     dt = 0.1
     meeting = _between(0.4, 0.6, batch, 1, draw=draw) * horizon * dt
     speed = _between(0.8, 1.4, batch, agents, draw=draw)
@@ -141,7 +146,7 @@ def _walkers(batch: int, agents: int, horizon: int, _: bool, draw: torch.Generat
 
 
 def _parameters(energy: FeatureEnergy, scene: Scene, modes: int, horizon: int, draw: torch.Generator) -> GameParameters:
-    """Weights about one, goals near where everybody would be anyway, initial strategies near zero."""
+    """Weights about one, goals near the positions reached at constant velocity, initial strategies near zero."""
     batch, agents = scene.agent_mask.shape
     speed = scene.current[..., 3]
     noise = torch.randn(batch, modes, agents, horizon, 2, dtype=torch.float64, generator=draw)
@@ -154,7 +159,7 @@ def _parameters(energy: FeatureEnergy, scene: Scene, modes: int, horizon: int, d
     return GameParameters(
         own_weights={name: _between(0.5, 1.5, batch, modes, agents, draw=draw) for name in energy.own},
         pair_weights={"proximity": _between(2.0, 4.0, batch, modes, agents * (agents - 1) // 2, draw=draw)},
-        # Turn rates scale with 1 / speed: what counts is the sideways acceleration.
+        # Turn rates scale with 1 / speed, so that lateral accelerations are alike.
         initial_controls=0.3 * noise * torch.stack((torch.ones_like(speed), 1 / (1 + speed)), -1)[:, None, :, None],
         goals=ahead[:, None] + off * (0.03 * speed * horizon * scene.dt)[:, None, :, None],
         **chosen,

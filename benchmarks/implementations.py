@@ -1,4 +1,4 @@
-"""Who is measured: functions from the parameters of a game to its controls, and what is asked of them."""
+"""Implementations of the layer: functions from the parameters of a game to its controls, with forward and backward calls."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NAMES = ("peer", "reference", "pytorch", "compiled", "cuda")
 
 
 class Missing(Exception):
-    """An implementation that cannot run here; the message says why."""
+    """An implementation cannot run here; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Implementation:
     solve: Callable[[GameParameters], Tensor]
 
     def forward(self) -> Tensor:
-        """The controls, without a graph."""
+        """The controls, computed without a graph."""
         with torch.no_grad():
             controls = self.solve(self.game.parameters)
         self._wait()
@@ -59,7 +59,7 @@ class Implementation:
 
     @cached_property
     def cotangent(self) -> Tensor:
-        """What gradients are contracted with."""
+        """Fixed random cotangent of the controls."""
         like = self.game.parameters.initial_controls
         return torch.randn(like.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(like)
 
@@ -72,7 +72,7 @@ def prepare(name: str, game: Game, linear_solver: str = peer.LINEAR_SOLVERS[0]) 
     """The implementation called ``name`` for a game.
 
     Args:
-        linear_solver: the peer's, out of :data:`benchmarks.peer.LINEAR_SOLVERS`.
+        linear_solver: linear solver of the peer, one of :data:`benchmarks.peer.LINEAR_SOLVERS`.
 
     Raises:
         Missing: it cannot run here.
@@ -99,7 +99,7 @@ def prepare(name: str, game: Game, linear_solver: str = peer.LINEAR_SOLVERS[0]) 
 
 
 def disagreement(implementation: Implementation, tolerance: float = 1e-5) -> str | None:
-    """How far controls and gradients are from those of the plain reference, if too far; solved in float64.
+    """Difference of controls and gradients from the reference's in float64 as a message; None within the tolerance.
 
     Controls are compared by difference, gradients by difference relative to their largest entry.
     """

@@ -1,7 +1,8 @@
-"""Time, memory, and what the machine could do at best."""
+"""Measurement of time and memory, and the peak rates of the machine."""
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import multiprocessing
 import statistics
@@ -18,7 +19,18 @@ import torch
 Key = TypeVar("Key", bound=Hashable)
 
 SHORTEST = 0.02
-"""What takes less time than this [s] is run several times in a row, and the mean counts as one measurement."""
+"""An action that takes less time than this [s] is run several times in a row; the mean counts as one measurement."""
+
+
+def positive(text: str) -> int:
+    """A whole number, 1 or more, from the command line.
+
+    Raises:
+        argparse.ArgumentTypeError: as said.
+    """
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, 1 or more")
+    return int(text)
 
 
 @dataclass(frozen=True)
@@ -26,8 +38,8 @@ class Times:
     """Medians over the rounds [ms].
 
     Attributes:
-        cpu: of the process, over all its threads; does not count what other processes do meanwhile.
-        wall: of the clock on the wall.
+        cpu: CPU time of the process, over all its threads; other processes do not count.
+        wall: elapsed time.
     """
 
     cpu: float
@@ -35,9 +47,9 @@ class Times:
 
 
 def interleaved(actions: Mapping[Key, Callable[[], Any]], repeats: int) -> dict[Key, Times]:
-    """Times of several actions, taken in turns, so that a machine that slows down slows all of them down.
+    """Median times of several actions, which take turns, so that a change of the machine's speed concerns all of them.
 
-    Each action is run once before any is measured. Actions on a GPU have to wait for it themselves.
+    Each action is run once before any is measured. An action on a GPU has to synchronise with it.
     """
     inner = {}
     for name, action in actions.items():
@@ -60,10 +72,10 @@ def interleaved(actions: Mapping[Key, Callable[[], Any]], repeats: int) -> dict[
 
 
 def keep_freed_memory() -> None:
-    """Let this process keep the memory that it frees, instead of asking the system for it again and again.
+    """Let this process keep the memory that it frees, instead of requesting it from the system again (glibc only).
 
-    Half of the time of an implementation with large temporary arrays would otherwise go into pages of zeros: this favours
-    those that allocate most. Of effect with glibc only.
+    Otherwise an implementation with large temporary arrays spends half of its time in pages of zeros; so this favours the
+    implementations that allocate most.
     """
     if sys.platform == "linux":
         trim_threshold, top_pad, mmap_max = -1, -2, -4
@@ -80,9 +92,9 @@ def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def peak_mb(action: Callable[[], Any]) -> float | None:
-    """How much memory [MB] an action needs at its peak, beyond what the process holds already; None if unknown.
+    """Peak memory [MB] of an action beyond that of the process before it; None where it is unknown.
 
-    Meaningful in a fresh process, in which no freed memory lies about.
+    It is meaningful in a fresh process only, which holds no freed memory.
     """
     if sys.platform != "linux":
         return None
@@ -104,8 +116,8 @@ class Machine:
     """Measured rates [GFLOP/s] with the current number of threads, float32.
 
     Attributes:
-        product: of a product of 1024 x 1024 matrices: no kernel is faster.
-        cholesky: of batched factorisations of n x n matrices.
+        product: rate of a product of 1024 x 1024 matrices, which no kernel exceeds.
+        cholesky: rate of batched factorisations of n x n matrices.
     """
 
     product: float
@@ -118,7 +130,7 @@ def machine(n: int) -> Machine:
     batch = torch.randn(32, n, n)
     batch = batch @ batch.mT + n * torch.eye(n)
     out, info = torch.empty_like(matrix), torch.empty(32, dtype=torch.int32)
-    factors = torch.empty_like(batch).mT  # in Fortran's order, in place: as fast as it gets
+    factors = torch.empty_like(batch).mT  # column-major and in place: the fastest way
     actions = {
         "product": lambda: torch.mm(matrix, matrix, out=out),
         "cholesky": lambda: torch.linalg.cholesky_ex(factors.copy_(batch), out=(factors, info)),

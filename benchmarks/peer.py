@@ -1,7 +1,7 @@
-"""Theseus 0.2.3 on the same problems, in its fastest mode and written as favourably as we know.
+"""Theseus 0.2.3 on the same problems, in its fastest mode and in the most favourable formulation that we know.
 
-One vector of all unknowns, one cost function per group of residuals, Jacobians by ``vmap``, fixed damping, no tolerance to
-stop at, unrolled differentiation, B M problems in one batch, and of its dense linear solvers whichever takes less time.
+One vector of all unknowns, one cost function per group of residuals, Jacobians by ``vmap``, fixed damping, no stopping
+tolerance, unrolled differentiation, B M problems in one batch, and the faster one of its dense linear solvers.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor  # Theseus does not tell whether it wants a Jacobian
+from torch._C._functorch import is_functorch_wrapped_tensor  # Theseus does not say whether it computes a Jacobian
 
 from benchmarks.games import Game
 from benchmarks.residuals import problem
 from epo_lightning.scene import GameParameters
 
 LINEAR_SOLVERS = ("LUDenseSolver", "CholeskyDenseSolver")
-"""What usually is the faster one comes first."""
+"""Dense linear solvers, the usually faster one first."""
 
 
 def prepare(game: Game, linear_solver: str) -> Callable[[GameParameters], Tensor]:
@@ -27,7 +27,7 @@ def prepare(game: Game, linear_solver: str) -> Callable[[GameParameters], Tensor
     Raises:
         ImportError: Theseus is not installed.
     """
-    with warnings.catch_warnings(action="ignore"):  # sparse solvers that are not there, and not wanted
+    with warnings.catch_warnings(action="ignore"):  # about sparse solvers that are not installed, nor needed
         import theseus
 
     plain = problem(game)

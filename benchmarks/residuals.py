@@ -1,8 +1,8 @@
-"""The same energies once more, in plain torch and without a line of :mod:`epo_lightning.game`.
+"""An independent implementation of the energies in plain torch, without code of :mod:`epo_lightning.game`.
 
-One function of one batch of problems, for the peer and for the reference: no loop over time, agents or pairs, signals that
-share an array share every operation, and unknowns lie channel by channel so that nothing is copied. Each of these choices
-makes automatic differentiation of it faster.
+It is a function of one batch of problems, for the peer and for the reference. There is no loop over time, agents or pairs;
+signals that share an array share every operation; unknowns are ordered by channel, so that nothing is copied. Each of these
+choices makes its automatic differentiation faster.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ CHANNELS = {
     "lane": ("lane",),
     "steer": ("steer",),
 }
-"""Features that are computed together; an energy has all features of a group, or none, but for ``speed``."""
+"""Features that are computed together; an energy has all features of a group or none (``speed`` may have one)."""
 EXCESSES = {"control_excess": ("acc", "turnr"), "rate_excess": ("jerk", "turnacc"), "speed_excess": ("vel",)}
-"""Signals whose violation of bounds counts."""
+"""Signals with bounds, by group."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """B M problems in a row: a function and the tensors it takes besides the controls.
+    """B M problems in one batch: the function of their residuals and its tensors besides the controls.
 
     Attributes:
         residuals: from unknowns [b, 2 N K], ``tensors``, names of groups and ``still`` to the groups' weighted residuals
-            [b, R], for any b. ``still`` holds the closest points of lanes: so they enter the Jacobian J of a step, while the
-            gradient of a step lets them slide along.
+            [b, R], for any b. ``still`` treats the nearest points of lanes as constants, as in the Jacobian J of a step;
+            otherwise they move along with the positions, as in the gradient through a step.
         groups: all groups of the energy.
-        constants: what nobody differentiates: initial states, lanes, sizes.
-        game: where the problems come from.
+        constants: tensors without gradient: initial states, lanes, sizes.
+        game: the game that the problems belong to.
     """
 
     residuals: Callable[[Tensor, dict[str, Tensor], tuple[str, ...], bool], Tensor]
@@ -143,7 +143,7 @@ def problem(game: Game) -> Problem:
                 case "goal":
                     value = position[..., -1:] - given["goals"][..., None]
                 case "lane":
-                    value = position - _foot(position.detach() if still else position, given["lanes"])
+                    value = position - _nearest_point(position.detach() if still else position, given["lanes"])
                 case "steer":
                     value = (given["base"][..., None] * controls[:, 1] / speed.clamp_min(1.0)).atan()[:, None]
                 case _:
@@ -155,8 +155,8 @@ def problem(game: Game) -> Problem:
     return Problem(residuals, (*groups, *("proximity",) * bool(energy.pair)), constants, game)
 
 
-def _foot(position: Float[Tensor, "b 2 N K"], lanes: Float[Tensor, "b N Q 2"]) -> Float[Tensor, "b 2 N K"]:
-    """The closest point of every agent's polyline; which segment it lies on is a constant."""
+def _nearest_point(position: Float[Tensor, "b 2 N K"], lanes: Float[Tensor, "b N Q 2"]) -> Float[Tensor, "b 2 N K"]:
+    """The nearest point of every agent's polyline; the choice of the segment is a constant."""
     point = position.permute(0, 2, 3, 1)[..., None, :]  # [b, N, K, 1, 2]
     start, along = lanes[:, :, None, :-1], lanes.diff(dim=2)[:, :, None]
     share = (((point.detach() - start) * along).sum(-1) / along.square().sum(-1)).clamp(0.0, 1.0)

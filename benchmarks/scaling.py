@@ -1,4 +1,4 @@
-"""How cost grows with agents, modes and time steps: ``python -m benchmarks.epo_layer --scaling --plot scaling.png``."""
+"""Growth of the cost with agents, modes and time steps: ``python -m benchmarks.epo_layer --scaling --plot scaling.png``."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ AXES = (
     ("modes M", "exid", "M", (1, 2, 4, 8, 16, 32, 64)),
     ("time steps K", "exid", "K", (10, 20, 40, 80)),
 )
-"""Title, setting, what grows and how."""
+"""Title, setting, name of the size that grows, and its values."""
 SIZES = {"B": 8, "M": 2, "N": 4, "K": 20, "S": 2}
-"""What does not grow."""
+"""Sizes that do not grow."""
 LONGEST = 1e3
-"""Nobody is asked for more after having taken this long [ms]."""
+"""An implementation that took longer than this [ms] is not measured at larger sizes."""
 ARRAYS = 12
-"""Dense Jacobians of which the memory of automatic differentiation consists, per step; measured."""
+"""Memory of automatic differentiation per step, in dense Jacobians; measured."""
 
 
 def run(
     names: Sequence[str], sizes: Mapping[str, int | None], repeats: int, threads: int, console: Console
 ) -> dict[str, list[Measurement]]:
-    """Measurements of every implementation along every axis, by title, as far as memory and patience reach."""
+    """Measurements of every implementation along every axis, by title, within the limits of memory and time."""
     found: dict[str, list[Measurement]] = {title: [] for title, *_ in AXES}
     for title, setting, axis, values in AXES:
         left = list(names)

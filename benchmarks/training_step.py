@@ -1,7 +1,7 @@
-"""Where the time of a training step goes: ``python -m benchmarks.training_step [override ...]``.
+"""CPU time of a training step by stage: ``python -m benchmarks.training_step [override ...]``.
 
-Forecasters of the paper's RPI experiments, batches of 32 scenes, everything as `epo train` composes it, without Lightning's
-own bookkeeping. Overrides are those of `epo train`, for example ``solver.backend=pytorch``.
+It measures the forecasters of the paper's RPI experiments on batches of 32 scenes, composed as by `epo train` but without
+Lightning's own bookkeeping. Overrides are those of `epo train`, for example ``solver.backend=pytorch``.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -18,13 +18,17 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
+from benchmarks.measure import positive
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings, read
 from epo_lightning.forecasters import Forecaster
-from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.forecasters.epo import EPO
+from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.solvers.backward import Backward
+from epo_lightning.solvers.base import Minimiser
 
 EXPERIMENTS = ("v_lstm", "v_lstm_sc", "v_lstm_epo")
 STAGES = (
@@ -37,12 +41,14 @@ STAGES = (
     "rest of backward",
     "optimizer",
 )
+WARM_UP = 5
+"""Rounds before the first one that counts."""
 GOAL = 0.15
-"""Share of a step that we want the layer to stay below."""
+"""Goal for the layer's share of a step."""
 
 
 class Clock:
-    """CPU time [s] by stage. What is timed within a stage does not count for that stage as well."""
+    """CPU time [s] by stage; the time of a nested stage does not count for the outer one."""
 
     def __init__(self) -> None:
         self.spent = dict.fromkeys(STAGES, 0.0)
@@ -50,7 +56,7 @@ class Clock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count what happens within for ``name``."""
+        """Count the time within this context for ``name``."""
         outer, self._inner = self._inner, 0.0
         start = time.process_time()
         yield
@@ -60,25 +66,29 @@ class Clock:
 
 
 class Cut:
-    """A solver around which the graph is cut, so that its own forward and backward can be timed apart from the rest.
+    """A solution's derivative (``backward=``) with the graph cut around it, so that the layer is timed apart from the rest.
 
-    The features from which everything is decoded are a third place to cut: otherwise the backward pass of the losses would
-    run through the backbone before that of the layer is known.
+    The graph is cut at the features of the backbone too: otherwise the backward pass of the losses would run through the
+    backbone before that of the layer has added its gradients.
     """
 
-    def __init__(self, solver: Callable[[FeatureEnergy, Scene, GameParameters], Solution], clock: Clock) -> None:
-        self.solver, self.clock = solver, clock
+    def __init__(self, differentiate: Backward, clock: Clock) -> None:
+        self.differentiate, self.clock = differentiate, clock
         self.features, self.inputs, self.outputs = Edges(), Edges(), Edges()
 
-    def __call__(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Solution:
+    def __getattr__(self, name: str) -> Any:
+        """All other attributes are those of the derivative."""
+        return getattr(self.differentiate, name)
+
+    def __call__(self, minimiser: Minimiser, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """Solve, between two cuts."""
         parameters = parameters.map(self.inputs.cut)
         with self.clock.stage("layer, forward"):
-            solution = self.solver(energy, scene, parameters)
+            solution = self.differentiate(minimiser, energy, scene, parameters)
         return solution.map(self.outputs.cut)
 
     def backward(self, loss: Tensor) -> None:
-        """Backward through everything, from cut to cut."""
+        """Backward pass through the whole graph, from cut to cut."""
         with self.clock.stage("rest of backward"):
             loss.backward()
         with self.clock.stage("layer, backward"):
@@ -89,13 +99,13 @@ class Cut:
 
 
 class Edges:
-    """Where a graph was cut: tensors before and after."""
+    """The tensors before and after a cut of the graph."""
 
     def __init__(self) -> None:
         self.pairs: list[tuple[Tensor, Tensor]] = []
 
     def cut(self, tensor: Tensor) -> Tensor:
-        """The same numbers, as a leaf."""
+        """The same values as a leaf of a new graph."""
         if not tensor.requires_grad:
             return tensor
         after = tensor.detach().requires_grad_()
@@ -103,14 +113,14 @@ class Edges:
         return after
 
     def backward(self) -> None:
-        """Hand on the gradients that have arrived."""
+        """Pass the gradients of the leaves on to the tensors before the cut."""
         reached = [(before, after.grad) for before, after in self.pairs if after.grad is not None]
         torch.autograd.backward([before for before, _ in reached], [gradient for _, gradient in reached])
         self.pairs = []
 
 
 class Step:
-    """One forecaster and its data, ready to take training steps on the clock."""
+    """A forecaster with its data and optimizer, instrumented to time its training steps."""
 
     def __init__(self, experiment: str, overrides: Sequence[str]) -> None:
         settings = read(Settings, compose("train", [f"experiment=rpi/{experiment}", *overrides]))
@@ -128,9 +138,9 @@ class Step:
         self.optimizer = self.model.optimizer.configure(self.model.parameters(), 1000)["optimizer"]
         self.clock = Clock()
         self.cut: Cut | None = None
-        if hasattr(self.model, "solver"):
-            self.cut = Cut(self.model.solver, self.clock)  # type: ignore[arg-type]
-            self.model.solver = self.cut  # type: ignore[assignment]
+        if isinstance(self.model, EPO):
+            self.cut = Cut(self.model.differentiate, self.clock)
+            self.model.differentiate = self.cut  # type: ignore[assignment]
         for name, module in self.model.named_children():
             if not name.endswith("_metrics"):
                 self._time(module, "backbone" if name == "backbone" else "decoders")
@@ -146,7 +156,7 @@ class Step:
         module.forward = timed
 
     def take(self) -> dict[str, float]:
-        """Seconds by stage of one training step."""
+        """Seconds of one training step by stage."""
         self.clock.spent = dict.fromkeys(STAGES, 0.0)
         with self.clock.stage("data"):
             scene = next(self.batches)
@@ -170,7 +180,7 @@ def _forever(loader: Any) -> Iterator[Scene]:
 
 
 def _random_scenes(batch: int, horizon: int, dt: float) -> Iterator[Scene]:
-    """Two agents within metres of each other, where the data set has not been generated."""
+    """Random scenes of two agents, used where the data set has not been generated."""
     while True:
         state = torch.randn(batch, 2, 19, 4)
         yield Scene(
@@ -185,12 +195,12 @@ def _random_scenes(batch: int, horizon: int, dt: float) -> Iterator[Scene]:
 
 
 def measure(steps: Sequence[Step], repeats: int) -> list[dict[str, float]]:
-    """Median milliseconds by stage, of steps that the forecasters take in turns."""
+    """Median milliseconds by stage; the forecasters take turns."""
     taken: list[list[dict[str, float]]] = [[] for _ in steps]
-    for round_ in range(repeats + 5):
+    for round_ in range(repeats + WARM_UP):
         for step, spent in zip(steps, taken, strict=True):
             found = step.take()
-            if round_ >= 5:  # warm by now
+            if round_ >= WARM_UP:
                 spent.append(found)
     return [{stage: 1e3 * statistics.median(t[stage] for t in spent) for stage in STAGES} for spent in taken]
 
@@ -199,7 +209,7 @@ def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.training_step", description=__doc__)
     parser.add_argument("overrides", nargs="*", help="as for `epo train`")
-    parser.add_argument("--repeats", type=int, default=50, help="training steps; the median counts")
+    parser.add_argument("--repeats", type=positive, default=50, help="training steps; the median counts")
     arguments = parser.parse_args(given)
     torch.set_num_threads(1)
     assembly.quiet()

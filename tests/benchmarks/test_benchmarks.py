@@ -1,0 +1,100 @@
+"""Smoke tests of the benchmarks at their smallest sizes, and their errors: one line for a foreseeable mistake."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks import dashboards, epo_layer, extraction, scaling, training_step
+
+FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
+SMALL = ["--B", "2", "--M", "1", "--K", "4", "--S", "1", "--repeats", "1"]
+
+
+def refused(main, *words: object) -> str:
+    """The one line with which a benchmark ends."""
+    with pytest.raises(SystemExit) as found:
+        main([str(word) for word in words])
+    message = str(found.value)
+    assert found.value.code not in (0, None)
+    assert "\n" not in message
+    return message
+
+
+def test_epo_layer_compares_the_implementations(tmp_path, capsys):
+    epo_layer.main([*SMALL, "--settings", "rpi", "--implementations", "pytorch", "--json", str(tmp_path / "lines")])
+    shown = capsys.readouterr().out
+    assert "rpi: B=2, M=1, N=2, K=4, S=1" in shown
+    assert "through the public API, pytorch" in shown
+    (line,) = map(json.loads, (tmp_path / "lines").read_text().splitlines())
+    assert line["implementation"] == "pytorch"
+    assert line["forward_ms"] > 0
+    assert line["forward_backward_ms"] > line["forward_ms"]
+
+
+def test_epo_layer_scales(tmp_path, capsys, monkeypatch):
+    axes = [(title, setting, axis, (2, 3)) for title, setting, axis, _ in scaling.AXES]
+    monkeypatch.setattr(scaling, "AXES", axes)
+    plot = tmp_path / "scaling.png"
+    implementations = ["--implementations", "pytorch", "reference"]
+    epo_layer.main([*SMALL, "--N", "2", "--scaling", "--plot", str(plot), *implementations])
+    shown = capsys.readouterr().out
+    assert all(f"{title}: {axis} = 3: pytorch" in shown for title, _, axis, _ in axes)
+    assert plot.stat().st_size > 1000
+
+
+def test_epo_layer_refuses_sizes_that_are_no_game(capsys):
+    assert refused(epo_layer.main, *SMALL, "--K", 1).startswith("K = 1: a game takes B, M, N and S of at least 1")
+    refused(epo_layer.main, "--repeats", 0)
+    assert "'0' is not a whole number, 1 or more" in capsys.readouterr().err
+
+
+def test_a_training_step_is_timed_by_stage(capsys, tmp_path):
+    training_step.main(["--repeats", "1", f"data.root={tmp_path}"])
+    shown = capsys.readouterr().out
+    assert "random scenes" in shown
+    assert all(stage in shown for stage in training_step.STAGES)
+    last = next(line for line in shown.splitlines() if "layer, forward" in line)
+    assert float(last.split("│")[-2].split()[0]) > 0, "the last forecaster has the layer"
+    assert "the layer's share of a step" in shown
+
+
+def test_a_training_step_refuses_what_epo_train_refuses():
+    assert "solver.backend" in refused(training_step.main, "solver.backend=cuda")
+
+
+def test_dashboards_are_compared(capsys):
+    dashboards.main(["--loggers", "csv", "--data", "data=drawn", "data.scenes=32", "--epochs", "1", "--repeats", "1"])
+    shown = capsys.readouterr().out
+    assert "rpi/v_lstm_epo, 1 epochs, median of 1" in shown
+    assert "(+0.0%)" in shown
+
+
+def test_dashboards_say_which_data_are_missing(tmp_path):
+    assert "epo generate" in refused(dashboards.main, "--data", "data=rpi", f"data.root={tmp_path}")
+
+
+def test_extraction_is_timed(capsys):
+    extraction.main([str(FIXTURE), "--recordings", "1", "--batches", "2"])
+    shown = capsys.readouterr().out
+    for stage in ("reading", "extraction", "loading"):
+        (number,) = [line.split()[1] for line in shown.splitlines() if line.startswith(stage)][:1]
+        assert float(number.replace(",", "")) > 0
+
+
+@pytest.mark.parametrize("format_", ["commonroad", "ucy", "exid"])
+def test_extraction_of_a_folder_of_another_format_is_one_line(format_, tmp_path):
+    folder = FIXTURE if format_ != "exid" else tmp_path
+    message = refused(extraction.main, folder, "--format", format_)
+    assert str(folder) in message
+    assert f"--format is {format_}" in message
+
+
+def test_extraction_of_a_format_that_does_not_exist_names_the_nearest():
+    assert "did you mean 'exid'" in refused(extraction.main, FIXTURE, "--format", "exdi")
