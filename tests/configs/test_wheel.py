@@ -16,7 +16,8 @@ import sys
 sys.path.insert(0, {site!r})
 from pathlib import Path
 from epo_lightning.solvers.gauss_newton import compiled
-print(Path(compiled.__file__).parents[2], compiled._library().epo_levels() > 0)
+from epo_lightning.solvers.gauss_newton.kernel import interface
+print(Path(compiled.__file__).parents[2], interface.library().epo_levels() > 0)
 """
 
 

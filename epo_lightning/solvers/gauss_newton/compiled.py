@@ -1,20 +1,17 @@
-"""The layer as compiled code for CPUs: all steps in one call, their adjoint in another, a problem per vector lane.
+"""The compiled backend for CPUs: all steps in one call, their adjoint in another, one problem per vector lane.
 
-Every step is a linear-quadratic problem that one backward and one forward recursion over time solve in O(K N^3); see
-`docs/solver.md` and `kernel/`. The library has a plain C interface, so that building it needs a C++ compiler and nothing
-else, and one build serves every version of Python and PyTorch.
+Every step is a linear-quadratic problem, which one backward and one forward recursion over time solve in O(K N^3); see
+`docs/solver.md` and `kernel/`. The library has a plain C interface: building it needs a C++ compiler only, and one build
+serves every version of Python and PyTorch.
+
+The library's threads end before a call returns, and Python handles signals between calls only. An interrupt therefore never
+leaves a thread behind that writes to released memory; it waits for the call to end.
 """
 
 from __future__ import annotations
 
-import ctypes
 import functools
-import os
 import warnings
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -24,108 +21,12 @@ from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Solution
-from epo_lightning.solvers.gauss_newton.kernel.build import load
-
-OWN = (
-    "goal",
-    "lane",
-    "velref",
-    "vel",
-    "acc",
-    "turnr",
-    "jerk",
-    "turnacc",
-    "steer",
-    "velb",
-    "accb",
-    "turnrb",
-    "jerkb",
-    "turnaccb",
-)
-"""Own features in the kernel's order."""
-SIGNALS = ("vel", "acc", "turnr", "jerk", "turnacc")
-"""Signals with bounds in the kernel's order."""
-MOST_AGENTS = 64
-"""The kernel keeps who touches whom as bits of a word."""
-
-_Address, _Integer, _Real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
-
-
-class _Game(ctypes.Structure):
-    _fields_ = (
-        *((name, _Integer) for name in ("B", "M", "N", "K", "lines", "points", "pair_stride")),
-        ("dt", _Real),
-        ("bounds", _Real * 2 * len(SIGNALS)),
-        ("initial", _Address),
-        ("initial_strides", _Integer * 2),
-        ("present", _Address),
-        ("size", _Address),
-        ("own", _Address * len(OWN)),
-        ("own_strides", _Integer * 3 * len(OWN)),
-        ("pair", _Address),
-        ("pair_strides", _Integer * 3),
-        ("goals", _Address),
-        ("goals_strides", _Integer * 4),
-        ("references", _Address),
-        ("reference", _Address),
-        ("reference_speed", _Address),
-    )
-
-
-class _Run(ctypes.Structure):
-    _fields_ = (
-        ("steps", _Integer),
-        ("step_size", _Real),
-        ("damping", _Address),
-        ("damping_strides", _Integer * 2),
-        ("record", _Integer),
-        ("start", _Address),
-        ("iterates", _Address),
-        ("iterate_stride", _Integer),
-        *((name, _Address) for name in ("directions", "states", "initial_energy", "energy", "gradient_norm", "status")),
-    )
-
-
-class _Gradients(ctypes.Structure):
-    _fields_ = (
-        ("controls", _Address),
-        ("iterates", _Address),
-        ("states", _Address),
-        ("own", _Address * len(OWN)),
-        ("pair", _Address),
-        ("goals", _Address),
-    )
-
-
-@functools.cache
-def _find() -> ctypes.CDLL | str:
-    """The library, or why there is none."""
-    try:
-        library = load()
-    except OSError as error:
-        return (
-            f"{error}; with a C++ compiler on the path, "
-            "`python -m epo_lightning.solvers.gauss_newton.kernel.build` builds it"
-        )
-    run = (ctypes.POINTER(_Game), ctypes.POINTER(_Run))
-    library.epo_solve.argtypes = (_Integer, *run, _Integer, _Integer, ctypes.POINTER(_Address))
-    library.epo_differentiate.argtypes = (_Address, *run, ctypes.POINTER(_Gradients))
-    library.epo_release.argtypes, library.epo_release.restype = (_Address,), None
-    for name in ("epo_solve", "epo_differentiate", "epo_lanes", "epo_levels"):
-        getattr(library, name).restype = _Integer
-    library.epo_choose.argtypes, library.epo_choose.restype = (_Integer,), None
-    return library
-
-
-def _library() -> ctypes.CDLL:
-    library = _find()
-    if isinstance(library, str):
-        raise RuntimeError(f"the compiled layer is missing: {library}")
-    return library
+from epo_lightning.solvers.gauss_newton.kernel import interface
+from epo_lightning.solvers.gauss_newton.kernel.interface import MOST_AGENTS, OWN, SIGNALS, Address, Game, Gradients, Run
 
 
 def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
-    """Why the kernel cannot solve a game; None where it can."""
+    """Reason why the kernel cannot solve a game; None where it can."""
     controls = parameters.initial_controls
     if controls.device.type != "cpu":
         return f"the compiled layer runs on CPUs, and these tensors are on {controls.device}"
@@ -138,13 +39,13 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
             return f"the compiled layer does not know the feature {name!r}"
     if scene.agent_mask.shape[1] > MOST_AGENTS:
         return f"the compiled layer takes up to {MOST_AGENTS} agents, not {scene.agent_mask.shape[1]}"
-    library = _find()
+    library = interface.find()
     return f"the compiled layer is missing: {library}" if isinstance(library, str) else None
 
 
 @functools.cache
 def say_once(reason: str) -> None:
-    """Make it visible that plain PyTorch takes the kernel's place."""
+    """Warn once per reason that plain PyTorch replaces the kernel."""
     warnings.warn(
         f"{reason}. Plain PyTorch does the same, at a tenth of the speed or less; solver.backend=pytorch asks for it.",
         stacklevel=2,
@@ -162,8 +63,8 @@ def solve(
 ) -> Solution:
     """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
 
-    Differentiable with respect to weights, goals and initial controls. Problems are shared out among
-    ``torch.get_num_threads()`` threads; results do not depend on how many there are.
+    The solution is differentiable with respect to weights, goals and initial controls. Problems are shared out among
+    ``torch.get_num_threads()`` threads; results do not depend on their number. An interrupt waits for the call to end.
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates)
     if call.record:
@@ -183,14 +84,16 @@ def solve(
     )
 
 
-@dataclass
 class _Tape:
-    """What a range of problems leaves for the adjoint; owned by the library until released."""
+    """Data of a call for its adjoint, in the library's memory, which is freed with this object."""
 
-    address: int
+    def __init__(self) -> None:
+        self.address = Address()
+        self._release = interface.library().epo_release
 
     def __del__(self) -> None:
-        _library().epo_release(self.address)
+        if self.address:
+            self._release(self.address)
 
 
 class _Call:
@@ -210,7 +113,7 @@ class _Call:
         self.controls, self.steps, self.keep_iterates = controls, steps, keep_iterates
         self.doubles = controls.dtype == torch.float64
         weights = parameters.own_weights
-        if _has_gaps(energy, scene):  # a line that does not exist pulls nobody
+        if _has_gaps(energy, scene):  # the weight of a line that does not exist is zero
             weights = {**weights, "lane": energy.own_weight(scene, parameters, "lane")}
         self.own = [_as(controls.dtype, weights[name]) for name in energy.own]
         self.pair = [_as(controls.dtype, parameters.pair_weights[name]) for name in energy.pair]
@@ -218,7 +121,7 @@ class _Call:
         self.inputs = (*self.own, *self.pair, *self.goals)
         self.slots = [OWN.index(name) for name in energy.own]
         self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs))
-        self.tapes: list[_Tape] = []
+        self.tape = _Tape()
         self._describe(energy, scene, parameters)
         self._reserve(step_size, damping)
 
@@ -228,27 +131,29 @@ class _Call:
         kept: list[Tensor] = []
 
         def hold(tensor: Tensor) -> Tensor:
-            # Only the address travels: the tensor has to live as long as this call.
+            # The kernel gets the address alone: the tensor has to live as long as this call.
             kept.append(tensor)
             return tensor
 
-        game = self.game = _Game(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt)
+        game = self.game = Game(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt)
         game.pair_stride = min(energy.pair_stride, horizon + 1)
         for index, name in enumerate(SIGNALS):
             if name in energy.bounds:
                 game.bounds[index][:] = energy.bounds[name]
         initial = _as(like, scene.current)
         initial = hold(initial if initial.stride(-1) == 1 else initial.contiguous())
-        game.initial, game.initial_strides[:] = initial.data_ptr(), initial.stride()[:2]
+        game.initial, (game.initial_b, game.initial_n) = initial.data_ptr(), initial.stride()[:2]
         game.present = hold(scene.agent_mask.contiguous()).data_ptr()
         if scene.size is not None:
             game.size = hold(_as(like, scene.size).contiguous()).data_ptr()
         for slot, weight in zip(self.slots, self.own, strict=True):
             game.own[slot], game.own_strides[slot][:] = weight.data_ptr(), weight.stride()
         if self.pair and agents > 1:
-            game.pair, game.pair_strides[:] = self.pair[0].data_ptr(), self.pair[0].stride()
+            game.pair = self.pair[0].data_ptr()
+            game.pair_b, game.pair_m, game.pair_p = self.pair[0].stride()
         if self.goals:
-            game.goals, game.goals_strides[:] = self.goals[0].data_ptr(), self.goals[0].stride()
+            game.goals = self.goals[0].data_ptr()
+            game.goals_b, game.goals_m, game.goals_n, game.goals_x = self.goals[0].stride()
         if "lane" in energy.own:
             assert scene.references is not None
             assert parameters.reference is not None
@@ -274,11 +179,12 @@ class _Call:
         self.damping = _as(controls.dtype, damping).contiguous()
         by_agent = damping.dim() == 3
         self.start = controls.detach().contiguous()
-        self.arguments = _Run(
+        self.arguments = Run(
             steps=self.steps,
             step_size=step_size,
             damping=self.damping.data_ptr(),
-            damping_strides=(shape[2], 1) if by_agent else (1, 0),
+            damping_problem=shape[2] if by_agent else 1,
+            damping_agent=int(by_agent),
             record=self.record,
             start=self.start.data_ptr(),
             iterates=self.iterates.data_ptr(),
@@ -292,25 +198,22 @@ class _Call:
         )
 
     def run(self) -> None:
-        library = _library()
-        problems = self.controls.shape[0] * self.controls.shape[1]
+        """Take all steps; fills the results.
 
-        def part(bounds: tuple[int, int]) -> None:
-            tape = _Address()
-            _check(library.epo_solve(self.doubles, self.game, self.arguments, *bounds, tape))
-            if tape.value:
-                self.tapes.append(_Tape(tape.value))
-
-        _in_parallel(part, _parts(problems, library.epo_lanes()))
+        Raises:
+            MemoryError: the library could not allocate its memory.
+        """
+        threads, tape = torch.get_num_threads(), self.tape.address
+        _check(interface.library().epo_solve(self.doubles, self.game, self.arguments, threads, tape))
 
     def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor | None]:
-        library = _library()
+        """Gradients by the inputs for cotangents of the controls (overwritten by their gradient), iterates and states."""
         batch, modes, agents = self.controls.shape[:3]
         new = self.controls.new_zeros
         own = new((len(self.own), batch, modes, agents))
         pair = new((batch, modes, agents * (agents - 1) // 2)) if self.pair else None
         goals = new((batch, modes, agents, 2)) if self.goals else None
-        gradients = _Gradients(controls=controls.data_ptr())
+        gradients = Gradients(controls=controls.data_ptr())
         if iterates is not None:
             gradients.iterates = iterates.data_ptr()
         if states is not None:
@@ -322,30 +225,27 @@ class _Call:
         if goals is not None:
             gradients.goals = goals.data_ptr()
 
-        def part(tape: _Tape) -> None:
-            _check(library.epo_differentiate(tape.address, self.game, self.arguments, gradients))
-
-        _in_parallel(part, self.tapes)
+        _check(interface.library().epo_differentiate(self.tape.address, self.game, self.arguments, gradients))
         return [*own.unbind(0), *([pair] if pair is not None else []), *([goals] if goals is not None else [])]
 
 
 def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:
-    """Whether there are reference lines that do not exist."""
+    """Whether some reference lines are masked out."""
     return "lane" in energy.own and scene.reference_mask is not None and not scene.reference_mask.all()
 
 
 class _Unrolled(torch.autograd.Function):
-    """All steps as one node of the graph: controls, states and, when asked for, every iterate."""
+    """Autograd function of all steps; returns controls, states and, with ``keep_iterates``, every iterate."""
 
     @staticmethod
     def forward(ctx: Any, call: _Call, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         call.run()
         ctx.call = call
-        # The kernel holds addresses: saving the tensors makes sure that nobody changes them in between.
+        # The kernel reads these tensors again in the backward pass: saved, a change in place raises an error.
         ctx.save_for_backward(*inputs, *call.kept)
         ctx.set_materialize_grads(False)
         iterates = [iterate.clone() for iterate in call.iterates] if call.keep_iterates else []
-        # An output that the node holds would be a cycle: its memory would wait for the garbage collector.
+        # A node that holds its own output is a reference cycle: its memory would wait for the garbage collector.
         states, call.states = call.states, None
         return call.iterates[-1].clone(), states, *iterates
 
@@ -369,41 +269,10 @@ class _Unrolled(torch.autograd.Function):
 
 
 def _as(dtype: torch.dtype, tensor: Tensor) -> Tensor:
-    # `to` takes a microsecond even where it has nothing to do, and there are twenty tensors.
+    # `to` takes a microsecond even where nothing is to be done, and there are twenty tensors.
     return tensor if tensor.dtype == dtype else tensor.to(dtype)
-
-
-def _parts(problems: int, lanes: int) -> list[tuple[int, int]]:
-    """Ranges of problems for the threads, in whole registers of lanes."""
-    registers = -(-problems // lanes)
-    threads = max(1, min(torch.get_num_threads(), registers))
-    edges = [min(problems, lanes * (registers * t // threads)) for t in range(threads + 1)]
-    return list(pairwise(edges))
 
 
 def _check(outcome: int) -> None:
     if outcome:
         raise MemoryError("there is not enough memory for the compiled layer: solve fewer scenes or modes at a time")
-
-
-@functools.cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="epo")
-
-
-if hasattr(os, "register_at_fork"):
-    # Threads do not survive a fork, but their pool would, and wait for them for ever.
-    os.register_at_fork(after_in_child=_threads.cache_clear)
-
-
-def _in_parallel(body: Callable[[Any], None], parts: Sequence[Any]) -> None:
-    # The library lets go of Python's lock while it works.
-    rest: list[Future[None]] = []
-    try:
-        rest.extend(_threads().submit(body, part) for part in parts[1:])
-        body(parts[0])
-    finally:
-        # Whatever happens here, the others write to memory that this call holds: it must not return before they do.
-        wait(rest)
-    for future in rest:
-        future.result()

@@ -35,9 +35,9 @@ from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.pullback import pullback
 from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
-_RETRIES = 4
+RETRIES = 4
 """Number of times that the damping of a sample without a Cholesky factor is raised tenfold."""
-_LEAST_RAISED_DAMPING = 1e-3
+LEAST_RAISED_DAMPING = 1e-3
 """Smallest damping from which raising starts."""
 _HOLDING = 1e30
 """Finite stand-in for infinite damping in the matrices, which avoids inf - inf."""
@@ -275,8 +275,8 @@ def _retry(
     outcome: Int[Tensor, " C"],
 ) -> None:
     """Factorise matrices without a factor again with increasing damping; writes ``factors`` and ``outcome`` in place."""
-    raised = damping.clamp_min(_LEAST_RAISED_DAMPING)
-    for _ in range(_RETRIES):
+    raised = damping.clamp_min(LEAST_RAISED_DAMPING)
+    for _ in range(RETRIES):
         raised = 10.0 * raised
         where = (outcome == Status.STOPPED).nonzero()[:, 0]
         if len(where) == 0:

@@ -22,6 +22,7 @@ from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, 
 from epo_lightning.solvers.diagnostics import quasi_newton
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 OWN = ("goal", "acc", "turnr")
@@ -404,7 +405,7 @@ def test_choices_that_cost_infinitely_much_have_gaps_that_say_so():
 
 # Holding agents.
 
-SOLVERS = [compiled.solve] if not isinstance(compiled._find(), str) else []
+SOLVERS = [compiled.solve] if not isinstance(interface.find(), str) else []
 SOLVERS += [structured.solve, lambda *a, **o: structured.solve(*a, split=False, **o)]
 
 

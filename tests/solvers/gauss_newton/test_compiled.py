@@ -1,13 +1,15 @@
-"""The compiled layer: the suite of all backends, and what only it has: threads, a library that may be missing."""
+"""Tests of the compiled backend: the suite of all backends, its threads, its interface, and a missing library."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
+import re
 import shutil
+import signal
 import subprocess
 import sys
-import time
 import warnings
 from pathlib import Path
 
@@ -20,10 +22,10 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Status
 from epo_lightning.solvers.gauss_newton import compiled
-from epo_lightning.solvers.gauss_newton.kernel import build
+from epo_lightning.solvers.gauss_newton.kernel import build, interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
-if isinstance(compiled._find(), str) and shutil.which("c++") is None:
+if isinstance(interface.find(), str) and shutil.which("c++") is None:
     pytest.skip("there is no C++ compiler on this machine, so the kernel was not built", allow_module_level=True)
 
 
@@ -32,13 +34,13 @@ class TestCompiled(BackendSuite):
 
 
 def test_the_kernel_was_built_from_these_sources():
-    assert compiled._library().epo_fingerprint() == build.fingerprint()
+    assert interface.library().epo_fingerprint() == build.fingerprint()
 
 
 def test_all_levels_of_instructions_agree():
     scene, energy = random_scene(9, 3, history=2, size=1.5, dtype=torch.float64), FeatureEnergy(ALL, bounds=BOUNDS)
     parameters = random_game(scene, modes=3, horizon=9)
-    library = compiled._library()
+    library = interface.library()
     count = library.epo_levels()
     results = []
     try:
@@ -138,7 +140,7 @@ def test_the_layer_takes_it_where_it_can_and_says_once_where_it_cannot(monkeypat
     assert not torch.equal(by_default, plain), "two ways to the same numbers differ in the last bits"
     torch.testing.assert_close(by_default, plain, rtol=0, atol=1e-4)
 
-    monkeypatch.setattr(compiled, "_find", lambda: "it was not built")
+    monkeypatch.setattr(interface, "find", lambda: "it was not built")
     compiled.say_once.cache_clear()
     with pytest.warns(
         UserWarning, match="the compiled layer is missing: it was not built.*Plain PyTorch does the same"
@@ -150,7 +152,7 @@ def test_the_layer_takes_it_where_it_can_and_says_once_where_it_cannot(monkeypat
     with pytest.raises(ValueError, match=r"solver\.backend is 'compiled', but the compiled layer is missing"):
         LevenbergMarquardt(backend="compiled")(energy, scene, parameters)
     with pytest.raises(RuntimeError, match="it was not built"):
-        compiled._library()
+        interface.library()
 
 
 def test_other_sources_are_noticed(tmp_path, monkeypatch):
@@ -212,19 +214,94 @@ def test_a_forked_process_has_threads_of_its_own():
     subprocess.run([sys.executable, "-c", _FORK.format(path=path)], check=True, timeout=120)
 
 
-def test_an_interrupted_call_waits_for_its_threads():
-    """They write to memory that the call holds."""
-    done = []
+_INTERRUPTS = """
+import random, signal, sys, time, torch
+sys.path[:0] = {path!r}
+from games import BOUNDS, leaves_of, random_game, random_scene
+from epo_lightning import FeatureEnergy, LevenbergMarquardt
 
-    def body(part):
-        if part == 0:
-            raise KeyboardInterrupt
-        time.sleep(0.2)
-        done.append(part)
+class Interrupt(BaseException):
+    pass
 
-    with pytest.raises(KeyboardInterrupt):
-        compiled._in_parallel(body, [0, 1, 2])
-    assert sorted(done) == [1, 2]
+def handler(*_):
+    raise Interrupt
+
+torch.set_num_threads(8)
+own = ("acc", "turnr", "goal")
+scene, energy = random_scene(96, 3, history=2, size=2.0), FeatureEnergy(own, bounds=BOUNDS)
+solve, parameters = LevenbergMarquardt(2, backend="compiled"), random_game(scene, 2, 20, own=own)
+
+def gradients():
+    leaves = leaves_of(parameters)
+    solve(energy, scene, leaves).states.square().sum().backward()
+    return [leaf.grad for leaf in (leaves.initial_controls, leaves.goals, *leaves.own_weights.values())]
+
+expected = gradients()
+start = time.perf_counter()
+gradients()
+took = time.perf_counter() - start
+draw, interrupted, overwritten = random.Random(0), 0, 0
+signal.signal(signal.SIGALRM, handler)
+for _ in range(300):
+    try:
+        # The first interrupt comes at a random moment, and further ones every 0.2 ms, also during the handling of the first.
+        signal.setitimer(signal.ITIMER_REAL, draw.uniform(1e-5, 1.2 * took), 2e-4)
+        gradients()
+    except Interrupt:
+        interrupted += 1
+    while True:
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            break
+        except Interrupt:
+            pass
+    # What the call has released is allocated again: a thread that still ran would write into it.
+    sentinels = [torch.full_like(one, 7.0) for one in expected for _ in range(4)]
+    time.sleep(0.002)
+    overwritten += any((sentinel != 7.0).any().item() for sentinel in sentinels)
+    del sentinels
+assert all(torch.equal(one, other) for one, other in zip(gradients(), expected))
+print(interrupted, overwritten)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no interval timers on this system")
+def test_interrupts_leave_no_thread_that_writes_to_released_memory():
+    """Also the second interrupt, while the first one is handled; the results afterwards are those of before."""
+    path = [str(Path(__file__).parents[2]), str(Path(__file__).parents[3])]
+    program = [sys.executable, "-c", _INTERRUPTS.format(path=path)]
+    found = subprocess.run(program, check=True, timeout=300, capture_output=True, text=True)
+    interrupted, overwritten = map(int, found.stdout.split())
+    assert interrupted > 100
+    assert overwritten == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("WHEELBASE", 0.5, "kWheelbase is 0.5 in Python and 0.6 in the kernel"),
+        ("RETRIES", 5, "kRetries is 5 in Python and 4.0 in the kernel"),
+        ("OWN", ("lane", "goal", *interface.OWN[2:]), "GOAL is 1 in Python and 0.0 in the kernel; LANE is 0 in Python"),
+        ("SIGNALS", interface.SIGNALS[:-1], "BOUND_TURNACC is missing in Python and 4.0 in the kernel"),
+    ],
+)
+def test_a_constant_that_differs_from_the_kernel_is_named(monkeypatch, name, value, message):
+    monkeypatch.setattr(interface, name, value)
+    interface.find.cache_clear()
+    with pytest.raises(RuntimeError, match=re.escape(message)):
+        interface.find()
+    monkeypatch.undo()
+    interface.find.cache_clear()
+    assert not isinstance(interface.find(), str)
+
+
+def test_a_structure_that_differs_from_the_kernel_is_named(monkeypatch):
+    class Run(ctypes.Structure):
+        _fields_ = (("extra", ctypes.c_int64), *interface.Run._fields_)
+
+    monkeypatch.setattr(interface, "Run", Run)
+    with pytest.raises(RuntimeError, match=r"EpoRun\.damping is 24 in Python and 16\.0.*EpoRun\.extra.*sizeof EpoRun"):
+        interface.find.__wrapped__()
 
 
 _SHORT_OF_MEMORY = """

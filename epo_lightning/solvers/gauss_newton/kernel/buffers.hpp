@@ -1,4 +1,4 @@
-// Memory that is kept for the next call: fresh pages cost more than the arithmetic done in them.
+// Memory that is kept for the next call: mapping fresh pages costs more time than the arithmetic done in them.
 #pragma once
 
 #include <cstddef>
@@ -11,7 +11,7 @@
 
 namespace EPO_LEVEL {
 
-/// An array of vectors; its memory comes from, and goes back to, what earlier arrays have left.
+/// An array of vectors. Its memory comes from a pool of released arrays and returns to it.
 template <class T>
 class Buffer {
   public:
@@ -21,7 +21,7 @@ class Buffer {
         auto& left = pool().left;
         std::size_t best = left.size();
         for (std::size_t i = 0; i < left.size(); ++i)
-            // A much larger piece is better kept for a larger array.
+            // A much larger piece is kept for a larger array.
             if (left[i].second >= count && left[i].second <= 2 * count + kSmall && (best == left.size() || left[i].second < left[best].second))
                 best = i;
         if (best == left.size()) {
@@ -77,7 +77,7 @@ class Buffer {
     std::size_t size_ = 0;
 };
 
-/// Memory that is handed out piece by piece and taken back all at once.
+/// An arena: pieces are taken one by one and released all at once by `clear`.
 template <class T>
 class Arena {
   public:

@@ -1,9 +1,16 @@
 // The functions that Python calls, in the best version that this processor can run.
+//
+// A call shares its problems out among threads of its own and joins them before it returns. An interrupt cannot come in
+// between: Python handles signals between two of its own instructions, and the whole call is one of them. The arrays that
+// the threads write to, which belong to the caller, therefore outlive the threads.
 
-#include <new>
+#include <algorithm>
+#include <atomic>
+#include <memory>
+#include <thread>
 #include <vector>
 
-#include "game.hpp"
+#include "layout.hpp"
 
 #define DECLARE(name) \
     namespace name { \
@@ -34,53 +41,91 @@ std::vector<const EpoLevel*> runnable() {
 const std::vector<const EpoLevel*> levels = runnable();
 const EpoLevel* chosen = levels.back();
 
-/// A tape, and who knows how to read it.
+/// The tapes of one call, one per range of problems, and the level that reads them.
 struct Handle {
     const EpoLevel* level;
     bool doubles;
-    void* tape;
+    std::vector<void*> tapes;
+
+    ~Handle() {
+        for (void* tape : tapes)
+            if (tape) (doubles ? level->release_double : level->release_float)(tape);
+    }
 };
+
+/// Runs body(0) .. body(count - 1), each on a thread of its own, and returns when all have ended: 0, or 1 where memory was
+/// missing. The calling thread takes the first, and those for which the system has no thread left.
+template <class Body>
+int64_t in_parallel(int64_t count, const Body& body) {
+    std::atomic<int64_t> outcome{0};
+    const auto run = [&](int64_t index) noexcept {
+        try {
+            body(index);
+        } catch (...) {  // allocations are all that can fail
+            outcome = 1;
+        }
+    };
+    std::vector<std::thread> threads(std::size_t(count - 1));
+    for (int64_t index = 1; index < count; ++index) {
+        try {
+            threads[index - 1] = std::thread(run, index);
+        } catch (...) {
+            run(index);
+        }
+    }
+    run(0);
+    for (std::thread& thread : threads)
+        if (thread.joinable()) thread.join();
+    return outcome;
+}
 
 }  // namespace
 
 extern "C" {
 
-/// Of the sources, so that a stale library is noticed.
+/// Hash of the sources from which the library was built.
 int64_t epo_fingerprint() { return EPO_FINGERPRINT; }
 
 int64_t epo_levels() { return int64_t(levels.size()); }
 
-/// Use level 0 (plain) to `epo_levels() - 1` (the best, as at the start) from now on. Tests compare them.
+/// Sizes, offsets and constants, up to an entry without a name.
+const EpoLayoutEntry* epo_layout() { return kLayout; }
+
+/// Use level 0 (plain) to `epo_levels() - 1` (the best, and the default) from now on; for the tests, which compare the levels.
 void epo_choose(int64_t level) { chosen = levels[level]; }
 
-int64_t epo_lanes() { return chosen->lanes; }
-
-/// Solve problems [first, last). `tape` becomes what `epo_differentiate` needs, or null; it must be released.
-/// Returns 0, or 1 where there was not enough memory.
-int64_t epo_solve(int64_t doubles, const EpoGame* game, const EpoRun* run, int64_t first, int64_t last, void** tape) {
+/// Solves all problems on up to `threads` threads, in whole registers of problems, so that results do not depend on them.
+/// `*tape` becomes the data for `epo_differentiate`, or null where nothing is recorded; `epo_release` frees it.
+/// Returns 0, or 1 where there was not enough memory; then there is no tape.
+int64_t epo_solve(int64_t doubles, const EpoGame* game, const EpoRun* run, int64_t threads, void** tape) {
     *tape = nullptr;
     try {
-        void* made = (doubles ? chosen->solve_double : chosen->solve_float)(game, run, first, last);
-        if (made) *tape = new Handle{chosen, doubles != 0, made};
-        return 0;
-    } catch (const std::bad_alloc&) {
+        const EpoLevel& level = *chosen;
+        const int64_t problems = game->B * game->M, lanes = level.lanes, registers = (problems + lanes - 1) / lanes;
+        const int64_t ranges = std::max<int64_t>(1, std::min(threads, registers));
+        const auto edge = [&](int64_t range) { return std::min(problems, lanes * (registers * range / ranges)); };
+        std::unique_ptr<Handle> handle(new Handle{&level, doubles != 0, std::vector<void*>(std::size_t(ranges))});
+        const int64_t outcome = in_parallel(ranges, [&](int64_t range) {
+            const auto solve = doubles ? level.solve_double : level.solve_float;
+            handle->tapes[range] = solve(game, run, edge(range), edge(range + 1));
+        });
+        if (outcome == 0 && run->record) *tape = handle.release();
+        return outcome;
+    } catch (...) {
         return 1;
     }
 }
 
+/// The adjoint of a call of `epo_solve`, on as many threads. Returns 0, or 1 where there was not enough memory.
 int64_t epo_differentiate(const void* tape, const EpoGame* game, const EpoRun* run, const EpoGradients* gradients) {
     const Handle& handle = *static_cast<const Handle*>(tape);
+    const auto differentiate = handle.doubles ? handle.level->differentiate_double : handle.level->differentiate_float;
     try {
-        (handle.doubles ? handle.level->differentiate_double : handle.level->differentiate_float)(handle.tape, game, run, gradients);
-        return 0;
-    } catch (const std::bad_alloc&) {
+        return in_parallel(int64_t(handle.tapes.size()), [&](int64_t range) { differentiate(handle.tapes[range], game, run, gradients); });
+    } catch (...) {
         return 1;
     }
 }
 
-void epo_release(void* tape) {
-    Handle* handle = static_cast<Handle*>(tape);
-    (handle->doubles ? handle->level->release_double : handle->level->release_float)(handle->tape);
-    delete handle;
-}
+void epo_release(void* tape) { delete static_cast<Handle*>(tape); }
 }

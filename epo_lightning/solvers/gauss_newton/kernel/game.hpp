@@ -1,6 +1,9 @@
-// What the caller hands over: plain pointers and strides (in elements), so that no array is copied on the way in.
+// The interface to Python: plain pointers and strides (in elements), so that no array is copied on the way in.
+//
+// `interface.py` repeats these structures, enumerations and constants; `layout.hpp` exports them, and loading compares the two.
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 
 /// Weighted own features, in the order in which weights and their gradients are passed.
@@ -12,13 +15,22 @@ enum Control { ACCELERATION, TURN_RATE };
 /// Signals that can have bounds.
 enum Bounded { BOUND_VEL, BOUND_ACC, BOUND_TURNR, BOUND_JERK, BOUND_TURNACC, BOUND_COUNT };
 
+/// Outcome of a problem: all steps taken; some with a raised damping only; or the last good iterate kept.
+enum Status { SOLVED, DAMPED, STOPPED };
+
+constexpr int64_t kMostAgents = 64;         // contacts are a 64-bit mask per agent
+constexpr double kWheelbase = 0.6;          // distance between the axles as a share of a vehicle's length
+constexpr double kSlowestSteering = 1.0;    // speed [m/s] below which steering angles are those of this speed
+constexpr int64_t kRetries = 4;             // number of tenfold increases of the damping of a group that has no factor
+constexpr double kLeastRaisedDamping = 1e-3;  // smallest value from which the damping is raised
+
 extern "C" {
 
-/// B scenes with M modes each: B * M problems of N agents over K steps. A null pointer is a feature that is not there.
+/// B scenes with M modes each: B * M problems of N agents over K steps. A null pointer stands for an absent feature.
 struct EpoGame {
     int64_t B, M, N, K;
     int64_t lines, points;     // reference lines R of an agent and their points Q
-    int64_t pair_stride;       // pairs count at states pair_stride, 2 pair_stride, ...
+    int64_t pair_stride;       // pairs are evaluated at states pair_stride, 2 pair_stride, ...
     double dt;
     double bounds[BOUND_COUNT][2];
     const void* initial;       // [B, N, 4] x, y, heading, speed
@@ -40,9 +52,9 @@ struct EpoGame {
 struct EpoRun {
     int64_t steps;
     double step_size;
-    const void* damping;       // [B, M], or [B, M, N]: infinite for agents that are held where they are
+    const void* damping;       // [B, M], or [B, M, N]: infinite for agents that do not move
     int64_t damping_problem, damping_agent;
-    int64_t record;            // whether to keep what the adjoint needs
+    int64_t record;            // whether to keep factors and nearest points for the adjoint
     const void* start;
     void* iterates;            // [S + 1, ...], or one array that is overwritten where iterate_stride is 0
     int64_t iterate_stride;
@@ -51,7 +63,7 @@ struct EpoRun {
     void* initial_energy;      // [B, M]
     void* energy;              // [B, M]
     void* gradient_norm;       // [B, M]
-    int64_t* status;           // [B, M] 0 solved, 1 damped, 2 stopped
+    int64_t* status;           // [B, M] of type Status
 };
 
 /// Cotangents in, gradients out. `controls` is the cotangent of u_S on entry and of u_0 on return.

@@ -1,4 +1,4 @@
-// W independent games of n agents side by side: what they hold, where they move, and their features, step by step.
+// W independent games of n agents side by side: their parameters, trajectories and features, step by step.
 #pragma once
 
 #include <cstddef>
@@ -17,14 +17,14 @@ struct Path {
     Vec<T>*heading, *speed, *sine, *cosine, *x, *y;
 };
 
-/// How a trajectory changes along a direction of its controls.
+/// Tangent of a trajectory: its derivative along a direction of the controls.
 template <class T>
 struct Tangent {
     Vec<T>*turn, *thrust;                // the direction [K]
     Vec<T>*heading, *speed, *x, *y;      // [K + 1]
 };
 
-/// A feature's value and slope for a bounded signal: how far it leaves [low, high], and 1 above, -1 below, 0 within.
+/// Violation of the bounds [low, high] by a signal, and its derivative: 1 above, -1 below, 0 within.
 template <class T>
 INLINE void violation(Vec<T> value, const double* bound, Vec<T>& excess, Vec<T>& slope) {
     const T low = T(bound[0]), high = T(bound[1]);
@@ -33,10 +33,10 @@ INLINE void violation(Vec<T> value, const double* bound, Vec<T>& excess, Vec<T>&
     slope = (value > high ? one : zero) - (value < low ? one : zero);
 }
 
-/// Where a control of agent i stands among the m unknowns of a step, which follow the order (heading, speed).
+/// Index of a control of agent i among the m unknowns of a step, which are in the order (heading, speed).
 INLINE int unknown(int i, int channel) { return 2 * i + (channel == ACCELERATION); }
 
-/// A sum of squared residuals around one signal: energy, pull (its derivative) and stiffness.
+/// Gauss-Newton model of a sum of squared residuals of one signal: energy, first derivative (pull) and second (stiffness).
 template <class T>
 struct Model {
     Vec<T> energy{}, pull{}, stiffness{};
@@ -56,7 +56,7 @@ struct Model {
     }
 };
 
-/// What phi = -<J mu, r + J d> asks of one signal: cotangent of the signal; weights' gradients are added on the way.
+/// Derivative of phi = -<J mu, r + J d> by one signal (its cotangent); gradients by the weights are added on the way.
 template <class T>
 struct Adjoint {
     Vec<T> along_mu, along_d, cotangent{};
@@ -72,14 +72,14 @@ struct Adjoint {
     }
 };
 
-/// Equivalent steering angle atan(q omega), q = wheelbase / max(v, 1), with its first two derivatives.
+/// Equivalent steering angle atan(q omega), q = wheelbase / max(v, kSlowestSteering), with its first two derivatives.
 template <class T>
 struct Steering {
     Vec<T> value, by_turn, by_speed, turn_turn, turn_speed, speed_speed;
     INLINE Steering(Vec<T> wheelbase, Vec<T> turn, Vec<T> speed) {
-        const Vec<T> one = splat<T>(1), zero{};
-        const Mask<T> moving = speed > one;
-        const Vec<T> inverse = one / (moving ? speed : one), q = wheelbase * inverse, t = q * turn;
+        const Vec<T> one = splat<T>(1), slowest = splat<T>(T(kSlowestSteering)), zero{};
+        const Mask<T> moving = speed > slowest;
+        const Vec<T> inverse = one / (moving ? speed : slowest), q = wheelbase * inverse, t = q * turn;
         const Vec<T> d = one / (one + t * t);
         value = arctan<T>(t);
         by_turn = q * d;
@@ -90,7 +90,7 @@ struct Steering {
     }
 };
 
-/// Two agents at one step: how deep they overlap and in which direction they part.
+/// Overlap of two agents at one step: its depth, and the unit vector from the second agent to the first.
 template <class T>
 struct Contact {
     Mask<T> active;
@@ -102,7 +102,7 @@ struct Contact {
         const Vec<T> safe = root<T>(apart ? squared : one);
         distance = apart ? safe : zero;
         active = reach > distance;
-        // Agents at one and the same point have no direction between them: the feature is flat there.
+        // The direction between two agents at the same point is undefined: the feature has derivative zero there.
         const Vec<T> inverse = apart && active ? one / safe : zero;
         depth = active ? reach - distance : zero;
         x = dx * inverse;
@@ -110,12 +110,12 @@ struct Contact {
     }
 };
 
-/// Nearest points of the agents' reference lines, and the directions in which they slide (zero at corners).
+/// Nearest points on the agents' reference lines, and the unit tangents along which they move (zero at corners).
 template <class T>
-struct Feet {
-    Vec<T>*x, *y, *slide_x, *slide_y;  // [n, K + 1], of which states 1 .. K are in use
+struct Nearest {
+    Vec<T>*x, *y, *tangent_x, *tangent_y;  // [n, K + 1], of which states 1 .. K are in use
     static std::size_t size(int n, int K) { return std::size_t(4) * n * (K + 1); }
-    static Feet at(Vec<T>* memory, int n, int K) {
+    static Nearest at(Vec<T>* memory, int n, int K) {
         const int each = n * (K + 1);
         return {memory, memory + each, memory + 2 * each, memory + 3 * each};
     }
@@ -133,14 +133,14 @@ struct Group {
     Vec<T>*weight;                        // [OWN_COUNT, n]
     Vec<T>*pair_weight, *reach;           // [pairs]
     Vec<T>*goal_x, *goal_y, *reference_speed, *wheelbase;  // [n]
-    Feet<T> feet;                         // by `find_feet`, or of an earlier call
+    Nearest<T> nearest;                   // from `find_nearest`, or kept by an earlier call
     Vec<T>*turn, *thrust;                 // controls [n, K]
     std::vector<Path<T>> path;
 
     Vec<T> own(int feature, int i) const { return weight[feature * count.agents() + i]; }
     bool has(int feature) const { return game.own[feature] != nullptr; }
 
-    /// Lane `lane` holds items[lane * (n + 1)]: the problem, then its agents. The last item fills what is left.
+    /// Lane `lane` holds the row items[lane * (n + 1)]: the problem, then its agents. Unused lanes repeat the last row.
     Group(const EpoGame& game, Arena<T>& arena, Count<N> count, const int32_t* items, int filled, const T* controls)
         : game(game), count(count), K(int(game.K)), pairs(count.agents() * (count.agents() - 1) / 2), dt(T(game.dt)), arena(arena) {
         const int n = count.agents();
@@ -202,7 +202,7 @@ struct Group {
                 p.heading[0][lane] = start[2];
                 p.speed[0][lane] = start[3];
             }
-            // Changes are summed up by themselves: far from the origin, small steps would drown in large coordinates.
+            // Changes are summed separately: added to large coordinates one by one, small steps would be rounded away.
             Vec<T> x{}, y{}, turned{}, faster{};
             for (int k = 0; k < K; ++k) {
                 sincos<T>(p.heading[k], p.sine[k], p.cosine[k]);
@@ -218,7 +218,7 @@ struct Group {
         }
     }
 
-    /// How agent i moves along a direction, and the matrix Z of step k.
+    /// Computes the tangent of agent i's trajectory along its direction of the controls.
     void roll_tangent(int i, const Tangent<T>& t) const {
         const Path<T>& p = path[i];
         t.heading[0] = t.speed[0] = t.x[0] = t.y[0] = Vec<T>{};
@@ -231,6 +231,7 @@ struct Group {
         }
     }
 
+    /// The matrix Z of step k for every agent.
     void motions(int k, Motion<T>* Z) const {
         for (int i = 0; i < count.agents(); ++i) {
             const Path<T>& p = path[i];
@@ -239,17 +240,17 @@ struct Group {
         }
     }
 
-    /// The nearest points of the reference lines, written to `found`; the directions in which they slide only where asked for.
-    template <bool SLIDES>
-    void find_feet(const Feet<T>& found) {
-        feet = found;
+    /// Computes the nearest points of the reference lines in the memory of `found`, and with TANGENTS their unit tangents.
+    template <bool TANGENTS>
+    void find_nearest(const Nearest<T>& found) {
+        nearest = found;
         Vec<T>* segments = arena.take((game.points - 1) * 5);
-        // Four states share every segment that is loaded, and their chains of comparisons run side by side.
+        // Four states share each load of a segment, and their chains of comparisons are independent of each other.
         for (int i = 0; i < count.agents(); ++i) {
             load_line(i, segments);
             int k = 1;
-            for (; k + 4 <= K + 1; k += 4) find_feet_at<SLIDES, 4>(i, k, segments);
-            for (; k <= K; ++k) find_feet_at<SLIDES, 1>(i, k, segments);
+            for (; k + 4 <= K + 1; k += 4) find_nearest_at<TANGENTS, 4>(i, k, segments);
+            for (; k <= K; ++k) find_nearest_at<TANGENTS, 1>(i, k, segments);
         }
     }
 
@@ -288,7 +289,7 @@ struct Group {
         return model;
     }
 
-    /// Weights, goals and radii: what features need, and a bare rollout does not.
+    /// Loads weights, goals and radii, which the features need and a bare rollout does not.
     void load_parameters() {
         const int n = count.agents();
         weight = arena.take(OWN_COUNT * n);
@@ -317,7 +318,7 @@ struct Group {
                     goal_y[i][lane] = goal[game.goals_x];
                 }
                 if (has(VELREF)) reference_speed[i][lane] = static_cast<const T*>(game.reference_speed)[row];
-                if (has(STEER)) wheelbase[i][lane] = T(0.6) * size[2 * row];
+                if (has(STEER)) wheelbase[i][lane] = T(kWheelbase) * size[2 * row];
             }
             if (!game.pair) continue;
             int p = 0;
@@ -334,15 +335,15 @@ struct Group {
   private:
     std::vector<int> owners_;
 
-    template <bool SLIDES, int STATES>
-    INLINE void find_feet_at(int i, int k, const Vec<T>* s) {
+    template <bool TANGENTS, int STATES>
+    INLINE void find_nearest_at(int i, int k, const Vec<T>* s) {
         const Vec<T> zero{}, one = splat<T>(1);
         const Vec<T>*x = path[i].x + k, *y = path[i].y + k;
         const int at = i * (K + 1) + k;
         Vec<T> best[STATES], near_x[STATES], near_y[STATES], inside[STATES], ahead_x[STATES], ahead_y[STATES];
         for (int q = 0; q < STATES; ++q) {
             best[q] = splat<T>(T(INFINITY));
-            // Where nothing is nearest, there is something that is not a number, and it should show.
+            // Without a comparison that holds, an input is NaN; the nearest point is NaN then as well.
             near_x[q] = near_y[q] = splat<T>(T(NAN));
             inside[q] = ahead_x[q] = ahead_y[q] = zero;
         }
@@ -356,19 +357,19 @@ struct Group {
                 best[q] = nearer ? squared : best[q];
                 near_x[q] = nearer ? at_x : near_x[q];
                 near_y[q] = nearer ? at_y : near_y[q];
-                if (SLIDES) {
+                if (TANGENTS) {
                     inside[q] = nearer ? (along == raw ? s[4] : zero) : inside[q];
                     ahead_x[q] = nearer ? s[2] : ahead_x[q];
                     ahead_y[q] = nearer ? s[3] : ahead_y[q];
                 }
             }
         for (int q = 0; q < STATES; ++q) {
-            feet.x[at + q] = near_x[q];
-            feet.y[at + q] = near_y[q];
-            if (SLIDES) {
+            nearest.x[at + q] = near_x[q];
+            nearest.y[at + q] = near_y[q];
+            if (TANGENTS) {
                 const Vec<T> scale = root<T>(inside[q]);
-                feet.slide_x[at + q] = ahead_x[q] * scale;
-                feet.slide_y[at + q] = ahead_y[q] * scale;
+                nearest.tangent_x[at + q] = ahead_x[q] * scale;
+                nearest.tangent_y[at + q] = ahead_y[q] * scale;
             }
         }
     }
@@ -380,7 +381,7 @@ struct Group {
         for (int lane = 0; lane < W; ++lane) {
             const int a = agent[i * W + lane];
             const int64_t line = game.reference[int64_t(problem[lane]) * game.N + a];
-            const bool exists = line >= 0 && line < game.lines;  // else the sample is stopped anyway
+            const bool exists = line >= 0 && line < game.lines;  // otherwise the problem is STOPPED, see `valid`
             rows[lane] = static_cast<const T*>(game.references) +
                          ((int64_t(scene[lane]) * game.N + a) * game.lines + (exists ? line : 0)) * points * 2;
         }

@@ -1,6 +1,6 @@
-// Arithmetic on W problems at once, one per lane of a vector register, and the few functions that C++ has no vectors for.
+// Arithmetic on W problems at once, one per lane of a vector register, and vector versions of a few library functions.
 //
-// Nothing here, or above it, mixes lanes: what a lane computes depends on that lane alone, bit by bit.
+// No function here, or in the files that use it, mixes lanes: the result of a lane depends on that lane alone, bit by bit.
 #pragma once
 
 #include <algorithm>
@@ -182,8 +182,8 @@ INLINE Vec<T> root(Vec<T> x) {
     return result;
 }
 
-/// Sine and cosine, to about one unit in the last place for angles of up to some thousand radians; beyond what reduction can
-/// do, not a number rather than a wrong one.
+/// Sine and cosine, to about one unit in the last place for angles of up to some thousand radians; NaN for angles that are
+/// too large for the reduction.
 template <class T>
 INLINE void sincos(Vec<T> angle, Vec<T>& sine, Vec<T>& cosine) {
     using L = Lanes<T>;

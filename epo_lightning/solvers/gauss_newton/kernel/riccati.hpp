@@ -17,7 +17,7 @@
 
 namespace EPO_LEVEL {
 
-/// Number of agents: known when compiled where N > 0, else when run.
+/// Number of agents: known at compile time where N > 0, else at run time.
 template <int N>
 struct Count {
     int dynamic;
@@ -44,14 +44,14 @@ INLINE void subtract_products(Vec<T>* C, int ldc, const Vec<T>* A, int astep, in
 }
 
 /// Overwrite the lower triangle of H [m, m] with its Cholesky factor, reciprocals on the diagonal.
-/// Lanes of `sound` turn false where a pivot is not positive.
+/// Lanes of `positive` turn false where a pivot is not positive.
 template <class T, int N>
-INLINE void factorise(Count<N> count, Vec<T>* H, Mask<T>& sound) {
+INLINE void factorise(Count<N> count, Vec<T>* H, Mask<T>& positive) {
     const int m = count.controls();
     for (int j = 0; j < m; ++j) {
         Vec<T> pivot = H[j * m + j];
         for (int k = 0; k < j; ++k) pivot -= H[j * m + k] * H[j * m + k];
-        sound &= pivot > 0;
+        positive &= pivot > 0;
         const Vec<T> inverse = T(1) / root<T>(pivot);
         H[j * m + j] = inverse;
         for (int i = j + 1; i < m; ++i) {
@@ -116,7 +116,7 @@ INLINE void transition(
             row[v] = dt * mirrored<T>(P, ld, m + r, v) + P[(2 * m + r) * ld + v] + by_x * Z[a].x_speed + by_y * Z[a].y_speed;
         }
         row[2 * m + r] = -rates[r];
-        // Above the diagonal, only blocks on it are looked at.
+        // Above the diagonal, only entries of the diagonal blocks are read.
         for (int j = r + 1; j % 4 != 0 && j < m; ++j) row[2 * m + j] = Vec<T>{};
     }
     for (int a = 0; a < n; ++a) G[2 * a * ld + m + 2 * a + 1] += coupling[a];
@@ -151,7 +151,7 @@ INLINE void transition(
     }
 }
 
-/// Columns [from, from + S) of P -= G' G, from the diagonal down; of the controls' rows nothing is left from the step after.
+/// Columns [from, from + S) of P -= G' G, from the diagonal down; of the controls' rows keep nothing of the next step.
 template <class T, int N, int S>
 INLINE void subtract_square(Count<N> count, Vec<T>* P, const Vec<T>* G, int from) {
     const int m = count.controls(), ld = 3 * m;
@@ -191,7 +191,7 @@ INLINE void eliminate_controls(Count<N> count, const Vec<T>* L, const Vec<T>* ra
 }
 
 /// One step back of the linear terms: y of the next state, with its stage costs, and h of the controls, to y of this state.
-/// `h` becomes L^-1 h, which the way forward needs; `first` is the step whose state is given.
+/// `h` becomes L^-1 h, which the forward recursion needs; `first` is the step whose state is given.
 template <class T, int N>
 INLINE void pull_linear(
     Count<N> count, const Vec<T>* L, const Vec<T>* G, T dt, const Motion<T>* Z, bool first, Vec<T>* y, Vec<T>* h) {

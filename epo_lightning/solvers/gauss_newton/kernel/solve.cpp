@@ -12,18 +12,20 @@
 namespace EPO_LEVEL {
 namespace {
 
-/// Groups of touching agents by size: items[n] holds rows of the problem and its n agents, in ascending order.
+static_assert(kMostAgents == 8 * sizeof(uint64_t), "contacts are a mask of one bit per agent");
+
+/// Groups of agents in contact by size: items[n] holds rows of a problem and its n agents, in ascending order.
 struct Plan {
     std::vector<std::vector<int32_t>> items;
     int64_t groups(int n, int lanes) const { return (int64_t(items[n].size()) / (n + 1) + lanes - 1) / lanes; }
 };
 
-/// Which agents of W problems touch each other: bit j of touching[i * W + lane].
+/// Contacts between the agents of W problems: bit j of touching[i * W + lane] is set where i and j overlap.
 template <class T>
 void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, const T* controls, uint64_t* touching) {
     constexpr int W = Lanes<T>::W;
     const int N = int(game.N), K = int(game.K);
-    // Only states at which pairs count are kept.
+    // Only the states at which pairs are evaluated are kept.
     const int stride = int(game.pair_stride), kept = K / stride;
     Vec<T>*x = arena.take(N * kept), *y = arena.take(N * kept), *box = arena.take(4 * N), *radius = arena.take(N);
     Vec<T>* given = arena.take(2 * K);
@@ -128,12 +130,12 @@ Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last
     return plan;
 }
 
-/// What one step leaves for its adjoint.
+/// Data of one step for its adjoint.
 template <class T>
 struct StepTape {
     Plan plan;
-    std::vector<Buffer<T>> factors, feet;  // by group size, group after group
-    std::vector<char> sound;               // by problem of the range
+    std::vector<Buffer<T>> factors, nearest;  // by group size, group after group
+    std::vector<char> taken;               // whether a problem of the range took the step
 };
 
 template <class T>
@@ -174,10 +176,10 @@ INLINE bool finite(T value) {
     return value - value == 0;
 }
 
-/// Whether a problem is all finite numbers, and its lines exist, where nothing computed from it would tell otherwise: a pair
-/// that never touches hides its weight, and a line all its points but the nearest.
+/// Whether the inputs of a problem are finite and its lines exist, for inputs that the results may not depend on: the weight
+/// of a pair that never touches, and the points of a line that are not the nearest.
 template <class T>
-bool known(const EpoGame& game, int64_t problem) {
+bool valid(const EpoGame& game, int64_t problem) {
     const int64_t b = problem / game.M, m = problem % game.M;
     const uint8_t* present = game.present + b * game.N;
     int64_t pair = 0;
@@ -205,9 +207,6 @@ bool known(const EpoGame& game, int64_t problem) {
     return true;
 }
 
-constexpr int kRetries = 4;            // how often the damping of a group without factors is raised tenfold
-constexpr double kLeastRaised = 1e-3;  // where raising starts from when the damping is smaller
-
 template <class T>
 std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t first, int64_t last) {
     constexpr int W = Lanes<T>::W;
@@ -218,10 +217,10 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
     T* const norm = static_cast<T*>(run.gradient_norm);
     Arena<T> arena;
     std::vector<Buffer<T>> reused(game.N + 1);
-    std::vector<char> whole(last - first);
+    std::vector<char> inputs_valid(last - first);
     for (int64_t problem = first; problem < last; ++problem) {
-        whole[problem - first] = known<T>(game, problem);
-        run.status[problem] = whole[problem - first] ? 0 : 2;
+        inputs_valid[problem - first] = valid<T>(game, problem);
+        run.status[problem] = inputs_valid[problem - first] ? SOLVED : STOPPED;
     }
     for (int64_t problem = first; problem < last; ++problem)
         for (int64_t i = 0; i < game.N; ++i) {
@@ -239,22 +238,22 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
         StepTape<T> step;
         step.plan = make_plan<T>(game, arena, first, last, controls);
         step.factors.resize(game.N + 1);
-        step.feet.resize(game.N + 1);
-        step.sound = whole;
+        step.nearest.resize(game.N + 1);
+        step.taken = inputs_valid;
         for (int n = 1; n <= game.N; ++n) {
             const std::size_t groups = step.plan.groups(n, W);
             if (groups && (record || !reused[n]))
                 (record ? step.factors : reused)[n] = Buffer<T>((record ? groups : 1) * Factors<T>::size(n, game.K));
-            if (groups && record && lanes) step.feet[n] = Buffer<T>(groups * Feet<T>::size(n, game.K));
+            if (groups && record && lanes) step.nearest[n] = Buffer<T>(groups * Nearest<T>::size(n, game.K));
         }
         if (s == 0) std::fill(energies[0] + first, energies[0] + last, T(0));
         for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
             const int n = group.count.agents();
             group.load_parameters();
             if (lanes && record)
-                group.template find_feet<true>(Feet<T>::at(step.feet[n].data() + index * Feet<T>::size(n, game.K), n, game.K));
+                group.template find_nearest<true>(Nearest<T>::at(step.nearest[n].data() + index * Nearest<T>::size(n, game.K), n, game.K));
             else if (lanes)
-                group.template find_feet<false>(Feet<T>::at(arena.take(Feet<T>::size(n, game.K)), n, game.K));
+                group.template find_nearest<false>(Nearest<T>::at(arena.take(Nearest<T>::size(n, game.K)), n, game.K));
             Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game.K) : reused[n].data();
             const auto factors = Factors<T>::at(memory, n, game.K);
             Vec<T>*turn = arena.take(n * game.K), *thrust = arena.take(n * game.K), energy;
@@ -264,22 +263,22 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
                     given[i][lane] = static_cast<const T*>(
                         run.damping)[group.problem[lane] * run.damping_problem + group.agent[i * W + lane] * run.damping_agent];
                 damping[i] = given[i];
-                raised[i] = most<T>(given[i], splat<T>(T(kLeastRaised)));
+                raised[i] = most<T>(given[i], splat<T>(T(kLeastRaisedDamping)));
             }
-            Mask<T> sound, failed{};
+            Mask<T> positive, failed{};
             for (int attempt = 0;; ++attempt) {
-                solve_step(group, damping, factors, turn, thrust, energy, sound);
-                if (attempt == kRetries || !any<T>(~sound)) break;
-                failed |= ~sound;
+                solve_step(group, damping, factors, turn, thrust, energy, positive);
+                if (attempt == kRetries || !any<T>(~positive)) break;
+                failed |= ~positive;
                 for (int i = 0; i < n; ++i) {
                     raised[i] *= T(10);
-                    damping[i] = sound ? damping[i] : given[i] + raised[i];
+                    damping[i] = positive ? damping[i] : given[i] + raised[i];
                 }
             }
             for (int lane = 0; lane < filled; ++lane) {
                 const int problem = group.problem[lane];
-                if (failed[lane]) run.status[problem] = std::max<int64_t>(run.status[problem], 1);
-                if (!sound[lane]) step.sound[problem - first] = 0;
+                if (failed[lane]) run.status[problem] = std::max<int64_t>(run.status[problem], DAMPED);
+                if (!positive[lane]) step.taken[problem - first] = 0;
                 if (s == 0) energies[0][problem] += energy[lane];
             }
             group.store(turn, thrust, filled, directions, [](int) { return true; });
@@ -287,15 +286,15 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
         for (int64_t problem = first; problem < last; ++problem) {
             T *d = directions + problem * size, *from = controls + problem * size, *to = next + problem * size;
             const T alpha = T(run.step_size);
-            // Absent agents have no direction: nobody stored one.
+            // Absent agents are in no group, so no direction was stored for them.
             const uint8_t* present = game.present + problem / game.M * game.N;
             for (int64_t i = 0; i < game.N; ++i)
                 if (!present[i]) std::fill(d + i * row, d + (i + 1) * row, T(0));
-            bool sound = step.sound[problem - first];
-            for (int64_t e = 0; e < size; ++e) sound &= finite(from[e] + alpha * d[e]);
-            step.sound[problem - first] = sound;
-            if (!sound) run.status[problem] = 2;
-            for (int64_t e = 0; e < size; ++e) to[e] = sound ? from[e] + alpha * d[e] : from[e];
+            bool taken = step.taken[problem - first];
+            for (int64_t e = 0; e < size; ++e) taken &= finite(from[e] + alpha * d[e]);
+            step.taken[problem - first] = taken;
+            if (!taken) run.status[problem] = STOPPED;
+            for (int64_t e = 0; e < size; ++e) to[e] = taken ? from[e] + alpha * d[e] : from[e];
         }
         if (record) tape->steps.push_back(std::move(step));
     }
@@ -306,7 +305,7 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
     for_each_group<T>(game, arena, make_plan<T>(game, arena, first, last, controls), controls, [&](auto& group, int64_t, int filled) {
         const int n = group.count.agents();
         group.load_parameters();
-        if (lanes) group.template find_feet<false>(Feet<T>::at(arena.take(Feet<T>::size(n, game.K)), n, game.K));
+        if (lanes) group.template find_nearest<false>(Nearest<T>::at(arena.take(Nearest<T>::size(n, game.K)), n, game.K));
         Vec<T> energy, squared;
         evaluate(group, energy, squared);
         for (int lane = 0; lane < filled; ++lane) {
@@ -327,7 +326,7 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
     return record ? std::move(tape) : nullptr;
 }
 
-/// Adds to the cotangent of the controls what a cotangent of the states x_1 .. x_K makes of it.
+/// Adds the pullback of a cotangent of the states x_1 .. x_K to the cotangent of the controls.
 template <class T>
 void pull_states(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last, const T* controls, const T* states, T* bar) {
     Plan single;
@@ -383,7 +382,7 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
         for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
             const int n = group.count.agents(), K = group.K;
             group.load_parameters();
-            if (game.own[LANE]) group.feet = Feet<T>::at(step.feet[n].data() + index * Feet<T>::size(n, K), n, K);
+            if (game.own[LANE]) group.nearest = Nearest<T>::at(step.nearest[n].data() + index * Nearest<T>::size(n, K), n, K);
             const auto factors = Factors<T>::at(step.factors[n].data() + index * Factors<T>::size(n, K), n, K);
             Vec<T>*bar_turn = arena.take(n * K), *bar_thrust = arena.take(n * K);
             Vec<T>*mu_turn = arena.take(n * K), *mu_thrust = arena.take(n * K);
@@ -400,8 +399,8 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
             for (int e = 0; e < group.pairs; ++e) by.pair[e] = Vec<T>{};
             for (int e = 0; e < n; ++e) by.goal_x[e] = by.goal_y[e] = Vec<T>{};
             differentiate(group, mu_turn, mu_thrust, d_turn, d_thrust, bar_turn, bar_thrust, by);
-            // A step that was not taken passes its cotangent on as it is.
-            const auto taken = [&](int lane) { return step.sound[group.problem[lane] - first] != 0; };
+            // A step that was not taken passes its cotangent on unchanged.
+            const auto taken = [&](int lane) { return step.taken[group.problem[lane] - first] != 0; };
             group.store(bar_turn, bar_thrust, filled, bar, taken);
             for (int lane = 0; lane < filled; ++lane) {
                 if (!taken(lane)) continue;

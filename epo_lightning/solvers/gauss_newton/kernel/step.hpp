@@ -1,4 +1,4 @@
-// One Levenberg-Marquardt step of a group, what it leaves behind for its adjoint, and that adjoint.
+// One Levenberg-Marquardt step of a group, the factors that it keeps for its adjoint, and that adjoint.
 #pragma once
 
 #include "group.hpp"
@@ -25,8 +25,8 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>
         if (P) P[(m + 2 * i + 1) * ld + m + 2 * i + 1] += speed.stiffness;
         Model<T> in_x, in_y;
         if (g.has(LANE)) {
-            in_x.add(g.own(LANE, i), g.path[i].x[state] - g.feet.x[i * (g.K + 1) + state]);
-            in_y.add(g.own(LANE, i), g.path[i].y[state] - g.feet.y[i * (g.K + 1) + state]);
+            in_x.add(g.own(LANE, i), g.path[i].x[state] - g.nearest.x[i * (g.K + 1) + state]);
+            in_y.add(g.own(LANE, i), g.path[i].y[state] - g.nearest.y[i * (g.K + 1) + state]);
         }
         if (g.has(GOAL) && state == g.K) {
             in_x.add(g.own(GOAL, i), g.path[i].x[state] - g.goal_x[i]);
@@ -109,7 +109,7 @@ struct ControlCosts {
     }
 };
 
-/// The way forward: from L^-1 h [K, m] to the direction [n, K].
+/// The forward recursion: from L^-1 h [K, m] to the direction [n, K].
 template <class T, int N>
 INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* h, Vec<T>* turn, Vec<T>* thrust) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
@@ -127,11 +127,13 @@ INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* 
 }
 
 /// The damped Gauss-Newton direction of every lane, [n, K] turn rates and accelerations; its factors; the energy.
+/// `positive` says in which lanes the damped matrix is positive definite.
 ///
-/// Agents [n] have a damping each. Where it is infinite, the reciprocal pivots are zero, and so is the direction.
+/// The damping [n] is per agent. Where it is infinite, the reciprocal pivots are zero, and so is the direction.
 template <class T, int N>
 void solve_step(
-    const Group<T, N>& g, const Vec<T>* damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust, Vec<T>& energy, Mask<T>& sound) {
+    const Group<T, N>& g, const Vec<T>* damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust, Vec<T>& energy,
+    Mask<T>& positive) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
     Vec<T>*P = g.arena.take(ld * ld), *y = g.arena.take(ld), *h = g.arena.take(g.K * m), *damped = g.arena.take(m);
     Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
@@ -139,7 +141,7 @@ void solve_step(
     for (int e = 0; e < ld * ld; ++e) P[e] = Vec<T>{};
     for (int e = 0; e < ld; ++e) y[e] = Vec<T>{};
     energy = Vec<T>{};
-    sound = ~Mask<T>{};
+    positive = ~Mask<T>{};
     for (int k = g.K - 1; k >= 0; --k) {
         Vec<T>*L = factors.L + std::size_t(k) * m * m, *G = factors.G + std::size_t(k) * m * ld, *linear = h + k * m;
         energy += add_state_costs(g, k + 1, P, y);
@@ -148,7 +150,7 @@ void solve_step(
         g.motions(k, Z);
         for (int r = 0; r < m; ++r) damped[r] = costs.stiffness[r] + damping[r / 2];
         control_block(g.count, P, g.dt, damped, L);
-        factorise<T>(g.count, L, sound);
+        factorise<T>(g.count, L, positive);
         if (k > 0) {
             transition(g.count, P, g.dt, Z, costs.coupling, costs.rate_stiffness, G);
             eliminate_controls<T>(g.count, L, costs.rate_stiffness, G, P);
@@ -184,7 +186,7 @@ void solve_adjoint(const Group<T, N>& g, const Factors<T>& factors, Vec<T>* turn
     push(g, factors, h, turn, thrust);
 }
 
-/// Energy and squared norm of its gradient.
+/// Energy, and the squared norm of its gradient.
 template <class T, int N>
 void evaluate(const Group<T, N>& g, Vec<T>& energy, Vec<T>& squared_norm) {
     const int n = g.count.agents(), m = 2 * n;
@@ -291,13 +293,13 @@ void differentiate(
             if (g.has(VELREF)) speed.add(g.own(VELREF, i), p.speed[state] - g.reference_speed[i], weigh(VELREF));
             if (g.has(VELB)) speed.add_bounded(g.own(VELB, i), p.speed[state], g.game.bounds[BOUND_VEL], weigh(VELB));
             nodes[2 * i + 1] += speed.cotangent;
-            const auto pull_to = [&](int feature, Vec<T> x, Vec<T> y, Vec<T> slide_x, Vec<T> slide_y) {
-                // The foot of a lane slides along it with the position: that part of the first tangent does not count.
+            const auto pull_to = [&](int feature, Vec<T> x, Vec<T> y, Vec<T> tangent_x, Vec<T> tangent_y) {
+                // The nearest point of a lane moves along it with the position: the residual has no derivative in that direction.
                 const Vec<T> w = g.own(feature, i), squared = w * w;
                 const Vec<T> gap_x = p.x[state] - x + t2.x[state], gap_y = p.y[state] - y + t2.y[state];
-                const Vec<T> slid = t1.x[state] * slide_x + t1.y[state] * slide_y;
-                s[0] -= squared * (t1.x[state] - slid * slide_x);
-                s[1] -= squared * (t1.y[state] - slid * slide_y);
+                const Vec<T> along_line = t1.x[state] * tangent_x + t1.y[state] * tangent_y;
+                s[0] -= squared * (t1.x[state] - along_line * tangent_x);
+                s[1] -= squared * (t1.y[state] - along_line * tangent_y);
                 s[2] -= squared * gap_x;
                 s[3] -= squared * gap_y;
                 s[4] -= squared * t1.x[state];
@@ -306,7 +308,7 @@ void differentiate(
             };
             if (g.has(LANE)) {
                 const int at = i * (K + 1) + state;
-                pull_to(LANE, g.feet.x[at], g.feet.y[at], g.feet.slide_x[at], g.feet.slide_y[at]);
+                pull_to(LANE, g.nearest.x[at], g.nearest.y[at], g.nearest.tangent_x[at], g.nearest.tangent_y[at]);
             }
             if (g.has(GOAL) && state == K) {
                 pull_to(GOAL, g.goal_x[i], g.goal_y[i], Vec<T>{}, Vec<T>{});
@@ -353,7 +355,7 @@ void differentiate(
                 return -squared * (s1_moves * value + s1 * (by_self + s2_moves));
             };
             bar_turn[i * K + k] += slope(steer.by_turn, steer.turn_turn, steer.turn_speed);
-            // The speed before this step is a node that the next pass through the loop sums up; the first one is given.
+            // The speed before this step is summed up by the next iteration of the loop; the first speed is given.
             if (k > 0) nodes[2 * i + 1] += slope(steer.by_speed, steer.turn_speed, steer.speed_speed);
             weigh(STEER) -= T(2) * w * s1 * value;
         }

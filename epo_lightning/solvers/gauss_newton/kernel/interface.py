@@ -1,0 +1,166 @@
+"""The kernel's C interface as :mod:`ctypes` structures, and the library behind it.
+
+Its structures, enumerations and constants are declared in `game.hpp` as well. The library exports them (`layout.hpp`), and
+loading compares them with those of this module.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+
+from epo_lightning.game.features import SLOWEST_STEERING, WHEELBASE
+from epo_lightning.scene import Status
+from epo_lightning.solvers.gauss_newton.kernel.build import load
+from epo_lightning.solvers.gauss_newton.structured import LEAST_RAISED_DAMPING, RETRIES
+
+OWN = (
+    "goal",
+    "lane",
+    "velref",
+    "vel",
+    "acc",
+    "turnr",
+    "jerk",
+    "turnacc",
+    "steer",
+    "velb",
+    "accb",
+    "turnrb",
+    "jerkb",
+    "turnaccb",
+)
+"""Own features in the kernel's order."""
+SIGNALS = ("vel", "acc", "turnr", "jerk", "turnacc")
+"""Signals with bounds in the kernel's order."""
+MOST_AGENTS = 64
+"""Contacts are a 64-bit mask in the kernel, hence at most 64 agents."""
+
+Address, Integer, Real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+
+
+class Game(ctypes.Structure):
+    _fields_ = (
+        *((name, Integer) for name in ("B", "M", "N", "K", "lines", "points", "pair_stride")),
+        ("dt", Real),
+        ("bounds", Real * 2 * len(SIGNALS)),
+        ("initial", Address),
+        *((name, Integer) for name in ("initial_b", "initial_n")),
+        ("present", Address),
+        ("size", Address),
+        ("own", Address * len(OWN)),
+        ("own_strides", Integer * 3 * len(OWN)),
+        ("pair", Address),
+        *((name, Integer) for name in ("pair_b", "pair_m", "pair_p")),
+        ("goals", Address),
+        *((name, Integer) for name in ("goals_b", "goals_m", "goals_n", "goals_x")),
+        *((name, Address) for name in ("references", "reference", "reference_speed")),
+    )
+
+
+class Run(ctypes.Structure):
+    _fields_ = (
+        ("steps", Integer),
+        ("step_size", Real),
+        ("damping", Address),
+        *((name, Integer) for name in ("damping_problem", "damping_agent")),
+        ("record", Integer),
+        ("start", Address),
+        ("iterates", Address),
+        ("iterate_stride", Integer),
+        *((name, Address) for name in ("directions", "states", "initial_energy", "energy", "gradient_norm", "status")),
+    )
+
+
+class Gradients(ctypes.Structure):
+    _fields_ = (
+        ("controls", Address),
+        ("iterates", Address),
+        ("states", Address),
+        ("own", Address * len(OWN)),
+        ("pair", Address),
+        ("goals", Address),
+    )
+
+
+class _Entry(ctypes.Structure):
+    _fields_ = (("name", ctypes.c_char_p), ("value", Real))
+
+
+def layout() -> dict[str, float]:
+    """Sizes, offsets and constants that this module shares with the kernel, under the names of `layout.hpp`."""
+    found: dict[str, float] = {}
+    for name, structure in (("EpoGame", Game), ("EpoRun", Run), ("EpoGradients", Gradients)):
+        found[f"sizeof {name}"] = ctypes.sizeof(structure)
+        found |= {f"{name}.{field[0]}": getattr(structure, field[0]).offset for field in structure._fields_}
+    found |= {name.upper(): index for index, name in enumerate(OWN)} | {"OWN_COUNT": len(OWN)}
+    found |= {f"BOUND_{name.upper()}": index for index, name in enumerate(SIGNALS)} | {"BOUND_COUNT": len(SIGNALS)}
+    found |= {status.name: status.value for status in Status}
+    return found | {
+        "kMostAgents": MOST_AGENTS,
+        "kWheelbase": WHEELBASE,
+        "kSlowestSteering": SLOWEST_STEERING,
+        "kRetries": RETRIES,
+        "kLeastRaisedDamping": LEAST_RAISED_DAMPING,
+    }
+
+
+def _check_layout(library: ctypes.CDLL) -> None:
+    """Compare :func:`layout` with the library's own table.
+
+    Raises:
+        RuntimeError: they differ; the message names every entry that does.
+    """
+    library.epo_layout.restype = ctypes.POINTER(_Entry)
+    table, theirs, index = library.epo_layout(), {}, 0
+    while table[index].name is not None:
+        theirs[table[index].name.decode()] = table[index].value
+        index += 1
+    ours = layout()
+    differences = [
+        f"{name} is {ours.get(name, 'missing')} in Python and {theirs.get(name, 'missing')} in the kernel"
+        for name in sorted(ours.keys() | theirs.keys())
+        if ours.get(name) != theirs.get(name)
+    ]
+    if differences:
+        raise RuntimeError(
+            f"the compiled layer does not fit kernel/interface.py: {'; '.join(differences)}. "
+            "Change interface.py and game.hpp together: they describe the same structures and constants."
+        )
+
+
+@functools.cache
+def find() -> ctypes.CDLL | str:
+    """The library, or the reason why there is none.
+
+    Raises:
+        RuntimeError: the library's structures or constants differ from those of this module.
+    """
+    try:
+        loaded = load()
+    except OSError as error:
+        return (
+            f"{error}; with a C++ compiler on the path, "
+            "`python -m epo_lightning.solvers.gauss_newton.kernel.build` builds it"
+        )
+    _check_layout(loaded)
+    run = (ctypes.POINTER(Game), ctypes.POINTER(Run))
+    loaded.epo_solve.argtypes = (Integer, *run, Integer, ctypes.POINTER(Address))
+    loaded.epo_differentiate.argtypes = (Address, *run, ctypes.POINTER(Gradients))
+    loaded.epo_release.argtypes, loaded.epo_release.restype = (Address,), None
+    for name in ("epo_solve", "epo_differentiate", "epo_levels"):
+        getattr(loaded, name).restype = Integer
+    loaded.epo_choose.argtypes, loaded.epo_choose.restype = (Integer,), None
+    return loaded
+
+
+def library() -> ctypes.CDLL:
+    """The library.
+
+    Raises:
+        RuntimeError: it is missing, or differs from this module.
+    """
+    found = find()
+    if isinstance(found, str):
+        raise RuntimeError(f"the compiled layer is missing: {found}")
+    return found

@@ -1,0 +1,43 @@
+// Sizes, offsets and constants of the interface by name, for the comparison with their copies in `interface.py`.
+#pragma once
+
+#include "game.hpp"
+
+extern "C" {
+
+struct EpoLayoutEntry {
+    const char* name;  // null at the end of the table
+    double value;
+};
+}
+
+#define EPO_FIELD(type, field) {#type "." #field, double(offsetof(type, field))}
+#define EPO_SIZE(type) {"sizeof " #type, double(sizeof(type))}
+#define EPO_CONSTANT(name) {#name, double(name)}
+
+constexpr EpoLayoutEntry kLayout[] = {
+    EPO_SIZE(EpoGame), EPO_SIZE(EpoRun), EPO_SIZE(EpoGradients),
+    EPO_FIELD(EpoGame, B), EPO_FIELD(EpoGame, M), EPO_FIELD(EpoGame, N), EPO_FIELD(EpoGame, K),
+    EPO_FIELD(EpoGame, lines), EPO_FIELD(EpoGame, points), EPO_FIELD(EpoGame, pair_stride), EPO_FIELD(EpoGame, dt),
+    EPO_FIELD(EpoGame, bounds), EPO_FIELD(EpoGame, initial), EPO_FIELD(EpoGame, initial_b), EPO_FIELD(EpoGame, initial_n),
+    EPO_FIELD(EpoGame, present), EPO_FIELD(EpoGame, size), EPO_FIELD(EpoGame, own), EPO_FIELD(EpoGame, own_strides),
+    EPO_FIELD(EpoGame, pair), EPO_FIELD(EpoGame, pair_b), EPO_FIELD(EpoGame, pair_m), EPO_FIELD(EpoGame, pair_p),
+    EPO_FIELD(EpoGame, goals), EPO_FIELD(EpoGame, goals_b), EPO_FIELD(EpoGame, goals_m), EPO_FIELD(EpoGame, goals_n),
+    EPO_FIELD(EpoGame, goals_x), EPO_FIELD(EpoGame, references), EPO_FIELD(EpoGame, reference),
+    EPO_FIELD(EpoGame, reference_speed),
+    EPO_FIELD(EpoRun, steps), EPO_FIELD(EpoRun, step_size), EPO_FIELD(EpoRun, damping), EPO_FIELD(EpoRun, damping_problem),
+    EPO_FIELD(EpoRun, damping_agent), EPO_FIELD(EpoRun, record), EPO_FIELD(EpoRun, start), EPO_FIELD(EpoRun, iterates),
+    EPO_FIELD(EpoRun, iterate_stride), EPO_FIELD(EpoRun, directions), EPO_FIELD(EpoRun, states),
+    EPO_FIELD(EpoRun, initial_energy), EPO_FIELD(EpoRun, energy), EPO_FIELD(EpoRun, gradient_norm), EPO_FIELD(EpoRun, status),
+    EPO_FIELD(EpoGradients, controls), EPO_FIELD(EpoGradients, iterates), EPO_FIELD(EpoGradients, states),
+    EPO_FIELD(EpoGradients, own), EPO_FIELD(EpoGradients, pair), EPO_FIELD(EpoGradients, goals),
+    EPO_CONSTANT(GOAL), EPO_CONSTANT(LANE), EPO_CONSTANT(VELREF), EPO_CONSTANT(VEL), EPO_CONSTANT(ACC), EPO_CONSTANT(TURNR),
+    EPO_CONSTANT(JERK), EPO_CONSTANT(TURNACC), EPO_CONSTANT(STEER), EPO_CONSTANT(VELB), EPO_CONSTANT(ACCB),
+    EPO_CONSTANT(TURNRB), EPO_CONSTANT(JERKB), EPO_CONSTANT(TURNACCB), EPO_CONSTANT(OWN_COUNT),
+    EPO_CONSTANT(BOUND_VEL), EPO_CONSTANT(BOUND_ACC), EPO_CONSTANT(BOUND_TURNR), EPO_CONSTANT(BOUND_JERK),
+    EPO_CONSTANT(BOUND_TURNACC), EPO_CONSTANT(BOUND_COUNT),
+    EPO_CONSTANT(SOLVED), EPO_CONSTANT(DAMPED), EPO_CONSTANT(STOPPED),
+    EPO_CONSTANT(kMostAgents), EPO_CONSTANT(kWheelbase), EPO_CONSTANT(kSlowestSteering), EPO_CONSTANT(kRetries),
+    EPO_CONSTANT(kLeastRaisedDamping),
+    {nullptr, 0.0},
+};
