@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def main(words: Sequence[str] | None = None) -> None:
     except ConfigError as error:
         if trace:
             raise
-        print(f"epo: {error}", file=sys.stderr)
+        print(f"epo: {mask(str(error))}", file=sys.stderr)
         raise SystemExit(2) from None
     except BrokenPipeError:  # `epo config ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -216,7 +217,7 @@ def _config(arguments: Arguments) -> None:
     if not checking:
         import yaml
 
-        print(yaml.safe_dump(config, sort_keys=False, default_flow_style=None, width=120), end="")
+        print(yaml.safe_dump(mask(config), sort_keys=False, default_flow_style=None, width=120), end="")
         return
     if verb != "train":
         from epo_lightning.experiment.verbs import check
@@ -280,6 +281,10 @@ def _multirun(arguments: Arguments) -> None:
             assembly.check(settings)
             train.refuse_occupied(settings, train.folder_for(settings))
         print(f"{len(listed)} runs")
+        for done in compose.launch("train", arguments.overrides, listed, job_of_sweep, arguments.extra):
+            if isinstance(done._return_value, Exception):
+                raise done._return_value  # its property would first print the overrides
+        return
     compose.multirun("train", arguments.overrides, job_of_sweep, arguments.extra)
 
 

@@ -34,6 +34,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 
 TRAINING, FINISHED, FAILED = "training", "finished", "failed"
@@ -280,16 +281,16 @@ class RunFolder:
         return content
 
     def begin(self, config: Mapping[str, Any], record: Mapping[str, Any]) -> None:
-        """Write the configuration, then the record: a folder with both is a run."""
+        """Write the configuration, then the record, both without secrets: a folder with both is a run."""
         import yaml
 
-        text = yaml.safe_dump(dict(config), sort_keys=False, default_flow_style=None, width=120)
+        text = yaml.safe_dump(mask(dict(config)), sort_keys=False, default_flow_style=None, width=120)
         write_text(self.config_file, HEADER + text)
-        write_json(self.record_file, {**record, "status": TRAINING})
+        write_json(self.record_file, mask({**record, "status": TRAINING}))
 
     def update(self, **changes: Any) -> None:
         """Change entries of run.json."""
-        write_json(self.record_file, {**self.record, **changes})
+        write_json(self.record_file, mask({**self.record, **changes}))
 
 
 def discover(root: str | Path) -> Iterator[RunFolder]:

@@ -15,7 +15,8 @@ FLOORS = {
     "registry": set(),
     "task": {"registry"},
     "identity": set(),
-    "run_folder": {"registry"},
+    "masking": set(),
+    "run_folder": {"registry", "masking"},
     "optimizers": {"registry"},
     "losses": set(),
     "game": {"scene", "registry"},
@@ -39,7 +40,7 @@ FLOORS = {
         "losses",
         "optimizers",
     },
-    "report": {"scene", "registry", "metrics", "run_folder", "identity"},
+    "report": {"scene", "registry", "metrics", "run_folder", "identity", "masking"},
 }
 """What each room may import, besides itself; `experiment` and `cli` stand on top of everything."""
 

@@ -60,7 +60,7 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
         ConfigError: a part, key or value that cannot work, or sizes that do not fit together, in one sentence.
     """
     if settings.logger.mlflow is not None:
-        mlflow.check()
+        mlflow.check(settings.logger.mlflow)
     data = build_data(settings.data)
     data.order_seed = settings.seed
     check_share(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)

@@ -26,6 +26,7 @@ from epo_lightning.experiment.dashboards.wandb import WandB
 from epo_lightning.experiment.opening import open_checkpoint
 from epo_lightning.experiment.pictures import choose, draw, forecast_of
 from epo_lightning.identity import SECTIONS, identity
+from epo_lightning.masking import mask
 from epo_lightning.run_folder import RunFolder, read_json, read_log
 
 
@@ -105,9 +106,9 @@ def _facts(settings: Settings, config: Mapping[str, Any], run: RunFolder) -> Fac
     sweep = Path(settings.sweep).name if settings.sweep else None
     return Facts(
         id=f"{key}-{began}",
-        name=f"{settings.title} (seed {settings.seed})",
+        name=mask(f"{settings.title} (seed {settings.seed})"),
         group=sweep,
-        config={name: config.get(name) for name in ("title", "experiment", "budget", *SECTIONS)},
+        config=mask({name: config.get(name) for name in ("title", "experiment", "budget", *SECTIONS)}),
         tags={
             "identity": key,
             "data_digest": str(record.get("data_digest")),

@@ -17,9 +17,9 @@ from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import EvaluatedRun, Report, build_tables, collect, write_report
-from epo_lightning.report.made import distinct
+from epo_lightning.report.render import code
 from epo_lightning.report.runs import scored
-from epo_lightning.report.tables import Row
+from epo_lightning.report.tables import Row, distinct
 from epo_lightning.report.write import is_timed, why_left_out
 from epo_lightning.run_folder import RunFolder
 
@@ -93,16 +93,23 @@ def of_sweep(sweep: Sweep) -> Report:
 def preface(runs: Sequence[EvaluatedRun]) -> str:
     """What a reader has to know before the scores of runs: that the budget was not the paper's, and how to use that."""
     budgets = sorted({run.budget for run in runs} - {"paper"})
-    words = [word for run in runs for word in shlex.split(run.command)]
+    words = [word for run in runs for word in _words(run.command)]
     changed = sorted({word for word in words if word.lstrip("+").startswith(("trainer.", "data.")) and _matters(word)})
     if not budgets and not changed:
         return ""
-    changes = f" Changed by hand: `{' '.join(changed)}`." if changed else ""
+    changes = f" Changed by hand: {code(' '.join(changed))}." if changed else ""
     return (
         f"**Budget: {', '.join(budgets or ['paper'])}.**{changes} These runs saw other data or another number of steps than "
         "the paper's, so the numbers show that everything works, not which row is best, and do not reproduce the table. The "
         "paper's settings are those of `epo train` without `budget=`."
     )
+
+
+def _words(command: str) -> list[str]:
+    try:
+        return shlex.split(command)
+    except ValueError:  # an unbalanced quote, written by an older version
+        return command.split()
 
 
 def _matters(word: str) -> bool:

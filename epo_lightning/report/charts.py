@@ -18,10 +18,9 @@ from epo_lightning.report.curves import (
     steps_curves,
     steps_names,
 )
-from epo_lightning.report.made import distinct
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
 from epo_lightning.report.runtime import draw_modes, heat_map
-from epo_lightning.report.tables import Row, Table
+from epo_lightning.report.tables import Table, distinct, trained_rows
 from epo_lightning.report.timings import Timing, grid, methods, over_modes, places, time
 
 Size = tuple[float, float]
@@ -73,12 +72,10 @@ def charts_of(tables: Sequence[Table], timings: Sequence[Timing]) -> list[Chart]
 
 
 def _learning(tables: Sequence[Table]) -> Iterable[Chart]:
-    """One chart per data set; a row that was evaluated on two splits learned once."""
-    by_data: dict[str, dict[tuple[object, ...], Row]] = {}
-    for row in distinct(tables):
-        by_data.setdefault(row.runs[0].data, {}).setdefault(tuple(run.path for run in row.runs), row)
+    """One chart per data set."""
+    by_data = trained_rows(tables)
     for data, rows in by_data.items():
-        curves, notes = learning_curves(rows.values())
+        curves, notes = learning_curves(rows)
         if curves:
             yield Chart(
                 section=LEARNING,

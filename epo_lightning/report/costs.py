@@ -6,9 +6,8 @@ import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from epo_lightning.report.made import distinct
 from epo_lightning.report.render import Sheet
-from epo_lightning.report.tables import MISSING, Row, Table
+from epo_lightning.report.tables import MISSING, Row, Table, distinct, trained_rows
 from epo_lightning.report.timings import Timing, duration, time
 from epo_lightning.run_folder import RunFolder
 
@@ -20,9 +19,6 @@ def cost_sheets(tables: Sequence[Table], timings: Sequence[Timing]) -> list[Shee
 
     Times are means over seeds. Forecasts that were timed on different machines stand in columns of their own.
     """
-    by_data: dict[str, dict[tuple[Path, ...], Row]] = {}
-    for row in distinct(tables):  # a row that was evaluated on two splits cost once
-        by_data.setdefault(row.runs[0].data, {}).setdefault(tuple(run.path for run in row.runs), row)
     shown = timings_of(tables, timings)
     machines = list(dict.fromkeys(timing.machine for timing in shown))
     labels = {
@@ -31,8 +27,8 @@ def cost_sheets(tables: Sequence[Table], timings: Sequence[Timing]) -> list[Shee
     }
     return [
         sheet
-        for data, rows in by_data.items()
-        if (sheet := _sheet(f"Cost: {data}", list(rows.values()), shown, labels)) is not None
+        for data, rows in trained_rows(tables).items()
+        if (sheet := _sheet(f"Cost: {data}", rows, shown, labels)) is not None
     ]
 
 

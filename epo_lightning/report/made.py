@@ -8,7 +8,8 @@ from typing import Any
 
 from epo_lightning.identity import row_identity
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.tables import Row, Table
+from epo_lightning.report.runs import data_name
+from epo_lightning.report.tables import Row, Table, distinct
 from epo_lightning.report.timings import Timing
 from epo_lightning.run_folder import RunFolder
 
@@ -60,14 +61,6 @@ class Made:
         return ", ".join(dict.fromkeys(run.data_digest for run in self.runs))
 
 
-def distinct(tables: Iterable[Table]) -> list[Row]:
-    """The rows of all tables, each once: tables of one data set and split show the same rows."""
-    rows: dict[tuple[object, ...], Row] = {}
-    for row in (row for table in tables for row in table.rows):
-        rows.setdefault((row.runs[0].split, *(run.path for run in row.runs)), row)
-    return list(rows.values())
-
-
 def how_made(tables: Sequence[Table], timings: Sequence[Timing] = ()) -> list[Made]:
     """The rows of all tables, then the runs that were timed only."""
     rows = [_of_row(row) for row in distinct(tables)]
@@ -100,7 +93,7 @@ def _timed(timings: Iterable[Timing]) -> list[Made]:
     return [
         Made(
             str(config.get("title", "untitled")),
-            f"{config['data'].get('dataset', config['data']['name'])}, runtime",
+            f"{data_name(config['data'])}, runtime",
             str((config.get("budget") or {}).get("name", "-")),
             tuple(sorted(runs, key=lambda run: run.seed)),
         )

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from epo_lightning.report.charts import Chart
-from epo_lightning.report.made import Made, distinct
+from epo_lightning.report.made import Made
 from epo_lightning.report.render import Sheet, difference_text, own_text, paper_text, signed, with_ends
 from epo_lightning.report.style import svg
-from epo_lightning.report.tables import Row, Table
+from epo_lightning.report.tables import Row, Table, distinct
 
 WIDEST, COLORS = 1500, 128
 """Pictures are scaled down to this many pixels and reduced to this many colours: a page should be small enough to mail."""
@@ -72,10 +72,9 @@ def page(content: Content) -> str:
     )
     environment.filters["marked"] = lambda text: Markup(_marked(text))
     rows = distinct(content.tables)
-    places = {id(row): place for place, row in enumerate(rows)}
-    by_runs = {_key(row): place for place, row in enumerate(rows)}
+    places = {row.key: place for place, row in enumerate(rows)}
     cells: list[dict[str, Any]] = []
-    tables = [_table(table, cells, lambda row: places.get(id(row), by_runs[_key(row)])) for table in content.tables]
+    tables = [_table(table, cells, lambda row: places[row.key]) for table in content.tables]
     pictures = [(path, picture_uri(path)) for path in content.pictures]
     scenes = [(_caption(path), uri) for path, uri in pictures if "weights" not in path.stem]
     weights = [(_caption(path), uri) for path, uri in pictures if "weights" in path.stem]
@@ -95,10 +94,6 @@ def page(content: Content) -> str:
         runs=len({run.folder for made in content.made for run in made.runs}),
         data=list(dict.fromkeys(made.what.split(", ")[0] for made in content.made)),
     )
-
-
-def _key(row: Row) -> tuple[object, ...]:
-    return (row.runs[0].split, *(run.path for run in row.runs))
 
 
 def _table(table: Table, cells: list[dict[str, Any]], place: Any) -> dict[str, Any]:

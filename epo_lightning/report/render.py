@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -243,7 +244,19 @@ def _plain(text: str) -> str:
     text = " ".join(text.split())
     for special in "\\|*`[]":
         text = text.replace(special, "\\" + special)
-    return text.replace("<", "&lt;")
+    return without_html(text)
+
+
+def without_html(text: str) -> str:
+    """Markdown in which nothing is HTML."""
+    return text.replace("&", "&amp;").replace("<", "&lt;")
+
+
+def code(text: str) -> str:
+    """Text as code in Markdown, between more backticks than there are in it."""
+    fence = "`" * (max(map(len, re.findall("`+", text)), default=0) + 1)
+    space = " " if text.startswith("`") or text.endswith("`") else ""
+    return f"{fence}{space}{text}{space}{fence}"
 
 
 def _markdown_cell(row: Row, column: Column) -> str:
@@ -290,8 +303,19 @@ def _csv(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows(lines)
+    writer.writerows([_no_formula(cell) for cell in line] for line in lines)
     return text.getvalue()
+
+
+def _no_formula(cell: object) -> object:
+    """A cell that spreadsheets take for what it is: text that looks like a formula gets an apostrophe, numbers do not."""
+    if not isinstance(cell, str) or not cell.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell
 
 
 def with_ends(rows: tuple[Row, ...]) -> Iterable[tuple[Row, bool]]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from epo_lightning.identity import identity, row_identity
+from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, read_json
 
@@ -157,9 +158,9 @@ def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, 
     _entry(config, run.config_file, COPY, "data", "name")
     return EvaluatedRun(
         path=run.path,
-        name=setting("title"),
+        name=mask(setting("title")),
         seed=int(seed),
-        data=_data(config["data"]),
+        data=data_name(config["data"]),
         backbone=setting("backbone", "name"),
         forecaster=setting("forecaster", "name"),
         experiment=str(config.get("experiment") or ""),
@@ -171,7 +172,7 @@ def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, 
         trained_digest=trained,
         metrics={name: float(value) for name, value in metrics.items()},
         git_commit=str(record.get("git_commit") or _version(record)),
-        command=recorded("command"),
+        command=mask(recorded("command")),  # older versions wrote secrets
         parameters=record.get("parameters"),
         identity=identity(config, trained),
         row=row_identity(config, trained),
@@ -179,9 +180,14 @@ def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, 
     )
 
 
-def _data(section: Mapping[str, Any]) -> str:
-    """What a data set is called; scenes drawn in the shapes of two tasks are two."""
+def data_name(section: Mapping[str, Any]) -> str:
+    """Name of a data set in tables and captions, from the ``data`` section of a configuration.
+
+    RPI's hard split is ``rpi_hard``; scenes drawn in the shapes of two tasks are two data sets.
+    """
     name = str(section.get("dataset") or section["name"])
+    if section.get("split") == "hard":
+        return f"{name}_hard"
     return f"{name} ({section['like']})" if name == "drawn" and "like" in section else name
 
 

@@ -99,4 +99,6 @@ def _words(row: Row) -> str:
     run = row.runs[0]
     parts = [f"data={run.data}", f"backbone={run.backbone}", f"forecaster={run.forecaster}"]
     chosen = [f"experiment={run.experiment}"] if run.experiment else parts
+    if run.experiment and run.config["data"].get("split") == "hard":
+        chosen += [f"data={run.data}"]
     return " ".join([*chosen, *(word(key, value) for key, value in row.settings.items())])

@@ -46,6 +46,7 @@ STYLE: dict[Any, Any] = {
     "legend.framealpha": 0.85,
     "legend.edgecolor": "none",
     "figure.facecolor": "white",
+    "text.parse_math": False,  # titles are text, whatever dollars are in them
 }
 
 

@@ -121,6 +121,11 @@ class Row:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
+    def key(self) -> tuple[str, str, str]:
+        """Data set, split and identity: equal for the same row in two tables, where its ranks may differ."""
+        return self.runs[0].data, self.runs[0].split, self.identity
+
+    @property
     def title(self) -> str:
         """What it shares with rows that differ in settings only."""
         return self.runs[0].name
@@ -244,10 +249,17 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
 def distinct(tables: Iterable[Table]) -> list[Row]:
     """The rows of all tables, each once: the tables of one data set and split show the same rows."""
     rows: dict[tuple[str, str, str], Row] = {}
-    for table in tables:
-        for row in table.rows:
-            rows.setdefault((table.data, table.split, row.identity), row)
+    for row in (row for table in tables for row in table.rows):
+        rows.setdefault(row.key, row)
     return list(rows.values())
+
+
+def trained_rows(tables: Iterable[Table]) -> dict[str, list[Row]]:
+    """The rows of all tables by data set; a row that was evaluated on two splits was trained once, and stands there once."""
+    found: dict[str, dict[str, Row]] = {}
+    for row in distinct(tables):
+        found.setdefault(row.runs[0].data, {}).setdefault(row.identity, row)
+    return {data: list(rows.values()) for data, rows in found.items()}
 
 
 def _shown(title: str, columns: tuple[Column, ...], rows: Sequence[Row]) -> list[Table]:

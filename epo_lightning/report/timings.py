@@ -13,6 +13,7 @@ from epo_lightning.identity import canonical, essence
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
 from epo_lightning.report.render import Sheet
+from epo_lightning.report.runs import data_name
 from epo_lightning.run_folder import RunFolder, read_json
 
 METHOD = ("forecaster", "dynamics", "energy", "solver", "backward", "objective")
@@ -68,7 +69,7 @@ def _read(run: RunFolder) -> Timing:
         if not all(math.isfinite(value) and value > 0 for value in seconds.values()):
             raise ValueError("seconds must be positive numbers")
         threads, batch = int(content["threads"]), int(content["batch"])
-        what = f"{config['data'].get('dataset', config['data']['name'])}, {config['backbone']['name']}"
+        what = f"{data_name(config['data'])}, {config['backbone']['name']}"
         machine = f"{content['machine']} ({content['device']}, {threads} thread{'s' if threads > 1 else ''})"
         machine += f", batches of {batch}" if batch > 1 else ""
         steps = content["steps"]

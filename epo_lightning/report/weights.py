@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from torch import Tensor
 
 from epo_lightning.report.style import AGENT_COLORS, AGENTS, save, style
@@ -58,8 +58,13 @@ def learned_weights(
         ]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
         for axes in panels[-1]:
-            axes.set_xlabel("squared weight $w^2$ (median, 50%, 90%)")
+            axes.set_xlabel("squared weight w² (median, 50%, 90%)")
         return save(figure, path)
+
+
+def _power(value: float, _: object) -> str:
+    """A power of ten: ``10⁻³``"""
+    return "10" + str(round(math.log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def _draw(axes: Axes, weights: Mapping[str, Tensor], colors: Sequence[str] = AGENT_COLORS) -> None:
@@ -87,7 +92,7 @@ def _draw(axes: Axes, weights: Mapping[str, Tensor], colors: Sequence[str] = AGE
     # Powers of ten alone, but a narrow panel that holds one of them needs a second number to be read.
     tens = math.log10(axes.get_xlim()[1]) // 1 - math.log10(axes.get_xlim()[0]) // 1
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if tens > 1 else (1.0, 3.0)))
-    axes.xaxis.set_major_formatter(LogFormatterMathtext() if tens > 1 else FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_major_formatter(FuncFormatter(_power if tens > 1 else lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_yticks(range(len(weights)), list(weights))
     axes.set_ylim(len(weights) - 0.4, -0.6)

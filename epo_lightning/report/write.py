@@ -17,6 +17,7 @@ from epo_lightning.report.made import Made, how_made
 from epo_lightning.report.render import (
     COMPARISON_LEGEND,
     Sheet,
+    code,
     comparison_sheet,
     comparisons_to_csv,
     legend,
@@ -24,6 +25,7 @@ from epo_lightning.report.render import (
     to_csv,
     to_markdown,
     to_rich,
+    without_html,
 )
 from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, scored
 from epo_lightning.report.selection import BestSetting, best_settings
@@ -130,10 +132,10 @@ def write_report(
     markdown = "\n".join(
         part
         for part in (
-            f"# Results: {report.title}\n",
-            f"`{report.sweep}`\n" if report.sweep else "",
+            f"# Results: {without_html(report.title)}\n",
+            f"{code(report.sweep)}\n" if report.sweep else "",
             preface.strip() + "\n" if preface.strip() else "",
-            *(note + "\n" for note in notes),
+            *(without_html(note) + "\n" for note in notes),
             *(to_markdown(table) for table in tables),
             legend(tables) + "\n" if tables else "",
             *(to_markdown(sheet) for sheet in costs),
@@ -219,8 +221,13 @@ def _how_made(rows: Sequence[Made], report: Report) -> str:
         for row in rows
     )
     lines = [to_markdown(Sheet("How this was made", header, entries, left=6))]
-    commands = {run.folder: f"- `{run.folder}`: `{run.command}`" for row in rows for run in row.runs}
-    lines += [*commands.values(), "", f"Written by `{report.command}`."]
+    commands = {run.folder: f"- {code(run.folder)}: {code(run.command)}" for row in rows for run in row.runs}
+    lines += [*commands.values(), "", f"Written by {code(report.command)}."]
     if report.left_out:
-        lines += ["", "Left out:", "", *(f"- `{folder}`: {state}" for folder, state in report.left_out)]
+        lines += [
+            "",
+            "Left out:",
+            "",
+            *(f"- {code(folder)}: {without_html(state)}" for folder, state in report.left_out),
+        ]
     return "\n".join([*lines, ""])

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import shlex
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from experiment.conftest import TINY, Epo
+from report.run_folders import make_run, scores
+
+from epo_lightning.masking import is_masked, mask
+from epo_lightning.run_folder import RunFolder
 
 ROW = "experiment=rpi/v_lstm_sc"
 
@@ -31,3 +36,130 @@ def test_files_of_runs_sweeps_and_reports_have_the_permissions_that_the_umask_le
     for path in entries:
         expected = (0o777 if path.is_dir() else 0o666) & ~umask
         assert oct(path.stat().st_mode & 0o777) == oct(expected), path
+
+
+# Secrets
+
+SECRET = "hunter2"
+ADDRESS = f"postgresql://me:{SECRET}@localhost:1/none?sslkey={SECRET}&x=1"
+
+
+@pytest.mark.parametrize(
+    ("text", "masked"),
+    [
+        ("postgresql://me:p@ss/w@host/db", "postgresql://me:***@host/db"),
+        ("https://ghp_abc@host/x", "https://***@host/x"),
+        ("https://host/x?a=1&api_token=abc&b=2", "https://host/x?a=1&api_token=***&b=2"),
+        ("run 'uri=mysql://u:p@h' and http://h:5000/a?b=c", "run 'uri=mysql://u:***@h' and http://h:5000/a?b=c"),
+        ("sqlite:///runs/mlflow.db", "sqlite:///runs/mlflow.db"),
+        ("mail me@host: no address", "mail me@host: no address"),
+    ],
+)
+def test_secrets_in_addresses_are_masked(text: str, masked: str) -> None:
+    assert mask(text) == masked
+    assert mask(masked) == masked
+    assert is_masked(masked) == (text != masked)
+    assert mask({"a": [text, 1], "b": None}) == {"a": [masked, 1], "b": None}
+
+
+def files_with(text: str, folder: Path) -> list[str]:
+    return [str(path) for path in folder.rglob("*") if path.is_file() and text.encode() in path.read_bytes()]
+
+
+@pytest.fixture
+def mlflow_hears(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The addresses that MLflow's client is opened with; no server answers."""
+    mlflow = pytest.importorskip("mlflow")
+    heard: list[str] = []
+
+    def client(uri: str) -> None:
+        heard.append(uri)
+        raise ConnectionError(f"{uri} does not answer")
+
+    monkeypatch.setattr(mlflow, "MlflowClient", client)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    return heard
+
+
+LOGGED = (ROW, *TINY, "logger=[mlflow]", f"logger.mlflow.uri='{ADDRESS}'", "seed=0")
+
+
+def test_a_password_is_used_and_written_nowhere(
+    epo: Epo, mlflow_hears: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert epo("train", *LOGGED, "run_dir=one", "score=test") == 0
+    assert epo("train", "-m", *LOGGED, "runs=many", "optimizer.lr=1e25") != 0
+    assert epo("sweep", "rpi_main", *LOGGED, "score=test", "optimizer.lr=1e25") == 1
+    assert epo("report", "runs=one", "out=report") == 0
+    assert epo("config", *LOGGED) == 0
+    assert set(mlflow_hears) == {ADDRESS}
+    assert "me:***@localhost" in RunFolder(Path("one")).config()["logger"]["mlflow"]["uri"]
+    assert files_with(SECRET, tmp_path) == []
+    said = capfd.readouterr()  # on stdout Hydra repeats the words of -m
+    assert SECRET not in said.err
+
+
+def test_a_continued_run_gets_the_password_again(
+    epo: Epo, mlflow_hears: list[str], refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert epo("train", *LOGGED, "run_dir=run") == 0
+    RunFolder(Path("run")).update(status="training")
+    message = refused("train", "resume=run")
+    assert "MLFLOW_TRACKING_URI" in message
+    assert "existing=continue" in message
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///another.db")
+    assert "MLFLOW_TRACKING_URI" in refused("train", "resume=run")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", ADDRESS)
+    assert epo("train", "resume=run") == 0
+    RunFolder(Path("run")).update(status="training")
+    monkeypatch.delenv("MLFLOW_TRACKING_URI")
+    assert epo("train", *LOGGED, "run_dir=run", "existing=continue") == 0
+    assert mlflow_hears == [ADDRESS] * 3
+
+
+def test_reports_mask_what_older_versions_wrote(tmp_path: Path, epo: Epo) -> None:
+    run = make_run(tmp_path / "runs" / "a", "V-LSTM", "marginal", scores(0.3))
+    text = run.record_file.read_text()
+    run.record_file.write_text(text.replace("epo train", f"epo train logger.mlflow.uri={ADDRESS}"))
+    assert epo("report", "runs=runs") == 0
+    assert files_with("me:***@localhost", tmp_path / "report")
+    assert files_with(SECRET, tmp_path / "report") == []
+
+
+def test_environment_variables_are_resolved_for_the_configuration_tree_alone(
+    epo: Epo, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("A_NAME", SECRET)
+    for words in (("train",), ("train", "-m", "seed=0,1"), ("sweep", "rpi_main"), ("config",)):
+        assert "environment variables are not resolved" in refused(*words, "title='${oc.env:A_NAME}'")
+    tree = tmp_path / "tree" / "experiment"
+    tree.mkdir(parents=True)
+    (tree / "mine.yaml").write_text("# @package _global_\ntitle: ${oc.env:A_NAME}\n")
+    assert epo("train", f"--config-dir={tree.parent}", "experiment=mine", *TINY, "run_dir=run") == 0
+    assert RunFolder(Path("run")).record["title"] == SECRET
+
+
+# Commands
+
+
+def test_recorded_commands_can_be_given_to_a_shell(epo: Epo) -> None:
+    titles = (r"title='it\'s'", "title='a \"quote'", 'title="a\'b"', "title='$HOME `x` !'", "title='two\nlines'")
+    for number, title in enumerate(titles):
+        assert epo("train", ROW, *TINY, f"run_dir=run{number}", title, "score=test") == 0, title
+        record = RunFolder(Path(f"run{number}")).record
+        assert shlex.split(record["command"]) == ["epo", "train", ROW, *TINY, title, "score=test"]
+        assert epo("report", f"runs=run{number}", f"out=report{number}") == 0, title
+    assert epo("train", "-m", ROW, *TINY, titles[0], "seed=0") == 0
+    (run,) = Path("runs").rglob("run.json")
+    words = shlex.split(RunFolder(run.parent).record["command"])
+    title = RunFolder(run.parent).record["title"]
+    assert title == "it's"
+    assert epo("train", *words[2:], "run_dir=again") == 0
+    assert RunFolder(Path("again")).record["title"] == title
+
+
+def test_an_old_command_with_an_unbalanced_quote_stops_no_report(tmp_path: Path, epo: Epo) -> None:
+    run = make_run(tmp_path / "runs" / "a", "V-LSTM", "marginal", scores(0.3))
+    run.update(command="epo train title='it's trainer.max_epochs=3")
+    assert epo("report", "runs=runs") == 0
+    assert "trainer.max_epochs=3" in Path("report/results.md").read_text()

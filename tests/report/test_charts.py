@@ -14,12 +14,12 @@ from matplotlib.text import Text
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.charts import charts_of
 from epo_lightning.report.curves import Curve, draw_learning, draw_steps, learning_curves, steps_curves, validation_log
-from epo_lightning.report.made import distinct, how_made
+from epo_lightning.report.made import how_made
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES, STEPS
 from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.runtime import draw_modes, heat_map
 from epo_lightning.report.style import svg
-from epo_lightning.report.tables import build_tables
+from epo_lightning.report.tables import build_tables, distinct
 from epo_lightning.report.timings import grid, over_modes, places, read_timings, time, timing_sheet
 
 from .page_runs import over_runtime, over_steps, rows_with_seeds, timed, write_log

@@ -279,3 +279,31 @@ def test_backward_and_objective_may_differ_between_rows(tmp_path: Path) -> None:
         make_run(tmp_path / name, "EPO", "epo", scores(0.1), settings=settings)
     names = [row.name.partition(",")[0] for row in build_tables(collect(tmp_path))[0].rows]
     assert names == ["EPO", "EPO"]
+
+
+def test_every_energy_stands_below_its_own_name(tmp_path: Path) -> None:
+    """EPO's game costs 2.0 at the initial strategies, 1.5 as forecast and 1.0 at the optimum."""
+    of_methods(tmp_path / "runs")
+    write_report(Report.of_folder(tmp_path / "runs"), tmp_path / "out", console=Console(file=io.StringIO()))
+    expected = {
+        "energy, initial": "2.00",
+        "energy, solved": "1.50",
+        "energy, optimum": "1.00",
+        "gradient norm": "0.750",
+        "Nash gap": "0.250",
+        "Nash gap, relative": "0.125",
+    }
+    table = tables_of(tmp_path / "again")["rpi, test split: equilibrium"]
+    by_column = {column.label: column.metric for column in table.columns}
+    assert by_column["energy, solved"] == "energy_solved"
+    assert by_column["energy, optimum"] == "energy_optimum"
+    for text, separator in (((tmp_path / "out/results.md").read_text(), "|"), (to_latex(table), "&")):
+        header = next(line for line in text.splitlines() if "energy, solved" in line)
+        values = next(line for line in text.splitlines() if "EPO" in line and "1.50" in line)
+        cells = [[cell.strip(" \\*") for cell in line.strip("|").split(separator)] for line in (header, values)]
+        shown = dict(zip(*cells, strict=True))
+        for name, value in expected.items():
+            assert value in shown[name].partition(r"\,")[0], (name, shown)
+    rows = list(csv.DictReader((tmp_path / "out" / "results.csv").open()))
+    means = {row["metric"]: float(row["mean"]) for row in rows if row["method"] == "EPO"}
+    assert [means[f"energy_{name}"] for name in ("initial", "solved", "optimum")] == [2.0, 1.5, 1.0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import shutil
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
+from epo_lightning.report import Report, write_report
 from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.tables import Cell, Row, build_tables, distinct
 from epo_lightning.run_folder import RunFolder, write_json
@@ -339,3 +342,21 @@ def test_a_run_that_was_killed_before_it_began_is_no_damage(tmp_path: Path) -> N
     make_run(tmp_path / "b", "V-LSTM + SC", "scene_consistent", scores(0.3))
     (make_run(tmp_path / "a", "V-LSTM", "marginal", None).path / "run.json").unlink()
     assert [run.path.name for run in collect(tmp_path)] == ["b"]
+
+
+def test_tables_and_captions_name_the_hard_split(tmp_path: Path) -> None:
+    """The split is read from a run's configuration, so older runs are named as well."""
+    for folder, split in (("paper", "paper"), ("hard", "hard")):
+        make_run(
+            tmp_path / folder, "V-LSTM", "marginal", scores(0.3), digest=split, settings={"data.split": split}
+        ).update(steps=10, seconds=1.0)
+    tables = build_tables(collect(tmp_path))
+    assert [table.title for table in tables] == ["rpi, test split", "rpi_hard, test split"]
+    paper, hard = (table.rows[0].cells["minSADE"].paper for table in tables)
+    assert paper is not None
+    assert hard is None, "the paper reports on its own split"
+    write_report(Report.of_folder(tmp_path), tmp_path / "out", console=Console(file=io.StringIO()))
+    for name in ("results.md", "results.tex", "index.html"):
+        text = (tmp_path / "out" / name).read_text()
+        assert "rpi_hard, test split" in text or r"rpi\_hard, test split" in text, name
+    assert "Cost: rpi_hard" in (tmp_path / "out" / "results.md").read_text()

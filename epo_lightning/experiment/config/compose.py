@@ -20,6 +20,7 @@ from epo_lightning.registry import ConfigError, nearest
 
 if TYPE_CHECKING:
     from hydra._internal.hydra import Hydra
+    from hydra.core.utils import JobReturn
     from omegaconf import DictConfig
 
 PACKAGE = Path(__file__).resolve().parents[2]
@@ -174,8 +175,14 @@ def launch(
     jobs: Sequence[list[str]],
     task: Callable[[DictConfig], Any],
     extra: Sequence[str],
-) -> None:
-    """Hand these jobs to the launcher that the configuration chooses; what becomes of them is for their task to say."""
+) -> Sequence[JobReturn]:
+    """Hand these jobs to the launcher that the configuration chooses.
+
+    Unlike Hydra's sweeper it writes no multirun.yaml, which would hold the secrets of the command line.
+
+    Returns:
+        one entry per job, with its result or the exception that it raised.
+    """
     from hydra._internal.callbacks import Callbacks
     from hydra.core.plugins import Plugins
     from hydra.types import HydraContext
@@ -189,8 +196,9 @@ def launch(
             config=config,
         )
         callbacks.on_multirun_start(config=config, config_name=name)
-        launcher.launch(jobs, initial_job_idx=0)
+        done = launcher.launch(jobs, initial_job_idx=0)
         callbacks.on_multirun_end(config=config, config_name=name)
+    return done
 
 
 def multirun(name: str, overrides: Sequence[str], task: Callable[[DictConfig], Any], extra: Sequence[str] = ()) -> Any:
@@ -202,6 +210,12 @@ def multirun(name: str, overrides: Sequence[str], task: Callable[[DictConfig], A
 def _composed(instance: Hydra, name: str, overrides: Sequence[str], multirun: bool = False) -> DictConfig:
     from hydra.types import RunMode
 
+    for word in overrides:
+        if re.search(r"\$\{\s*oc\.env\s*:", word):
+            raise ConfigError(
+                f"{word}: environment variables are not resolved in overrides, because run folders would keep their values; "
+                'let the shell replace them, key="$NAME", or write the interpolation into a file of the configuration tree'
+            )
     with _one_sentence(instance, name, overrides):
         return instance.compose_config(
             config_name=name,

@@ -18,6 +18,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 
 from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Row
+from epo_lightning.masking import mask
 
 BEHIND = 20_000
 """So many rows a dashboard may be behind: less than a hundred megabytes."""
@@ -82,7 +83,7 @@ class Aside(Logger):
                     self.dashboard.close(ending)
                     return
         except BaseException as error:  # nothing that happens here is the training's business, SystemExit included
-            self._switch_off(" ".join(f"{type(error).__name__}: {error}".split())[:300])
+            self._switch_off(mask(" ".join(f"{type(error).__name__}: {error}".split()))[:300])
 
     def _waiting(self) -> tuple[list[Row], Ending | None]:
         """The next row and all that come up soon after it, or the ending."""

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from epo_lightning.experiment.config.settings import MLflowSettings
 from epo_lightning.experiment.dashboards.base import ARTIFACTS, Dashboard, Ending, Facts, Row
+from epo_lightning.masking import is_masked, mask
 from epo_lightning.registry import ConfigError
 
 SQLITE = "sqlite:///"
@@ -20,14 +21,32 @@ KIND = {"mlflow.experimentKind": "custom_model_development"}
 """Without it, MLflow's page guesses, and may show runs as it shows the traces of a language model."""
 
 
-def check() -> None:
-    """Whether MLflow is there.
+def check(settings: MLflowSettings) -> None:
+    """Check that MLflow is installed and its address complete.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: one of them is not the case.
     """
     if find_spec("mlflow") is None:
         raise ConfigError("logger=[mlflow] needs MLflow: pip install 'epo_lightning[mlflow]', or leave it out")
+    tracking_uri(settings, default="")
+
+
+def tracking_uri(settings: MLflowSettings, default: str) -> str:
+    """The address of the server or database: ``logger.mlflow.uri``, else MLFLOW_TRACKING_URI, else ``default``.
+
+    Raises:
+        ConfigError: the address comes from a run folder, which keeps no secrets, and the environment does not complete it.
+    """
+    given = os.environ.get("MLFLOW_TRACKING_URI", "")
+    if not settings.uri or not is_masked(settings.uri):
+        return settings.uri or given or default
+    if mask(given) != settings.uri:
+        raise ConfigError(
+            f"logger.mlflow.uri={settings.uri}: run folders keep no passwords; set MLFLOW_TRACKING_URI to the whole "
+            "address, or give the command that began the run again, with its address and existing=continue"
+        )
+    return given
 
 
 class MLflow(Dashboard):
@@ -39,8 +58,7 @@ class MLflow(Dashboard):
     def __init__(self, facts: Facts, settings: MLflowSettings, runs: Path) -> None:
         super().__init__(facts)
         self._settings = settings
-        default = f"{SQLITE}{runs.expanduser().resolve() / 'mlflow.db'}"
-        self._uri = settings.uri or os.environ.get("MLFLOW_TRACKING_URI") or default
+        self._uri = f"{SQLITE}{runs.expanduser().resolve() / 'mlflow.db'}"
         self._known: dict[str, tuple[int, float]] = {}  # last step and value of each metric
         self._last = 0
         self._ended: int | None = None  # when an earlier process ended the run, if it told all
@@ -63,6 +81,7 @@ class MLflow(Dashboard):
         os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
         from mlflow import MlflowClient
 
+        self._uri = tracking_uri(self._settings, default=self._uri)
         with self._alone():
             self._client = MlflowClient(self._uri)
             place = None if not self._uri.startswith(SQLITE) else self._artifacts()

@@ -32,6 +32,7 @@ from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config.settings import Measured, Settings, measures, read
 from epo_lightning.experiment.sweeps.orphans import end_with
 from epo_lightning.identity import identity
+from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_json, write_text
 
@@ -154,7 +155,7 @@ class Sweep:
 
     def _entry(self, job: Job) -> dict[str, Any]:
         return {
-            "overrides": list(job.overrides),
+            "overrides": mask(list(job.overrides)),
             "folder": self._place(job.run),
             "identity": job.identity,
             "title": job.title,
@@ -225,7 +226,7 @@ class Sweep:
             "name": name,
             "label": self.label,
             "command": command,
-            "overrides": list(overrides),
+            "overrides": mask(list(overrides)),
             "directory": str(Path.cwd()),
             "cache": os.environ.get("EPO_CACHE"),
             "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -266,9 +267,9 @@ class Sweep:
                 write_json(self.folder / "found" / name, self._entry(Job.of(config, overrides)))
             training.train(dict(config), overrides)
         except Exception as error:
-            message = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            message = mask(f"{type(error).__name__}: {' '.join(str(error).split())}")
             message = message.replace(f"{self.root}{os.sep}", f"{os.path.relpath(self.root)}{os.sep}")
-            write_text(self._failure(run), f"{message}\n\n{traceback.format_exc()}")
+            write_text(self._failure(run), f"{message}\n\n{mask(traceback.format_exc())}")
             raise RunFailed(f"{settings.title}, seed {settings.seed}: {message}") from None
         return next(iter(run.record.get("best", {}).values()), None)
 

@@ -16,6 +16,7 @@ from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.config.settings import Settings, TrainerSettings, read
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
 from epo_lightning.experiment.sweeps.watch import news, status, summary
+from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import value_text, word
 from epo_lightning.run_folder import RunFolder, read_json
@@ -56,7 +57,7 @@ def run(
     jobs = _listed(sweep, words, extra)
     with sweep.lock():
         states = [sweep.state(job) for job in jobs]
-        sweep.begin(name, shlex.join(["epo", "sweep", name, *overrides]), overrides, jobs, stop_on_failure)
+        sweep.begin(name, shlex.join(mask(["epo", "sweep", name, *overrides])), overrides, jobs, stop_on_failure)
         if jobs:
             print(f"{sweep.label}: {summary(Counter(states))}", flush=True)
         with news(sweep):

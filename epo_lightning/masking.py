@@ -1,0 +1,49 @@
+"""Secrets in addresses, replaced by ``***`` in everything that is written: ``postgresql://me:***@host/db?sslkey=***``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import TypeVar
+
+MASK = "***"
+
+_RULES = (
+    (re.compile(r"(://[^\s:/?#@]*:)\S*@"), rf"\1{MASK}@"),  # user:password@
+    (re.compile(r"(https?://)[^\s/?#@:*]+@"), rf"\1{MASK}@"),  # token@
+    (
+        re.compile(
+            r"([?&;][\w.-]*(?:token|key|pass|pwd|secret|credential|signature|sig|auth)[\w.-]*=)[^\s&;#'\"]+", re.I
+        ),
+        rf"\1{MASK}",
+    ),
+)
+
+Value = TypeVar("Value")
+
+
+def mask(value: Value) -> Value:
+    """The same value with the secrets of all addresses in it masked: passwords, tokens as user names or in queries.
+
+    Args:
+        value: text, or mappings and lists with text in them; other values are left as they are.
+    """
+    if isinstance(value, str):
+        return _text(value)  # type: ignore[return-value]
+    if isinstance(value, Mapping):
+        return {key: mask(entry) for key, entry in value.items()}  # type: ignore[return-value]
+    if isinstance(value, list | tuple):
+        return type(value)(map(mask, value))  # type: ignore[return-value, call-arg]
+    return value
+
+
+def is_masked(text: str) -> bool:
+    """Whether text has lost a secret."""
+    return MASK in text and mask(text) == text
+
+
+def _text(text: str) -> str:
+    if "://" in text:
+        for pattern, replacement in _RULES:
+            text = pattern.sub(replacement, text)
+    return text
