@@ -1,14 +1,13 @@
-"""Learning the density exp(-E) / Z without sampling: where the energy is a parabola, Z is a determinant.
+"""Maximum likelihood of the density exp(-E) / Z without sampling, by Laplace's approximation of Z.
 
-With g and H the gradient and the curvature of E at the demonstrated controls u, of which there are d,
+With the gradient g and the Hessian H of E at the d demonstrated controls u,
 
     -log p(u) = 1/2 g^T H^-1 g - 1/2 log det H + d/2 log 2 pi,
 
-exactly so for quadratic energies, and Laplace's approximation for others. The first term draws the minimum towards what was
-observed, the second makes it as narrow there as the data allow. H is the Gauss-Newton matrix J^T J + eps I of the residuals'
-Jacobian J.
+which is exact for quadratic energies. The first term pulls the minimum towards the observation, the second makes it as
+narrow there as the data allow. H is the Gauss-Newton matrix J^T J + eps I of the residuals' Jacobian J.
 
-Controls that were not observed are integrated out. With g_B and H_B the rows of those, the density of the others has
+Controls that were not observed are integrated out. With the rows g_B and H_B of these, the density of the others has
 
     -log p(u_A) = (1/2 g^T H^-1 g - 1/2 log det H) - (1/2 g_B^T H_B^-1 g_B - 1/2 log det H_B) + d_A/2 log 2 pi.
 """
@@ -42,19 +41,19 @@ from epo_lightning.solvers.general import dense
 class Laplace(Objective):
     """Negative log-likelihood of the demonstration under a mixture of Gaussians, one around every mode's game.
 
-    L = -log sum_m pi_m p_m(u) / d with the forecast's probabilities pi; which mode answers for which scene, and how likely
-    it was, is learned along with the energies. Controls have no common unit: the likelihood is per control, of m/s^2 and
-    rad/s, and may be negative. The controls that were observed are found by tracking
-    (:mod:`~epo_lightning.game.tracking`); an agent's after its last observed step are integrated out.
+    L = -log sum_m pi_m p_m(u) / d with the forecast's probabilities pi; the assignment of scenes to modes is learned along
+    with the energies. Controls have no common unit: the likelihood is per control, in m/s^2 and rad/s, and may be negative.
+    Observed controls are found by tracking (:mod:`~epo_lightning.game.tracking`); an agent's controls after its last
+    observed step are integrated out.
 
-    Besides the weighted terms, ``tracking`` is logged, the distance [m] between observed positions and those of the controls
-    that stand for them; and ``flat``, the share of games without a density, because their H is singular or no number: these
-    are left out of the mixture, and scenes without any game teach nothing.
+    Besides the weighted terms, ``tracking`` is logged, the distance [m] between observed positions and those reproduced by
+    tracking; and ``flat``, the fraction of games without a density because H is singular or not finite. These are left out
+    of the mixture, and scenes without any density contribute zero.
 
     Args:
-        weights: lambda of ``density``; of ``initial``, minSADE of the initial strategies, which no likelihood teaches; and
-            of ``goal`` (idle where no goal is decoded).
-        damping: eps; keeps H positive definite where no feature looks at a control.
+        weights: lambda of ``density``; of ``initial``, minSADE of the initial strategies, which the likelihood does not
+            train; and of ``goal`` (no effect where no goal is decoded).
+        damping: eps, which keeps H positive definite for controls without any feature.
     """
 
     terms = ("density", "initial", "goal")
@@ -63,7 +62,7 @@ class Laplace(Objective):
 
     def __init__(self, weights: Mapping[str, float], damping: float = 1e-3) -> None:
         if not 0 <= damping < float("inf"):
-            raise ValueError(f"damping must be 0 or more, and finite, not {damping}")
+            raise ValueError(f"objective.damping must be 0 or more, and finite, not {damping}")
         self.weights = checked_weights(weights, self.terms)
         self.damping = damping
 
@@ -73,10 +72,10 @@ class Laplace(Objective):
         assert forecast.initial_states is not None
         controls, missed = observed_controls(energy.dynamics, scene)
         modes = forecast.probabilities.shape[1]
-        log_density, sound = log_densities(
+        log_density, exists = log_densities(
             energy, scene, forecast.parameters, controls[:, None].expand(-1, modes, -1, -1, -1), self.damping
         )
-        joint = forecast.log_probabilities + torch.where(sound, log_density, -torch.inf)
+        joint = forecast.log_probabilities + torch.where(exists, log_density, -torch.inf)
         known = (joint != -torch.inf).any(1)
         joint = torch.where(known[:, None], joint, 0.0)
         count = 2 * demonstrated(scene).sum((1, 2)).clamp_min(1)
@@ -89,7 +88,7 @@ class Laplace(Objective):
             "initial": (self.weights["initial"], initial),
             **goal_term(scene, forecast, self.weights["goal"]),
             "tracking": (0.0, missed.sum() / followed.sum().clamp_min(1)),
-            "flat": (0.0, (~sound).to(density.dtype).mean()),
+            "flat": (0.0, (~exists).to(density.dtype).mean()),
         }
 
 
@@ -100,55 +99,55 @@ def log_densities(
     controls: Float[Tensor, "B M N K 2"],
     damping: float,
 ) -> tuple[Float[Tensor, "B M"], Bool[Tensor, "B M"]]:
-    """log p of the demonstrated ones among the controls of present agents, and where there is one; zero elsewhere."""
+    """log p of the demonstrated controls, and a mask of the games that have a density; log p is zero elsewhere."""
 
     def linearised(*game: Any) -> tuple[Tensor, Tensor]:
         return _linearised(energy, damping, *game)
 
     slope, matrix = linearised(scene, parameters, controls)
-    # What is no number anywhere in J is none on the diagonal of J^T J.
+    # A NaN anywhere in J reaches the diagonal of J^T J.
     finite = (slope + matrix.diagonal(dim1=-2, dim2=-1)).isfinite().all(-1)
     if not finite.all():
         slope, matrix = evaluated(linearised, scene, parameters, controls, finite)
-    value, sound = _Parabola.apply(slope, matrix)
+    value, definite = _LogDensity.apply(slope, matrix)
     told = demonstrated(scene)
     present = scene.agent_mask[..., None].expand_as(told)
     if not (told | ~present).all():
-        # Rows that are demonstrated become unit rows, like those of absent agents, which are worth nothing.
+        # Rows of demonstrated controls become unit rows with zero gradient, which contribute zero.
         rest = by_channel((present & ~told)[:, None, ..., None].expand(-1, -1, -1, -1, 2)).to(slope)
         both = rest[..., None] * rest[..., None, :]
-        value_of_rest, known = _Parabola.apply(slope * rest, matrix * both + (1.0 - rest).diag_embed())
-        value, sound = value - value_of_rest, sound & known
+        value_of_rest, rest_definite = _LogDensity.apply(slope * rest, matrix * both + (1.0 - rest).diag_embed())
+        value, definite = value - value_of_rest, definite & rest_definite
     value = value + math.log(2.0 * math.pi) * told.sum((1, 2))[:, None]
-    sound = sound & finite
-    return -torch.where(sound, value, 0.0).to(controls.dtype), sound
+    exists = definite & finite
+    return -torch.where(exists, value, 0.0).to(controls.dtype), exists
 
 
-class _Parabola(torch.autograd.Function):
-    """1/2 g^T H^-1 g - 1/2 log det H, zero and without gradient where H has no Cholesky factor. The upper half of H is read.
+class _LogDensity(torch.autograd.Function):
+    """1/2 g^T H^-1 g - 1/2 log det H, zero and without gradient where H is not positive definite; reads H's upper half.
 
-    With a = H^-1 g the gradient by g is a, and that by H is -1/2 (a a^T + H^-1): cheaper and steadier than to differentiate
-    the factorisation.
+    With a = H^-1 g the gradient by g is a, and that by H is -1/2 (a a^T + H^-1), which is cheaper and numerically more
+    stable than differentiating the factorisation.
     """
 
     @staticmethod
     def forward(ctx: Any, slope: Float[Tensor, "B M n"], matrix: Float[Tensor, "B M n n"]) -> tuple[Tensor, Tensor]:
         factor, info = torch.linalg.cholesky_ex(matrix.mT)  # the layout that LAPACK takes
-        sound = info == 0
-        if not sound.all():
+        definite = info == 0
+        if not definite.all():
             identity = torch.eye(slope.shape[-1], dtype=slope.dtype, device=slope.device)
-            factor = torch.where(sound[..., None, None], factor, identity)
+            factor = torch.where(definite[..., None, None], factor, identity)
         half = torch.linalg.solve_triangular(factor, slope[..., None], upper=False)
         value = 0.5 * half.square().sum((-2, -1)) - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        ctx.save_for_backward(half, factor, sound)
-        ctx.mark_non_differentiable(sound)
-        return torch.where(sound, value, 0.0), sound
+        ctx.save_for_backward(half, factor, definite)
+        ctx.mark_non_differentiable(definite)
+        return torch.where(definite, value, 0.0), definite
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Float[Tensor, "B M"], _: Tensor) -> tuple[Tensor, Tensor]:
-        half, factor, sound = ctx.saved_tensors
-        cotangent = torch.where(sound, cotangent, 0.0)[..., None]
+        half, factor, definite = ctx.saved_tensors
+        cotangent = torch.where(definite, cotangent, 0.0)[..., None]
         solved = torch.linalg.solve_triangular(factor.mT, half, upper=True)
         by_matrix = torch.cholesky_inverse(factor).mT  # symmetric, and rows are contiguous
         by_matrix = by_matrix.addcmul_(solved, solved.mT).mul_(-0.5 * cotangent[..., None])

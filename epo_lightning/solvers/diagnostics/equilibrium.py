@@ -1,20 +1,20 @@
-"""How close a forecast is to an open-loop Nash equilibrium of the game that was inferred for it, in numbers all rows share.
+"""Distance of a forecast from an open-loop Nash equilibrium of its inferred game, comparable between rows of a table.
 
-In an equilibrium nobody gains by changing its strategy alone. Agent i's gain is the most that its J_i = E_i + sum_j E_ij can
-fall while the others stay, and because the game has the potential E, E falls by as much (Theorem 1):
+In an equilibrium no agent can improve by changing its strategy alone. The Nash gap of agent i is the largest decrease of its
+objective J_i = E_i + sum_j E_ij while the others keep their strategies, and because E is a potential, E falls by as much
+(Theorem 1):
 
     gap_i(u) = J_i(u) - min over u_i' of J_i(u_i', u_-i) = E(u) - min over u_i' of E(u_i', u_-i).
 
-Where strategies are controls the minima are local ones, converged tightly: the *best response* of an agent is the better one
-of two descents, from its own strategy and from the one that it has in the optimum, and the gap is a lower bound. Where
-strategies are chosen among candidates the minimum is one over a row of a table, and exact.
+For controls the minima are local ones, converged tightly: the *best response* of an agent is the better result of two
+minimisations, from its own strategy and from its strategy in the optimum, so that the gap is a lower bound. For candidates
+the minimum is taken over a row of a table, and exact.
 
-Only the most likely joint mode is looked at, the one that overlap rates look at too: every scene is one game, and its best
-responses are *worlds* in which one agent moves and the others are held. All worlds of a batch are solved side by side,
-and those that have arrived are left out.
+Only the most likely joint mode is evaluated, as for overlap rates. Every best response is a *world*: a copy of the scene in
+which one agent moves and the others are held. All worlds of a batch are solved in parallel, and converged ones are left out.
 
-Networks need not be bounded from below: where a descent is given up while the energy is still falling fast, there is no
-minimum to compare with, and the optimum and the gaps of that scene are NaN.
+Networks may be unbounded from below: if a minimisation ends while the energy is still falling fast, there is no minimum to
+compare with, and the optimum and the gaps of that scene are NaN.
 """
 
 from __future__ import annotations
@@ -38,37 +38,37 @@ from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LEAST_DAMPING, MOST_DAMPING, Backend, backend
 
 _GAUSS_NEWTON, _NEWTON = 20, 60
-"""Steps at most. The first kind is cheap and never looks back; the second one arrives where residuals stay large."""
+"""Largest numbers of steps. Gauss-Newton steps are cheap; Newton steps converge where residuals stay large."""
 _START, _SMALL = 1e-2, 1e-4
-"""Damping at the start, and up to which a step that changes nothing says that there is nothing to gain."""
+"""Initial damping, and the largest damping at which a step without decrease counts as converged."""
 _TOLERANCE = 1e-13
-"""Of the energy: smaller changes are rounding."""
+"""Relative change of the energy that counts as rounding error."""
 _SWEEPS = 100
-"""At most, of coordinate descent over candidates: each lowers the energy, so there is an end, and it comes soon."""
+"""Largest number of sweeps of coordinate descent over candidates; it ends earlier when no choice changes."""
 
 
 @torch.no_grad()
 def equilibrium(energy: Energy, scene: Scene, forecast: JointForecast) -> Equilibrium | None:
-    """The report on the most likely joint mode of every scene, in float64.
+    """The equilibrium report of the most likely joint mode of every scene, in float64.
 
-    - Energies made of features: damped Gauss-Newton steps, one agent at a time by an infinite damping of the others.
-    - Solutions that are choices among candidates (``tables`` and ``assignment``): from the tables, exact. The optimum is the
-      lowest of what choosing anew, agent after agent, leads to from any of the joint modes.
+    - Feature energies: damped Gauss-Newton and Newton steps of one agent, with infinite damping of the others.
+    - Solutions that are choices among candidates (``tables`` and ``assignment``): exact, from the tables. The optimum is the
+      best result of coordinate descent, agent by agent, from all joint modes.
     - Any other energy with a gradient: quasi-Newton steps (:mod:`~epo_lightning.solvers.diagnostics.quasi_newton`).
 
-    Features are sums of squares and always have a minimum. With other energies a descent may find none in its 300
-    evaluations: ``optimum`` and the gaps of such a scene are NaN, and its other values are reported.
+    Feature energies are sums of squares and always have a minimum. For other energies 300 evaluations may find none:
+    ``optimum`` and the gaps of such a scene are NaN, and its other values are reported.
 
-    A scene that holds no finite numbers has no finite report, and leaves those of the others as they are.
+    A scene with NaN or infinite values has no finite report, and does not affect the others.
 
     Args:
-        energy: what was minimised.
-        scene: what was observed.
-        forecast: with the game (``parameters``) and how it was solved (``solution``).
+        energy: the minimised energy.
+        scene: the scene.
+        forecast: a forecast with the game (``parameters``) and its ``solution``.
 
     Returns:
-        the report; None where the forecast has no game or no solution, and for energies that offer no gradient and whose
-        solution has no tables.
+        the report; None if the forecast has no game or no solution, or if the energy offers no gradient and the solution
+        has no tables.
     """
     parameters, solution = forecast.parameters, forecast.solution
     if parameters is None or solution is None:
@@ -89,8 +89,8 @@ def equilibrium(energy: Energy, scene: Scene, forecast: JointForecast) -> Equili
 
 @dataclass(frozen=True)
 class Descent:
-    """From where to where: what is minimised before and after, the controls after, the slope before, and whether a minimum
-    was found."""
+    """The result of a minimisation in W worlds: values before and after, controls after, gradient norm before, and a mask
+    of the worlds where a minimum was found."""
 
     before: Float[Tensor, " W"]
     after: Float[Tensor, " W"]
@@ -100,13 +100,13 @@ class Descent:
 
 
 Descend = Callable[[Energy, Scene, GameParameters, Tensor | None], Descent]
-"""(energy, scene, game, agent [W]) -> the descent of E by all controls, or of J_i by those of one agent of every world."""
+"""(energy, scene, game, agent [W]) -> minimisation of E over all controls, or of J_i over one agent's controls per world."""
 
 
 def _smooth(
     descend: Descend, energy: Energy, scene: Scene, game: GameParameters, initial: Float[Tensor, " B"]
 ) -> Equilibrium:
-    """The report of strategies that are controls, given how to descend."""
+    """The report for controls as strategies, with a method to minimise."""
     optimum = descend(energy, scene, game, None)
     origin, agent = scene.agent_mask.nonzero(as_tuple=True)
     worlds, games = scene[origin], game[origin]
@@ -129,7 +129,7 @@ def _smooth(
 
 
 def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent: Int[Tensor, " W"] | None) -> Descent:
-    """Damped Gauss-Newton steps; J_i is the energy of a game in which only i and its pairs have weights."""
+    """Damped Gauss-Newton and Newton steps; J_i is the energy of a game in which only i and its pairs have weights."""
     assert isinstance(energy, FeatureEnergy)
     start = game.initial_controls
     held = None
@@ -175,7 +175,7 @@ def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent:
 def _gauss_newton(
     solve: Backend, energy: FeatureEnergy, scene: Scene, game: GameParameters, damping: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where a damped Gauss-Newton step leads, and the energy there."""
+    """Controls and energy after a damped Gauss-Newton step."""
     there = solve(energy, scene, game, 1, 1.0, damping, False)
     return there.controls, there.energy
 
@@ -183,7 +183,7 @@ def _gauss_newton(
 def _newton(
     solve: Backend, energy: FeatureEnergy, scene: Scene, game: GameParameters, damping: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The same with the exact Hessian. Where that has no factor, nothing has become better: more damping will be tried."""
+    """Controls and energy after a damped Newton step; the energy is infinite where the Hessian is not positive definite."""
     controls = game.initial_controls
     split = controls.device.type == "cpu"
     model = expand(energy, scene, game, controls, not split, exact=True)
@@ -195,7 +195,7 @@ def _newton(
 
 
 def _descend_any(energy: Energy, scene: Scene, game: GameParameters, agent: Int[Tensor, " W"] | None) -> Descent:
-    """Quasi-Newton steps with derivatives by automatic differentiation."""
+    """Quasi-Newton steps with gradients by automatic differentiation."""
     start = game.initial_controls
     if start.numel() == 0:
         return _nowhere(start)
@@ -235,15 +235,15 @@ def _finite(
     mode: Int[Tensor, " B"],
     initial: Float[Tensor, " B"],
 ) -> Equilibrium:
-    """The report of choices among candidates."""
+    """The report for choices among candidates."""
     options = _options(mask, tables, assignment)  # of all modes
     energy = _chosen_energy(mask, tables, assignment, options)
     by_mode = [_of_mode(each, mode)[:, 0] for each in (energy, options, assignment)]
     solved, mine, choice = by_mode
     objective = mine.gather(2, _valid(mask, choice)[..., None])[..., 0]
     lowest = mine.amin(2)
-    gap = torch.where(objective == lowest, 0.0, objective - lowest)  # infinite energies are equal, too
-    # Choosing anew, agent after agent, from every mode.
+    gap = torch.where(objective == lowest, 0.0, objective - lowest)  # also for infinite energies
+    # Coordinate descent, agent by agent, from every mode.
     assignment = _valid(mask[:, None], assignment)
     for _ in range(_SWEEPS):
         before = assignment
@@ -259,7 +259,7 @@ def _finite(
     return Equilibrium(
         initial=initial,
         energy=solved,
-        optimum=torch.minimum(solved, settled),  # equal, but for the order of additions
+        optimum=torch.minimum(solved, settled),  # they may differ by rounding errors
         gradient_norm=torch.full_like(solved, torch.nan),
         nash_gap=torch.where(mask, gap, 0.0),
         objective=torch.where(mask, objective, 0.0),
@@ -267,7 +267,7 @@ def _finite(
 
 
 def _options(mask: Bool[Tensor, "B N"], tables: Tables, assignment: Int[Tensor, "B M N"]) -> Float[Tensor, "B M N C"]:
-    """J_i of every candidate of every agent while the others keep theirs."""
+    """J_i for every candidate of every agent while the others keep theirs."""
     batch, modes, agents = assignment.shape
     choice = _valid(mask[:, None], assignment)
     first, second = pairs(agents, mask.device)
@@ -287,7 +287,7 @@ def _chosen_energy(
     assignment: Int[Tensor, "B M N"],
     options: Float[Tensor, "B M N C"],
 ) -> Float[Tensor, "B M"]:
-    """E of an assignment: every pair is in the objectives of both its agents, so half of them and half of the own terms."""
+    """E of an assignment, 1/2 sum_i (J_i + E_i), because a pair term is in the objectives of both agents."""
     choice = _valid(mask[:, None], assignment)[..., None]
     objective = options.gather(3, choice)[..., 0]
     own = torch.where(mask[..., None], tables.unary, 0.0).double()[:, None]
@@ -295,12 +295,12 @@ def _chosen_energy(
 
 
 def _valid(mask: Bool[Tensor, "*#batch N"], assignment: Int[Tensor, "*batch N"]) -> Int[Tensor, "*batch N"]:
-    """Whatever stands for absent agents is not an index."""
+    """The assignment with 0 for absent agents, whose entries may be no valid index."""
     return torch.where(mask, assignment, 0)
 
 
 def _relevant(scene: Scene) -> Scene:
-    """What an energy may refer to, which is little: worlds hold it once for every agent."""
+    """The fields of a scene that an energy may use; others are dropped, because worlds copy the scene for every agent."""
     return Scene(
         history=scene.history[:, :, -1:],
         dt=scene.dt,
@@ -314,7 +314,7 @@ def _relevant(scene: Scene) -> Scene:
 
 
 def _game(scene: Scene, parameters: GameParameters, solution: Solution, mode: Int[Tensor, " B"]) -> GameParameters:
-    """The game of one mode in every scene, starting from its solution."""
+    """The game of one mode in every scene, with its solution as initial strategies."""
     game = dataclasses.replace(parameters, context=None).map(lambda tensor: _of_mode(tensor, mode))
     controls = _of_mode(solution.controls, mode)
     controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
@@ -322,17 +322,17 @@ def _game(scene: Scene, parameters: GameParameters, solution: Solution, mode: In
 
 
 def _of_mode(values: Tensor, mode: Int[Tensor, " B"]) -> Tensor:
-    """One mode of every scene, [B, 1, ..]; one game for all modes is that of each of them."""
+    """The values of one mode per scene, [B, 1, ..]; values shared by all modes are taken as they are."""
     scenes = torch.arange(len(mode), device=mode.device)
     return values[scenes, mode.clamp_max(values.shape[1] - 1)][:, None]
 
 
 def _only(agent: Int[Tensor, " W"], agents: int) -> Bool[Tensor, "W N"]:
-    """Which of N agents is the one of each world."""
+    """Mask of the moving agent of each world."""
     return agent[:, None] == torch.arange(agents, device=agent.device)
 
 
 def _nowhere(controls: Float[Tensor, "W 1 N K 2"]) -> Descent:
-    """The descent of no world at all."""
+    """The result for empty controls."""
     none = controls.new_zeros(len(controls))
     return Descent(none, none, controls, none, none == 0)

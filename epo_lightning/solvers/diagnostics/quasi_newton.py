@@ -1,7 +1,7 @@
-"""BFGS for many small functions at once, each of which goes its own way and stops on its own.
+"""BFGS for many small functions in parallel, each with its own steps and its own termination.
 
-The inverse Hessians are kept as they are, [W, n, n]: for one agent's controls, n = 2 K, that is little, and takes fewer
-evaluations than a limited memory (Nocedal and Wright, Numerical Optimization, Section 6.1).
+The inverse Hessians [W, n, n] are stored completely: for one agent's controls, n = 2 K, they are small, and BFGS takes fewer
+evaluations than L-BFGS (Nocedal and Wright, Numerical Optimization, Section 6.1).
 """
 
 from __future__ import annotations
@@ -14,36 +14,37 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 _EVALUATIONS = 300
+"""Largest number of evaluations."""
 _DECREASE = 1e-4
-"""Armijo's constant: which share of the promised decrease a step has to keep."""
+"""Armijo constant: required decrease relative to the linear prediction."""
 _SHORTEST = 1e-12
-"""Share of a step: who has to go less far does not get any further."""
+"""Shortest relative step before the line search gives up."""
 _CURVED = 1e-10
-"""Cosine of step and change of slope from which on the curvature is positive beyond rounding."""
+"""Smallest cosine of a step and the change of the gradient that is positive beyond rounding errors."""
 _TOLERANCE = 1e-10
-"""Of the value: where less is promised, a function is at its minimum."""
+"""Predicted decrease, relative to the value, below which a function is at its minimum."""
 _LATELY, _FALLING = 30, 1e-2
-"""Who still loses more than this share of its whole decrease in its last 30 evaluations has not come near a minimum."""
+"""A function that loses more than this fraction of its total decrease in the last 30 evaluations is not near a minimum."""
 _UPDATES = 3
-"""At least, before a promise counts: the first ones know nothing of the curvature."""
+"""Least number of updates before a predicted decrease counts: before them the inverse Hessian is a multiple of I."""
 _ENTRIES = 2**24
-"""Of inverse Hessians at a time: a bound on memory (128 MB)."""
+"""Largest number of entries of inverse Hessians at a time, which bounds the memory (128 MB)."""
 
 Evaluate = Callable[[Int[Tensor, " w"], Float[Tensor, "w n"]], tuple[Float[Tensor, " w"], Float[Tensor, "w n"]]]
-"""Values and slopes of some of the functions: their numbers, and a point for each."""
+"""(indices of some functions, a point for each) -> their values and gradients."""
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """What W functions were and have become, where, and how steep they were.
+    """The results of W minimisations.
 
     Attributes:
         before, after: values at the start and at ``point``.
-        point: the lowest that was found.
+        point: the point of the lowest value.
         slope: Euclidean norm of the gradient at the start.
-        found: whether ``point`` is next to a minimum: a step promised nothing, or none helped any more, or the evaluations
-            ran out when there was little left to gain. Otherwise the function was given up while it was still falling; it
-            may have no minimum at all.
+        found: whether ``point`` is close to a minimum: the predicted decrease vanished, the line search failed, or the
+            evaluations ended with little decrease left. Otherwise the function was still falling fast when the evaluations
+            ended; it may have no minimum at all.
     """
 
     before: Float[Tensor, " W"]
@@ -54,11 +55,11 @@ class Minimum:
 
 
 def minimise(evaluate: Evaluate, start: Float[Tensor, "W n"]) -> Minimum:
-    """Descend from ``start`` until a step promises less than 1e-10 of the value, in at most 300 evaluations.
+    """Minimise from ``start`` until the predicted decrease is below 1e-10 of the value, in at most 300 evaluations.
 
-    Steps are halved, or shortened to where a parabola has its minimum, until they lower the value; what was found is never
-    above the start. A function without a finite value stays where it is, and is not found. Those that run out of
-    evaluations are, unless they lost more than 1 % of their whole decrease in the last 30.
+    Steps are shortened by quadratic interpolation or halved until they lower the value, so the result is never above the
+    start. A function with a start value that is not finite keeps its start, with ``found`` False. ``found`` is True for
+    functions that run out of evaluations, unless they lost more than 1 % of their total decrease in the last 30.
     """
     many = max(1, _ENTRIES // max(1, start.shape[1] ** 2))
     numbers = torch.arange(len(start), device=start.device)
@@ -75,7 +76,7 @@ def _minimise(evaluate: Evaluate, start: Tensor, numbers: Tensor) -> Minimum:
     left = (before.isfinite() & steep.isfinite().all(1) & (steep != 0).any(1)).nonzero()[:, 0]
     x, f, g = start[left], before[left], steep[left]
     unit = torch.eye(start.shape[1], dtype=start.dtype, device=start.device)
-    # The first step is one unit of the controls long at most.
+    # The first step has a length of one at most.
     inverse = unit / g.norm(dim=1).clamp_min(1.0)[:, None, None]
     updates, stride = torch.zeros_like(left), torch.ones_like(f)
     lately = before.clone()
@@ -91,13 +92,13 @@ def _minimise(evaluate: Evaluate, start: Tensor, numbers: Tensor) -> Minimum:
         accepted = (value <= f + _DECREASE * stride * promised) & slope.isfinite().all(1)
         moved = torch.where(accepted[:, None], trial - x, 0.0)
         change = torch.where(accepted[:, None], slope - g, 0.0)
-        bent = (moved * change).sum(1)
-        curved = bent > _CURVED * moved.norm(dim=1) * change.norm(dim=1)
+        curvature = (moved * change).sum(1)
+        curved = curvature > _CURVED * moved.norm(dim=1) * change.norm(dim=1)
         fresh = (curved & (updates == 0)).nonzero()[:, 0]
-        inverse[fresh] = unit * (bent / change.square().sum(1))[fresh, None, None]
-        _update_(inverse, moved, change, torch.where(curved, bent, torch.inf))
+        inverse[fresh] = unit * (curvature / change.square().sum(1))[fresh, None, None]
+        _update_(inverse, moved, change, torch.where(curved, curvature, torch.inf))
         updates = updates + curved
-        # Where the parabola through the value and slope here and the value there has its minimum.
+        # Minimum of the parabola through value and directional derivative here and the value there.
         excess = value - f - stride * promised
         parabola = (-0.5 * promised * stride.square() / excess).nan_to_num(0.0)
         shorter = torch.minimum(torch.maximum(parabola, 0.1 * stride), 0.5 * stride)
@@ -119,14 +120,15 @@ def _update_(
     inverse: Float[Tensor, "w n n"],
     moved: Float[Tensor, "w n"],
     change: Float[Tensor, "w n"],
-    bent: Float[Tensor, " w"],
+    curvature: Float[Tensor, " w"],
 ) -> None:
-    """Inverse Hessians after steps s along which slopes changed by y, in place; unchanged where s . y is infinite.
+    """BFGS update of inverse Hessians by steps s and changes y of the gradient, in place; none where s . y is infinite.
 
     H <- H + s a^T - (H y) s^T / s.y   with   a = (1 + y.H y / s.y) s / s.y - H y / s.y.
     """
     along = (inverse * change[:, None]).sum(2)
-    bent = bent[:, None]
-    factor = torch.where(bent.isfinite(), (1.0 + (change * along).sum(1, keepdim=True) / bent) / bent, 0.0)
-    inverse.addcmul_(moved[:, :, None], (factor * moved - along / bent)[:, None])
-    inverse.addcmul_(along[:, :, None], (moved / bent)[:, None], value=-1.0)
+    curvature = curvature[:, None]
+    factor = (1.0 + (change * along).sum(1, keepdim=True) / curvature) / curvature
+    factor = torch.where(curvature.isfinite(), factor, 0.0)
+    inverse.addcmul_(moved[:, :, None], (factor * moved - along / curvature)[:, None])
+    inverse.addcmul_(along[:, :, None], (moved / curvature)[:, None], value=-1.0)

@@ -1,10 +1,10 @@
-"""Who takes which of C candidates: the density p(k) = exp(-E(k)) / Z over joint assignments k, and its best ones.
+"""Joint assignments k of candidates to agents: the density p(k) = exp(-E(k)) / Z, and the assignments of lowest energy.
 
     E(k) = sum_i unary_i(k_i) + sum_{i<j} pair_ij(k_i, k_j)
 
 These are functions of energy tables alone (:class:`~epo_lightning.scene.Tables`), differentiable with respect to them. An
-energy of plus infinity is an impossible candidate or an impossible pair of them: its probability is zero, and no gradient
-passes. Absent agents take their first candidate at no cost, whatever their entries hold.
+energy of plus infinity marks an impossible candidate or pair of candidates: its probability and its gradient are zero.
+Absent agents take their first candidate at no cost, whatever their entries are.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from torch import Tensor
 from epo_lightning.game.pairs import pairs
 
 LIMIT = 4096
-"""Up to how many joint assignments C^N all of them are looked at."""
+"""Largest number C^N of joint assignments that are enumerated."""
 BEAM = 256
-"""How many partial assignments are kept where there are more than that."""
+"""Number of partial assignments that the beam search keeps."""
 
 
 def enumerable(agents: int, candidates: int) -> bool:
-    """Whether all joint assignments can be looked at. Absent agents count, so that this is known without looking."""
+    """Whether all joint assignments can be enumerated. Absent agents count, so that this is known from the shapes."""
     return candidates**agents <= LIMIT
 
 
 def settle(
     unary: Float[Tensor, "B N C"], pair: Float[Tensor, "B P C C"], mask: Bool[Tensor, "B N"]
 ) -> tuple[Float[Tensor, "B N C"], Float[Tensor, "B P C C"]]:
-    """The same tables with absent agents settled: their first candidate costs nothing, and the others are impossible."""
+    """The tables with absent agents fixed: their first candidate costs nothing, and the others are impossible."""
     first, second = pairs(mask.shape[1], mask.device)
     idle = unary.new_full(unary.shape[-1:], torch.inf)
     idle[:1] = 0.0
@@ -42,7 +42,7 @@ def settle(
 def energies(
     unary: Float[Tensor, "B N C"], pair: Float[Tensor, "B P C C"], assignments: Int[Tensor, "B A N"]
 ) -> Float[Tensor, "B A"]:
-    """E of joint assignments, from tables that are settled."""
+    """E of joint assignments, from tables that :func:`settle` returned."""
     chosen = assignments.transpose(1, 2)
     first, second = pairs(unary.shape[1], unary.device)
     both = chosen[:, first] * unary.shape[2] + chosen[:, second]
@@ -52,7 +52,7 @@ def energies(
 def enumerate_(
     unary: Float[Tensor, "B N C"], pair: Float[Tensor, "B P C C"], mask: Bool[Tensor, "B N"]
 ) -> tuple[Float[Tensor, "B N C"], Float[Tensor, " B"]]:
-    """log p(k_i) and log Z by looking at every joint assignment; both -inf where none is possible.
+    """log p(k_i) and log Z by enumeration of all joint assignments; both -inf where none is possible.
 
     Raises:
         ValueError: there are more than :data:`LIMIT`.
@@ -65,7 +65,7 @@ def enumerate_(
     unary, pair = settle(unary, pair, mask)
     likelihood = -_all_energies(unary, pair)
     total = log_sum_exp(likelihood, (1,))
-    # Where agent i's choice is one dimension, those of the agents before and after it are two more.
+    # Views with three dimensions of choices: of the agents before i, of agent i, and of the agents after it.
     digits = [likelihood.view(batch, count**i, count, count ** (agents - 1 - i)) for i in range(agents)]
     marginals = [log_sum_exp(digit, (1, 3)) for digit in digits]
     stacked = torch.stack(marginals, 1) if marginals else unary
@@ -85,20 +85,20 @@ def sum_product(
         p(k_i)  ~ exp(-unary_i(k_i)) prod_n m_ni(k_i)
         log Z   = sum_{i<j} log Z_ij + sum_i (1 - d_i) log Z_i
 
-    with Z_i and Z_ij the normalisers of the beliefs about agents and pairs, and d_i the number of i's neighbours. Every
-    message is sent in every iteration. Exact where the pairs that matter form a tree and messages have crossed it; elsewhere
-    good for soft pair energies and biased for hard ones, for which it may not even settle: damping helps then.
+    with the normalisers Z_i and Z_ij of the beliefs about agents and pairs, and the number d_i of i's neighbours. All
+    messages are updated in every iteration. Exact for trees of interacting pairs, once messages have crossed them. For other
+    graphs it is accurate for soft pair energies and biased for hard ones, where it may not converge without damping.
 
     Args:
-        unary, pair, mask: the tables, and who is present.
-        iterations: how often messages are sent.
-        damping: the share of the logarithm of the message before in every new one, in [0, 1).
+        unary, pair, mask: the tables, and the mask of present agents.
+        iterations: number of message updates.
+        damping: weight of the old log-message in the new one, in [0, 1).
     """
     unary, pair = settle(unary, pair, mask)
     batch, agents, count = unary.shape
     first, second = pairs(agents, unary.device)
     linked = (mask[:, first] & mask[:, second])[..., None]
-    # Neither log Z nor marginals change in substance when every agent's lowest energy is zero, but roundoff does.
+    # Shifting every agent's lowest energy to zero changes neither log Z nor the marginals, but reduces rounding errors.
     lowest = _finite(unary.detach().amin(2))
     local = lowest[..., None] - unary
     forth = back = unary.new_zeros(batch, len(first), count)
@@ -109,7 +109,7 @@ def sum_product(
         if damping:
             sent_forth = (1.0 - damping) * sent_forth + damping * forth
             sent_back = (1.0 - damping) * sent_back + damping * back
-        # What absent agents would say means nothing, exactly nothing.
+        # Messages from and to absent agents are exactly zero.
         forth, back = torch.where(linked, sent_forth, 0.0), torch.where(linked, sent_back, 0.0)
     belief = local + _inbox(forth, back, first, second, agents).sum(2)
     of_agents = log_sum_exp(belief, (2,))
@@ -126,7 +126,7 @@ def sum_product(
 def partition(
     unary: Float[Tensor, "B N C"], pair: Float[Tensor, "B P C C"], mask: Bool[Tensor, "B N"]
 ) -> tuple[Float[Tensor, "B N C"], Float[Tensor, " B"]]:
-    """log p(k_i) and log Z, exact where all assignments can be looked at, and from ten rounds of messages elsewhere."""
+    """log p(k_i) and log Z: exact where all assignments can be enumerated, from ten message updates elsewhere."""
     if enumerable(unary.shape[1], unary.shape[2]):
         return enumerate_(unary, pair, mask)
     return sum_product(unary, pair, mask)
@@ -140,18 +140,18 @@ def best(
     states: Float[Tensor, "B C N K 4"] | None = None,
     apart: float = 0.0,
 ) -> tuple[Int[Tensor, "B M N"], Float[Tensor, "B M"]]:
-    """The M joint assignments of lowest energy, lowest first; where fewer are possible, they begin anew with the first.
+    """The M joint assignments of lowest energy, lowest first; if fewer are possible, they are repeated in order.
 
-    Exact up to :data:`LIMIT` assignments. Beyond, an approximation: agents decide one after the other, in their order, and
-    of their joint choices so far the :data:`BEAM` of lowest energy are kept.
+    Exact up to :data:`LIMIT` assignments. Beyond that it is a beam search: agents are added one after the other, and the
+    :data:`BEAM` partial assignments of lowest energy are kept.
 
     Args:
-        unary, pair, mask: the tables, and who is present.
+        unary, pair, mask: the tables, and the mask of present agents.
         modes: M.
-        states: of the candidates, for ``apart``.
-        apart: distance [m], mean over agents and steps, that modes have to keep from each other where they can: each further
-            one is the best of those that keep it from all before, and if there is none, the best of the others (DSDNet's
-            suppression). Looks at the :data:`BEAM` best assignments.
+        states: states of the candidates, for ``apart``.
+        apart: distance [m], mean over agents and steps, between modes where possible: each further mode is the best of the
+            assignments at this distance from all modes before, or the best of the others if there is none (DSDNet's
+            suppression). Only the :data:`BEAM` best assignments are considered.
     """
     unary, pair = settle(unary, pair, mask)
     with torch.no_grad():
@@ -175,7 +175,7 @@ def best(
 
 
 def log_sum_exp(values: Float[Tensor, "..."], dims: tuple[int, ...]) -> Float[Tensor, "..."]:
-    """log sum exp, with a gradient of zero where all is -inf (PyTorch's is not a number there)."""
+    """log sum exp, with a gradient of zero where all entries are -inf (PyTorch's gradient is NaN there)."""
     top = _finite(values.detach().amax(dims, keepdim=True))
     total = (values - top).exp().sum(dims)
     none = total == 0
@@ -183,7 +183,7 @@ def log_sum_exp(values: Float[Tensor, "..."], dims: tuple[int, ...]) -> Float[Te
 
 
 def _finite(values: Tensor) -> Tensor:
-    """The same with zeros for infinities."""
+    """The values with zero in place of infinities and NaN."""
     return torch.where(values.isfinite(), values, 0.0)
 
 
@@ -193,7 +193,7 @@ def _normalised(message: Float[Tensor, "B P C"]) -> Float[Tensor, "B P C"]:
 
 @cache
 def _numbers(agents: int) -> dict[tuple[int, int], int]:
-    """Where among the pairs the one of agents i < j is."""
+    """Index of the pair of agents i < j, by (i, j)."""
     first, second = (side.tolist() for side in pairs(agents))
     return {both: number for number, both in enumerate(zip(first, second, strict=True))}
 
@@ -214,7 +214,7 @@ def _all_energies(unary: Float[Tensor, "B N C"], pair: Float[Tensor, "B P C C"])
 
 
 def _inbox(forth: Tensor, back: Tensor, first: Tensor, second: Tensor, agents: int) -> Float[Tensor, "B N N C"]:
-    """Messages by whom they are for and whom they are from."""
+    """Messages by receiver and sender."""
     batch, _, count = forth.shape
     inbox = forth.new_zeros(batch, agents * agents, count)
     inbox = inbox.index_copy(1, second * agents + first, forth).index_copy(1, first * agents + second, back)
@@ -228,9 +228,9 @@ def _cavities(
     first: Tensor,
     second: Tensor,
 ) -> tuple[Float[Tensor, "B P C"], Float[Tensor, "B P C"]]:
-    """What both agents of a pair believe without what the other one told them.
+    """The cavity beliefs of both agents of every pair: their beliefs without the message from the other one.
 
-    Added up from both sides instead of subtracted: impossible minus impossible is not a number.
+    They are sums over all other messages instead of differences, because inf - inf is NaN.
     """
     inbox = _inbox(forth, back, first, second, local.shape[1])
     none = torch.zeros_like(inbox[:, :, :1])
@@ -259,10 +259,10 @@ def _beam(unary: Float[Tensor, "B N C"], pair: Float[Tensor, "B P C C"]) -> Int[
 
 
 def _distances(states: Float[Tensor, "B C N K 4"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B N C C"]:
-    """Every agent's share in the mean distance between joint assignments, by its two candidates; zero for absent agents."""
+    """Contributions of the agents to the mean distance of two joint assignments, by their candidates; zero if absent."""
     position = torch.where(mask[:, None, :, None, None], states[..., :2], 0.0).transpose(1, 2)
     steps = position.shape[3]
-    # One candidate after the other: all of them at once are C times as much to hold.
+    # Candidate by candidate, because all at once would take C times the memory.
     way = [torch.linalg.vector_norm(position - one[:, :, None], dim=-1).sum(-1) for one in position.unbind(2)]
     return torch.stack(way, 2) / (steps * mask.sum(1).clamp_min(1))[:, None, None, None]
 
@@ -274,7 +274,7 @@ def _spread(
     modes: int,
     apart: float,
 ) -> Int[Tensor, "B M"]:
-    """Which of the assignments found become modes, best first, that keep their distance where they can."""
+    """Indices of the assignments that become modes, best first, at the distance ``apart`` where possible."""
     free, far = possible, torch.ones_like(possible)
     choices = found.transpose(1, 2)
     ranks: list[Tensor] = []

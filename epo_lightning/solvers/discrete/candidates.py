@@ -1,8 +1,8 @@
 """Minimisers over finite sets: every agent has C candidates, and joint modes are the best of their C^N combinations.
 
-JFP (Luo et al., CoRL 2022) decodes the candidates and looks at all combinations; DSDNet (Zeng et al., ECCV 2020) draws them
-from a model of motion and passes messages. Energies may be anything: nothing is differentiated to find the minimum, and the
-minimum is one of the candidates exactly.
+JFP (Luo et al., CoRL 2022) decodes the candidates and enumerates all combinations; DSDNet (Zeng et al., ECCV 2020) samples
+them from a model of motion and uses sum-product message passing. Energies need no gradient, and the minimum is exactly one
+of the combinations.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from epo_lightning.game.checks import check_number, check_whole, is_number
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status, Tables
@@ -26,15 +27,15 @@ from epo_lightning.solvers.discrete import assignments
 
 @dataclass(frozen=True)
 class Candidates(Minimiser):
-    """What minimisers over candidates share: tables of energies, the best assignments, and the density over all of them.
+    """The base of minimisers over candidates: energy tables, the best assignments, and the density over all assignments.
 
     ``parameters`` hold one game, and the candidates as ``initial_controls`` [B, C, N, K, 2]. Controls, states and energies
-    of the modes are differentiable with respect to them and to the game; which candidates they are is not.
+    of the modes are differentiable with respect to them and to the game; the choice of candidates is not.
 
     Attributes:
         candidates: number C of strategies of every agent.
-        apart: distance [m] that modes keep from each other where they can (:func:`~.assignments.best`); 0 for the best ones.
-        modes: number M of joint modes, which the forecaster knows.
+        apart: distance [m] between modes where possible (:func:`~.assignments.best`); 0 to take the best assignments.
+        modes: number M of joint modes, set by the forecaster.
     """
 
     provides = frozenset({TABLES})
@@ -45,21 +46,19 @@ class Candidates(Minimiser):
 
     def __post_init__(self) -> None:
         for name in ("candidates", "modes"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"solver.{name} must be 1 or more, not {getattr(self, name)}")
-        if not 0 <= self.apart < float("inf"):
-            raise ConfigError(f"solver.apart must be 0 or more metres, and finite, not {self.apart}")
+            check_whole(f"solver.{name}", getattr(self, name))
+        check_number("solver.apart [m]", self.apart, zero=True)
 
     def for_modes(self, modes: int) -> Candidates:
-        """The same for M joint modes."""
+        """This minimiser for M joint modes."""
         return dataclasses.replace(self, modes=modes)
 
     def starts(self, modes: int) -> int:
-        """C, however many modes."""
+        """Number C of candidates, for any number of modes."""
         return self.candidates
 
     def games(self, modes: int) -> int:
-        """One: the modes are different answers to one game."""
+        """One game: the modes are different assignments in it."""
         return 1
 
     @abstractmethod
@@ -71,8 +70,8 @@ class Candidates(Minimiser):
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """Choose the M best joint assignments.
 
-        A scene whose tables hold what is no number, or in which no joint assignment is possible (or found), is STOPPED: all
-        its modes are everyone's first candidate, and its density is not a number.
+        A scene whose tables contain NaN or minus infinity, or in which no joint assignment is possible (or found), is
+        STOPPED: all its modes are the first candidates of all agents, and its density is NaN.
 
         Raises:
             ValueError: scene and parameters do not fit together, or (on a CPU) an agent has no valid candidate.
@@ -85,16 +84,16 @@ class Candidates(Minimiser):
         states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
 
         unary, pair = assignments.settle(*raw, mask)
-        sound = (unary > -torch.inf).flatten(1).all(1) & (pair > -torch.inf).flatten(1).all(1)
-        known = torch.where(sound[:, None, None], unary, 0.0), torch.where(sound[:, None, None, None], pair, 0.0)
-        if unary.device.type == "cpu":  # elsewhere, looking would make the host wait
+        valid = (unary > -torch.inf).flatten(1).all(1) & (pair > -torch.inf).flatten(1).all(1)
+        known = torch.where(valid[:, None, None], unary, 0.0), torch.where(valid[:, None, None, None], pair, 0.0)
+        if unary.device.type == "cpu":  # on other devices, the check would make the host wait
             _check(known[0])
         log_marginals, log_partition = self.density(*known, mask)
         chosen, lowest = assignments.best(*known, mask, self.modes, states, self.apart)
-        sound = sound & (log_partition > -torch.inf) & (lowest[:, 0] < torch.inf)
-        chosen = torch.where(sound[:, None, None], chosen, 0)
-        alone = unary.detach().argmin(2)[:, None]  # everyone's cheapest, whatever the others do
-        alone = torch.where(sound[:, None, None], alone, 0)
+        solved = valid & (log_partition > -torch.inf) & (lowest[:, 0] < torch.inf)
+        chosen = torch.where(solved[:, None, None], chosen, 0)
+        alone = unary.detach().argmin(2)[:, None]  # every agent's cheapest candidate, without pair terms
+        alone = torch.where(solved[:, None, None], alone, 0)
         found = assignments.energies(unary, pair, chosen)
         return Solution(
             controls=_choose(controls, chosen),
@@ -102,13 +101,13 @@ class Candidates(Minimiser):
             initial_energy=assignments.energies(unary, pair, alone).expand_as(found),
             energy=found,
             gradient_norm=torch.full_like(found, torch.nan),
-            status=torch.where(sound, Status.SOLVED, Status.STOPPED)[:, None].expand(found.shape),
+            status=torch.where(solved, Status.SOLVED, Status.STOPPED)[:, None].expand(found.shape),
             tables=Tables(
                 states=states,
                 unary=unary,
                 pair=pair,
-                log_marginals=torch.where(sound[:, None, None], log_marginals, torch.nan),
-                log_partition=torch.where(sound, log_partition, torch.nan),
+                log_marginals=torch.where(solved[:, None, None], log_marginals, torch.nan),
+                log_partition=torch.where(solved, log_partition, torch.nan),
             ),
             assignment=chosen,
         )
@@ -117,10 +116,10 @@ class Candidates(Minimiser):
 @register("solver", "enumeration")
 @dataclass(frozen=True)
 class Enumeration(Candidates):
-    """All joint assignments are looked at: exact, up to C^N = 4096, as 6 candidates of 4 agents stay well below.
+    """Enumeration of all joint assignments: exact, for up to C^N = 4096 assignments (6 candidates of 4 agents are 1296).
 
-    Where there are more, messages take its place (:class:`SumProduct` with its defaults), which a warning says once. Agents
-    count by what a batch is padded to.
+    For more assignments :class:`SumProduct` with its defaults is used instead, with a warning once. N is the number of
+    agents that a batch is padded to.
     """
 
     def density(
@@ -128,20 +127,20 @@ class Enumeration(Candidates):
     ) -> tuple[Float[Tensor, "B N C"], Float[Tensor, " B"]]:
         _, agents, candidates = unary.shape
         if not assignments.enumerable(agents, candidates):
-            _say_once(agents, candidates)
+            _warn_once(agents, candidates)
         return assignments.partition(unary, pair, mask)
 
 
 @register("solver", "sum_product")
 @dataclass(frozen=True)
 class SumProduct(Candidates):
-    """Messages between agents (DSDNet): any number of agents and candidates, marginals and log Z approximate.
+    """Sum-product message passing between agents (DSDNet): approximate marginals and log Z for any number of agents.
 
-    Modes are exact as long as all assignments can be looked at, and found by a beam search where they cannot.
+    Modes are exact as long as all assignments can be enumerated, and found by a beam search otherwise.
 
     Attributes:
-        iterations: how often everyone sends its messages.
-        damping: the share of the message before in every new one, 0 <= damping < 1; for hard pair energies.
+        iterations: number of message updates.
+        damping: weight of the old log-message in the new one, 0 <= damping < 1; useful for hard pair energies.
     """
 
     iterations: int = 10
@@ -149,10 +148,9 @@ class SumProduct(Candidates):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.iterations < 1:
-            raise ConfigError(f"solver.iterations must be 1 or more, not {self.iterations}")
-        if not 0 <= self.damping < 1:
-            raise ConfigError(f"solver.damping must be in [0, 1), not {self.damping}")
+        check_whole("solver.iterations", self.iterations)
+        if not is_number(self.damping) or not 0 <= self.damping < 1:
+            raise ConfigError(f"solver.damping must be a number in [0, 1), not {self.damping!r}")
 
     def density(
         self, unary: Float[Tensor, "B N C"], pair: Float[Tensor, "B P C C"], mask: Bool[Tensor, "B N"]
@@ -161,16 +159,16 @@ class SumProduct(Candidates):
 
 
 def _choose(of_candidates: Float[Tensor, "B C N K X"], chosen: Int[Tensor, "B M N"]) -> Float[Tensor, "B M N K X"]:
-    """What belongs to the candidates that agents take in every mode."""
+    """The values of the candidates that agents take in every mode."""
     index = chosen[..., None, None].expand(-1, -1, -1, *of_candidates.shape[3:])
     return of_candidates.gather(1, index)
 
 
 def _check(unary: Float[Tensor, "B N C"]) -> None:
-    """Refuse scenes in which somebody can do nothing.
+    """Check that every agent has a valid candidate.
 
     Raises:
-        ValueError: as said.
+        ValueError: all energies of an agent are infinite; the message names scene and agent.
     """
     stuck = ~unary.isfinite().any(2)
     if stuck.any():
@@ -182,10 +180,10 @@ def _check(unary: Float[Tensor, "B N C"]) -> None:
 
 
 @cache
-def _say_once(agents: int, candidates: int) -> None:
-    """Make it visible that an approximation takes the place of what was asked for."""
+def _warn_once(agents: int, candidates: int) -> None:
+    """Warn that sum-product messages are used instead of enumeration."""
     warnings.warn(
         f"{candidates} candidates of {agents} agents make more than {assignments.LIMIT} joint assignments: marginals and "
-        "log Z come from ten rounds of messages and modes from a beam search; solver=sum_product asks for that",
+        "log Z come from ten message updates and modes from a beam search; choose solver=sum_product to silence this",
         stacklevel=4,
     )

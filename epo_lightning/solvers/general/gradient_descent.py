@@ -1,18 +1,19 @@
-"""Steps against the gradient: for energies of which no more is known than that.
+"""Gradient descent, for any energy that has a gradient.
 
     u <- u - eta S^2 dE/du
 
-S = diag(scale) says how far controls of either channel move for the same force; it is gradient descent in u / S. Near a
-minimum with the Hessian H the steps contract if eta lambda_max(S H S) < 2 and run away beyond that, so the stiffest
-direction limits eta and the softest ones take 1 / (eta lambda) steps. On highways a turn rate moves positions by the speed
-more than an acceleration does, and a scale like [1, 0.03] makes both about as stiff. A step that is too long is seen,
-because the energy rises or ceases to be a number: it is not taken, and the sample's next ones are half as long. Weights are
-inferred, and a game with stiff ones would run away otherwise; learning from where it ran to would make it stiffer still.
+S = diag(scale) is a preconditioner per channel: this is gradient descent in u / S. Near a minimum with the Hessian H the
+steps converge if eta lambda_max(S H S) < 2 and diverge beyond that, so the stiffest direction limits eta, and a direction of
+eigenvalue lambda takes about 1 / (eta lambda) steps. On highways a turn rate moves positions more than an acceleration, by a
+factor of the speed, and a scale like [1, 0.03] makes both about equally stiff. A step that is too long raises the energy or
+makes it infinite or NaN: it is rejected, and the sample's next steps are half as long. This matters because weights are
+inferred: a game with stiff weights would diverge, and learning from the diverged controls would make it stiffer still.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from epo_lightning.game.checks import check_number, check_whole, is_number
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.selection import evaluated
 from epo_lightning.registry import ConfigError, register
@@ -31,12 +33,12 @@ from epo_lightning.solvers.general.dense import gradient
 
 @dataclass(frozen=True)
 class Progress:
-    """What the steps so far leave behind for the next ones.
+    """The memory of the steps so far, with which the next ones continue.
 
     Attributes:
-        length: share of the step size that a sample's next step has.
-        lowest: energy that it has come down to.
-        taken: whether it has taken any step.
+        length: factor on the step size for a sample's next step.
+        lowest: lowest energy so far.
+        taken: whether the sample has accepted any step.
     """
 
     length: Float[Tensor, "B M"]
@@ -47,10 +49,10 @@ class Progress:
 @register("solver", "gradient_descent")
 @dataclass(frozen=True)
 class GradientDescent(Stepwise):
-    """S steps against the gradient, differentiable: EBIOC's "optimisation variant" of its synthesis (arXiv 1904.05453).
+    """S differentiable gradient steps: EBIOC's "optimisation variant" of its synthesis (arXiv 1904.05453).
 
-    A step that would raise a sample's energy is not taken, and the next ones are half as long: its status is DAMPED, or
-    STOPPED where no step could be taken at all.
+    A step that would raise a sample's energy is rejected, and the next ones are half as long: the status is DAMPED, or
+    STOPPED where no step was accepted.
 
     Example::
 
@@ -60,7 +62,7 @@ class GradientDescent(Stepwise):
     Attributes:
         steps: number S of steps.
         step_size: eta.
-        scale: of the channels acceleration [m/s^2] and turn rate [rad/s].
+        scale: diagonal of S for acceleration [m/s^2] and turn rate [rad/s].
     """
 
     needs = frozenset({GRADIENT})
@@ -72,17 +74,16 @@ class GradientDescent(Stepwise):
 
     def __post_init__(self) -> None:
         check_steps(self.steps, self.scale)
-        if not 0 < self.step_size < float("inf"):
-            raise ConfigError(f"solver.step_size must be positive and finite, not {self.step_size}")
+        check_number("solver.step_size", self.step_size)
 
     def with_steps(self, steps: int) -> GradientDescent:
-        """The same with another S."""
+        """This minimiser with another number of steps."""
         return dataclasses.replace(self, steps=steps)
 
     def run(
         self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Progress | None = None
     ) -> tuple[Solution, Progress]:
-        """Take a number of steps; how long the next ones are is remembered.
+        """Take a number of steps; returns the solution, and the progress to continue with.
 
         Raises:
             ValueError: scene and parameters do not fit together.
@@ -90,16 +91,16 @@ class GradientDescent(Stepwise):
         return descend(energy, scene, parameters, steps, self.step_size, self.scale, progress=memory)
 
 
-def check_steps(steps: int, scale: Sequence[float]) -> None:
-    """Refuse a number of steps or a scale that cannot be.
+def check_steps(steps: Any, scale: Any) -> None:
+    """Check a number of steps and a scale.
 
     Raises:
-        ConfigError: as said.
+        ConfigError: steps are no whole number, 0 or more, or the scale is not two positive, finite numbers.
     """
-    if steps < 0:
-        raise ConfigError(f"solver.steps must be 0 or more, not {steps}")
-    if isinstance(scale, str) or len(scale) != 2 or not all(0 < channel < float("inf") for channel in scale):
-        raise ConfigError(f"solver.scale takes two positive numbers, of accelerations and turn rates, not {scale}")
+    check_whole("solver.steps", steps, least=0)
+    channels = list(scale) if isinstance(scale, Sequence) and not isinstance(scale, str) else []
+    if len(channels) != 2 or not all(is_number(channel) and 0 < channel < math.inf for channel in channels):
+        raise ConfigError(f"solver.scale takes two positive numbers, for accelerations and turn rates, not {scale!r}")
 
 
 def descend(
@@ -114,17 +115,17 @@ def descend(
 ) -> tuple[Solution, Progress]:
     """Take steps u <- u - eta S^2 dE/du + noise S z from the initial strategies, with z ~ N(0, I).
 
-    Differentiable if gradients are recorded, which steps are taken being constant. Absent agents' controls are zero. Noise
-    keeps an energy of n controls n / 2 above its lowest value: what lies ten times as far above was too long a step.
+    Differentiable if gradients are recorded; acceptance of steps has no gradient. Absent agents' controls are zero. With
+    noise, the energy of n controls stays about n / 2 above its lowest value, and steps up to ten times that are accepted.
 
     Args:
         energy, scene, parameters: the game.
-        steps, step_size, scale, noise: S, eta, the diagonal of S, and how much noise.
-        progress: that of the steps which led to the initial strategies; None at the start. Steps in two parts are then
-            the same as in one, and the status is that of both.
+        steps, step_size, scale, noise: number of steps, eta, the diagonal of S, and the noise's standard deviation.
+        progress: progress of the steps that led to the initial strategies; None at the start. Steps in two parts give the
+            same result as in one, and the status covers both.
 
     Returns:
-        the solution, and the progress with which one would go on.
+        the solution, and the progress to continue with.
 
     Raises:
         ValueError: scene and parameters do not fit together.
@@ -136,11 +137,11 @@ def descend(
     present = scene.agent_mask[:, None, :, None, None]
     controls = torch.where(present, start, 0.0)
     channels = start.new_tensor(list(scale))
-    everyone = torch.ones(start.shape[:2], dtype=torch.bool, device=start.device)
-    energies, slope, sound = _look(energy, scene, parameters, controls, everyone)
+    every_sample = torch.ones(start.shape[:2], dtype=torch.bool, device=start.device)
+    energies, slope, finite = _evaluate(energy, scene, parameters, controls, every_sample)
     initial_energy = energies
     if progress is None:
-        progress = Progress(torch.ones_like(energies), energies, torch.zeros_like(sound))
+        progress = Progress(torch.ones_like(energies), energies, torch.zeros_like(finite))
     length, lowest, taken = progress.length, progress.lowest, progress.taken
     slack = 5.0 * (10.0 + scene.agent_mask.sum(1)[:, None] * start.shape[-2:].numel()) if noise else 0.0
     for step in range(steps):
@@ -148,10 +149,10 @@ def descend(
         moved = controls - step_size * reach * channels.square() * slope
         if noise:
             moved = moved + noise * reach.sqrt() * channels * torch.where(present, torch.randn_like(start), 0.0)
-        # Nothing comes after the last gradient that would have to be differentiated.
+        # The last gradient moves nothing, so it needs no graph.
         with torch.set_grad_enabled(torch.is_grad_enabled() and step < steps - 1):
-            value, ahead, finite = _look(energy, scene, parameters, moved, sound)
-        good = finite & (value <= lowest + slack)
+            value, ahead, finite_there = _evaluate(energy, scene, parameters, moved, finite)
+        good = finite_there & (value <= lowest + slack)
         keep = good[..., None, None, None]
         controls, slope = torch.where(keep, moved, controls), torch.where(keep, ahead, slope)
         energies, length = torch.where(good, value, energies), torch.where(good, length, 0.5 * length)
@@ -164,19 +165,19 @@ def descend(
         initial_energy=initial_energy,
         energy=energies,
         gradient_norm=slope.detach().flatten(2).norm(dim=-1),
-        status=torch.where(sound & (taken | (steps == 0)), shortened, Status.STOPPED),
+        status=torch.where(finite & (taken | (steps == 0)), shortened, Status.STOPPED),
     )
     return solution, Progress(length, lowest, taken)
 
 
-def _look(
+def _evaluate(
     energy: Energy,
     scene: Scene,
     parameters: GameParameters,
     controls: Float[Tensor, "B M N K 2"],
     going: Bool[Tensor, "B M"],
 ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M N K 2"], Bool[Tensor, "B M"]]:
-    """The energy, its gradient, and which samples go on: both are numbers."""
+    """The energy, its gradient, and a mask of the samples in ``going`` where both are finite."""
     value, slope = gradient(energy, scene, parameters, controls)
     going = going & value.isfinite() & slope.flatten(2).isfinite().all(-1)
     if torch.is_grad_enabled() and not going.all():

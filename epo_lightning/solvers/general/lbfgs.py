@@ -1,7 +1,7 @@
-"""Limited-memory BFGS, for any energy that has a gradient: no Hessian, some more steps.
+"""Limited-memory BFGS, for any energy that has a gradient: it needs no Hessian, but more steps than Newton's method.
 
-``torch.optim.LBFGS`` has one history and one line search for all samples, which would make a forecast depend on the batch it
-is in. Here every sample has its own.
+``torch.optim.LBFGS`` has one history and one line search for all samples, so that a forecast would depend on its batch. Here
+every sample has its own.
 """
 
 from __future__ import annotations
@@ -12,19 +12,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from epo_lightning.game.checks import check_number, check_whole
 from epo_lightning.game.energy import GRADIENT, Energy
-from epo_lightning.registry import ConfigError, register
+from epo_lightning.registry import register
 from epo_lightning.scene import GameParameters, Scene, Solution
 from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.general import descent
 from epo_lightning.solvers.general.dense import gradient
 
 _DECREASE = 1e-4
-"""Share of the decrease that the gradient promises with which a step is accepted (Armijo)."""
+"""Armijo constant: required decrease relative to the linear prediction."""
 _CURVATURE = 1e-10
-"""Cosine between a step and the change of the gradient below which they are not remembered: there is no curvature in it."""
+"""Smallest cosine between a step and the change of the gradient for which the pair enters the history."""
 _SHORTEST = 1e-12
-"""Share of a direction at which the search along it is given up."""
+"""Shortest relative step before the line search gives up."""
 
 
 @register("solver", "lbfgs")
@@ -32,17 +33,17 @@ _SHORTEST = 1e-12
 class LBFGS(Minimiser):
     """Quasi-Newton steps with the two-loop recursion (Nocedal and Wright, Algorithm 7.4) and backtracking.
 
-    What TGL minimises with (history 65, at most 1000 iterations, tolerance 1e-3). Every evaluation is one step: a sample
-    either accepts the trial and turns to a new direction, or shortens its step by quadratic interpolation. Where a whole
-    search fails, the history is dropped, and then the sample.
+    TGL's minimiser (history 65, at most 1000 iterations, tolerance 1e-3). Every evaluation is one step: a sample either
+    accepts the trial and takes a new direction, or shortens its step by quadratic interpolation. If a line search fails, the
+    history is dropped; if it fails again, the sample ends.
 
-    Solutions are constants to automatic differentiation; ``backward=implicit`` is what learns through them.
+    Solutions are constants to automatic differentiation; use ``backward=implicit`` to learn through them.
 
     Attributes:
-        steps: how often energy and gradient are evaluated at most.
+        steps: largest number of evaluations of energy and gradient.
         tolerance: a sample has converged where the largest entry of its gradient, or of a full step, is no larger than this;
-            or where it cannot be improved in its precision.
-        history: how many steps are remembered.
+            or where rounding errors prevent further improvement.
+        history: number of steps in the history.
     """
 
     needs = frozenset({GRADIENT})
@@ -53,12 +54,9 @@ class LBFGS(Minimiser):
     history: int = 20
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ConfigError(f"solver.steps must be 0 or more, not {self.steps}")
-        if not 0 <= self.tolerance < float("inf"):
-            raise ConfigError(f"solver.tolerance must be 0 or more, and finite, not {self.tolerance}")
-        if self.history < 1:
-            raise ConfigError(f"solver.history must be 1 or more, not {self.history}")
+        check_whole("solver.steps", self.steps, least=0)
+        check_number("solver.tolerance", self.tolerance, zero=True)
+        check_whole("solver.history", self.history)
 
     @torch.no_grad()
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
@@ -66,9 +64,9 @@ class LBFGS(Minimiser):
         if controls.numel() == 0:
             return descent.nothing(controls)
         value, slope = gradient(energy, scene, parameters, controls)
-        initial, sound = value, descent.finite(value, slope)
-        status = descent.first_status(sound)
-        done = ~sound | (descent.largest(slope) <= self.tolerance)
+        initial, finite = value, descent.finite(value, slope)
+        status = descent.first_status(finite)
+        done = ~finite | (descent.largest(slope) <= self.tolerance)
         shape = *controls.shape[:2], self.history, slope[0, 0].numel()
         moves, changes = slope.new_zeros(shape), slope.new_zeros(shape)
         direction, length = _downhill(slope), torch.ones_like(value)
@@ -86,7 +84,7 @@ class LBFGS(Minimiser):
             moves, changes = _remember(curved, moves, move), _remember(curved, changes, change)
             near = (length == 1.0) & (descent.largest(there - controls) <= self.tolerance)
             controls = torch.where(_wide(better), there, controls)
-            # The parabola through both energies and the slope between them.
+            # Minimum of the parabola through both energies with the directional derivative at the first.
             shorter = -0.5 * length * promised / (trial[0] - value - promised)
             shorter = shorter.nan_to_num(0.0).clamp(0.1 * length, 0.5 * length)
             value, slope = torch.where(better, trial[0], value), torch.where(_wide(better), trial[1], slope)
@@ -115,21 +113,21 @@ def _dot(one: Tensor, other: Tensor) -> Tensor:
 
 
 def _downhill(slope: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "B M N K 2"]:
-    """The direction of steepest descent, no longer than one."""
+    """The direction of steepest descent, of length one at most."""
     return -slope / _wide(slope.flatten(2).norm(dim=-1).clamp_min(1.0))
 
 
 def _remember(
     whose: Tensor, memory: Float[Tensor, "B M L n"], newest: Float[Tensor, "B M n"]
 ) -> Float[Tensor, "B M L n"]:
-    """The memory without its oldest entry and with the newest as its last one, for some samples."""
+    """The memory with its oldest entry replaced by the newest one, for some samples."""
     return torch.where(whose[..., None, None], torch.cat((memory[:, :, 1:], newest[:, :, None]), 2), memory)
 
 
 def _times(
     moves: Float[Tensor, "B M L n"], changes: Float[Tensor, "B M L n"], slope: Float[Tensor, "B M N K 2"]
 ) -> Float[Tensor, "B M N K 2"]:
-    """The inverse Hessian that the history tells of, times the gradient. Entries of zero change nothing."""
+    """The approximate inverse Hessian of the history times the gradient; entries of zero have no effect."""
     curvature = _dot(moves, changes)
     inverse = torch.where(curvature > 0, 1.0 / torch.where(curvature > 0, curvature, 1.0), 0.0)
     result, shares = slope.flatten(2), []

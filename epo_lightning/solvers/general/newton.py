@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from epo_lightning.game.checks import check_number, check_whole
 from epo_lightning.game.energy import GRADIENT, Energy
-from epo_lightning.registry import ConfigError, register
+from epo_lightning.registry import register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.general import descent
@@ -17,28 +18,28 @@ from epo_lightning.solvers.general.dense import factorise, gradient, hessian
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-7, 1e7
 _TRIES = 6
-"""Steps that are tried with one Hessian, which costs more than all of them."""
+"""Trial steps per Hessian; computing the Hessian costs more than all of them."""
 _SHORTEST = 0.03
-"""Share of a step below which it is not shortened any more, but damped."""
+"""Shortest relative step of the line search; below it the damping is raised instead."""
 
 
 @register("solver", "newton")
 @dataclass(frozen=True)
 class Newton(Minimiser):
-    """Steps -(H + lambda I)^-1 grad E with a damping lambda that makes the matrix positive definite, no longer than helps.
+    """Newton steps -(H + lambda I)^-1 grad E with damping lambda and a line search.
 
-    Without a Cholesky factor lambda is multiplied by 10. A step that does not lower the energy is shortened, to where the
-    slope along it would vanish if it changed linearly, which costs no other factor; when that does not help soon, lambda is
-    multiplied by 10 as well. A whole step that is accepted divides it by 10. Lambda is the sample's own, begins at 1e-3 and
-    stays within [1e-7, 1e7]. Near a minimum the number of correct digits about doubles with every step; where residuals are
-    linear by pieces (:class:`~epo_lightning.solvers.general.dense.PiecewiseQuadratic`), it is reached in a few.
+    If the matrix is not positive definite, lambda is multiplied by 10. A step that does not lower the energy is shortened by
+    the secant rule, which needs no further factorisation; if that does not help soon, lambda is multiplied by 10 as well. An
+    accepted full step divides lambda by 10. Every sample has its own lambda, which begins at 1e-3 and stays within
+    [1e-7, 1e7]. Convergence is quadratic near a minimum; with piecewise linear residuals
+    (:class:`~epo_lightning.solvers.general.dense.PiecewiseQuadratic`) a few steps suffice.
 
-    Solutions are constants to automatic differentiation; ``backward=implicit`` is what learns through them.
+    Solutions are constants to automatic differentiation; use ``backward=implicit`` to learn through them.
 
     Attributes:
-        steps: how many Hessians are computed at most.
+        steps: largest number of Hessians.
         tolerance: a sample has converged where the largest entry of its gradient, or of a step with little damping, is no
-            larger than this; or where it cannot be improved in its precision.
+            larger than this; or where rounding errors prevent further improvement.
     """
 
     needs = frozenset({GRADIENT})
@@ -48,10 +49,8 @@ class Newton(Minimiser):
     tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ConfigError(f"solver.steps must be 0 or more, not {self.steps}")
-        if not 0 <= self.tolerance < float("inf"):
-            raise ConfigError(f"solver.tolerance must be 0 or more, and finite, not {self.tolerance}")
+        check_whole("solver.steps", self.steps, least=0)
+        check_number("solver.tolerance", self.tolerance, zero=True)
 
     @torch.no_grad()
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
@@ -59,23 +58,22 @@ class Newton(Minimiser):
         if controls.numel() == 0:
             return descent.nothing(controls)
         value, slope = gradient(energy, scene, parameters, controls)
-        sound = descent.finite(value, slope)
-        done = ~sound | (descent.largest(slope) <= self.tolerance)
-        now = _Iterate(
-            controls, value, slope, torch.full_like(value, _FIRST_DAMPING), descent.first_status(sound), done
-        )
+        finite = descent.finite(value, slope)
+        done = ~finite | (descent.largest(slope) <= self.tolerance)
+        damping = torch.full_like(value, _FIRST_DAMPING)
+        now = _Iterate(controls, value, slope, damping, descent.first_status(finite), done)
         for _ in range(self.steps):
             if descent.ended(now.done):
                 break
             going = ~now.done.all(1)
             if going.device.type != "cpu" or going.all():
                 now = self._advanced(energy, scene, parameters, now)
-            else:  # scenes that have converged cost nothing
+            else:  # scenes that have converged are left out
                 now = now.with_(going, self._advanced(energy, scene[going], parameters[going], now.of(going)))
         return descent.solution(energy, scene, now.controls, (value, now.value), now.slope, now.status)
 
     def _advanced(self, energy: Energy, scene: Scene, parameters: GameParameters, now: _Iterate) -> _Iterate:
-        """One Hessian further."""
+        """The iterates after one more Hessian."""
         controls, value, slope, damping, status, done = vars(now).values()
         matrix = hessian(energy, scene, parameters, controls)
         known = matrix.flatten(2).sum(-1).isfinite()
@@ -98,7 +96,7 @@ class Newton(Minimiser):
             exhausted = definite & (length * promised <= descent.rounding(value))
             stuck = open_ & ~better & (exhausted | (damping >= _MOST_DAMPING))
             status = torch.where(open_ & ~definite & (status == Status.SOLVED), int(Status.DAMPED), status)
-            # Where the slope along the step would vanish, from what it is at both ends.
+            # The secant rule: the point where the directional derivative vanishes if it is linear along the step.
             share = promised / (promised + (trial[1] * move).flatten(2).sum(-1))
             shorter = length * share.nan_to_num(0.0).clamp(0.1, 0.5)
             controls = torch.where(_wide(better), there, controls)
@@ -115,7 +113,7 @@ class Newton(Minimiser):
 
 @dataclass(frozen=True)
 class _Iterate:
-    """Where every sample is, the energy and the gradient there, its damping, and whether it has come to an end."""
+    """The iterates of all samples: controls, energy, gradient, damping, status, and a mask of those that have ended."""
 
     controls: Float[Tensor, "B M N K 2"]
     value: Float[Tensor, "B M"]
@@ -129,7 +127,7 @@ class _Iterate:
         return _Iterate(**{name: tensor[scenes] for name, tensor in vars(self).items()})
 
     def with_(self, scenes: Bool[Tensor, " B"], others: _Iterate) -> _Iterate:
-        """The same with other iterates of some scenes."""
+        """These iterates, with others for some scenes."""
         new = vars(others)
         return _Iterate(**{name: tensor.index_put((scenes,), new[name]) for name, tensor in vars(self).items()})
 
@@ -146,13 +144,12 @@ def _steps(
     move: Float[Tensor, "B M N K 2"],
     definite: Bool[Tensor, "B M"],
 ) -> tuple[Float[Tensor, "B M N K 2"], Bool[Tensor, "B M"]]:
-    """The damped steps of some samples and whether they have a factor, beside those that others had before."""
-    some = (
-        which if which.device.type == "cpu" else torch.ones_like(which)
-    )  # elsewhere the host would wait for the count
+    """The damped steps, and a mask of the positive definite matrices, recomputed for ``which`` samples."""
+    # On other devices all samples are recomputed, because selecting some would make the host wait for their number.
+    some = which if which.device.type == "cpu" else torch.ones_like(which)
     chosen = matrix[some]
     chosen.diagonal(dim1=-2, dim2=-1).add_(damping[some][..., None])
-    factor, sound = factorise(chosen)
+    factor, has_factor = factorise(chosen)
     step = -torch.cholesky_solve(slope[some].flatten(1)[..., None], factor).view_as(slope[some])
-    new, found = move.masked_scatter(_wide(some), step), definite.masked_scatter(some, sound)
+    new, found = move.masked_scatter(_wide(some), step), definite.masked_scatter(some, has_factor)
     return torch.where(_wide(which), new, move), torch.where(which, found, definite)

@@ -200,7 +200,7 @@ def test_agents_that_can_do_nothing_are_named():
 
 def test_messages_take_over_where_there_is_too_much_to_enumerate_and_say_so_once():
     scene, game = played(1, 5, 6)
-    candidates._say_once.cache_clear()
+    candidates._warn_once.cache_clear()
     with pytest.warns(UserWarning, match="more than 4096"):
         many = Enumeration(candidates=6, modes=2)(ENERGY, scene, game)
     with warnings.catch_warnings():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 
+import jaxtyping
 import numpy as np
 import pytest
 import scipy.optimize
@@ -305,14 +306,18 @@ def test_a_weight_of_zero_leaves_the_floor():
 @pytest.mark.parametrize(
     ("kind", "changes", "message"),
     [
-        (Newton, {"steps": -1}, "solver.steps"),
+        (Newton, {"steps": -1}, "solver.steps must be a whole number, 0 or more, not -1"),
+        (Newton, {"steps": 1.5}, "solver.steps must be a whole number, 0 or more, not 1.5"),
+        (Newton, {"tolerance": float("nan")}, "solver.tolerance must be a number, 0 or more, and finite, not nan"),
+        (Newton, {"tolerance": "1e-6"}, "solver.tolerance must be a number, 0 or more, and finite, not '1e-6'"),
         (Newton, {"tolerance": -1.0}, "solver.tolerance"),
         (LBFGS, {"steps": -1}, "solver.steps"),
         (LBFGS, {"tolerance": float("inf")}, "solver.tolerance"),
         (LBFGS, {"history": 0}, "solver.history"),
     ],
 )
-def test_mistakes_in_configurations(kind, changes, message):
+def test_mistakes_in_configurations(kind, changes, message, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checks would come first
     with pytest.raises(ConfigError, match=message):
         kind(**changes)
 
