@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from epo_lightning.game.energy import Energy
@@ -35,6 +35,11 @@ def begin(energy: Energy, scene: Scene, parameters: GameParameters) -> tuple[Sce
     if scene.history.dtype != start.dtype:
         scene = scene.to(start.dtype)
     return scene, torch.where(scene.agent_mask[:, None, :, None, None], start, 0.0)
+
+
+def wide(samples: Shaped[Tensor, "B M"]) -> Shaped[Tensor, "B M 1 1 1"]:
+    """Values of samples that broadcast with controls."""
+    return samples[..., None, None, None]
 
 
 def largest(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "B M"]:

@@ -73,7 +73,7 @@ class LBFGS(Minimiser):
         for _ in range(self.steps):
             if descent.ended(done):
                 break
-            there = torch.where(_wide(done), controls, controls + _wide(length) * direction)
+            there = torch.where(descent.wide(done), controls, controls + descent.wide(length) * direction)
             trial = gradient(energy, scene, parameters, there)
             promised = length * _dot(slope.flatten(2), direction.flatten(2))
             better = (trial[0] <= value + _DECREASE * promised) | descent.level(value, slope, *trial)
@@ -83,11 +83,11 @@ class LBFGS(Minimiser):
             curved = better & (_dot(move, change) > _CURVATURE * move.norm(dim=-1) * change.norm(dim=-1))
             moves, changes = _remember(curved, moves, move), _remember(curved, changes, change)
             near = (length == 1.0) & (descent.largest(there - controls) <= self.tolerance)
-            controls = torch.where(_wide(better), there, controls)
+            controls = torch.where(descent.wide(better), there, controls)
             # Minimum of the parabola through both energies with the directional derivative at the first.
             shorter = -0.5 * length * promised / (trial[0] - value - promised)
             shorter = shorter.nan_to_num(0.0).clamp(0.1 * length, 0.5 * length)
-            value, slope = torch.where(better, trial[0], value), torch.where(_wide(better), trial[1], slope)
+            value, slope = torch.where(better, trial[0], value), torch.where(descent.wide(better), trial[1], slope)
             done = done | (better & (near | (descent.largest(slope) <= self.tolerance)))
 
             failed = ~done & ~better & (length < _SHORTEST)
@@ -96,16 +96,12 @@ class LBFGS(Minimiser):
             onward = -_times(moves, changes, slope)
             forget = failed | (better & (_dot(slope.flatten(2), onward.flatten(2)) >= 0))
             moves, changes = (torch.where(forget[..., None, None], 0.0, kept) for kept in (moves, changes))
-            fresh = _wide(forget | ~(changes != 0).flatten(2).any(-1))
+            fresh = descent.wide(forget | ~(changes != 0).flatten(2).any(-1))
             onward = torch.where(fresh, _downhill(slope), onward)
             turned = better | failed
-            direction = torch.where(_wide(turned), onward, direction)
+            direction = torch.where(descent.wide(turned), onward, direction)
             length = torch.where(turned, 1.0, shorter)
         return descent.solution(energy, scene, controls, (initial, value), slope, status)
-
-
-def _wide(samples: Tensor) -> Tensor:
-    return samples[..., None, None, None]
 
 
 def _dot(one: Tensor, other: Tensor) -> Tensor:
@@ -114,7 +110,7 @@ def _dot(one: Tensor, other: Tensor) -> Tensor:
 
 def _downhill(slope: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "B M N K 2"]:
     """The direction of steepest descent, of length one at most."""
-    return -slope / _wide(slope.flatten(2).norm(dim=-1).clamp_min(1.0))
+    return -slope / descent.wide(slope.flatten(2).norm(dim=-1).clamp_min(1.0))
 
 
 def _remember(

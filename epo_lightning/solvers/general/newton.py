@@ -86,7 +86,7 @@ class Newton(Minimiser):
                 break
             if not descent.ended(~stale):
                 move, definite = _steps(matrix, damping, slope, stale, move, definite)
-            there = torch.where(_wide(open_), controls + _wide(length) * move, controls)
+            there = torch.where(descent.wide(open_), controls + descent.wide(length) * move, controls)
             trial = gradient(energy, scene, parameters, there)
             better = (trial[0] < value) | descent.level(value, slope, *trial)
             better = open_ & definite & descent.finite(*trial) & better
@@ -99,8 +99,8 @@ class Newton(Minimiser):
             # The secant rule: the point where the directional derivative vanishes if it is linear along the step.
             share = promised / (promised + (trial[1] * move).flatten(2).sum(-1))
             shorter = length * share.nan_to_num(0.0).clamp(0.1, 0.5)
-            controls = torch.where(_wide(better), there, controls)
-            value, slope = torch.where(better, trial[0], value), torch.where(_wide(better), trial[1], slope)
+            controls = torch.where(descent.wide(better), there, controls)
+            value, slope = torch.where(better, trial[0], value), torch.where(descent.wide(better), trial[1], slope)
             done = done | stuck | (better & (near | (descent.largest(slope) <= self.tolerance)))
             stale = open_ & ~better & (~definite | (shorter < _SHORTEST))
             length = torch.where(stale, 1.0, shorter)
@@ -132,10 +132,6 @@ class _Iterate:
         return _Iterate(**{name: tensor.index_put((scenes,), new[name]) for name, tensor in vars(self).items()})
 
 
-def _wide(samples: Tensor) -> Tensor:
-    return samples[..., None, None, None]
-
-
 def _steps(
     matrix: Float[Tensor, "B M n n"],
     damping: Float[Tensor, "B M"],
@@ -151,5 +147,5 @@ def _steps(
     chosen.diagonal(dim1=-2, dim2=-1).add_(damping[some][..., None])
     factor, has_factor = factorise(chosen)
     step = -torch.cholesky_solve(slope[some].flatten(1)[..., None], factor).view_as(slope[some])
-    new, found = move.masked_scatter(_wide(some), step), definite.masked_scatter(some, has_factor)
-    return torch.where(_wide(which), new, move), torch.where(which, found, definite)
+    new, found = move.masked_scatter(descent.wide(some), step), definite.masked_scatter(some, has_factor)
+    return torch.where(descent.wide(which), new, move), torch.where(which, found, definite)
