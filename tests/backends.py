@@ -1,4 +1,4 @@
-"""What every way of taking the layer's steps must do: subclass the suite, say which `solve`, and inherit its tests.
+"""The suite of all backends of the layer: subclass it, set `solve`, and inherit its tests.
 
 The reference is written for clearness: a dense Jacobian from forward-mode differentiation, a general linear solver, and
 plain automatic differentiation through both.
@@ -37,7 +37,7 @@ def reference(energy, scene, parameters, steps, step_size, damping):
 
 
 def gradients(parameters: GameParameters) -> dict[str, torch.Tensor]:
-    """What has gathered at the leaves, by name."""
+    """The gradients of the leaves, by name."""
     leaves = {"initial_controls": parameters.initial_controls, "goals": parameters.goals}
     leaves |= {**parameters.own_weights, **parameters.pair_weights}
     return {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}

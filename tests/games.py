@@ -14,7 +14,7 @@ from epo_lightning.scene import GameParameters, Scene
 from epo_lightning.solvers.gauss_newton.expansion import expand
 
 BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}
-"""Narrow enough for random controls to leave them."""
+"""Bounds that random controls leave."""
 ALL = tuple(OWN_FEATURES)
 """Every built-in own feature."""
 EXID = ("goal", "lane", "velref", "vel", "acc", "jerk", "steer", "turnr", "turnacc")
@@ -56,7 +56,7 @@ def random_scene(
 
 
 def highway_scene(scenes: int = 3, agents: int = 4, *, candidates: int = 6, horizon: int = 8) -> Scene:
-    """Vehicles on three lanes of a motorway, up to 60 m apart, who keep or change their lane.
+    """Vehicles on three lanes of a motorway, up to 60 m apart, that keep or change their lane.
 
     Of every scene, one lane has no vector and one agent no last future step; agents have between one and all candidates.
     """
@@ -208,7 +208,7 @@ def pad(
 
 @contextmanager
 def nearest_points_held() -> Iterator[None]:
-    """The nearest points of reference lines stay where they are under differentiation, as in the Gauss-Newton model."""
+    """The nearest points of reference lines are held under differentiation, as in the Gauss-Newton model."""
     sliding = feature_derivatives.nearest_point
     feature_derivatives.nearest_point = lambda position, line: tuple(part.detach() for part in sliding(position, line))
     try:

@@ -89,7 +89,7 @@ def violation(value: Float[Tensor, "*shape"], lower: float, upper: float) -> Der
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What own features refer to besides the trajectory; zero for absent agents, None where no feature needs it.
+    """Inputs of own features besides the trajectory: zero for absent agents, None where no feature needs them.
 
     Attributes:
         initial: the states x_0.

@@ -26,7 +26,7 @@ from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarq
 
 OWN = ("goal", "velref", "acc", "turnr", "jerk")
 SIZES = ((1.8, 0.6), (0.5, 0.5), (3.9, 1.7), (4.0, 1.8), (4.7, 1.9), (7.9, 2.2), (8.0, 2.3), (16.0, 2.5), (0.4, 0.7))
-"""Length and width of a bicycle, a pedestrian, cars, vans, trucks, and of what is wider than long."""
+"""Length and width of a bicycle, a pedestrian, cars, vans, trucks, and of an agent that is wider than long."""
 
 
 def circles_of(state, size):
@@ -44,7 +44,7 @@ def slow_overlap(first, second, first_size, second_size):
 
 
 def traffic(scenes=2, agents=4, dtype=torch.float64, apart=3.0, **options):
-    """Vehicles of all sizes, some of them in each other's way, and a game with weights for circles."""
+    """Vehicles of all sizes, some of them overlapping, and a game with weights for circles."""
     scene = random_scene(scenes, agents, history=2, dtype=dtype, **options)
     scene.history[..., :2] *= apart
     scene.size.copy_(torch.tensor(SIZES, dtype=dtype)[torch.randint(len(SIZES), (scenes, agents))])
@@ -284,7 +284,7 @@ def test_pairs_that_only_outer_circles_reach_are_edges():
 
 @pytest.mark.parametrize("size", SIZES)
 def test_the_extent_bounds_where_circles_are_felt(size):
-    """Edges leave out who is farther away: nobody there overlaps."""
+    """Edges leave out pairs that are farther apart, which cannot overlap."""
     extent = row_extent(torch.tensor(size, dtype=torch.float64)).item()
     centres, radius = circles_of((0.0, 0.0, 0.7), size)
     reach = Point(0.0, 0.0).buffer(extent + 1e-6, 512)

@@ -24,7 +24,7 @@ SIZES = ((1.6, 0.7), (0.5, 0.5), (3.6, 1.9), (4.0, 1.8), (4.7, 1.9), (8.0, 2.3),
 
 
 def drawn(shape, agents=4, scenes=4, modes=3, dtype=torch.float64):
-    """Vehicles of all sizes on a small place, seconds apart from step to step."""
+    """Vehicles of all sizes in a small area, with long steps."""
     scene = dataclasses.replace(random_scene(scenes, agents, history=2, dtype=dtype), dt=1.0)
     scene.history[..., :2] *= 5.0
     scene.size.copy_(torch.tensor(SIZES, dtype=dtype)[torch.randint(len(SIZES), (scenes, agents))])
@@ -99,7 +99,7 @@ def test_who_only_touches_does_not_collide():
 
 
 def test_the_network_sees_waypoints():
-    """A straight way of constant speed: places, no turn, and the way so far, which is as long as it is far."""
+    """Straight motion at constant speed: positions, no turn, and the distance travelled."""
     energy, scene, game = drawn("disc", agents=1, scenes=1, modes=1)
     assert energy.waypoints == [0, 1, 2, 3]
     assert CollisionEnergy(Unicycle(), WIDTH, 20, 1.0, "disc").waypoints == [3, 7, 11, 15, 19]

@@ -12,7 +12,7 @@ ROLL = DoubleIntegrator().rollout
 
 
 def loop(state, controls, dt):
-    """Positions, velocities and what they look like, one step after the other."""
+    """Positions and velocities, step by step, and the heading and speed of these velocities."""
     x, y, theta, speed = state
     vx, vy = speed * math.cos(theta), speed * math.sin(theta)
     states = []

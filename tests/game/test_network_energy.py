@@ -1,4 +1,4 @@
-"""What energies that are networks have in common: tables, absent agents, and named features beside the networks."""
+"""The base of network energies: tables, absent agents, and named features as further terms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ each = pytest.mark.parametrize("kind", KINDS)
 
 
 def crowd(scenes=2, agents=3, modes=2, own=()):
-    """Agents as large as they are far apart, so that some collide and some do not, and a game for them."""
+    """Agents as large as they are far apart, so that some collide and others do not, and a game for them."""
     scene = random_scene(scenes, agents, history=2, size=1.0, dtype=torch.float64)
     scene.size[..., 1] *= 0.5
     scene = dataclasses.replace(scene, dt=0.5)

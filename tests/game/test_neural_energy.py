@@ -1,4 +1,4 @@
-"""The energy that is a network: against itself written out, against finite differences, and where agents coincide."""
+"""The neural energy against plain arithmetic and finite differences, and for agents that coincide."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_gradients_and_hessians_equal_finite_differences():
 
 
 def test_every_control_matters():
-    """The last position of explicit Euler does not depend on the last controls; without heading and speed they were free."""
+    """The last position does not depend on the last controls (explicit Euler), but heading and speed do."""
     energy, scene, game = drawn()
     controls = game.initial_controls.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(energy(scene, game, controls).sum(), controls)

@@ -1,4 +1,4 @@
-"""Pair features that depend on who comes first leave the class of potential games and are refused."""
+"""Pair features that depend on the order of the two agents define no potential game and are refused."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def distance(first, second):
 
 
 def behind(first, second):
-    """The first one's interest alone: to keep five metres from who is ahead of it."""
+    """A cost of the first agent alone: to keep five metres from the agent ahead of it."""
     heading = torch.stack((first[..., 2].cos(), first[..., 2].sin()), -1)
     ahead = ((second[..., :2] - first[..., :2]) * heading).sum(-1)
     return torch.relu(5.0 - ahead) * (ahead > 0) * (distance(first, second) < 5.0)

@@ -1,4 +1,4 @@
-"""Controls from observed motion: exact where the dynamics made it, close where they did not, and nothing from nowhere."""
+"""Controls from observed motion: exact for futures of the dynamics, close for others, zero where unobserved."""
 
 from __future__ import annotations
 

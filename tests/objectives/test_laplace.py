@@ -1,4 +1,4 @@
-"""Laplace's likelihood against exact Gaussians, dense matrices and finite differences, and what it must leave out."""
+"""Laplace's likelihood against exact Gaussians, dense matrices and finite differences, and games without a density."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def forecast_of(energy, scene, parameters, logits=None):
 
 
 def gaussians(scene, parameters, damping=0.0):
-    """The exact density of all controls of a scene: its energy is a parabola, read off at controls of zero."""
+    """The exact Gaussian of all controls of a scene: the energy is quadratic, expanded at zero controls."""
     origin = torch.zeros_like(parameters.initial_controls)
     with torch.enable_grad():
         at = origin.requires_grad_()
@@ -146,7 +146,7 @@ def test_controls_that_were_not_observed_are_integrated_out():
 
 
 class Other(Energy):
-    """An energy of a kind of which nothing is known but residuals."""
+    """An energy that offers residuals only."""
 
     offers = frozenset({GRADIENT, RESIDUALS})
 

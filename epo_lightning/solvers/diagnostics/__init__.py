@@ -1,1 +1,1 @@
-"""How close a joint strategy is to an equilibrium of its game."""
+"""Distance of joint strategies from an equilibrium of their game."""

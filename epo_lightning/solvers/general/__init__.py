@@ -1,1 +1,1 @@
-"""Minimisers that ask an energy for no more than its value: Newton, quasi-Newton, gradient descent, sampling."""
+"""Minimisers of any differentiable energy: Newton, quasi-Newton, gradient descent, Langevin sampling."""

@@ -1,4 +1,4 @@
-"""How close a forecast is to an equilibrium, against closed forms, other minimisers, loops over tables, and held agents."""
+"""The equilibrium report against closed forms, other minimisers, loops over tables, and held agents."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SLOW = settings(max_examples=12, deadline=None, suppress_health_check=[HealthChe
 
 
 class Opaque(Energy):
-    """An energy of features that does not say so: no solver knows its structure."""
+    """A feature energy that does not declare its features, so that no solver knows its structure."""
 
     offers = frozenset({GRADIENT})
 
@@ -46,7 +46,7 @@ class Opaque(Energy):
 
 
 class Valued(Opaque):
-    """One without derivatives."""
+    """An energy without derivatives."""
 
     offers = frozenset()
 
@@ -410,7 +410,7 @@ SOLVERS += [structured.solve, lambda *a, **o: structured.solve(*a, split=False, 
 
 
 def reduced(energy, scene, parameters, steps, step_size, damping, held):
-    """Damped Gauss-Newton steps of those who are not held, by a dense matrix of their controls alone, one game at a time."""
+    """Damped Gauss-Newton steps of the agents that are not held, by a dense matrix of their controls, game by game."""
     controls = parameters.initial_controls
     free = ~held[..., None, None].expand(controls.shape)
     for _ in range(steps):
@@ -517,7 +517,7 @@ def test_who_falls_without_end_is_given_up_and_who_creeps_is_not():
 
 
 class Downhill(Opaque):
-    """An energy that falls without end with the accelerations of whoever starts to the right of the origin."""
+    """An energy that is unbounded from below in the accelerations of agents that start to the right of the origin."""
 
     def own_terms(self, scene, parameters, states, controls):
         terms = self.features.own_terms(scene, parameters, states, controls)

@@ -1,4 +1,4 @@
-"""Minimisers over candidates: tables against energies of whole joint strategies, and what is made of them."""
+"""Minimisers over candidates: tables against energies of joint strategies, and solutions against the tables."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def played(scenes: int = 2, agents: int = 3, count: int = 3) -> tuple[Scene, Gam
 
 
 def with_absent(game: GameParameters) -> GameParameters:
-    """The same with an absent agent who holds no numbers."""
+    """The same with an absent agent that holds NaN."""
     controls = game.initial_controls
     wide = widen(dataclasses.replace(game, initial_controls=controls[:, :1]), 1)
     nothing = torch.full_like(controls[:, :, :1], NAN)

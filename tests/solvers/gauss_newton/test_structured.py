@@ -1,4 +1,4 @@
-"""The PyTorch backend against a dense reference, bit by bit against itself, and without a word to the host."""
+"""The PyTorch backend against a dense reference, bit by bit against itself, and without making the host wait."""
 
 from __future__ import annotations
 
@@ -251,7 +251,7 @@ def test_undeclared_features_solve_to_what_declared_ones_do(twins, split, stride
 
 
 def test_undeclared_features_have_the_implicit_gradients_of_declared_ones(twins):
-    """The exact Hessian: closed forms and second derivatives of declared shapes against automatic differentiation."""
+    """The exact Hessian: closed forms and second derivatives of declared features against automatic differentiation."""
     scene = random_scene(2, 3, history=2, size=1.0, dtype=torch.float64)
     parameters = random_game(scene, 1, 5, spread=0.1)
     parameters = dataclasses.replace(parameters, goals=torch.zeros_like(parameters.goals))

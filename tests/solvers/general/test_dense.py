@@ -101,7 +101,7 @@ def test_gauss_newton_is_exact_where_residuals_are_linear():
 @pytest.mark.parametrize("function", [hessian, gauss_newton])
 @pytest.mark.parametrize("convex", [True, False])
 def test_matrices_are_differentiable_by_the_game(function, convex):
-    """What a Laplace approximation differentiates: log det H, here against central differences."""
+    """The gradient of log det H, which a Laplace approximation needs, against central differences."""
     scene, game = convex_game() if convex else feature_game()
     energy = convex_energy() if convex else FEATURES
     name, kind = ("order", "pair_weights") if convex else ("goal", "own_weights")

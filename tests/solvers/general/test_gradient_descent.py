@@ -1,4 +1,4 @@
-"""Gradient descent: closed forms on quadratic energies, its derivative, and what it does where there are no numbers."""
+"""Gradient descent: closed forms on quadratic energies, its derivative, and its treatment of NaN."""
 
 from __future__ import annotations
 

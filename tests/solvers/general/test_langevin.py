@@ -1,4 +1,4 @@
-"""Langevin samples against what is known of them: their exact law on quadratic energies, step by step and in the limit."""
+"""Langevin samples against their exact distribution on quadratic energies, after some steps and in the limit."""
 
 from __future__ import annotations
 

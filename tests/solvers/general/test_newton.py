@@ -1,4 +1,4 @@
-"""Newton's method and L-BFGS: closed forms, SciPy, each other, one minimiser for every order, and samples on their own."""
+"""Newton's method and L-BFGS: closed forms, SciPy, each other, one minimiser for every order, independence of samples."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def feature_game(scenes=3, modes=2, size=1.0, spread=0.1):
 
 @both
 def test_two_agents_on_a_line_have_a_closed_form(minimise):
-    """Both drive along x, want to be elsewhere, and are never as far apart as the order asks for: linear and quadratic."""
+    """Two agents along x that never keep the distance of the order: all hinges are active, so the energy is quadratic."""
     steps, dt, gap = 7, 0.2, 50.0
     start, speed, goal = np.array([0.0, -3.0]), np.array([2.0, 3.0]), np.array([6.0, 4.0])
     reach, order, touch = np.array([1.3, 0.7]), -1.0, 0.4
@@ -141,7 +141,7 @@ def test_the_papers_energy_has_the_minimum_that_levenberg_marquardt_finds(minimi
 
 
 def test_newton_leaves_where_the_hessian_is_indefinite():
-    """Where agents are in each other's way, hinges bend the energy down, and undamped steps would go up."""
+    """Where agents overlap, hinges make the Hessian indefinite, and undamped steps would raise the energy."""
     scene, game = feature_game(size=3.0)
     scene = dataclasses.replace(scene, dt=0.4)
     least = torch.linalg.eigvalsh(hessian(FEATURES, scene, game, game.initial_controls).detach())[..., 0]
@@ -224,7 +224,7 @@ def test_energies_never_rise_with_more_steps(minimise):
 
 @both
 def test_samples_go_their_own_way(minimise):
-    """In a batch, in any company, a sample has the result that it has alone."""
+    """A sample has the same result alone and in any batch."""
     scene, game = convex_game(scenes=3, agents=2, modes=2)
     easy = PRECISE[0](convex_energy(), scene[0], game[0]).controls
     game = dataclasses.replace(game, initial_controls=torch.cat((easy, game.initial_controls[1:])))
