@@ -290,6 +290,8 @@ def _multirun(arguments: Arguments) -> None:
 
 def _sweep(arguments: Arguments) -> None:
     """See ``SWEEP_USAGE``."""
+    from textwrap import fill
+
     from epo_lightning.experiment.sweeps import sweeping
 
     words = list(arguments.overrides)
@@ -304,7 +306,7 @@ def _sweep(arguments: Arguments) -> None:
         if words:
             raise ConfigError(f"which sweep? `epo sweep <name> {' '.join(words)}`; known: {', '.join(known)}")
         for option, says in known.items():
-            print(f"  {option:<22}{says}")
+            print(fill(says, 120, initial_indent=f"  {option:<22}", subsequent_indent=" " * 24))
         return
     if name not in known:
         raise ConfigError(f"unknown sweep {name!r}: {nearest(name, known)}")

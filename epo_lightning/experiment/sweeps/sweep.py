@@ -34,6 +34,7 @@ from epo_lightning.experiment.sweeps.orphans import end_with
 from epo_lightning.identity import identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.runs import data_name
 from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_json, write_text
 
 State = Literal["waiting", "running", "interrupted", "failed", "done"]
@@ -61,6 +62,7 @@ class Job:
         identity: what makes it this run.
         title, seed: how to call it.
         measures: what is measured when it is trained.
+        data: name of its data set; empty in records of older versions.
     """
 
     overrides: tuple[str, ...]
@@ -69,6 +71,7 @@ class Job:
     title: str
     seed: int
     measures: tuple[Measured, ...]
+    data: str = ""
 
     @classmethod
     def of(cls, config: Mapping[str, Any], overrides: Sequence[str]) -> Job:
@@ -81,7 +84,9 @@ class Job:
         data, _ = assembly.check(settings)
         run = training.folder_for(settings)
         name = identity(config, data.digest)
-        return cls(tuple(overrides), run, name, settings.title, settings.seed, settings.measures)
+        return cls(
+            tuple(overrides), run, name, settings.title, settings.seed, settings.measures, data_name(settings.data)
+        )
 
     @property
     def measured(self) -> bool:
@@ -151,7 +156,15 @@ class Sweep:
     def _job(self, entry: Mapping[str, Any]) -> Job:
         run = RunFolder(Path(os.path.relpath(self.root / entry["folder"])))
         measured = measures(entry["score"])  # null or a word in records of older versions
-        return Job(tuple(entry["overrides"]), run, entry["identity"], entry["title"], entry["seed"], measured)
+        return Job(
+            tuple(entry["overrides"]),
+            run,
+            entry["identity"],
+            entry["title"],
+            entry["seed"],
+            measured,
+            entry.get("data", ""),
+        )
 
     def _entry(self, job: Job) -> dict[str, Any]:
         return {
@@ -160,6 +173,7 @@ class Sweep:
             "identity": job.identity,
             "title": job.title,
             "seed": job.seed,
+            "data": job.data,
             "score": list(job.measures),
         }
 

@@ -152,15 +152,24 @@ def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra:
 
 
 def known(extra: Sequence[str] = ()) -> dict[str, str]:
-    """The names of all sweeps, and what the first line of each file says."""
+    """The names of all sweeps, and the description with which each file begins."""
     says = {}
     with compose.hydra(extra) as instance:
         for option in compose.options_of(instance, "sweeps"):
             files = (folder / "sweeps" / f"{option}.yaml" for folder in [*map(Path, extra), compose.tree()])
             lines = next((file.read_text(encoding="utf-8").splitlines() for file in files if file.is_file()), [])
-            comments = [line.lstrip("# ") for line in lines if line.startswith("#") and "@package" not in line]
-            says[option] = comments[0].partition(":  ")[0].rstrip(":") if comments else ""
+            says[option] = _description([line for line in lines if line.startswith("#") and "@package" not in line])
     return says
+
+
+def _description(comments: Sequence[str]) -> str:
+    """The first sentence of comment lines, which ends with a line that ends so, or before the command that follows it."""
+    text = ""
+    for line in comments:
+        text, _, command = f"{text} {line.lstrip('# ')}".strip().partition(":  ")
+        if command or text.endswith((":", ".", "?", "!")):
+            break
+    return text.rstrip(":")
 
 
 def show(name: str | None, overrides: Sequence[str]) -> None:

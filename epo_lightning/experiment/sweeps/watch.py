@@ -48,8 +48,12 @@ def status(sweep: Sweep) -> Counter[State]:
 
 
 def names_of(jobs: Sequence[Job]) -> dict[Path, str]:
-    """How to call each run among the others: title and seed, and the folder's name where those do not tell them apart."""
-    names = {job.run.path: f"{job.title}, seed {job.seed}" for job in jobs}
+    """Names that tell runs apart: title and seed, with the data set and then the folder where those are not enough."""
+    data: dict[str, set[str]] = {}
+    for job in jobs:
+        data.setdefault(job.title, set()).add(job.data)
+    titles = {title: "{} ({})" if len(found) > 1 else "{}" for title, found in data.items()}
+    names = {job.run.path: f"{titles[job.title].format(job.title, job.data)}, seed {job.seed}" for job in jobs}
     counts = Counter(names.values())
     folders = Counter((names[job.run.path], job.run.path.name) for job in jobs)
     for path, name in names.items():

@@ -15,13 +15,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from experiment import tiny
 from experiment.conftest import TINY, Epo
 
 from epo_lightning.experiment.config.compose import compose, jobs
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
 from epo_lightning.experiment.sweeps.watch import names_of, result
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.run_folder import RunFolder, discover, write_json
 
 SWEEP = ("sweep", "rpi_main", *TINY, "seed=0,1", "score=test")
 ROWS = ("const_vel", "v_lstm", "v_lstm_sc", "v_lstm_epo")
@@ -221,9 +222,13 @@ def test_mistakes_in_sweeps_are_refused(refused: Callable[..., str]) -> None:
 
 def test_sweeps_are_listed(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     assert epo("sweep") == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(list((SRC / "sweeps").glob("*.yaml")))
-    assert next(line for line in lines if " rpi_main " in line).endswith("every row with three seeds")
+    listed = re.split(r"\n(?=  \w)", capsys.readouterr().out)
+    told = {words[0]: " ".join(words[1:]) for words in map(str.split, listed)}
+    assert told.keys() == {path.stem for path in (SRC / "sweeps").glob("*.yaml")}
+    assert told["table1"].startswith("The paper's Table 1 as a table of results: five published methods")
+    for name, text in told.items():
+        counted = jobs("train", [f"sweeps={name}"])  # none for sweepers that choose as they go
+        assert re.search(rf" {len(counted) or 30} runs\b", text), (name, text)
     assert epo("sweep", "--help") == 0
     assert "--stop-on-failure" in capsys.readouterr().out
     assert epo("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/const_vel") == 0
@@ -241,6 +246,25 @@ def test_the_latest_sweep_of_a_name_is_found(tmp_path: Path) -> None:
         Sweep.find("rpi_main", ["budget=short"], tmp_path)
     with pytest.raises(ConfigError, match="no sweep rpi_mai has begun"):
         Sweep.find("rpi_mai", [], tmp_path)
+
+
+def test_runs_on_two_data_sets_are_told_apart_by_their_names() -> None:
+    def job(title: str, data: str, folder: str) -> Job:
+        return Job((), RunFolder(Path(folder)), folder, title, 0, ("test",), data)
+
+    named = [job("JFP", "rpi", "a/s0"), job("JFP", "highway_sim", "b/s0"), job("EPO", "rpi", "c/s0")]
+    assert list(names_of(named).values()) == ["JFP (rpi), seed 0", "JFP (highway_sim), seed 0", "EPO, seed 0"]
+    again = [*named, job("JFP", "rpi", "a/s0-abc")]
+    assert list(names_of(again).values())[-1] == "JFP (rpi), seed 0 (s0-abc)"
+
+
+def test_a_sweep_over_two_data_sets_records_their_names(tmp_path: Path) -> None:
+    rows = ("table1/rpi_jfp", "table1/highway_jfp")
+    words = [["data=drawn", "budget=smoke", f"experiment={row}"] for row in rows]
+    sweep = Sweep(tmp_path / "sweeps" / "table1")
+    sweep.begin("table1", "epo sweep table1", [], [Job.of(compose("train", word), word) for word in words], False)
+    names = list(names_of(sweep.jobs).values())
+    assert names == ["JFP (drawn (rpi)), seed 0", "JFP (drawn (highway)), seed 0"]
 
 
 def test_labels_say_what_is_run_and_not_where() -> None:
@@ -313,32 +337,39 @@ def test_a_stopped_sweep_says_so_and_leaves_nobody_behind(
 
 
 @pytest.mark.slow
-def test_a_sweep_killed_five_times_ends_as_if_it_had_not_been(tmp_path: Path) -> None:
-    environment = {**os.environ, "EPO_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(SRC)}
-    program = [sys.executable, "-m", "epo_lightning.cli"]
-    data = ["data.games=10", "data.placements=1"]
-    subprocess.run([*program, "generate", *data, "progress=false"], cwd=tmp_path, env=environment, check=True)
-    words = [*program, "sweep", "rpi_main", *data, "budget=smoke", "trainer.max_epochs=12", "score=test"]
+def test_a_sweep_killed_ten_times_ends_with_the_same_table(tmp_path: Path) -> None:
+    """Kill -9 of all its processes at random moments; no written row of a log is lost, and no finished run is run again."""
+    environment = {**os.environ, "PYTHONPATH": str(SRC)}
+    program = [sys.executable, str(Path(tiny.__file__).resolve())]
+    words = [*program, "sweep", "rpi_main", *TINY, "seed=0,1", "trainer.max_epochs=12", "score=test"]
 
     began = time.monotonic()
     subprocess.run([*words, "runs=whole"], cwd=tmp_path, env=environment, check=True)
     lasted = time.monotonic() - began
 
     rng = random.Random(0)
-    finished: dict[str, int] = {}
-    for _ in range(5):
-        process = subprocess.Popen([*words, "runs=parts"], cwd=tmp_path, env=environment)
-        time.sleep(rng.uniform(0.3, 0.9) * lasted)
-        process.send_signal(signal.SIGKILL)
+    finished: dict[Path, int] = {}
+    interrupted = 0
+    for _ in range(10):
+        process = subprocess.Popen([*words, "runs=parts"], cwd=tmp_path, env=environment, start_new_session=True)
+        time.sleep(rng.uniform(0.2, 0.7) * lasted)
+        os.killpg(process.pid, signal.SIGKILL)
         process.wait()
         for path in (tmp_path / "parts").glob("rpi/*/*/metrics.json"):
-            finished.setdefault(str(path), path.stat().st_mtime_ns)
+            finished.setdefault(path, path.stat().st_mtime_ns)
+        interrupted += any(run.state == "interrupted" for run in discover(tmp_path / "parts"))
     subprocess.run([*words, "runs=parts"], cwd=tmp_path, env=environment, check=True)
-
-    whole = {path.relative_to(tmp_path / "whole"): path for path in (tmp_path / "whole").glob("rpi/*/*/metrics.json")}
-    assert len(whole) == 12
-    for name, path in whole.items():
-        assert (tmp_path / "parts" / name).read_bytes() == path.read_bytes(), name
+    assert interrupted, "no kill hit a run that had begun"
     assert finished, "no kill came late enough to find a finished run"
-    assert all(Path(path).stat().st_mtime_ns == mark for path, mark in finished.items()), "a finished run ran again"
-    assert json.loads((tmp_path / "parts").glob("sweeps/*/sweep.json").__next__().read_text())["name"] == "rpi_main"
+    assert all(path.stat().st_mtime_ns == mark for path, mark in finished.items()), "a finished run ran again"
+
+    whole = [path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").glob("rpi/*/*/metrics.json")]
+    assert len(whole) == 8
+    for name in (file for run in whole for file in (run, run.parent / "logs" / "metrics.csv")):
+        assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    tables = []
+    for runs in ("whole", "parts"):
+        subprocess.run([*program, "report", "rpi_main", f"runs={runs}"], cwd=tmp_path, env=environment, check=True)
+        (table,) = (tmp_path / runs).glob("sweeps/*/report/results.csv")
+        tables.append(table.read_text())
+    assert tables[0] == tables[1]
