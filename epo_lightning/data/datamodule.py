@@ -1,8 +1,8 @@
-"""Batches of scenes for Lightning: data sets that are indexed by whole batches, and an order that can be resumed.
+"""Batches of scenes for Lightning: data sets that are indexed by whole batches, in a resumable order.
 
-All records of a split stay in memory; a batch is one ``index_select``. That is faster than any worker process here, so
-there are none. A batch is what an optimisation step sees, on however many devices. The order of an epoch depends on
-(seed, epoch) alone: a run that goes on at the beginning of an epoch sees exactly what it would have seen without the pause.
+All records of a split stay in memory, and a batch is one ``index_select``, which is faster than worker processes. A batch
+holds the scenes of an optimisation step on all devices together. The order of an epoch depends on (seed, epoch) alone: a run
+that is resumed at the beginning of an epoch sees the same batches as without the interruption.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from epo_lightning.task import Task
 
 
 class SceneDataset(Protocol):
-    """Records of a split; ``dataset[indices]`` with a LongTensor is a Scene of that many."""
+    """Records of a split; ``dataset[indices]`` with a LongTensor [B] is a Scene of B samples."""
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, indices: Tensor) -> Scene: ...
 
     def set_epoch(self, epoch: int) -> None:
-        """Make the choices that differ from epoch to epoch."""
+        """Draw what differs from epoch to epoch."""
 
 
 class Subset:
@@ -38,7 +38,7 @@ class Subset:
 
     Args:
         whole: the data set.
-        share: of its scenes, at least one of them.
+        share: share of its scenes; at least one is used.
     """
 
     def __init__(self, whole: SceneDataset, share: float) -> None:
@@ -58,7 +58,7 @@ class Subset:
         return self.whole[self.chosen[indices]]
 
     def set_epoch(self, epoch: int) -> None:
-        """Make the choices that differ from epoch to epoch."""
+        """Draw what differs from epoch to epoch."""
         self.whole.set_epoch(epoch)
 
 
@@ -67,13 +67,13 @@ class BatchSampler(DistributedSampler):
 
     Lightning calls ``set_epoch`` of a loader's sampler before each epoch, with the epoch that a checkpoint restored; the
     order follows from the seed and that number. Under distributed training rank r of n takes every n-th index of every
-    batch from r on, so that the ranks' shares are together the batch of one process; being a DistributedSampler only tells
-    Lightning not to put one of its own in this one's place.
+    batch from r on, so that all ranks together see the batch of one process. The base class DistributedSampler only keeps
+    Lightning from replacing this sampler by its own.
 
     Args:
-        dataset: is told the epoch as well.
+        dataset: its ``set_epoch`` is called as well.
         batch_size: scenes per batch, of all ranks together.
-        shuffle: whether the order is random; then also an incomplete last batch is dropped.
+        shuffle: whether the order is random; then an incomplete last batch is dropped.
         seed: of the order.
     """
 
@@ -88,8 +88,8 @@ class BatchSampler(DistributedSampler):
             self.scenes.set_epoch(epoch)
 
     def __iter__(self) -> Iterator[Tensor]:
-        # A generator, so that the order is drawn with the first batch: a resumed Lightning asks for the iterator before
-        # it says which epoch it is.
+        # A generator function draws the order with the first batch: Lightning creates the iterator of a resumed run
+        # before it sets the epoch.
         count = len(self.scenes)
         if self.shuffle:
             order = torch.randperm(count, generator=epoch_generator(self.seed, self.epoch))
@@ -99,7 +99,7 @@ class BatchSampler(DistributedSampler):
         if self.shuffle:
             check_share(self.batch_size, world)
         shares = (batch[rank::world] for batch in order.split(self.batch_size)[: len(self)])
-        # A last batch of fewer scenes than ranks leaves some ranks without any.
+        # The last batch may have fewer scenes than there are ranks; some ranks then have none.
         yield from (share for share in shares if len(share))
 
     def __len__(self) -> int:
@@ -109,10 +109,10 @@ class BatchSampler(DistributedSampler):
 
 
 def check_share(batch_size: int, world: int) -> None:
-    """A step is the mean over ranks, which is the mean over scenes only if all have the same number of them.
+    """Check that all ranks have the same number of scenes, so that the mean over ranks is the mean over scenes.
 
     Raises:
-        ConfigError: the batch cannot be divided evenly.
+        ConfigError: the batch cannot be divided evenly among the ranks.
     """
     if batch_size % world:
         raise ConfigError(
@@ -122,7 +122,7 @@ def check_share(batch_size: int, world: int) -> None:
 
 
 def epoch_generator(seed: int, epoch: int) -> torch.Generator:
-    """Random numbers of one epoch. Mixed by numpy: torch's generator looks at the last 32 bits of a seed only."""
+    """Random generator of one epoch. The seed is mixed by numpy, because torch uses only its last 32 bits."""
     return torch.Generator().manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
 
 
@@ -134,13 +134,13 @@ def _rank() -> tuple[int, int]:
 
 
 class SceneDataModule(LightningDataModule):
-    """Loaders over the splits ``train``, ``val`` and ``test``; a subclass says how a split is opened.
+    """Loaders over the splits ``train``, ``val`` and ``test``; a subclass defines how a split is opened.
 
     Attributes:
         task: sizes and units of the scenes; every data module sets it, in its class or its constructor.
-        share: of the scenes of every split that is used.
-        num_agents: agents per scene N.
-        order_seed: of the order of the batches; the data's own seed unless a run sets its own.
+        share: share of the scenes of every split that is used.
+        num_agents: number of agents per scene N.
+        order_seed: seed of the order of batches; the data's own seed unless a run sets its own.
     """
 
     task: Task
@@ -162,10 +162,10 @@ class SceneDataModule(LightningDataModule):
 
     def open(self, split: str) -> SceneDataset:
         """The data set of a split, read from disk."""
-        raise NotImplementedError(f"{type(self).__name__} does not say how a split is opened")
+        raise NotImplementedError(f"{type(self).__name__} does not define how a split is opened")
 
     def setup(self, stage: str | None = None) -> None:
-        """Open what a stage needs. The test split is not even read before the stage is ``test`` or ``predict``."""
+        """Open the splits that a stage needs. The test split is read only by the stages ``test`` and ``predict``."""
         names = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
         for name in names.get(stage or "fit", ("train", "val")):
             if name not in self._opened:

@@ -1,9 +1,8 @@
-"""Scenes drawn at random in memory: for measuring time, smoke tests and checks where there is no data set.
+"""Random scenes in memory, for time measurements, smoke tests and checks without a data set.
 
-They have the shapes of real ones exactly, because the classes that read real records read these: what is drawn here are the
-tables, and :class:`~epo_lightning.data.rpi.scenes.RPIDataset` and
-:class:`~epo_lightning.data.recorded.scenes.RecordedScenes` make
-scenes of them. There is nothing worth learning in them.
+Only the tables are drawn; the classes of the real data, :class:`~epo_lightning.data.rpi.scenes.RPIDataset` and
+:class:`~epo_lightning.data.recorded.scenes.RecordedScenes`, make scenes of them. Shapes are therefore those of real scenes.
+Models cannot learn anything useful from them.
 """
 
 from __future__ import annotations
@@ -27,22 +26,22 @@ from epo_lightning.scene import KINDS
 from epo_lightning.task import Task
 
 VERSION = 1
-"""Of the draws: raised whenever the same seed would give other scenes."""
+"""Version of the draws: raised whenever the same seed would give other scenes."""
 LANE_WIDTH, LANES = 3.5, 4
 """Width [m] and number of the road's lanes."""
 HEADWAY = 25.0
-"""Mean way [m] from a vehicle to the next on its lane."""
+"""Mean distance [m] from a vehicle to the next one on its lane."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What scenes are like: the sizes of a task, and how its tables are drawn.
+    """A kind of scenes: the sizes of a task, and the function that draws its tables.
 
     Attributes:
-        agents: of a scene, unless told otherwise.
+        agents: default number of agents.
         history: number H of observed steps.
         task: sizes and units, those of the real data.
-        tables: from (scenes, agents, kind, generator) to the columns that records of this task have.
+        tables: function from (scenes, agents, kind, generator) to the columns of records of this task.
     """
 
     agents: int
@@ -52,7 +51,7 @@ class Kind:
 
     @property
     def time(self) -> Tensor:
-        """When the steps of history and future are [s]; the last step of the history is at zero."""
+        """Times of the steps of history and future [s]; the last step of the history is at zero."""
         return self.task.dt * torch.arange(1 - self.history, self.task.horizon + 1, dtype=torch.float64)
 
 
@@ -61,9 +60,9 @@ def _between(low: float, high: float, *shape: int, draw: torch.Generator) -> Ten
 
 
 def _curves(start: Tensor, heading: Tensor, speed: Tensor, turn: Tensor, time: Tensor) -> Tensor:
-    """States [.., time, 4] of agents that drive on circles; ``start`` is where they are at time zero."""
+    """States [.., time, 4] of agents that move on circles; ``start`` is their position at time zero."""
     angle = heading[..., None] + turn[..., None] * time
-    # The chord of an arc, which is also right for a straight line.
+    # Length of the chord of an arc; the formula also holds for a straight line.
     half = 0.5 * turn[..., None] * time
     chord = speed[..., None] * time * torch.sinc(half / torch.pi)
     middle = heading[..., None] + half
@@ -72,7 +71,7 @@ def _curves(start: Tensor, heading: Tensor, speed: Tensor, turn: Tensor, time: T
 
 
 def _walkers(scenes: int, agents: int, kind: Kind, draw: torch.Generator, apart: float) -> Tensor:
-    """States [scenes, agents, H + K, 4] of agents that walk past about the same place, ``apart`` [m] from each other."""
+    """States [scenes, agents, H + K, 4] of agents that pass within about ``apart`` [m] of the same point."""
     speed = _between(0.7, 1.5, scenes, agents, draw=draw)
     heading = _between(-torch.pi, torch.pi, scenes, agents, draw=draw)
     turn = _between(-0.1, 0.1, scenes, agents, draw=draw)
@@ -83,7 +82,7 @@ def _walkers(scenes: int, agents: int, kind: Kind, draw: torch.Generator, apart:
 
 
 def _rpi(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
-    """Records with two modes each: the robot and the pedestrian meet, and go on as they turn or the other way round."""
+    """Records with two modes each: both agents meet, and continue with different turn rates in each mode."""
     states = _walkers(scenes, agents, kind, draw, apart=0.5)
     history, now = states[:, :, : kind.history], states[:, :, kind.history - 1]
     turn = _between(-0.1, 0.1, scenes, 2, agents, draw=draw)
@@ -100,7 +99,7 @@ def _rpi(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[st
 
 
 def _recorded(states: Tensor, present: Tensor, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
-    """The columns of an extract that has no map: every agent of every scene has a row of its own."""
+    """The columns of scene tables without a map; every agent of every scene has its own row."""
     scenes, agents = present.shape
     rows = states.flatten(0, 1).float()
     history, future = rows[:, : kind.history], rows[:, kind.history :]
@@ -123,7 +122,7 @@ def _recorded(states: Tensor, present: Tensor, kind: Kind, draw: torch.Generator
 
 
 def _pedestrians(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
-    """Two pedestrians or more of every scene are there."""
+    """Columns of scenes with at least two pedestrians each."""
     states = _walkers(scenes, agents, kind, draw, apart=3.0)
     count = torch.randint(min(2, agents), agents + 1, (scenes, 1), generator=draw)
     rows = scenes * agents
@@ -135,12 +134,12 @@ def _pedestrians(scenes: int, agents: int, kind: Kind, draw: torch.Generator) ->
 
 
 def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
-    """Vehicles on a straight road, one behind the other on each lane; about a third of them changes lane meanwhile."""
+    """Columns of scenes on a straight road, with vehicles one behind the other; about a third of them change lane."""
     rows, time = scenes * agents, kind.time
     order = torch.rand(scenes, agents, dtype=torch.float64, generator=draw).argsort(1)
     lane, place = order % LANES, order // LANES
     along = HEADWAY * (place - 0.5 * ((agents - 1) // LANES)) + _between(-5.0, 5.0, scenes, agents, draw=draw)
-    # Who is on the same lane drives about as fast.
+    # Vehicles on the same lane have similar speeds.
     pace = _between(22.0, 33.0, scenes, LANES, draw=draw).gather(1, lane)
     speed = pace + _between(-1.0, 1.0, scenes, agents, draw=draw)
     acceleration = _between(-0.5, 0.5, scenes, agents, draw=draw)
@@ -163,7 +162,7 @@ def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dic
     middle = LANE_WIDTH * (lane.flatten()[:, None] + torch.arange(1, -2, -1))  # left, own, right
 
     def lines(start: Tensor, end: Tensor, points: int) -> Tensor:
-        """Points [rows, R, points, 2] on the three lines of every vehicle, from ``start`` to ``end`` metres ahead of it."""
+        """Points [rows, R, points, 2] on every vehicle's three lines, from ``start`` to ``end`` [m] ahead of it."""
         ahead = start[:, None] + (end - start)[:, None] * torch.linspace(0.0, 1.0, points, dtype=torch.float64)
         x = (now[:, :1] + ahead)[:, None].expand(-1, LINES, -1)
         return torch.stack((x, middle[..., None].expand_as(x)), -1).float()
@@ -201,14 +200,14 @@ LIKE: Mapping[str, Kind] = {
 
 @register("data", "drawn")
 class DrawnData(SceneDataModule):
-    """Scenes drawn in memory, in the shapes of a task.
+    """Scenes drawn in memory, with the shapes of a task.
 
     Args:
         like: ``rpi`` (two discs with given goals), ``highway`` (vehicles, lanes and goal candidates) or ``pedestrians``
             (no map, no goals).
-        agents: of a scene; None for the task's own number.
-        scenes: of each split.
-        seed: of the draws, and of the batches' order where a run sets no other.
+        agents: number per scene; None for that of the task.
+        scenes: number per split.
+        seed: of the draws, and of the order of batches unless a run sets its own.
         batch_size: scenes per batch.
     """
 
@@ -233,20 +232,20 @@ class DrawnData(SceneDataModule):
         return cache.digest({**drawn, "seed": self.seed})[:16]
 
     def generate(self, workers: int | None = None, progress: bool = True) -> Path:
-        """There is nothing to generate.
+        """Refuse: drawn scenes are never written.
 
         Raises:
-            ConfigError: always, and says what to do instead.
+            ConfigError: always; it names what to do instead.
         """
         raise ConfigError(
-            "data=drawn is drawn in memory, there is nothing to generate: use it with epo train data=drawn"
+            "data=drawn is drawn in memory, there is nothing to generate: use it with `epo train data=drawn`"
         )
 
     def open(self, split: str) -> SceneDataset:
         """The scenes of a split."""
         draw = torch.Generator().manual_seed(len(SPLITS) * self.seed + SPLITS.index(split))
         if self.like == "rpi":
-            # Every record is two scenes, one for each of its modes.
+            # Every record becomes two scenes, one per mode.
             tables = self.kind.tables(-(-self.scenes // 2), self.num_agents, self.kind, draw)
             return RPIDataset(tables, seed=self.seed)
         tables = self.kind.tables(self.scenes, self.num_agents, self.kind, draw)

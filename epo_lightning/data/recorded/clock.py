@@ -1,4 +1,4 @@
-"""One clock for all agents of a recording: uninterrupted stretches of states at multiples of dt."""
+"""Resampling of recordings to a common clock: uninterrupted stretches of states at multiples of dt."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class Stretches:
 
     Attributes:
         dt: of the clock [s]; step s is at s dt, counted from the recording's frame 0.
-        agent: whose stretch it is.
+        agent: index of the agent of each stretch.
         first: its first step.
-        count: how many steps it lasts.
+        count: its number of steps.
         start: its first row.
-        state: x, y [m], heading [rad], speed [m/s] of every row; headings go on beyond half a turn.
-        ending: where tracks are smoothed, every row's state and those of the steps right before it as they are known at its
-            time: fitted to no later frame. Later smoothing knows better, but a forecaster must not.
+        state: x, y [m], heading [rad], speed [m/s] of every row; headings are unwrapped.
+        ending: only if tracks are smoothed: every row's state and the J - 1 states before it, estimated without later
+            frames. The centred smoothing of ``state`` is better, but a forecaster must not see the future.
     """
 
     dt: float
@@ -36,32 +36,32 @@ class Stretches:
 
     @property
     def now(self) -> Float[np.ndarray, "Z 4"]:
-        """Every row's state as it is known at its time."""
+        """Every row's state, estimated without later frames."""
         return self.state if self.ending is None else self.ending[:, 0]
 
     @property
     def owner(self) -> Int[np.ndarray, " Z"]:
-        """The stretch that each row belongs to."""
+        """Index of the stretch of each row."""
         return np.repeat(np.arange(len(self.count)), self.count)
 
 
 def stretches(
     tracks: TrackTable, dt: float, smoothing: float | None, shortest: int
 ) -> tuple[Stretches, dict[str, int]]:
-    """Put a recording on a clock.
+    """Stretches of a recording, resampled to the clock.
 
     Args:
         tracks: the recording.
         dt: of the clock [s].
         smoothing: length [s] of the window in which a parabola is fitted to positions and headings; None for data that
             are smooth already.
-        shortest: steps that a stretch must last to be of use.
+        shortest: smallest number of steps of a stretch; shorter ones are left out.
 
     Returns:
-        the stretches, and how many stretches were interrupted or left out, by reason.
+        the stretches, and the numbers of stretches that were interrupted or left out, by reason.
 
     Raises:
-        ConfigError: a clock that is faster than the recording.
+        ConfigError: the clock is faster than the recording.
     """
     if dt * tracks.rate < 1 - 1e-6:
         raise ConfigError(
@@ -106,13 +106,13 @@ def stretches(
 
 
 def _states(values: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "*n 4"]:
-    """Positions, headings and velocities as states: the speed is that along the heading."""
+    """States [.., 4] from positions, headings and velocities [.., 5]; the speed is the component along the heading."""
     x, y, heading, right, up = np.moveaxis(values, -1, 0)
     return np.stack([x, y, heading, right * np.cos(heading) + up * np.sin(heading)], -1)
 
 
 def _unwrap(heading: Float[np.ndarray, " n"], begin: Int[np.ndarray, " C"]) -> Float[np.ndarray, " n"]:
-    """Headings that go on beyond half a turn within a stretch."""
+    """Headings without jumps of a turn within a stretch."""
     turn = np.diff(heading, prepend=heading[:1])
     turns = np.round(turn / (2 * np.pi))
     turns[begin] = 0.0
@@ -128,9 +128,10 @@ def _smooth(
     window: int,
     rate: float,
 ) -> Float[np.ndarray, "n 5"]:
-    """Fit a parabola to every window of positions and headings (Savitzky-Golay); velocities are the parabolas' slopes.
+    """Positions, headings and velocities of a centred Savitzky-Golay filter: a parabola is fitted to every window.
 
-    Near the ends of a stretch, the first or last whole window's parabola goes on.
+    Velocities are the derivatives of the parabolas. Near the ends of a stretch, the parabola of its first or last complete
+    window is evaluated.
     """
     half = window // 2
     time, fit = _parabolas(window, rate)
@@ -155,14 +156,16 @@ def _ending(
     rate: float,
     dt: float,
 ) -> Float[np.ndarray, "Z J 4"]:
-    """The states at every step, and at those before it that a centred window would smooth with later frames, by the parabola
-    through the window that ends there; as they were recorded where a stretch is too young for a whole window.
+    """States of every step and of the steps before it that the centred filter would smooth with later frames.
+
+    They come from the parabola that is fitted to the window that ends at the step. Where a stretch has no complete window
+    yet, they are the recorded states.
 
     Args:
-        raw: positions, headings and velocities as recorded.
-        row: of ``raw``, the last one at or before each step.
-        before: how many rows of the stretch lie before that.
-        beyond: how far each step lies after its row [rows].
+        raw: recorded positions, headings and velocities.
+        row: index into ``raw`` of the last row at or before each step.
+        before: number of rows of the stretch before that row.
+        beyond: time from that row to the step [rows].
     """
     time, fit = _parabolas(window, rate)
     steps = int(window // 2 / (dt * rate)) + 1
@@ -175,7 +178,7 @@ def _ending(
 
 
 def _parabolas(window: int, rate: float) -> tuple[Float[np.ndarray, " window"], Float[np.ndarray, "3 window"]]:
-    """The times of a window's frames around its middle [s], and the matrix from samples to a parabola's coefficients."""
+    """Times of a window's frames relative to its middle [s], and the matrix from samples to a parabola's coefficients."""
     time = (np.arange(window) - window // 2) / rate
     return time, np.linalg.pinv(np.vander(time, 3, increasing=True))
 
@@ -183,7 +186,7 @@ def _parabolas(window: int, rate: float) -> tuple[Float[np.ndarray, " window"], 
 def _evaluate(
     fit: Float[np.ndarray, "3 window"], around: Float[np.ndarray, "*n window 3"], at: Float[np.ndarray, "*n"]
 ) -> Float[np.ndarray, "*n 5"]:
-    """Values and slopes of windows' parabolas: x, y, heading, and the speeds in x and y."""
-    constant, slope, bend = np.moveaxis(np.einsum("cw,...wv->...cv", fit, around), -2, 0)
+    """Values of windows' parabolas (x, y, heading) and first derivatives (velocities along x and y)."""
+    constant, linear, quadratic = np.moveaxis(np.einsum("cw,...wv->...cv", fit, around), -2, 0)
     t = at[..., None]
-    return np.concatenate([constant + slope * t + bend * t**2, (slope + 2 * bend * t)[..., :2]], -1)
+    return np.concatenate([constant + linear * t + quadratic * t**2, (linear + 2 * quadratic * t)[..., :2]], -1)

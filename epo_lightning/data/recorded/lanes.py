@@ -1,4 +1,4 @@
-"""Lanes: their geometry, which of them lead into or lie beside which, and where on them an agent is."""
+"""Lanes: their geometry, their successors and neighbours, and the positions of agents on them."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from epo_lightning.data.errors import RecordingError
 Polyline = Float[np.ndarray, "n 2"]
 
 LANE, SHOULDER = range(2)
-"""What a lane is for: driving, or standing in an emergency."""
+"""Kinds of lanes: for driving, or for stopping in an emergency."""
 FARTHEST = 1e7
-"""Coordinates [m] beyond this are no positions on this planet's road maps."""
+"""Largest absolute coordinate [m] that a road map may have."""
 BESIDE = 1.0
-"""How far beside all lanes [m] a position may be and still belong to the nearest one: maps have seams."""
+"""Largest distance [m] from the nearest lane at which a position is still assigned to it: maps have gaps between lanes."""
 ALONG = np.pi / 2
-"""An agent that heads across a lane by more than this [rad] is not driving on it."""
+"""Largest angle [rad] between an agent's heading and the direction of the lane that it drives on."""
 ASTRAY = 5.0
-"""Metres beside a centreline that weigh as much as one radian across it, where lanes lie over each other."""
+"""Offset [m] from a centreline that counts as much as a heading error of one radian, where lanes overlap."""
 HOPS = 6
-"""Lanes, one after the other, that an agent may pass within a time step."""
+"""Number of consecutive lanes that an agent may pass within a time step."""
 
 
 class Polylines:
-    """Many polylines, asked together: where along one of them a position is, and which point is how far along.
+    """Many polylines with vectorised queries: projection of positions, and points at given arc lengths.
 
     Args:
-        lines: each of at least two different points; consecutive equal points are passed over.
+        lines: each has at least two different points; consecutive equal points are ignored.
     """
 
     def __init__(self, lines: Sequence[Polyline]) -> None:
@@ -47,7 +47,7 @@ class Polylines:
         total = step.cumsum()
         self._along = total - total[self.first[:-1]][owner]
         self.length = self._along[self.first[1:] - 1]
-        # Numbers that grow through all polylines, so that one search finds the segment of any of them.
+        # Keys that increase over all polylines, so that one binary search finds the segment on any of them.
         self._base = np.concatenate([[0.0], (self.length + 1.0).cumsum()[:-1]])[: len(kept)]
         self._key = self._along + self._base[owner]
         self.geometry = shapely.linestrings(self.points, indices=owner) if len(kept) else np.empty(0, dtype=object)
@@ -58,7 +58,7 @@ class Polylines:
     def at(
         self, line: Int[np.ndarray, " n"], along: Float[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-        """The point so many metres along a line, and the unit tangent there; straight on beyond either end."""
+        """Points and unit tangents at the arc length ``along`` of a line; lines are extended straight at both ends."""
         inside = np.clip(along, 0.0, self.length[line])
         segment = np.searchsorted(self._key, self._base[line] + inside, side="right") - 1
         segment = np.clip(segment, self.first[line], self.first[line + 1] - 2)
@@ -70,30 +70,30 @@ class Polylines:
     def project(
         self, line: Int[np.ndarray, " n"], position: Float[np.ndarray, "n 2"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """How far along a line the point nearest to a position is, and how far the position is to the left of it [m].
+        """Arc length of the point of a line that is nearest to a position, and the position's offset to the left of it [m].
 
-        Lines go straight on beyond their ends: there, the first number is negative or more than the line's length.
+        Lines are extended straight at both ends; there, the arc length is negative or more than the line's length.
         """
         along = shapely.line_locate_point(self.geometry[line], shapely.points(position))
-        foot, tangent = self.at(line, along)
-        way = position - foot
+        nearest, tangent = self.at(line, along)
+        way = position - nearest
         beyond = (tangent * way).sum(1)
         along = np.where(along <= 0, along + np.minimum(beyond, 0.0), along)
         along = np.where(along >= self.length[line], along + np.maximum(beyond, 0.0), along)
-        foot, tangent = self.at(line, along)
-        way = position - foot
+        nearest, tangent = self.at(line, along)
+        way = position - nearest
         side = np.where(tangent[:, 0] * way[:, 1] - tangent[:, 1] * way[:, 0] < 0, -1.0, 1.0)
         return along, side * np.linalg.norm(way, axis=1)
 
 
 @dataclass(frozen=True)
 class Located:
-    """Where positions are on a map.
+    """Positions relative to the lanes of a map.
 
     Attributes:
-        lane: on which lane, -1 on none.
-        along: how far along its centreline [m].
-        offset: how far to the left of it [m].
+        lane: index of the lane, -1 for none.
+        along: arc length on its centreline [m].
+        offset: distance to the left of its centreline [m].
     """
 
     lane: Int[np.ndarray, " T"]
@@ -103,16 +103,16 @@ class Located:
 
 @dataclass(frozen=True)
 class LaneGraph:
-    """The lanes of a map. A lane is addressed by its place in these sequences, -1 is none.
+    """The lanes of a map. A lane is addressed by its index in these sequences; -1 stands for no lane.
 
     Attributes:
-        ids: what the map calls each lane.
+        ids: identifier of each lane in the map.
         left, right: boundaries of each lane, in driving direction [m].
         centre: centreline of each lane, in driving direction [m].
         successors: lanes that begin where a lane ends.
-        left_of, right_of: the lane beside each lane that a vehicle may change to, in the same driving direction.
-        adjacent_left, adjacent_right: the same, whether or not the marking between them may be crossed.
-        speed_limit: [m/s], NaN where there is none or none is known.
+        left_of, right_of: the neighbour of each lane, in the same driving direction, that a vehicle may change to.
+        adjacent_left, adjacent_right: the same, whether or not the marking between the lanes may be crossed.
+        speed_limit: [m/s]; NaN if there is none or it is unknown.
         kind: LANE or SHOULDER.
     """
 
@@ -132,7 +132,7 @@ class LaneGraph:
         return len(self.ids)
 
     def check(self, path: Path | str) -> LaneGraph:
-        """This graph, if it can be a map.
+        """This graph, after a check of its geometry and references.
 
         Args:
             path: of the file, for error messages.
@@ -162,7 +162,7 @@ class LaneGraph:
 
     @cached_property
     def predecessors(self) -> tuple[tuple[int, ...], ...]:
-        """Lanes that end where a lane begins."""
+        """For each lane, the lanes that end where it begins."""
         found: list[list[int]] = [[] for _ in range(len(self))]
         for lane, following in enumerate(self.successors):
             for successor in following:
@@ -171,12 +171,12 @@ class LaneGraph:
 
     @cached_property
     def centrelines(self) -> Polylines:
-        """All centrelines, to be asked together."""
+        """All centrelines."""
         return Polylines(self.centre)
 
     @cached_property
     def areas(self) -> np.ndarray:
-        """The ground between the boundaries of each lane, as shapely geometries."""
+        """Area between the boundaries of each lane, as shapely geometries."""
         rings = [np.concatenate([left, right[::-1]]) for left, right in zip(self.left, self.right, strict=True)]
         return np.array([shapely.make_valid(shapely.Polygon(ring)) for ring in rings], dtype=object)
 
@@ -185,8 +185,10 @@ class LaneGraph:
         return shapely.STRtree(self.areas)
 
     def locate(self, position: Float[np.ndarray, "T 2"], heading: Float[np.ndarray, " T"]) -> Located:
-        """On which lanes agents are: of the lanes around a position, the one whose centreline is near and whose direction an
-        agent shares; a crossing road may be nearer."""
+        """Lanes of agents: among the lanes that contain a position, the one with the best sum of distance and heading error.
+
+        The heading decides because the centreline of a crossing road may be nearer.
+        """
         found = Located(np.full(len(position), -1), np.zeros(len(position)), np.full(len(position), np.inf))
         points = shapely.points(position)
         row, lane = self._tree.query(points, predicate="intersects")
@@ -206,31 +208,31 @@ class LaneGraph:
         row: Int[np.ndarray, " n"],
         lane: Int[np.ndarray, " n"],
     ) -> None:
-        """Write into ``found`` the best of the lanes that are proposed for some rows."""
+        """Write into ``found`` the best among the candidate lanes of some rows."""
         along, offset = self.centrelines.project(lane, position[row])
         _, tangent = self.centrelines.at(lane, along)
         turned = np.cos(heading[row]) * tangent[:, 0] + np.sin(heading[row]) * tangent[:, 1]
         across = np.arccos(np.clip(turned, -1.0, 1.0))
         (fits,) = np.nonzero(across < ALONG)
-        # The last one written wins: the best fit, then the first lane.
+        # The best candidate is written last and stays; of equal ones, the lane with the lowest index.
         order = fits[np.lexsort((-lane[fits], -(np.abs(offset) + ASTRAY * across)[fits]))]
         found.lane[row[order]] = lane[order]
         found.along[row[order]] = along[order]
         found.offset[row[order]] = offset[order]
 
     def leads_to(self, lane: int, other: int) -> bool:
-        """Whether driving straight on leads from a lane to another."""
+        """Whether ``other`` is reached from ``lane`` by following successors."""
         return other in _reached(lane, self.successors)
 
     def beside(self, lane: int, other: int) -> bool:
-        """Whether a lane lies beside another, or beside what leads to it or comes after it."""
+        """Whether two lanes, or lanes that precede or follow them, are neighbours."""
         around = _reached(lane, self.successors) | _reached(lane, self.predecessors)
         near = _reached(other, self.successors) | _reached(other, self.predecessors)
         return any(int(beside[each]) in near for each in around for beside in (self.adjacent_left, self.adjacent_right))
 
 
 def _reached(lane: int, following: Sequence[tuple[int, ...]]) -> set[int]:
-    """A lane and those that are reached from it within a few hops."""
+    """A lane and all lanes that are reached from it within HOPS steps."""
     reached = {lane}
     for _ in range(HOPS):
         reached |= {other for each in reached for other in following[each]}
@@ -238,9 +240,9 @@ def _reached(lane: int, following: Sequence[tuple[int, ...]]) -> set[int]:
 
 
 def lane_changes(agent: Int[np.ndarray, " T"], located: Located, lanes: LaneGraph) -> Bool[np.ndarray, " T"]:
-    """Rows in which an agent is on the lane beside that of its row before, for the first time (exiD: ``laneChange``).
+    """Mask [T] of the rows in which an agent is first seen on a lane beside its previous one (exiD: ``laneChange``).
 
-    Rows on no lane are passed over.
+    Rows on no lane are ignored.
     """
     changed = np.zeros(len(agent), dtype=bool)
     (on,) = np.nonzero(located.lane >= 0)

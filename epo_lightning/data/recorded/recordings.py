@@ -31,9 +31,9 @@ from epo_lightning.registry import ConfigError, lookup, nearest, register
 from epo_lightning.task import Task
 
 VERSION = 2
-"""Of the extraction: raised whenever the same recordings would give other scenes."""
+"""Version of the extraction: raised whenever the same recordings would give other scenes."""
 PIECE, PIECES = 1 << 14, 64
-"""Bytes of a piece of a file, and how many of them its checksum is made of: all of it up to 1 MB."""
+"""Size [bytes] and number of the pieces of a file that enter its checksum; files up to 1 MB are covered completely."""
 UNITS = ("recording", "group")
 
 
@@ -59,23 +59,24 @@ class RecordedData(SceneDataModule):
     """Scenes extracted from a folder of recordings in any registered format.
 
     Args:
-        dataset: how tables and the cache call the data.
+        dataset: name of the data in tables and in the cache.
         format: name of a registered recording format.
         folder: of the recordings, or of a data set that was extracted from them. If it is absent, the data set that these
             settings would give is looked for in the cache.
-        windows: what becomes a scene: fields of :class:`~epo_lightning.data.recorded.windows.WindowConfig`.
-        map: whether there are lanes, and thus goal candidates.
-        test: groups (maps, scenes, layouts) that are the test split; null to draw ``test_share`` of them.
-        test_share: of the groups.
-        val_share: of what remains, drawn by ``val_by``.
+        windows: selection of the windows that become scenes, fields of
+            :class:`~epo_lightning.data.recorded.windows.WindowConfig`.
+        map: whether to use lanes, and thus goal candidates.
+        test: groups (maps, scenes, layouts) of the test split; null to draw ``test_share`` of them.
+        test_share: share of the groups that is drawn for the test split.
+        val_share: share of the remaining recordings or groups that is drawn for the validation split.
         val_by: ``recording`` or ``group``. Windows of one recording are never in two splits.
-        frame: ``aligned`` (x where the agents head on average) or ``fixed`` (axes of the recording, as in the paper).
+        frame: ``aligned`` (x along the agents' mean heading) or ``fixed`` (axes of the recording, as in the paper).
         shape: agents' outline in the overlap rates, ``box`` or ``disc``.
-        scale: metres that an input of one of a network stands for.
+        scale: length [m] that corresponds to 1 in the inputs of a network.
         root: folder of the cache; None for $EPO_CACHE or ``cache``.
-        seed: of the draws, and of the batches' order where a run sets no other.
+        seed: of the draws, and of the order of batches unless a run sets its own.
         batch_size: scenes per batch.
-        share: of the scenes of every split that is used, drawn once.
+        share: share of the scenes of every split that is used, drawn once.
     """
 
     def __init__(
@@ -117,7 +118,9 @@ class RecordedData(SceneDataModule):
                 raise ConfigError(f"unknown data.{name} {value!r}: {nearest(str(value), known)}")
         self.test_share, self.val_share, self.val_by = test_share, val_share, val_by
         if not 0 < scale < np.inf:
-            raise ConfigError(f"data.scale must be positive, not {scale}: the metres that an input of one stands for")
+            raise ConfigError(
+                f"data.scale must be positive, not {scale}: the length [m] that corresponds to 1 in the inputs of a network"
+            )
         self.frame = frame
         candidates = LINES * PER_LINE if map else 0
         self.task = Task(
@@ -354,7 +357,7 @@ def _absent() -> Recording:
 
 
 def _fingerprint(file: Path) -> list[Any]:
-    """Name, size and a checksum of a file, of large ones only pieces all over them: recordings have gigabytes."""
+    """Name, size and checksum of a file. Of large files only evenly spaced pieces are read: recordings have gigabytes."""
     size, checksum = file.stat().st_size, 0
     with file.open("rb") as content:
         for place in range(0, size, max(PIECE, (size - PIECE) // PIECES)):
@@ -396,7 +399,7 @@ def _complete(file: Path) -> bool:
 
 
 def _describe(scenes: SceneTables) -> dict[str, Any]:
-    """Numbers for people who want to know what they train on."""
+    """Statistics of the scenes of a split, for the report."""
     speed = scenes.history[:, -1, 3]
     found: dict[str, Any] = {
         "agents per scene": float((scenes.agents >= 0).sum(1).mean()),

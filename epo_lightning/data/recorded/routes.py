@@ -1,7 +1,7 @@
-"""Routes: the lines that an agent may follow, and the places on them that it may be heading for (Appendix C.2).
+"""Routes: reference lines that an agent may follow, and goal candidates on them (Appendix C.2).
 
-An agent on a lane may keep to it or change to the lane beside. Its goal candidates are points on the centrelines of these
-three lanes; where there is no lane beside, on the boundary of its own.
+An agent on a lane may keep to it or change to a neighbouring lane. Its goal candidates are points on the centrelines of
+these three lanes; on a side without a neighbouring lane, they lie on the boundary of its own lane.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from jaxtyping import Float, Int
 from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph, Located, Polyline, Polylines
 
 LINES = 3
-"""Lines per agent R: left, own, right."""
+"""Reference lines R per agent: left, own, right."""
 PER_LINE = 20
-"""Goal candidates on each of them: G = 60 in all."""
+"""Goal candidates per reference line: G = 60 in all."""
 POINTS = 24
-"""Points of a reference line Q."""
+"""Points Q of a reference line."""
 BRAKING, ACCELERATING = 4.0, 3.0
-"""What agents can do [m/s^2]: between these lies what they reach within the horizon."""
+"""Largest deceleration and acceleration of agents [m/s^2]: they bound the range of the goal candidates."""
 BEHIND, BEYOND = 5.0, 10.0
-"""How far reference lines go on behind an agent and beyond its farthest candidate [m]."""
+"""Lengths [m] of reference lines behind an agent and beyond its farthest candidate."""
 BACKWARDS, FORWARDS = 100.0, 500.0
-"""How far a lane is followed [m]."""
+"""Distances [m] over which the lanes before and after a lane are followed."""
 SHORTEST = 10.0
-"""Least length [m] of the piece of road on which candidates lie."""
+"""Smallest length [m] of the range of goal candidates."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """Where some agents may be going.
+    """Reference lines and goal candidates of n agents.
 
     Attributes:
-        references: the lines that they may follow.
-        candidates: positions that they may be heading for.
-        line: index of the line that each candidate lies on; the same for all agents.
+        references: points of the reference lines [m].
+        candidates: goal candidates [m].
+        line: index of the reference line of each candidate; the same for all agents.
     """
 
     references: Float[np.ndarray, "n R Q 2"]
@@ -46,7 +46,7 @@ class Route:
 
 
 class Routes:
-    """The lines that lead on from every lane of a map."""
+    """Lines that continue every lane of a map forwards and backwards: its centreline and both boundaries."""
 
     def __init__(self, lanes: LaneGraph) -> None:
         self.lanes = lanes
@@ -61,7 +61,7 @@ class Routes:
         self.lines = Polylines(
             [np.concatenate([side[lane] for lane in (*before, *after)]) for side in sides for before, after in chains]
         )
-        # A line may come by twice, on a loop or a ring: agents are looked for on the piece that they are on or beside.
+        # A line may pass an agent twice, on a loop or a roundabout: agents are projected on the piece of their own lane.
         self.parts = Polylines([line for side in sides for line in side])
         self.begin = np.array(
             [
@@ -78,12 +78,12 @@ class Routes:
     def of(
         self, position: Float[np.ndarray, "n 2"], speed: Float[np.ndarray, " n"], located: Located, time: float
     ) -> Route:
-        """Where agents may be going.
+        """Reference lines and goal candidates of agents.
 
         Args:
-            position, speed: of the agents.
-            located: where they are; every one on a lane.
-            time: within which goals are to be reached [s].
+            position, speed: of the agents [m, m/s].
+            located: their lanes; every agent is on one.
+            time: horizon within which goals are reached [s].
         """
         speed = np.maximum(speed, 0.0)
         far = speed * time + ACCELERATING * time**2 / 2
@@ -111,7 +111,7 @@ class Routes:
 
 
 def _straightest(following: Sequence[tuple[int, ...]], lanes: LaneGraph, forwards: bool) -> Int[np.ndarray, " W"]:
-    """Of the lanes that follow each lane (or lead to it), the one that goes on most nearly straight; -1 for none."""
+    """For each lane the successor (or predecessor) with the smallest change of direction; -1 for none."""
     found = np.full(len(lanes), -1)
     for lane, others in enumerate(following):
         if others:
@@ -132,7 +132,7 @@ def _length(line: Polyline) -> float:
 
 
 def _follow(lane: int, following: np.ndarray, length: np.ndarray, distance: float) -> list[int]:
-    """A lane and those that follow, until ``distance`` beyond its end, or until one comes again."""
+    """A lane and the lanes that follow it, up to ``distance`` [m] beyond its end or until a lane repeats."""
     chain, gone = [lane], 0.0
     while gone < distance:
         lane = int(following[lane])
@@ -146,7 +146,7 @@ def _follow(lane: int, following: np.ndarray, length: np.ndarray, distance: floa
 def _first_beside(
     chains: list[list[int]], neighbour: np.ndarray, lanes: LaneGraph, length: np.ndarray
 ) -> tuple[Int[np.ndarray, " W"], Float[np.ndarray, " W"]]:
-    """The first driving lane that comes to lie beside each lane or what follows it, and how far from the lane's start."""
+    """The first driving lane beside each lane or its continuation, and the distance [m] from the lane's start to it."""
     found, distance = np.full(len(lanes), -1), np.full(len(lanes), np.inf)
     for lane, chain in enumerate(chains):
         gone = 0.0
@@ -160,7 +160,7 @@ def _first_beside(
 
 
 def pieces(lanes: LaneGraph, vectors: int, spacing: float) -> Float[np.ndarray, "T V+1 2"]:
-    """The map for the network: every centreline cut into pieces of so many vectors, each of at most ``spacing`` [m]."""
+    """Lane polylines for the network: all centrelines cut into pieces of V ``vectors`` of at most ``spacing`` [m] each."""
     longest = vectors * spacing
     length = lanes.centrelines.length
     parts = np.maximum(np.ceil(length / longest - 1e-9), 1).astype(int)

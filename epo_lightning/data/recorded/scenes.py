@@ -1,4 +1,4 @@
-"""Extracted tables as scenes, put together a batch at a time."""
+"""Scenes from extracted tables, assembled batch by batch."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.scene import Scene
 
 FRAMES = ("fixed", "aligned")
-"""A scene's axes: those of the recording, or x where its agents head on average. The origin lies amid the agents."""
+"""Axes of a scene: those of the recording, or x along the mean heading of its agents. The origin is their mean position."""
 
 
 class RecordedScenes:
-    """Scenes of one split, put together batch by batch.
+    """Scenes of one split of a recorded data set.
 
     Args:
         tables: the columns of an :class:`~epo_lightning.data.recorded.windows.SceneTables`.
         dt: time step [s].
-        frame: ``fixed`` (axes of the recording, origin amid the agents) or ``aligned`` (x where they head on average).
+        frame: ``fixed`` (axes of the recording) or ``aligned`` (x along the agents' mean heading).
         names: of the recordings.
     """
 
@@ -32,7 +32,7 @@ class RecordedScenes:
         return len(self.tables["agents"])
 
     def set_epoch(self, epoch: int) -> None:
-        """Every epoch has the same scenes."""
+        """Does nothing: every epoch has the same scenes."""
 
     def __getitem__(self, indices: Tensor) -> Scene:
         of = {name: self.tables[name][indices] for name in ("agents", "lanes", "centre", "direction", "recording")}
@@ -42,7 +42,7 @@ class RecordedScenes:
         cosine, sine = angle.cos(), angle.sin()
 
         def move(points: Tensor) -> Tensor:
-            """Positions [B, .., 2] in the scenes' own frames."""
+            """Positions [B, .., 2] in the frames of their scenes."""
             shape = (len(indices), *[1] * (points.dim() - 2))
             x, y = (points[..., axis] - of["centre"][:, axis].to(points.dtype).view(shape) for axis in range(2))
             if self.frame == "fixed":
@@ -54,7 +54,7 @@ class RecordedScenes:
             values, mask = self.tables[name][rows], self.tables[f"{name}_mask"][rows] & present[..., None]
             heading = values[..., 2:3]
             if self.frame == "aligned":
-                # The branch of the current heading decides for the whole scene.
+                # Headings are shifted by whole turns so that the current one lies within half a turn of x.
                 now = self.tables["history"][rows, -1, 2].double() - angle[:, None]
                 turns = torch.round(now / (2 * torch.pi)) * 2 * torch.pi
                 heading = (heading.double() - (angle[:, None] + turns)[..., None, None]).float()
@@ -97,7 +97,7 @@ class RecordedScenes:
         )
 
     def provenance(self, indices: Sequence[int]) -> list[dict[str, Any]]:
-        """Which recording, frame and tracks each of some scenes was extracted from."""
+        """Recording, frame and tracks of each of some scenes."""
         found = []
         for index in indices:
             agents = self.tables["agents"][index]

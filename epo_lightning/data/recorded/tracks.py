@@ -24,25 +24,25 @@ from epo_lightning.data.recorded.lanes import FARTHEST, LaneGraph
 __all__ = ["Recording", "RecordingError", "RecordingSource", "TrackTable"]
 
 FASTEST = 120.0
-"""Speeds [m/s] beyond this are a mistake of units."""
+"""Largest speed [m/s]; more indicates a wrong unit."""
 LONGEST = 40.0
-"""Vehicles [m] longer than this are a mistake of units."""
+"""Largest length of a vehicle [m]; more indicates a wrong unit."""
 
 
 @dataclass(frozen=True)
 class TrackTable:
-    """Everything that moved in a recording. Rows are sorted by agent, and by frame within an agent; frames may be missing.
+    """Tracks of all agents of a recording. Rows are sorted by agent, and by frame within an agent; frames may be missing.
 
     Attributes:
         rate: frames per second [Hz].
         agent: index of each row's agent, 0 .. A-1.
         frame: number of each row's frame.
         position: of the centre [m].
-        heading: where the front points, counter-clockwise from x [rad]; any number of turns.
-        velocity: in the directions of x and y [m/s].
-        ids: what the recording calls each agent.
+        heading: direction of the front, counter-clockwise from x [rad]; any number of turns.
+        velocity: components along x and y [m/s].
+        ids: identifier of each agent in the recording.
         size: length and width of each agent [m].
-        kind: what each agent is, an index into :data:`~epo_lightning.scene.KINDS`.
+        kind: kind of each agent, an index into :data:`~epo_lightning.scene.KINDS`.
     """
 
     rate: float
@@ -64,14 +64,14 @@ class TrackTable:
         return self.velocity[:, 0] * np.cos(self.heading) + self.velocity[:, 1] * np.sin(self.heading)
 
     def check(self, path: Path | str) -> TrackTable:
-        """This table, if its numbers can be what they claim to be.
+        """This table, after a check that its numbers are plausible.
 
         Args:
             path: of the file, for error messages.
 
         Raises:
-            RecordingError: no rows, numbers that are not finite, units that cannot be right, an agent whose time goes
-                backwards or who is in two places in one frame.
+            RecordingError: no rows, numbers that are not finite, implausible units, or an agent whose frames do not
+                increase.
         """
 
         def first(bad: Any) -> int:
@@ -116,14 +116,14 @@ class TrackTable:
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording, read.
+    """The contents of one recording.
 
     Attributes:
         name: unique within its data set.
-        group: what splits keep together: a map, a scene, a layout.
-        tracks: what agents did.
-        lanes: where they could drive; None where there are no lanes.
-        dropped: how many things the reader left out, by reason.
+        group: recordings of one group may be kept in one split: a map, a scene, a layout.
+        tracks: of all agents.
+        lanes: lane graph of the map; None without a map.
+        dropped: numbers of items that the reader left out, by reason.
     """
 
     name: str
@@ -135,12 +135,12 @@ class Recording:
 
 @dataclass(frozen=True)
 class RecordingSource:
-    """A recording that can be read.
+    """A recording that can be read: its name, its files and the function that reads them.
 
     Attributes:
-        name, group: as of the :class:`Recording`.
-        files: what it is read from; their contents identify a data set.
-        read: reads it, in another process maybe, so it is a function of a module or a partial of one. Raises
+        name, group: those of the :class:`Recording`.
+        files: its files; their contents identify a data set.
+        read: reads it, possibly in another process, so it is a function at module level or a partial of one. Raises
             :class:`RecordingError`.
     """
 

@@ -22,34 +22,34 @@ from epo_lightning.data.recorded.tracks import Recording
 from epo_lightning.registry import ConfigError
 
 VECTORS, SPACING = 10, 6.0
-"""Vectors V of a lane polyline and their greatest length [m]."""
+"""Vectors V of a lane polyline and their largest length [m]."""
 MOST_BESIDE = 0.5
-"""Share of positions on no lane beyond which a map does not belong to its tracks."""
+"""Largest share of positions on no lane; above it, the map does not belong to the tracks."""
 AGREE = 0.2
-"""Length of the mean of the agents' directions below which they do not head anywhere together."""
+"""Smallest length of the mean of the agents' unit directions; below it, they have no common direction."""
 MOST_AGENTS, LONGEST_SMOOTHING = 32, 10.0
-"""Agents of a scene, and seconds of a smoothing window, that make sense."""
+"""Largest number of agents of a scene, and largest length [s] of the smoothing window."""
 CHUNK = 4_000_000
-"""Distances between agents that are held at a time."""
+"""Largest number of distances between agents that are computed at once, to bound the memory."""
 
 
 @dataclass(frozen=True)
 class WindowConfig:
-    """Which windows of a recording become scenes. The defaults are the paper's for exiD.
+    """Selection of the windows of a recording that become scenes. The defaults are the paper's for exiD.
 
     Attributes:
         dt: time step [s].
-        history: steps H until now, this one included (1.8 s).
-        horizon: steps K that are forecast (4 s).
-        agents: most agents N of a scene: a focal one and its nearest neighbours.
-        least_agents: windows with fewer are left out.
-        radius: neighbours are nearer than this to the focal agent [m]; null for no limit.
+        history: observed steps H, including the current one (1.8 s).
+        horizon: future steps K (4 s).
+        agents: largest number of agents N: a focal one and its nearest neighbours.
+        least_agents: windows with fewer agents are left out.
+        radius: largest distance from the focal agent to its neighbours [m]; null for no limit.
         lane_change: whether at least one agent must change lane within the window.
         every: steps between two windows.
-        complete: whether neighbours must be observed in the whole window, as the focal agent is, or only now.
-        smoothing: length [s] of the window in which tracks are smoothed; null for tracks that are smooth.
-        lanes: most lane polylines L of a scene, the nearest ones.
-        speed_limit: where lanes know none [m/s].
+        complete: whether neighbours must be observed in the whole window, like the focal agent, or only at the current step.
+        smoothing: length [s] of the smoothing filter; null for tracks that are smooth already.
+        lanes: largest number of lane polylines L of a scene, the nearest ones.
+        speed_limit: for lanes without one [m/s].
     """
 
     dt: float = 0.2
@@ -98,25 +98,25 @@ class WindowConfig:
 
 @dataclass(frozen=True)
 class SceneTables:
-    """The scenes of a recording, or of several.
+    """The scenes of one or more recordings, as columns.
 
     Attributes, by agent (A rows):
         history, history_mask, future, future_mask: states x, y [m], heading [rad], speed [m/s].
         size: length and width [m].
         kind: an index into :data:`~epo_lightning.scene.KINDS`.
-        track: what the recording calls the agent.
-        candidates, references, reference_speed: where it may be going; empty without a map.
+        track: identifier of the agent in the recording.
+        candidates, references, reference_speed: goal candidates and reference lines; empty without a map.
     Attributes, by lane polyline (T rows):
         polylines: points of the map's polylines.
     Attributes, by scene (S rows):
-        agents: the scene's agents, -1 for none.
-        lanes: its polylines, -1 for none.
-        centre: where its frame has its origin.
-        direction: where its agents head on average [rad].
+        agents: rows of the scene's agents, -1 for none.
+        lanes: rows of its polylines, -1 for none.
+        centre: mean position of its agents, the origin of its frame [m].
+        direction: mean heading of its agents [rad].
         recording: index of its recording.
         frame: the recording's frame number at t0.
     Attributes, by recording:
-        origin: what was subtracted from all coordinates of the recording.
+        origin: offset that was subtracted from all coordinates of the recording [m].
     """
 
     history: Float[np.ndarray, "A H 4"]
@@ -143,11 +143,11 @@ class SceneTables:
 
 
 INDEX_OF = {"agents": "history", "lanes": "polylines", "recording": "origin"}
-"""Fields that are indices, and whose rows they count."""
+"""Fields that hold row indices, and the fields that these index."""
 
 
 def joined(parts: list[SceneTables]) -> SceneTables:
-    """Several extracts as one: indices are moved to where the rows come to lie."""
+    """The concatenation of several tables, with all row indices adjusted."""
     columns: dict[str, np.ndarray] = {}
     for field in fields(SceneTables):
         values = [getattr(part, field.name) for part in parts]
@@ -162,14 +162,14 @@ def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | N
     """The scenes of a recording.
 
     Returns:
-        the scenes, None where there are none; and how many windows there were and where they went.
+        the scenes, None if there are none; and the number of windows, with the numbers that were left out by reason.
 
     Raises:
-        ConfigError: a config that needs lanes for a recording without, or a clock faster than the recording.
+        ConfigError: the settings need lanes, which the recording lacks, or the clock is faster than the recording.
     """
     if config.lane_change and recording.lanes is None:
         raise ConfigError(
-            f"{recording.name} has no lanes, so nobody can change lane on them: use data.windows.lane_change=false"
+            f"{recording.name} has no lanes, so there are no lane changes: use data.windows.lane_change=false"
         )
     counts: Counter[str] = Counter(recording.dropped)
     shortest = config.history + config.horizon if config.complete else 2
@@ -188,10 +188,10 @@ def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | N
 
 
 def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.ndarray, " Z"]]:
-    """Where every state is, and how many lane changes the rows have seen until then.
+    """The lane of every state, and the cumulative number of lane changes over the rows.
 
     Raises:
-        RecordingError: a map that does not fit the tracks.
+        RecordingError: the map does not fit the tracks.
     """
     rows = len(clock.state)
     if recording.lanes is None:
@@ -209,21 +209,21 @@ def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.n
 
 
 def _rows(clock: Stretches, moments: Int[np.ndarray, " S"], members: Int[np.ndarray, "S N"]) -> Int[np.ndarray, "S N"]:
-    """The rows of windows' members at their moments; -1 for none."""
+    """Rows of the members of windows at their moments; -1 for none."""
     return np.where(members >= 0, clock.start[members] + moments[:, None] - clock.first[members], -1)
 
 
 def _choose(
     clock: Stretches, changes: Int[np.ndarray, " Z"], config: WindowConfig, counts: Counter[str]
 ) -> tuple[Int[np.ndarray, " S"], Int[np.ndarray, "S N"]]:
-    """Moments and members (stretches) of all windows that pass, the focal agent first, then by distance."""
+    """Moments and members (stretches) of the selected windows; the focal agent is first, the others follow by distance."""
     found_moments, found_members = [np.empty(0, dtype=int)], [np.empty((0, config.agents), dtype=int)]
     for moment, stretch, focal in _crowds(clock, config):
         position = clock.now[_rows(clock, moment, stretch), :2]
         distance = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
         distance[np.broadcast_to((stretch < 0)[:, None], distance.shape)] = np.inf
-        everyone = np.arange(stretch.shape[1])
-        distance[:, everyone, everyone] = -1.0
+        diagonal = np.arange(stretch.shape[1])
+        distance[:, diagonal, diagonal] = -1.0
         nearest = np.argsort(distance, axis=-1, kind="stable")[..., : config.agents]
         reach = np.take_along_axis(distance, nearest, -1)
         members = np.take_along_axis(np.broadcast_to(stretch[:, None], distance.shape), nearest, -1)
@@ -252,7 +252,7 @@ def _choose(
 
 
 def _crowds(clock: Stretches, config: WindowConfig) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Moments, the stretches that are there at each (padded with -1), and which of them may be focal."""
+    """Moments, the stretches present at each (padded with -1), and the mask of those that may be focal, in chunks."""
     before, after = (config.history - 1, config.horizon) if config.complete else (1, 0)
     count = np.maximum(clock.count - before - after, 0)
     stretch = np.repeat(np.arange(len(count)), count)
@@ -282,7 +282,7 @@ def _assemble(
     moments: Int[np.ndarray, " S"],
     members: Int[np.ndarray, "S N"],
 ) -> SceneTables:
-    """Gather what is known of the chosen agents at their moments."""
+    """The tables of the selected windows."""
     rows = _rows(clock, moments, members)
     used, place = np.unique(rows, return_inverse=True)
     place = place.reshape(rows.shape)
@@ -313,7 +313,7 @@ def _assemble(
     centre = (at * there).sum(1) / there.sum(1)
     heading = now[place, 2]
     ahead = np.stack([(f(heading) * there[..., 0]).sum(1) for f in (np.cos, np.sin)], 1)
-    # Agents that head against each other have no mean: the focal one decides then.
+    # Opposite headings have no meaningful mean: the heading of the focal agent is used.
     scattered = np.linalg.norm(ahead, axis=1) < AGREE * there[..., 0].sum(1)
     direction = np.where(scattered, heading[:, 0], np.arctan2(ahead[:, 1], ahead[:, 0]))
     candidates, references = np.empty((len(used), 0, 2)), np.empty((len(used), 0, 0, 2))
@@ -348,7 +348,7 @@ def _assemble(
 
 
 def _nearest(polylines: np.ndarray, centre: np.ndarray, most: int) -> Int[np.ndarray, "S L"]:
-    """The polylines whose middles are nearest to each centre, nearest first."""
+    """Indices of the polylines whose middles are nearest to each centre, nearest first; padded with -1."""
     found = np.full((len(centre), most), -1, dtype=np.int32)
     if len(polylines):
         middle = polylines[:, polylines.shape[1] // 2]

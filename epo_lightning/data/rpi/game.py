@@ -1,16 +1,16 @@
-"""The robot-pedestrian game: who starts where, who wants what, and what it costs (App. "RPI").
+"""The robot-pedestrian game: start states, goals and costs (App. "RPI").
 
-Two unicycles cross a circle of radius 3 m. The robot's start and goal never change; the pedestrian starts at the angle
-``phi`` from the robot and walks to the antipode. Agent i pays, as a plain sum over the steps,
+Two unicycles cross a circle of radius 3 m. The robot's start and goal are fixed; the pedestrian starts at the angle ``phi``
+from the robot and walks to the opposite point. The cost of agent i is, as a sum over the steps,
 
     1/2 effort (a^2 + omega^2) + 1/2 slowness v^2 + soft bounds + 1/2 terminal (|p_K - goal|^2 + (theta_K - theta_goal)^2)
     + w max(0, radius - distance)^2,
 
-where the last term is the same for both: an exact potential game, whose potential is the sum of the own costs plus the
-shared term once.
+where the last term is shared by both agents. The game is therefore an exact potential game, whose potential is the sum of
+the own costs plus the shared term once.
 
-Sources: the paper's appendix; the constants that it does not print are those of GameInference.jl (Peters, 2020), but for
-the radius of the proximity cost (1.5 m there), with which agents of 0.25 m never come near each other.
+Sources: the paper's appendix. The constants that it does not print are those of GameInference.jl (Peters, 2020), except for
+the radius of the proximity cost: with its 1.5 m, agents of 0.25 m never come near each other.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class GameConstants:
         acceleration_limit: bound of the absolute acceleration [m/s^2].
         speed_min, speed_max: bounds of the speed [m/s].
         terminal: weight of the squared distance [m] and heading error [rad] at the end.
-        radius: distance [m] below which the agents disturb each other.
+        radius: distance [m] below which the proximity cost is positive.
         circle: radius of the circle of starts and goals [m].
         steps: horizon of a main game.
         weight_min, weight_max: range of the weight w of the proximity cost.
@@ -67,7 +67,7 @@ class GameConstants:
     sector: float = math.radians(30.0)
 
     def array(self) -> Array:
-        """The constants as the vector that the kernels read by the indices of ``kernels``."""
+        """The constants as a vector; the module ``kernels`` names its indices."""
         return np.array(dataclasses.astuple(self), dtype=np.float64)
 
 
@@ -76,7 +76,7 @@ class MainGame:
     """One main game at one placement of the pedestrian.
 
     Attributes:
-        game, placement: which one it is.
+        game, placement: its indices.
         weight: w, drawn once per main game and the same for both agents.
         phi: angle [rad] from the robot's start to the pedestrian's, seen from the middle; also the pedestrian's heading.
         start: joint start state, 2 x (x, y, heading, speed).
@@ -92,15 +92,15 @@ class MainGame:
 
 
 def generator(*key: int) -> np.random.Generator:
-    """Random numbers that depend on what they are for, (seed, game, placement, ...), never on who draws them when."""
+    """Random generator for a purpose, given by a key (seed, game, placement, ...), independent of the order of draws."""
     return np.random.default_rng(np.random.SeedSequence(list(key)))
 
 
 def main_game(seed: int, game: int, placement: int, placements: int, constants: GameConstants) -> MainGame:
-    """Draw w (once per game) and the jittered angle (once per placement), and place both agents at rest.
+    """A main game with both agents at rest: w is drawn once per game, the pedestrian's angle once per placement.
 
-    The circle without the sector around the robot is cut into ``placements`` equal arcs; the pedestrian stands anywhere
-    within its own.
+    The circle without the sector around the robot is cut into ``placements`` equal arcs; the angle is uniform within the arc
+    of the placement.
     """
     weight = float(generator(seed, game).uniform(constants.weight_min, constants.weight_max))
     arc = (2 * math.pi - 2 * constants.sector) / placements

@@ -1,7 +1,7 @@
-"""The game as compiled code: rollout, costs, their derivatives, and the trajectories' characteristics.
+"""Compiled functions of the game: rollout, costs and their derivatives, and characteristics of trajectories.
 
 Joint states are rows of 8, agent after agent (x, y, heading, speed); joint controls rows of 4 (acceleration, turn
-rate). States [K+1, 8] include the start, which costs nothing: nobody chooses it. ``c`` is ``GameConstants.array()``,
+rate). States [K+1, 8] include the start state, which has no cost because it is given. ``c`` is ``GameConstants.array()``,
 ``goals`` [2, 3] are (x, y, heading) of each agent.
 """
 
@@ -17,7 +17,7 @@ DT, EFFORT, SLOWNESS, BOUND, TURN_LIMIT, ACCELERATION_LIMIT, SPEED_MIN, SPEED_MA
 
 @njit(cache=True)
 def step(x: Array, u: Array, dt: float, out: Array) -> None:
-    """One step of explicit Euler for both unicycles; position moves with the speed and heading before the step."""
+    """One step of explicit Euler for both unicycles: positions change with the speed and heading before the step."""
     for s in (0, 4):
         a = s // 2
         out[s] = x[s] + dt * x[s + 3] * np.cos(x[s + 2])
@@ -28,7 +28,7 @@ def step(x: Array, u: Array, dt: float, out: Array) -> None:
 
 @njit(cache=True)
 def rollout(start: Array, u: Array, dt: float) -> Array:
-    """States [K+1, 8] that controls [K, 4] lead to."""
+    """States [K+1, 8] from a start state [8] and controls [K, 4]."""
     x = np.empty((len(u) + 1, 8))
     x[0] = start
     for k in range(len(u)):
@@ -38,13 +38,13 @@ def rollout(start: Array, u: Array, dt: float) -> Array:
 
 @njit(cache=True)
 def excess(value: float, low: float, high: float) -> float:
-    """How far ``value`` lies outside of [low, high], with its sign."""
+    """Signed distance of ``value`` from the interval [low, high]; zero inside."""
     return min(value - low, 0.0) + max(value - high, 0.0)
 
 
 @njit(cache=True)
 def costs(x: Array, u: Array, c: Array, goals: Array, w: float) -> tuple[float, float, float]:
-    """Own cost of the robot, own cost of the pedestrian, and the proximity cost that both pay."""
+    """Own cost of the robot, own cost of the pedestrian, and the shared proximity cost."""
     own = np.zeros(2)
     pair = 0.0
     steps = len(u)
@@ -69,7 +69,7 @@ def costs(x: Array, u: Array, c: Array, goals: Array, w: float) -> tuple[float, 
 
 @njit(cache=True)
 def linearise(x: Array, c: Array, moves: Array, A: Array, B: Array) -> None:
-    """Jacobians of the step. An agent that does not move (``moves`` 0) keeps its controls: its columns of B are empty."""
+    """Jacobians A, B of the step. Controls of an agent with ``moves`` 0 are fixed: its columns of B are zero."""
     dt = c[DT]
     A[:] = 0.0
     B[:] = 0.0
@@ -87,7 +87,7 @@ def linearise(x: Array, c: Array, moves: Array, A: Array, B: Array) -> None:
 
 @njit(cache=True)
 def add_own(i: int, x: Array, u: Array, c: Array, goals: Array, Q: Array, q: Array, R: Array, r: Array) -> None:
-    """Add gradient and (exact) Hessian of agent i's own cost."""
+    """Add the gradient and the exact Hessian of agent i's own cost."""
     s, a = 4 * i, 2 * i
     steps = len(u)
     for k in range(steps):
@@ -108,8 +108,8 @@ def add_own(i: int, x: Array, u: Array, c: Array, goals: Array, Q: Array, q: Arr
 def add_pair(x: Array, c: Array, w: float, exact: bool, Q: Array, q: Array) -> None:
     """Add gradient and Hessian of the proximity cost w max(0, radius - d)^2; Gauss-Newton unless ``exact``.
 
-    Exactly, the Hessian in the relative position is 2w (n n' - (radius - d) / d (I - n n')) with n the unit vector
-    between the agents: negative across n, because stepping aside helps at second order too. Gauss-Newton drops that part.
+    The exact Hessian in the relative position is 2w (n n' - (radius - d) / d (I - n n')) with n the unit vector between
+    the agents. Its second term is negative across n, because stepping aside increases the distance; Gauss-Newton drops it.
     """
     block = np.empty((2, 2))
     for k in range(1, len(x)):
@@ -154,7 +154,7 @@ def adjoint(A: Array, B: Array, q: Array, r: Array) -> tuple[Array, Array]:
 
 @njit(cache=True)
 def add_curvature(x: Array, c: Array, costates: Array, Q: Array) -> None:
-    """Add the second derivatives of the step, weighed by the costates: what makes the iteration Newton's method."""
+    """Add the second derivatives of the step times the costates, which turn the iteration into Newton's method."""
     dt = c[DT]
     for k in range(len(x) - 1):
         for s in (0, 4):
@@ -182,9 +182,9 @@ def potential_gradient(x: Array, u: Array, c: Array, goals: Array, w: float) -> 
 
 @njit(cache=True)
 def passage(x: Array) -> tuple[float, int, float, float]:
-    """How the agents pass: smallest distance [m], when, total rotation [rad] of the line of sight, smallest speed [m/s].
+    """Smallest distance [m], its step, total rotation [rad] of the line of sight, and smallest speed [m/s].
 
-    The sign of the rotation is the homotopy class: which side the agents keep of each other.
+    The sign of the rotation is the homotopy class: the side on which the agents pass each other.
     """
     smallest, when, rotation, slowest = np.inf, 0, 0.0, np.inf
     for k in range(len(x)):

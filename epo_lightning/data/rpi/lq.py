@@ -1,12 +1,12 @@
-"""Linear-quadratic problems, solved exactly: the steps that the iterative solvers repeat.
+"""Exact solutions of linear-quadratic problems, which the iterative solvers use in every iteration.
 
 Dynamics x_{k+1} = A_k x_k + B_k u_k, k = 0 .. K-1, and costs
 
     sum_k 1/2 x_k' Q_k x_k + q_k' x_k  (k = 0 .. K)  +  sum_k 1/2 u_k' R_k u_k + r_k' u_k  (k = 0 .. K-1).
 
-Both solvers return an affine policy u_k = G_k x_k + f_k. Shapes: A [K, n, n], B [K, n, m], Q [K+1, n, n], q [K+1, n],
-R [K, m, m], r [K, m]; with one leading player dimension on Q, q, R, r in a game. All of them work for any n, m and number
-of players.
+Both functions return an affine policy u_k = G_k x_k + f_k. Shapes: A [K, n, n], B [K, n, m], Q [K+1, n, n], q [K+1, n],
+R [K, m, m], r [K, m]; with a leading dimension of players on Q, q, R, r in a game. All functions work for any n, m and
+number of players.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from epo_lightning.data.rpi.game import Array
 
 @njit(cache=True)
 def transposed_product(a: Array, b: Array, out: Array) -> None:
-    """out = a' b. Row by row, skipping zeros: the matrices of a unicycle are three quarters empty."""
+    """out = a' b, row by row and without zeros: three quarters of the entries of a unicycle's matrices are zero."""
     out[:] = 0.0
     for k in range(a.shape[0]):
         for i in range(a.shape[1]):
@@ -39,7 +39,7 @@ def transpose(a: Array, out: Array) -> None:
 
 @njit(cache=True)
 def solve_positive(a: Array, b: Array) -> bool:
-    """Overwrite ``b`` with a^-1 b by Cholesky, ``a`` with its factor; False where ``a`` is not positive definite."""
+    """Overwrite ``b`` with a^-1 b by Cholesky, ``a`` with its factor; False if ``a`` is not positive definite."""
     n = a.shape[0]
     for j in range(n):
         pivot = a[j, j]
@@ -71,7 +71,7 @@ def solve_positive(a: Array, b: Array) -> bool:
 
 @njit(cache=True)
 def solve_general(a: Array, b: Array) -> bool:
-    """Overwrite ``b`` with a^-1 b by Gaussian elimination with row pivoting; False where ``a`` is singular."""
+    """Overwrite ``b`` with a^-1 b by Gaussian elimination with row pivoting; False if ``a`` is singular."""
     n = a.shape[0]
     for j in range(n):
         best = j
@@ -104,13 +104,13 @@ def solve_general(a: Array, b: Array) -> bool:
 def lq_minimum(
     A: Array, B: Array, Q: Array, q: Array, R: Array, r: Array, damping: float
 ) -> tuple[bool, Array, Array, float]:
-    """The minimiser of one LQ problem, by the Riccati recursion. For a potential game: its open-loop Nash equilibrium.
+    """Minimiser of one LQ problem, by the Riccati recursion; for a potential game, its open-loop Nash equilibrium.
 
     ``damping`` is added to the curvature in the controls (Levenberg).
 
     Returns:
         whether every step was strictly convex, the gains G [K, m, n], the offsets f [K, m], and the decrease of the cost
-        that the first-order terms promise (the sum of -f' Q_u, positive).
+        predicted by the first-order terms (the sum of -f' Q_u, positive).
     """
     steps, n, m = B.shape
     gains, offsets = np.zeros((steps, m, n)), np.zeros((steps, m))
@@ -183,7 +183,7 @@ def lq_minimum(
 
 @njit(cache=True)
 def lq_game(A: Array, B: Array, Q: Array, q: Array, R: Array, r: Array, owner: Array) -> tuple[bool, Array, Array]:
-    """The feedback Nash equilibrium of an LQ game, by the coupled Riccati recursion (Basar and Olsder, Corollary 6.1).
+    """Feedback Nash equilibrium of an LQ game, by the coupled Riccati recursion (Basar and Olsder, Corollary 6.1).
 
     At every step each player minimises its own cost to go against the others' policies; the N stationarity conditions
     are linear in the joint policy and are solved together. Here Q [N, K+1, n, n], q [N, K+1, n], R [N, K, m, m],

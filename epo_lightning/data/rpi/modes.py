@@ -1,8 +1,8 @@
-"""Modes: the different ways in which the agents can pass each other.
+"""Modes: the homotopy classes of joint trajectories, which differ in the side on which the agents pass each other.
 
-Two trajectories are one mode when they can be bent into each other without the agents meeting. With two agents in the plane
-that is decided by the sign of the total rotation of the line of sight from robot to pedestrian. On main games DBSCAN
-over whole trajectories (Peters, 2020) finds the same clusters, but it needs a radius and this does not.
+Two joint trajectories belong to one mode if one can be deformed into the other without a collision. For two agents in the
+plane, the sign of the total rotation of the line of sight from robot to pedestrian decides. On main games, DBSCAN over whole
+trajectories (Peters, 2020) finds the same clusters, but it needs a radius.
 """
 
 from __future__ import annotations
@@ -14,24 +14,25 @@ from epo_lightning.data.rpi.game import GameConstants
 from epo_lightning.data.rpi.solve import Solutions
 
 CLASSES = (1, -1)
+"""Signs of the rotation of the line of sight."""
 SMALLEST_DISTANCE = 0.5
-"""Solutions in which the agents' discs touch [m] are no ways of passing."""
+"""Distance of the agents' centres [m] at which their discs touch."""
 TIE = 1e-6
-"""Relative difference of costs below which the earlier start strategy wins."""
+"""Relative difference of costs below which the solution from the earlier start strategy is taken."""
 
 
-def sound(solutions: Solutions, constants: GameConstants) -> NDArray[np.bool_]:
-    """Which solutions may become modes: converged, without contact, without driving backwards. Shape [S]."""
+def admissible(solutions: Solutions, constants: GameConstants) -> NDArray[np.bool_]:
+    """Mask [S] of the solutions that may become modes: converged, without contact, without driving backwards."""
     return solutions.converged & (solutions.distance > SMALLEST_DISTANCE) & (solutions.speed >= constants.speed_min)
 
 
 def cheapest(solutions: Solutions, constants: GameConstants) -> dict[int, int]:
-    """The index of the cheapest sound solution of each homotopy class (+1, -1) that was found.
+    """Index of the cheapest admissible solution of each homotopy class (+1, -1) that was found.
 
-    Equal costs are the same solution up to the solver's tolerance; the one from the earliest start is kept, so that a
-    strategy that is being executed stays what it is to the last bit.
+    Solutions of equal cost are the same up to the solver's tolerance. The one from the earliest start strategy is taken, so
+    that a strategy that is being executed does not change by rounding.
     """
-    good = sound(solutions, constants)
+    good = admissible(solutions, constants)
     found = {}
     for side in CLASSES:
         members = np.flatnonzero(good & (np.sign(solutions.rotation) == side))

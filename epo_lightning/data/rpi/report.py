@@ -1,6 +1,6 @@
-"""What a generated set is like: sizes, modes over time, how well the games were solved, and how hard the set is.
+"""Report about a generated data set: sizes, modes over time, convergence of the solver, and simple baselines.
 
-Every number goes into the manifest; :func:`markdown` writes them for people.
+All numbers are stored in the manifest; :func:`markdown` formats them as tables.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from epo_lightning.data.rpi.game import DISC_RADIUS, Array, GameConstants, gener
 from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, Records
 
 BINS = ((18, 28), (28, 38), (38, 48), (48, 61))
-"""Steps k of the current state; 18 .. 27 is 1.8 .. 2.7 s after the start."""
+"""Ranges [first, end) of the step k of the current state; steps 18 .. 27 are 1.8 .. 2.7 s after the start."""
 GAIN = 1e-6
-"""Relative gain of a best response above which a strategy is no equilibrium."""
+"""Relative gain of a best response above which a strategy does not count as an equilibrium."""
 
 
 def describe(
-    parts: Mapping[str, Records], counts: Mapping[str, int], weights: Array, pool: Mapping[str, Any]
+    splits: Mapping[str, Records], counts: Mapping[str, int], weights: Array, pool: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The report of a set.
+    """The report about a data set, as plain values.
 
     Args:
-        parts: records of training, validation and test.
-        counts: what the solver did, for the whole pool.
+        splits: records of training, validation and test.
+        counts: numbers of solved and dropped games in the whole pool.
         weights: w of every main game.
         pool: configuration of the pool.
     """
-    rows = {name: np.concatenate([part[name] for part in parts.values()]) for name in parts["train"]}
+    rows = {name: np.concatenate([split[name] for split in splits.values()]) for name in splits["train"]}
     return {
-        "sizes": {part: _sizes(records) for part, records in parts.items()},
-        "weights": {part: sorted({float(w) for w in records["weight"]}) for part, records in parts.items()},
+        "sizes": {split: _sizes(records) for split, records in splits.items()},
+        "weights": {split: sorted({float(w) for w in records["weight"]}) for split, records in splits.items()},
         "two_modes": {"all": float((rows["modes"] == 2).mean()), **_over_time(rows)},
         "solver": _solver(counts, pool["solver"]),
         "nash": _nash(rows),
         "motion": _motion(rows, weights),
-        "baselines": {"constant_velocity": _constant_velocity(parts["test"]), "nearest_neighbour": _nearest(parts)},
+        "baselines": {"constant_velocity": _constant_velocity(splits["test"]), "nearest_neighbour": _nearest(splits)},
     }
 
 
@@ -54,7 +54,7 @@ def _sizes(records: Records) -> dict[str, int]:
 
 
 def _over_time(rows: Records) -> dict[str, float]:
-    """Share of records with two modes, by the time since the main game's start."""
+    """Share of records with two modes, by time since the main game's start."""
     shares = {}
     for first, end in BINS:
         chosen = (rows["step"] >= first) & (rows["step"] < end)
@@ -83,7 +83,7 @@ def _quantiles(values: NDArray, digits: tuple[float, ...] = (0.0, 0.5, 0.9, 0.99
 
 
 def _nash(rows: Records) -> dict[str, Any]:
-    """How far from an equilibrium: unilateral gradients, and what a best response from a perturbed start would win."""
+    """Distance from an equilibrium: unilateral gradients, and gains of best responses from perturbed strategies."""
     two = rows["modes"] == 2
     found = {}
     for name, gradient, gain in (
@@ -100,7 +100,10 @@ def _nash(rows: Records) -> dict[str, Any]:
 
 
 def _bellman(rows: Records) -> dict[str, float]:
-    """Largest difference [m, rad, m/s] of an executed mode from the rest of the one before: zero by Bellman's principle."""
+    """Largest difference [m, rad, m/s] between an executed mode and the rest of the mode of the step before.
+
+    By Bellman's principle of optimality it is zero.
+    """
     order = np.lexsort((rows["step"], rows["executed"], rows["placement"], rows["game"]))
     follows = np.diff(rows["step"][order]) == 1
     for name in ("game", "placement", "executed"):
@@ -137,7 +140,7 @@ def _motion(rows: Records, weights: Array) -> dict[str, Any]:
 
 
 def _euler(states: Array, controls: Array, history: Array) -> float:
-    """Largest difference of a stored state from one Euler step before it, over the executed futures."""
+    """Largest difference between a stored state and an Euler step from the state before, over the executed futures."""
     dt = GameConstants().dt
     before = np.concatenate([history[:, :, -1:], states[:, :, :-1]], axis=2)
     heading, speed = before[..., 2], before[..., 3]
@@ -146,7 +149,7 @@ def _euler(states: Array, controls: Array, history: Array) -> float:
 
 
 def constant_velocity(history: Array) -> Array:
-    """Positions [B, 2, 40, 2] of agents that go on with their current velocity."""
+    """Forecast of constant velocity, positions [B, 2, 40, 2]."""
     now = history[:, :, -1]
     velocity = now[..., 3:4] * np.stack([np.cos(now[..., 2]), np.sin(now[..., 2])], axis=-1)
     time = GameConstants().dt * np.arange(1, FUTURE + 1)
@@ -154,7 +157,7 @@ def constant_velocity(history: Array) -> Array:
 
 
 def _errors(forecast: Array, records: Records) -> dict[str, dict[str, float]]:
-    """ADE = SADE of one forecast: without modes to choose from, the mean over agents and steps is both."""
+    """ADE and FDE [m] of a forecast with one mode, for which ADE equals SADE."""
     two = records["modes"] == 2
     found = {}
     for name, mode, chosen in (("executed", 0, slice(None)), ("alternative", 1, two)):
@@ -168,24 +171,23 @@ def _constant_velocity(test: Records) -> dict[str, Any]:
 
 
 def _key(records: Records) -> Tensor:
-    """What a nearest neighbour is looked up by: positions of the history and goals. Shape [B, 2 * 19 * 2 + 4]."""
+    """Keys of the nearest-neighbour search, positions of history and goals, shape [B, 2 * 19 * 2 + 4]."""
     history = torch.from_numpy(records["history"][..., :2].reshape(len(records["step"]), -1))
     return torch.cat([history, torch.from_numpy(records["goals"]).flatten(1)], dim=1)
 
 
-def _nearest(parts: Mapping[str, Records]) -> dict[str, Any]:
-    """Copy the futures of the training record with the nearest history and goal (at most 6000 test records).
+def _nearest(splits: Mapping[str, Records]) -> dict[str, Any]:
+    """Errors of a forecast that copies the training record with the nearest history and goals (at most 6000 test records).
 
-    An alternative mode is compared with that neighbour's alternative, where the neighbour has one; otherwise with its
-    executed mode.
+    An alternative mode is compared with the neighbour's alternative mode if it has one, otherwise with its executed mode.
     """
-    train, test = parts["train"], parts["test"]
+    train, test = splits["train"], splits["test"]
     count = len(test["step"])
     chosen = np.sort(generator(0, 3).permutation(count)[:6000])
     test = {name: values[chosen] for name, values in test.items()}
     keys, queries = _key(train), _key(test)
     found = torch.cat([torch.cdist(block, keys).argmin(1) for block in queries.split(500)])
-    # cdist is fast but rounds in the third digit here: good enough to choose, not to report.
+    # cdist is fast but accurate to three digits only: enough to find neighbours, but not for the report.
     step = (queries - keys[found]).double().norm(dim=1).numpy() / np.sqrt(2 * (HISTORY + 1))
     nearest = found.numpy()
     same = train["states"][nearest, 0, :, :, :2].astype(np.float64)
@@ -199,7 +201,7 @@ def _nearest(parts: Mapping[str, Records]) -> dict[str, Any]:
 
 
 def markdown(report: Mapping[str, Any]) -> str:
-    """The report as markdown tables."""
+    """The report as Markdown tables."""
     lines = ["| split | records | samples | main games | w |", "|---|---|---|---|---|"]
     for part, size in report["sizes"].items():
         weights = report["weights"][part]
@@ -230,7 +232,7 @@ def markdown(report: Mapping[str, Any]) -> str:
         (f"share of executed modes with a gain above {GAIN:g}", nash["executed"]["gain_share"]),
         (f"share of alternative modes with a gain above {GAIN:g}", nash["alternative"]["gain_share"]),
         ("cost of alternative / executed, median", nash["cost_ratio"].get("0.5")),
-        ("largest difference from the tail before (Bellman)", nash["bellman"]["max"]),
+        ("largest difference from the rest of the previous mode (Bellman)", nash["bellman"]["max"]),
         ("records in which the discs overlap", motion["disc_overlaps"]),
         ("Euler residual", motion["euler_residual"]),
         ("acceleration, 99% [m/s^2]", motion["acceleration_99"]),

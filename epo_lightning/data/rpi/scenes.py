@@ -1,4 +1,4 @@
-"""Records as scenes, and the data module ``rpi``."""
+"""Scenes from RPI records, and the data module ``rpi``."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ DISC_DIAMETER = 0.5
 class RPIDataset:
     """Scenes of one split.
 
-    A record holds one history and one or two modes; ``targets`` says which of them are futures to learn:
-    ``executed`` (the mode that the agents followed), ``both`` (a sample per mode) or ``sampled`` (one of the record's
-    modes, drawn anew from (seed, epoch, index) each epoch).
+    A record has one history and one or two modes. ``targets`` selects the futures to learn: ``executed`` (the mode that the
+    agents followed), ``both`` (one sample per mode) or ``sampled`` (one of the record's modes, drawn in every epoch from
+    (seed, epoch, index)).
 
     Args:
         records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``states`` [R, 2 modes, 2, 40, 4] and ``modes`` [R].
-        targets: see above.
-        seed: of the draws.
+        targets: ``executed``, ``both`` or ``sampled``.
+        seed: of the draws of ``sampled``.
     """
 
     def __init__(self, records: Mapping[str, Tensor], targets: str = "both", seed: int = 0) -> None:
@@ -50,7 +50,7 @@ class RPIDataset:
         self.set_epoch(0)
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw the modes of an epoch."""
+        """Draw the modes of an epoch, if targets are sampled."""
         if self.targets == "sampled":
             draw = torch.rand(len(self.history), generator=epoch_generator(self.seed, epoch))
             self.mode = (draw * self.modes).long()
@@ -90,15 +90,15 @@ class RPIData(SceneDataModule):
 
     Args:
         root: folder of the cache; None for $EPO_CACHE or ``cache``.
-        seed: of the games, and of the batches' order where a run sets no other.
-        games: main games; one draw of w each. A tenth each, at least one, becomes validation and test.
-        placements: starts of the pedestrian per main game.
-        solver: ``potential`` (open-loop Nash) or ``feedback`` (iterative LQ game).
+        seed: of the games, and of the order of batches unless a run sets its own.
+        games: number of main games, each with its own w. A tenth, at least one, is for validation, and as many for test.
+        placements: start positions of the pedestrian per main game.
+        solver: ``potential`` (open-loop Nash equilibrium) or ``feedback`` (iterative LQ game).
         split: ``paper`` (unseen games) or ``hard`` (unseen w and directions).
-        sizes: most records of training, validation and test; None for all.
+        sizes: largest numbers of records of training, validation and test; None for all.
         targets: ``both``, ``executed`` or ``sampled``; see :class:`RPIDataset`.
         batch_size: scenes per batch.
-        share: of the scenes of every split that is used, drawn once.
+        share: share of the scenes of every split that is used, drawn once.
     """
 
     task = Task(horizon=40, dt=0.1, subsets=SUBSETS)
@@ -120,7 +120,7 @@ class RPIData(SceneDataModule):
         super().__init__(batch_size, seed, share)
         self.root = Path(root).expanduser() if root else cache.default_root()
         self.games = _whole("games", games, 3, "training, validation and test need main games of their own")
-        self.placements = _whole("placements", placements, 1, "the pedestrian must start somewhere")
+        self.placements = _whole("placements", placements, 1, "a main game needs a start position of the pedestrian")
         self.solver = _one_of("solver", solver, SOLVERS)
         self.split = _one_of("split", split, RULES)
         self.targets = _one_of("targets", targets, TARGETS)
@@ -131,26 +131,26 @@ class RPIData(SceneDataModule):
 
     @property
     def config(self) -> dict[str, Any]:
-        """Everything that the set on disk depends on."""
+        """Configuration of the data set: all values that its files depend on."""
         from epo_lightning.data.rpi.generate import pool_config, set_config
 
         return set_config(pool_config(self.seed, self.games, self.placements, self.solver), self.split, self.sizes)
 
     @property
     def folder(self) -> Path:
-        """Where the set lies, or will lie."""
+        """Folder of the data set, whether or not it exists."""
         from epo_lightning.data.rpi.generate import set_folder
 
         return set_folder(self.root, self.config)
 
     @property
     def digest(self) -> str:
-        """Hash of everything that a run's data depends on: the set and which of its modes are learned."""
+        """Hash of everything that a run's data depends on: the data set and the selection of its modes."""
         return cache.digest({"set": self.config, "targets": self.targets})[:16]
 
     @property
     def command(self) -> str:
-        """The command that makes this set, for error messages."""
+        """The command that makes this data set, for error messages."""
         defaults = {"seed": 0, "games": 20, "placements": 39, "solver": "potential", "split": "paper"}
         words = [
             f"data.{name}={getattr(self, name)}" for name, value in defaults.items() if getattr(self, name) != value
@@ -162,26 +162,27 @@ class RPIData(SceneDataModule):
         return " ".join(["epo generate data=rpi", *words])
 
     def generate(self, workers: int | None = None, progress: bool = True) -> Path:
-        """Make the set unless it is there already, and return its folder.
+        """Make the data set unless it exists already, and return its folder.
 
         Args:
             workers: processes; None for one per core. The bytes do not depend on it.
-            progress: whether to show a progress bar.
+            progress: whether to report progress.
 
         Raises:
-            cache.CacheError: the folder holds something broken, or a worker was killed.
+            cache.CacheError: the data set is broken or of another configuration, or a worker was killed.
+            OSError: the disk is full or read-only.
         """
         from epo_lightning.data.rpi.generate import make_set
 
         if workers is not None:
-            _whole("workers", workers, 1, "somebody has to solve the games")
+            _whole("workers", workers, 1, "the games are solved by worker processes")
         return make_set(self.root, self.config["pool"], self.split, self.sizes, workers, progress, self.command)
 
     def report(self) -> dict[str, Any]:
-        """The report that the set was made with.
+        """The report that was written with the data set.
 
         Raises:
-            cache.CacheError: the set is missing or broken.
+            cache.CacheError: the data set is missing, broken or of another configuration.
         """
         return cache.manifest(self.folder, self.command, self.config)["report"]
 
@@ -189,7 +190,8 @@ class RPIData(SceneDataModule):
         """The scenes of a split.
 
         Raises:
-            cache.CacheError: the set is missing, broken, of another format, or holds numbers that are not finite.
+            cache.CacheError: the data set is missing, broken, of another configuration, or holds numbers that are not
+                finite.
         """
         records = cache.load(self.folder, split, ("history", "goals", "states", "modes"), self.command, self.config)
         return RPIDataset(records, self.targets, self.seed)

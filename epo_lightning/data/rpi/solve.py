@@ -1,7 +1,8 @@
-"""Two ways to solve the game from a start strategy, compiled per problem.
+"""Two solvers of the game from a start strategy, compiled.
 
-``potential``: open-loop Nash, as the minimiser of the exact potential (iterative LQR). ``feedback``: feedback Nash, by the
-general-sum iterative linear-quadratic game of Fridovich-Keil et al. (2020) with the settings of Peters (2020).
+``potential``: open-loop Nash equilibrium, as the minimiser of the exact potential (iterative LQR).
+``feedback``: feedback Nash equilibrium, by the general-sum iterative linear-quadratic game of Fridovich-Keil et al. (2020)
+with the settings of Peters (2020).
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ class PotentialSettings:
     """Settings of the potential solver.
 
     Attributes:
-        tolerance: largest entry of the gradient at which it stops.
-        iterations: most iterations.
+        tolerance: largest absolute entry of the gradient at which the solver stops.
+        iterations: largest number of iterations.
         exact_from, exact_below: iteration, or largest entry of the gradient, from which the exact Hessian of costs and
-            dynamics replaces Gauss-Newton's: the latter is safe far away, the exact one finishes quadratically, also near
-            the ridge between two ways of passing.
+            dynamics replaces that of Gauss-Newton. The latter is robust far from a solution; the exact one converges
+            quadratically, also near the saddle between two modes.
     """
 
     tolerance: float = 1e-4
@@ -38,6 +39,7 @@ class PotentialSettings:
     exact_below: float = 20.0
 
     def array(self) -> Array:
+        """The settings as the vector that the compiled solver reads."""
         return np.array(dataclasses.astuple(self), dtype=np.float64)
 
 
@@ -46,11 +48,11 @@ class FeedbackSettings:
     """Settings of the feedback solver.
 
     Attributes:
-        step: scale of the offsets in the first trial of an iteration; halved until the move is small enough.
-        halvings: most halvings.
+        step: initial step length of an iteration; it is halved until the change of the states is small enough.
+        halvings: largest number of halvings.
         largest_move: largest change of an element of the states in one iteration.
-        tolerance: largest change of an element of the states at which it stops.
-        iterations: most iterations.
+        tolerance: largest change of an element of the states at which the solver stops.
+        iterations: largest number of iterations.
         regularisation: multiple of the identity added to the Hessians of states and controls.
     """
 
@@ -62,12 +64,13 @@ class FeedbackSettings:
     regularisation: float = 5.0
 
     def array(self) -> Array:
+        """The settings as the vector that the compiled solver reads."""
         return np.array(dataclasses.astuple(self), dtype=np.float64)
 
 
 @njit(cache=True)
 def follow(x: Array, u: Array, gains: Array, offsets: Array, scale: float, dt: float) -> tuple[Array, Array]:
-    """Roll out the affine policy around (x, u): u_k + scale * offset_k + gain_k (new x_k - x_k)."""
+    """States and controls of the affine policy around (x, u): u_k + scale * offset_k + gain_k (new x_k - x_k)."""
     new_x, new_u = np.empty_like(x), u.copy()
     new_x[0] = x[0]
     for k in range(len(u)):
@@ -91,10 +94,12 @@ def total(x: Array, u: Array, c: Array, goals: Array, w: float) -> float:
 def solve_potential(
     start: Array, u: Array, c: Array, goals: Array, w: float, moves: Array, settings: Array
 ) -> tuple[Array, Array, bool, int]:
-    """Minimise the potential over the controls of the agents that move ([1, 1]: Nash; [1, 0]: a best response).
+    """Minimum of the potential over the controls of the agents whose entry of ``moves`` is 1.
 
-    Iterative LQR: a quadratic model around the trajectory, its exact minimiser as a policy, a line search along it, and
-    Levenberg damping of the controls where the model is not convex or the search fails.
+    With [1, 1] it is an open-loop Nash equilibrium, with [1, 0] a best response of the first agent.
+
+    Iterative LQR: the minimiser of a quadratic model around the trajectory gives a policy, followed by a line search. The
+    controls are damped (Levenberg) where the model is not convex or the line search fails.
 
     Returns:
         states [K+1, 8], controls [K, 4], whether the gradient fell below the tolerance, iterations.
@@ -143,10 +148,10 @@ def solve_potential(
 def solve_feedback(
     start: Array, u: Array, c: Array, goals: Array, w: float, settings: Array
 ) -> tuple[Array, Array, bool, int]:
-    """Iterate LQ games around the trajectory until it stands still: an approximate feedback Nash equilibrium.
+    """Approximate feedback Nash equilibrium: LQ games around the trajectory are solved until it stops changing.
 
     Returns:
-        states [K+1, 8], controls [K, 4], whether the trajectory stood still, iterations.
+        states [K+1, 8], controls [K, 4], whether it converged, iterations.
     """
     first, halvings, largest, tolerance = settings[0], int(settings[1]), settings[2], settings[3]
     iterations, regularisation = int(settings[4]), settings[5]
@@ -188,7 +193,7 @@ def solve_feedback(
 def _solve_many(
     start: Array, starts: Array, c: Array, goals: Array, w: float, feedback: bool, settings: Array
 ) -> tuple[Array, Array, NDArray[np.bool_], Array]:
-    """Solve from each start strategy [S, K, 4]; see :class:`Solutions`."""
+    """The fields of :class:`Solutions` for start strategies [S, K, 4]."""
     count, steps = starts.shape[:2]
     states, controls = np.empty((count, steps + 1, 8)), np.empty((count, steps, 4))
     converged, facts = np.empty(count, dtype=np.bool_), np.empty((count, 7))
@@ -208,15 +213,15 @@ def _solve_many(
 
 @dataclass(frozen=True)
 class Solutions:
-    """What was found from S start strategies.
+    """Solutions from S start strategies.
 
     Attributes:
         states [S, K+1, 8], controls [S, K, 4]: the trajectories.
         converged [S]: whether the solver stopped at its tolerance.
-        agent_costs [S, 2], potential [S]: what each agent pays, and the potential.
+        agent_costs [S, 2], potential [S]: cost of each agent, and the potential.
         distance [S], rotation [S], speed [S]: smallest distance [m], rotation of the line of sight [rad] and smallest
-            speed [m/s] along the way.
-        iterations [S]: of the solver.
+            speed [m/s] along the trajectory.
+        iterations [S]: number of iterations.
     """
 
     states: Array
@@ -233,7 +238,7 @@ class Solutions:
 def solve(
     start: Array, starts: Array, constants: Array, goals: Array, weight: float, solver: str = "potential"
 ) -> Solutions:
-    """Solve the game from ``start`` [8] once per start strategy [S, K, 4]."""
+    """Solutions of the game with the start state ``start`` [8] from start strategies [S, K, 4]."""
     settings = FeedbackSettings().array() if solver == "feedback" else PotentialSettings().array()
     states, controls, converged, facts = _solve_many(
         start, np.ascontiguousarray(starts), constants, goals, weight, solver == "feedback", settings

@@ -1,7 +1,7 @@
-"""From one placement of a main game to records: solve, execute each mode, and solve again every 0.1 s.
+"""Records of one placement of a main game: it is solved, each mode is executed, and a sub-game is solved every 0.1 s.
 
-The receding horizon keeps the goal's time: the sub-game at step k has the K - k steps that are left. Every sub-game gives
-one record: what was seen until k, and the ways in which the agents could go on.
+The horizon shrinks: the sub-game at step k has the K - k steps that are left until the main game's end. Every sub-game
+gives one record: the history until k, and the modes of the future.
 """
 
 from __future__ import annotations
@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 
 from epo_lightning.data.rpi.game import AGENTS, Array, GameConstants, MainGame, generator
 from epo_lightning.data.rpi.kernels import costs, passage, potential_gradient
-from epo_lightning.data.rpi.modes import cheapest, sound
+from epo_lightning.data.rpi.modes import admissible, cheapest
 from epo_lightning.data.rpi.solve import PotentialSettings, solve, solve_potential
 
 HISTORY = 18
 """Steps before the current state (1.8 s)."""
 FUTURE = 40
-"""Steps to predict (4 s)."""
+"""Future steps (4 s)."""
 MAIN_STARTS = 12
+"""Start strategies of a main game."""
 RANDOM_STARTS = 14
+"""Random start strategies of a sub-game."""
 MODES = 2
 
 Records = dict[str, NDArray]
@@ -46,16 +48,16 @@ def random_starts(random: np.random.Generator, steps: int) -> Array:
 
 
 def by_agent(rows: Array) -> Array:
-    """[..., T, agents * width] -> [..., agents, T, width]."""
+    """Rows split by agent: from [..., T, agents * width] to [..., agents, T, width]."""
     return np.moveaxis(rows.reshape(*rows.shape[:-1], AGENTS, -1), -2, -3)
 
 
 def best_response_gain(
     start: Array, u: Array, constants: Array, game: MainGame, agent_costs: Array, noise: Array
 ) -> float:
-    """What the agents can win at most by changing their own strategy alone, relative to their cost.
+    """Largest relative decrease of an agent's cost by a best response, that is, by changing its own strategy alone.
 
-    Each agent's best response is sought from its strategy plus ``noise`` [K, 4]; the other's strategy stands.
+    The search for the best response starts from the agent's strategy plus ``noise`` [K, 4]; the other strategy is fixed.
     """
     best = 0.0
     settings = PotentialSettings().array()
@@ -74,10 +76,10 @@ def _agent_cost(x: Array, u: Array, constants: Array, game: MainGame, agent: int
 
 
 def play(seed: int, game: MainGame, constants: GameConstants, solver: str) -> tuple[Records, dict[str, int]]:
-    """Solve a main game, execute its modes and solve their sub-games.
+    """Records of a main game: its modes are executed and their sub-games solved.
 
     Returns:
-        the records (see ``FIELDS`` of ``generate``), stacked, and counts of what the solver did.
+        the records, stacked by field, and counts of solved and dropped games.
     """
     c = constants.array()
     random = generator(seed, game.game, game.placement, 1)
@@ -86,7 +88,7 @@ def play(seed: int, game: MainGame, constants: GameConstants, solver: str) -> tu
     counts = {
         "main_starts": len(main.converged),
         "main_converged": int(main.converged.sum()),
-        "main_kept": int(sound(main, constants).sum()),
+        "main_kept": int(admissible(main, constants).sum()),
         "main_games": 1,
         "main_both": int(len(modes) == MODES),
         "sub_starts": 0,
@@ -108,7 +110,7 @@ def play(seed: int, game: MainGame, constants: GameConstants, solver: str) -> tu
             counts["sub_games"] += 1
             counts["sub_starts"] += len(starts)
             counts["sub_converged"] += int(found.converged.sum())
-            counts["sub_kept"] += int(sound(found, constants).sum())
+            counts["sub_kept"] += int(admissible(found, constants).sum())
             noise = random.normal(0.0, 0.1, (steps, 2 * AGENTS))
             if side not in chosen:
                 counts["sub_dropped"] += 1

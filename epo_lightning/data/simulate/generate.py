@@ -1,7 +1,8 @@
-"""Making a folder of simulated recordings: one process per recording, finished ones are kept, the folder appears when whole.
+"""Generation of a folder of simulated recordings: one process per recording.
 
-Every recording draws from its own random numbers, so the bytes do not depend on the number of workers. Work goes on in a
-hidden folder beside the final one; a run that was killed continues there with the recordings that are not finished.
+Every recording draws from its own random numbers, so the bytes do not depend on the number of workers. The recordings are
+written to a hidden folder beside the final one, which is renamed when it is complete; a run that was killed continues there
+with the recordings that are not finished.
 """
 
 from __future__ import annotations
@@ -22,23 +23,24 @@ from epo_lightning.data.workers import Report, finished
 from epo_lightning.registry import ConfigError
 
 RECIPE = 2
-"""Version of the recipe: raised whenever the same configuration would give other recordings."""
+"""Version of the simulation: raised whenever the same configuration would give other recordings."""
 MOST_DROPPED = 0.05
-"""A simulation in which more than this share of vehicles move as none can is refused."""
+"""Largest share of vehicles with implausible motion; a simulation with more is refused."""
 
 
 def config(
     seed: int = 0, recordings: int = 3, minutes: float = 9.0, layouts: Sequence[int] | None = None
 ) -> dict[str, Any]:
-    """Everything that simulated recordings depend on, as plain values.
+    """Configuration of simulated recordings: all values that they depend on.
 
     Args:
-        recordings: per layout.
-        minutes: that each of them lasts.
-        layouts: their ids; all when not given.
+        seed: of the traffic.
+        recordings: number per layout.
+        minutes: duration of each recording.
+        layouts: ids of the layouts; None for all.
 
     Raises:
-        ConfigError: a value that cannot be.
+        ConfigError: a value is out of range.
     """
     known = [layout.id for layout in LAYOUTS]
     chosen = known if layouts is None else sorted(set(layouts))
@@ -65,15 +67,15 @@ def config(
 
 
 def map_path(layout: Layout) -> str:
-    """Where exiD v2.1 keeps a location's Lanelet2 map."""
+    """Path of a location's Lanelet2 map in exiD v2.1."""
     return f"maps/lanelet2/{layout.id}_{layout.name}/location{layout.id}.osm"
 
 
 def record(work: Path, name: str, number: int, place: Layout, seed: int, seconds: float) -> int:
-    """Simulate and write recording ``number`` of the configuration called ``name``; its ``.done`` file comes last.
+    """Simulate and write recording ``number`` of the configuration with the digest ``name``; its ``.done`` file comes last.
 
     Raises:
-        ConfigError: SUMO is missing or fails, too many vehicles have accidents, or nobody changes lane.
+        ConfigError: SUMO is missing or fails, too many vehicles have accidents, or there is no lane change.
     """
     with tempfile.TemporaryDirectory() as folder:
         traffic = simulate(place, [seed, number], seconds, Path(folder))
@@ -81,13 +83,13 @@ def record(work: Path, name: str, number: int, place: Layout, seed: int, seconds
     dropped = sum(motion.dropped.values())
     if dropped > MOST_DROPPED * len(traffic.size):
         raise ConfigError(
-            f"recording {number} on layout {place.name}: {dropped} of {len(traffic.size)} vehicles move as none can "
+            f"recording {number} on layout {place.name}: {dropped} of {len(traffic.size)} vehicles move implausibly "
             f"({motion.dropped}): use another seed"
         )
     changes = int(recording.lane_changes(motion).sum())
     if not changes:
         raise ConfigError(
-            f"recording {number} on layout {place.name}: nobody changes lane in {seconds:g} s: use more minutes"
+            f"recording {number} on layout {place.name}: no vehicle changes lane in {seconds:g} s: use more minutes"
         )
     paths = recording.write(motion, place, number, work / "data")
     done = {
@@ -114,7 +116,7 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _finished(work: Path, number: int, name: str) -> dict[str, Any] | None:
-    """What a finished recording says about itself, or None where it is not finished, damaged or of another configuration."""
+    """The record of a finished recording; None if it is not finished, damaged or of another configuration."""
     try:
         done = json.loads(_done_path(work, number).read_text())
         if done["config"] != name:
@@ -128,10 +130,10 @@ def _finished(work: Path, number: int, name: str) -> dict[str, Any] | None:
 
 
 def verify(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    """The manifest of a folder of simulated recordings, after a look at its configuration and the sizes of its files.
+    """The manifest of a folder of simulated recordings, after a check of its configuration and the sizes of its files.
 
     Raises:
-        cache.CacheError: another configuration, no manifest, a file that is missing or truncated.
+        cache.CacheError: the manifest is missing or of another configuration, or a file is missing or truncated.
     """
     remedy = f"delete the folder {folder} and make it again"
     try:
@@ -151,20 +153,21 @@ def verify(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def make_recordings(folder: Path, config: Mapping[str, Any], workers: int | None = None, progress: bool = True) -> Path:
-    """The folder of simulated recordings of a configuration, made now unless it is there already.
+    """The folder of simulated recordings of a configuration, made now unless it exists already.
 
     It has exiD's layout, ``data/XX_*.csv`` and ``maps/lanelet2/``, and a ``manifest.json`` with the configuration, every
-    file's size and SHA-256, and what each recording holds.
+    file's size and SHA-256, and a summary of each recording.
 
     Args:
-        folder: where it shall be.
-        config: of :func:`config`.
-        workers: processes; one per core when not given.
-        progress: whether to show a bar on standard error.
+        folder: its final place.
+        config: from :func:`config`.
+        workers: processes; None for one per core.
+        progress: whether to report progress on standard error.
 
     Raises:
-        ConfigError: SUMO is missing or fails, a recording without lane changes or with too many accidents.
-        cache.CacheError: the folder is there but something else or broken, or a worker was killed.
+        ConfigError: SUMO is missing or fails, or a recording has no lane changes or too many accidents.
+        cache.CacheError: the folder exists but is broken or of another configuration, or a worker was killed.
+        OSError: the disk is full or read-only.
     """
     if not cache.make_once(folder, lambda: _make(folder, config, workers, progress)):
         verify(folder, config)
@@ -191,7 +194,7 @@ def _make(folder: Path, config: Mapping[str, Any], workers: int | None, progress
 
 
 def _finish(folder: Path, work: Path, config: Mapping[str, Any], numbers: Mapping[int, int]) -> None:
-    """Add maps and manifest, and give the folder its name."""
+    """Add maps and manifest, and rename the folder to its final name."""
     name = cache.digest(config)
     files: dict[str, Any] = {}
     report: dict[str, Any] = {}

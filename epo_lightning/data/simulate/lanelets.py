@@ -1,7 +1,7 @@
-"""A layout as a Lanelet2 map in OpenStreetMap XML, as exiD v2.1 has them.
+"""Lanelet2 maps of layouts, in OpenStreetMap XML as in exiD v2.1.
 
-Lanelets are the strips cut wherever a lane begins, ends, joins or leaves. Points are shared by lanelets that follow each
-other and boundary ways by lanelets that lie beside each other: that is how Lanelet2 knows successors and neighbours.
+The strips are cut into lanelets wherever a lane begins, ends, joins or leaves. Consecutive lanelets share points and
+neighbouring lanelets share boundary ways, from which Lanelet2 derives successors and neighbours.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pyproj import Transformer
 from epo_lightning.data.simulate.layout import Layout
 
 LEAD_IN, LEAD_OUT = 30.0, 60.0
-"""How far [m] the map reaches before and behind the recorded area."""
+"""Lengths [m] of the map before and behind the recorded area."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Lanelet:
     """A piece of a strip.
 
     Attributes:
-        id: in the map.
+        id: its id in the map.
         strip: index into ``layout.strips``.
         begin, end: range of s [m].
     """
@@ -68,7 +68,7 @@ def write_map(layout: Layout, path: Path, spacing: float = 5.0) -> None:
         s = np.linspace(piece.begin, piece.end, max(2, round((piece.end - piece.begin) / spacing) + 1))
         for side, offset in zip(("left", "right"), layout.edges(layout.strips[piece.strip], s), strict=True):
             points = layout.locate(s, offset)
-            # Points that are the same to a millimetre are one node: of lanes that meet in it.
+            # Points that agree to a millimetre become one node, in which lanes meet.
             keys = [(round(along * 1e3), round(beside * 1e3)) for along, beside in zip(s, offset, strict=True)]
             for key, point in zip(keys, points, strict=True):
                 if key not in nodes:

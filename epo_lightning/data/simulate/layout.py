@@ -1,10 +1,10 @@
-"""Layouts: motorway sections with ramps, as smooth curves of our own.
+"""Layouts: motorway sections with ramps, as smooth curves.
 
-A reference curve s -> (x, y, heading), whose curvature is piecewise linear (straights, clothoids, arcs), carries strips:
-continuous lanes at a lateral offset d(s) to its left. A main lane has a constant offset; an acceleration lane goes on
-backwards as its on-ramp and a deceleration lane forwards as its off-ramp, each swinging away to the right. The traffic
-simulator only sees how strips lie beside each other in every section of the road; all geometry comes from here, so that
-vehicles cannot jump where sections meet.
+A reference curve s -> (x, y, heading) has piecewise linear curvature (straights, clothoids, arcs). Strips are continuous
+lanes at a lateral offset d(s) to its left. A main lane has a constant offset; an acceleration lane is continued backwards by
+its on-ramp and a deceleration lane forwards by its off-ramp, and both ramps turn away to the right. The traffic simulator
+only knows which strips are neighbours in every section of the road; all geometry comes from this module, so that vehicles
+do not jump where sections meet.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from jaxtyping import Float
 Values = Float[np.ndarray, " *n"]
 
 GRID = 0.25
-"""Spacing [m] at which the reference curve is integrated; linear interpolation between is good to 0.01 mm."""
+"""Spacing [m] at which the reference curve is integrated; linear interpolation in between is accurate to 0.01 mm."""
 CLEARANCE = 20.0
-"""A lane that begins or ends beside others is driven [m] later or earlier: whole vehicles stay inside while changing."""
+"""Length [m] at the beginning or end of a lane beside others that is not driven on, so that vehicles change inside it."""
 SWING = 80.0
 """Length [m] over which a ramp turns away from the road."""
 SHOULDER_WIDTH = 2.5
-"""Of a hard shoulder [m]."""
+"""Width of a hard shoulder [m]."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Strip:
     """A continuous lane.
 
     Attributes:
-        place: lanes from the rightmost main lane, positive to the left.
+        place: number of lanes from the rightmost main lane, positive to the left.
         begin, end: range of s in which it exists [m].
-        join: it is an on-ramp before this s [m].
-        leave: it is an off-ramp behind this s [m].
-        shoulder: a hard shoulder, on which nobody drives.
+        join: value of s before which it is an on-ramp [m].
+        leave: value of s behind which it is an off-ramp [m].
+        shoulder: whether it is a hard shoulder, which is not driven on.
     """
 
     place: float
@@ -50,12 +50,12 @@ class Strip:
     shoulder: bool = False
 
     def road(self, s: float) -> str:
-        """The carriageway that it belongs to at s: vehicles change lanes within one carriageway only."""
+        """Name of its carriageway at s; vehicles change lanes within one carriageway only."""
         return f"on{self.join:.0f}" if s < self.join else f"off{self.leave:.0f}" if s > self.leave else "main"
 
     @property
     def driven(self) -> tuple[float, float]:
-        """Where vehicles' front bumpers may be, in terms of s [m]."""
+        """Range of s in which vehicles' front bumpers may be [m]."""
         begins_beside = self.begin > 0 and math.isinf(self.join)
         ends_beside = math.isinf(self.leave)
         return self.begin + CLEARANCE * begins_beside, self.end - CLEARANCE * ends_beside
@@ -66,16 +66,16 @@ class Layout:
     """A motorway section.
 
     Attributes:
-        id, name: of the location; 0 is kept for testing.
-        curvature: (s, curvature) [m, 1/m] of the reference curve, linear between; positive turns left.
+        id, name: of the location; 0 is reserved for testing.
+        curvature: (s, curvature) [m, 1/m] of the reference curve, linear in between; positive turns left.
         heading: of the reference curve at s = 0 [rad].
         origin: UTM zone 32N easting and northing [m] of s = 0, which is also the origin of the recordings.
         width: of a lane [m].
-        limit: speed limit [m/s], None where there is none.
-        slope: how steeply ramps swing away, dd/ds.
+        limit: speed limit [m/s]; None without one.
+        slope: largest slope dd/ds of the ramps.
         strips: all lanes, and shoulders.
         area: range of s that is recorded [m].
-        main, on, off: vehicles per hour who arrive on the road, arrive on the on-ramp and take the off-ramp.
+        main, on, off: vehicles per hour that arrive on the road, arrive on the on-ramp and take the off-ramp.
     """
 
     id: int
@@ -94,12 +94,12 @@ class Layout:
 
     @property
     def lanes(self) -> tuple[Strip, ...]:
-        """The strips that are driven on."""
+        """The strips without the shoulders."""
         return tuple(strip for strip in self.strips if not strip.shoulder)
 
     @property
     def length(self) -> float:
-        """Of the simulated road [m]."""
+        """Length of the simulated road [m]."""
         return max(strip.end for strip in self.strips)
 
     @cached_property
@@ -123,7 +123,7 @@ class Layout:
 
     @property
     def course(self) -> tuple[Values, Values]:
-        """Values of s and the heading of the reference curve there, for interpolation."""
+        """Values of s and the heading of the reference curve at them, for interpolation."""
         return self._curve[0], self._curve[2]
 
     def edges(self, strip: Strip, s: Values) -> tuple[Values, Values]:
@@ -138,7 +138,7 @@ class Layout:
     def direction(self, strip: Strip, s: Values) -> Values:
         """Heading of a strip's centreline [rad]."""
         grid, curvature, heading, _, _ = self._curve
-        slope = self._steepness(strip.join - s) - self._steepness(s - strip.leave)
+        slope = self._swing_slope(strip.join - s) - self._swing_slope(s - strip.leave)
         stretch = 1.0 - np.interp(s, grid, curvature) * self.offset(strip, s)
         return np.interp(s, grid, heading) + np.arctan2(slope, stretch)
 
@@ -150,16 +150,17 @@ class Layout:
         return np.interp(s, grid, arc) - np.interp(strip.begin, grid, arc)
 
     def _swing(self, beyond: Values) -> Values:
-        """How far a ramp is away from its place on the road, so far beyond the point where it touches the road [m]."""
+        """Lateral offset [m] of a ramp, at a distance ``beyond`` the point where it touches the road."""
         x = np.clip(beyond / SWING, 0.0, 1.0)
         return self.slope * (SWING * (x**3 - x**4 / 2) + np.clip(beyond - SWING, 0.0, None))
 
-    def _steepness(self, beyond: Values) -> Values:
+    def _swing_slope(self, beyond: Values) -> Values:
+        """First derivative of :meth:`_swing`."""
         x = np.clip(beyond / SWING, 0.0, 1.0)
         return self.slope * (3 * x**2 - 2 * x**3)
 
     def sections(self, cuts: Iterable[float]) -> list[tuple[float, float]]:
-        """The road cut at some values of s [m]."""
+        """Sections (begin, end) of the road, cut at some values of s [m]."""
         kept = sorted({min(max(cut, 0.0), self.length) for cut in cuts} | {0.0, self.length})
         return list(pairwise(kept))
 
@@ -299,4 +300,4 @@ LAYOUTS = (
         off=0,
     ),
 )
-"""Seven layouts, as exiD has seven locations: ramps alone and in either order, weaving, a lane that ends or is added."""
+"""Seven layouts, like the seven locations of exiD: single ramps, two ramps in either order, weaving, and lanes that end."""

@@ -1,4 +1,4 @@
-"""What traffic does, worked out from raw tracks: who drives ahead of whom."""
+"""Leaders: the vehicle ahead of each vehicle, from tracks and lanes."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from epo_lightning.data.recorded.lanes import LaneGraph, Located
 from epo_lightning.data.recorded.tracks import TrackTable
 
 FURTHEST_LEADER = 250.0
-"""Gaps [m] longer than this are no following."""
+"""Largest distance to a leader [m]."""
 HOPS = 6
-"""How many lanes ahead leaders are looked for."""
+"""Number of consecutive lanes on which leaders are looked for."""
 
 
 def leaders(
     tracks: TrackTable, located: Located, lanes: LaneGraph
 ) -> tuple[Int[np.ndarray, " T"], Float[np.ndarray, " T"]]:
-    """The agent ahead of each row's agent, on its lane or the lanes that follow, and how far ahead its centre is.
+    """The agent ahead of each row's agent, on its lane or its successors, and the distance to it.
 
     Returns:
-        row of the leader in the same frame, -1 where there is none; distance between the centres along the lanes [m],
-        inf where there is none.
+        row of the leader in the same frame, -1 for none; distance between the centres along the lanes [m], inf for none.
     """
     rows = np.flatnonzero(located.lane >= 0)
     order = rows[np.lexsort((located.along[rows], located.lane[rows], tracks.frame[rows]))]
@@ -31,7 +30,7 @@ def leaders(
     leader[order[:-1][same]] = order[1:][same]
     distance[order[:-1][same]] = (located.along[order[1:]] - located.along[order[:-1]])[same]
 
-    # The first agent on each lane in each frame leads whoever is the last one on the lanes before.
+    # The first agent on a lane is the leader of the last agent on a preceding lane without agents in between.
     first, start = np.unique(place, return_index=True)
     last = order[np.append(~same, True)] if len(order) else order
     frontier, lane = last, located.lane[last]

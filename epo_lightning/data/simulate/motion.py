@@ -1,4 +1,4 @@
-"""Motion: what SUMO says about front bumpers in lanes becomes smooth paths of vehicles' centres on the plane."""
+"""Smooth trajectories of vehicles' centres in the plane, from SUMO's positions of front bumpers in lanes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from epo_lightning.data.simulate.layout import Layout
 from epo_lightning.data.simulate.traffic import CLASSES, Traffic
 
 WINDOW = 1.0
-"""Length [s] of the Savitzky-Golay filter, and the degree of its polynomials."""
+"""Length [s] of the Savitzky-Golay filter."""
 DEGREE = 3
+"""Degree of its polynomials."""
 HARDEST = 9.0
-"""No vehicle accelerates, brakes or swerves harder than this [m/s^2]: who does is left out."""
+"""Largest acceleration of a vehicle in any direction [m/s^2]; vehicles with more are left out."""
 SLOWEST = 2.0
-"""Below this speed [m/s] a vehicle's sideways speed says little about where it points."""
+"""Smallest speed [m/s] used for the slip angle, which is ill-defined at low speed."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Motion:
         heading: of the vehicle's axis [rad].
         strip: index into ``layout.lanes`` of the lane that holds the centre.
         size: length and width of each vehicle [m].
-        kind: of each vehicle, as exiD names it.
+        kind: class of each vehicle in exiD's terms.
         dropped: vehicles that were left out, by reason.
     """
 
@@ -51,7 +52,7 @@ class Motion:
     dropped: dict[str, int]
 
     def select(self, rows: Bool[np.ndarray, " T"]) -> Motion:
-        """Some rows, with vehicles and frames counted anew; no vehicle may lose rows in the midst of its track."""
+        """Some rows, with vehicles and frames renumbered; a vehicle must not lose rows in the middle of its track."""
         # Vehicles are numbered by their first appearance.
         present, begins = np.unique(self.vehicle[rows], return_index=True)
         present = present[np.argsort(self.frame[rows][begins], kind="stable")]
@@ -82,7 +83,7 @@ def savitzky_golay(
     """Value, first and second derivative of the polynomials fitted to ``half`` rows before and behind each row."""
     powers = (np.arange(-half, half + 1) * dt)[:, None] ** np.arange(degree + 1)
     fit = np.linalg.pinv(powers)
-    middle = values.mean(0)  # large coordinates would cost digits
+    middle = values.mean(0)  # avoids cancellation with large coordinates
 
     def filtered(row: int, factor: float) -> Float[np.ndarray, "t c"]:
         kernel = factor * fit[row, ::-1]
@@ -101,7 +102,7 @@ def strip_at(layout: Layout, s: Float[np.ndarray, " T"], d: Float[np.ndarray, " 
 
 
 def move(traffic: Traffic, layout: Layout, seconds: float) -> Motion:
-    """Smooth paths of all vehicles' centres, inside the recorded area and after the road has filled."""
+    """Smooth trajectories of all vehicles' centres, inside the recorded area and after the warm-up."""
     lanes = layout.lanes
     s = traffic.front - traffic.size[traffic.vehicle, 0] / 2
     middle = np.select(
@@ -112,7 +113,7 @@ def move(traffic: Traffic, layout: Layout, seconds: float) -> Motion:
     raw = np.column_stack([s, d, layout.locate(s, d)])
     value, rate, second = savitzky_golay(raw, 1 / traffic.rate, half)
     inside = slice(half, len(raw) - half)
-    # A window that reaches into another vehicle's rows says nothing.
+    # Windows that contain rows of two vehicles are dropped.
     own = traffic.vehicle[: -2 * half] == traffic.vehicle[2 * half :]
     frame = traffic.step[inside]
     s, d = value[:, 0], value[:, 1]

@@ -1,6 +1,6 @@
-"""How real does traffic look? The same numbers for any recordings, simulated or not.
+"""Statistics that compare simulated traffic with real recordings.
 
-All are taken from positions alone, after the same smoothing, so that recordings compare whatever their format derives.
+All are computed from positions alone, after the same smoothing, so that recordings of different formats are comparable.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from epo_lightning.data.simulate.leaders import leaders
 from epo_lightning.scene import KINDS
 
 DT, SMOOTHING = 0.2, 1.0
-"""Time step and window of smoothing [s] of everything that is described."""
+"""Time step and smoothing window [s] of all statistics."""
 SIDEWAYS = 0.2
-"""A lane change lasts as long as the vehicle moves sideways faster than this [m/s]."""
+"""Smallest lateral speed [m/s] during a lane change; it defines begin and end."""
 FURTHEST_ASIDE = 1.0
-"""An offset from the lane's middle that changes by more than this [m] in one step is an offset from another lane."""
+"""Largest change of the offset from the lane's middle in one step [m]; more is a change of the reference lane."""
 ACROSS = 2.0
-"""A lane change moves a vehicle at least this far sideways [m]; less is driving on the line."""
+"""Smallest lateral displacement of a lane change [m]; less is driving on the marking."""
 FOLLOWING = 100.0
-"""Who has a larger gap than this [m] follows nobody."""
+"""Largest gap [m] at which a vehicle counts as following its leader."""
 QUANTILES = (1, 5, 50, 95, 99)
 UNITS = {
     "speed": "m/s",
@@ -38,14 +38,14 @@ UNITS = {
     "lane-change duration": "s",
     "lane-change lateral speed": "m/s",
 }
-"""What is described, and in which unit."""
+"""Quantities and their units."""
 
 
 def describe(recordings: Iterable[Recording]) -> dict[str, dict[str, float]]:
     """Percentiles and counts of every quantity in :data:`UNITS`, over all vehicles and times of all recordings.
 
-    Headways are free distances, and times to cover them, behind leaders nearer than FOLLOWING. Lane changes per vehicle
-    and hour, vehicles and trucks are counted too. Recordings without lanes add to what needs no lanes.
+    Gaps are free distances to leaders nearer than FOLLOWING, and time headways are the times to cover them. Lane changes,
+    vehicles and trucks are counted too. Recordings without lanes contribute only to quantities that need no lanes.
     """
     found: dict[str, list[Float[np.ndarray, " n"]]] = {name: [] for name in UNITS}
     changes, hours, vehicles, trucks = 0, 0.0, 0, 0
@@ -84,7 +84,7 @@ def describe(recordings: Iterable[Recording]) -> dict[str, dict[str, float]]:
 
 
 def markdown(reports: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    """Several descriptions side by side, as a table of percentiles 1, 5, 50, 95, 99."""
+    """Table of several descriptions side by side, with the percentiles 1, 5, 50, 95, 99, in Markdown."""
     lines = ["| | " + " | ".join(reports) + " |", "|---" * (len(reports) + 1) + "|"]
     for name, unit in UNITS.items():
         cells = [
@@ -106,7 +106,7 @@ def markdown(reports: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
 
 
 def _table(clock: Stretches, tracks: TrackTable) -> TrackTable:
-    """The tracks as the clock sees them."""
+    """The tracks resampled to the clock."""
     x, y, heading, speed = clock.state.T
     owner = clock.owner
     return TrackTable(
@@ -147,11 +147,11 @@ def _motion(clock: Stretches) -> dict[str, Float[np.ndarray, " n"]]:
 def _manoeuvres(
     clock: Stretches, offset: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"]
 ) -> list[tuple[float, float]]:
-    """Duration [s] and greatest lateral speed [m/s] of the lane changes that a recording shows from begin to end."""
+    """Duration [s] and largest lateral speed [m/s] of the lane changes that are recorded from begin to end."""
     owner = clock.owner
     step = np.diff(offset)
     usable = (owner[1:] == owner[:-1]) & (np.abs(step) < FURTHEST_ASIDE)
-    # Where the lane changes, the offset is one from another lane: its rate is interpolated.
+    # At a change of lane the offset refers to another lane, so its rate is interpolated there.
     index = np.arange(len(step))
     rate = np.interp(index, index[usable], step[usable]) / DT if usable.any() else np.zeros(len(step))
     found = []

@@ -1,10 +1,10 @@
-"""A recording in exiD's files: tracks with all derived columns of v2.1, what each track is, and the recording itself.
+"""Writer of recordings in exiD's format: tracks with all derived columns of v2.1, track metadata and recording metadata.
 
-Derived columns come from the simulation, not from the map: which lane holds the centre, how far it is from the middle of
-that lane, who drives ahead. ``leadDHW`` is the free distance along the lane from front to rear bumper, ``leadTHW`` that
+Derived columns come from the simulation, not from the map: the lane of the centre, its offset from the middle of that lane,
+the vehicle ahead. ``leadDHW`` is the free distance along the lane from front to rear bumper, ``leadTHW`` that
 distance by the own speed, ``leadDV`` the own speed minus the leader's, ``leadTTC`` the distance by ``leadDV`` where it is
-positive. A vehicle beside is ahead, behind or alongside as its length is wholly ahead, wholly behind or neither. The three
-columns of OpenDRIVE ids that some copies of exiD have are absent, as there is no such map.
+positive. A vehicle on a neighbouring lane is ahead, behind or alongside if it is completely ahead, completely behind or
+neither. The three columns of OpenDRIVE ids that some copies of exiD have are absent, as there is no such map.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from epo_lightning.data.simulate.motion import Motion
 
 NONE = -1
 FAR = 1e5
-"""More [m] than any position along a road."""
+"""Upper bound of positions along a road [m]."""
 MOST_ALONGSIDE = 4
 
 
 def lane_changes(motion: Motion) -> Int[np.ndarray, " T"]:
-    """1 in the first frame in which a vehicle's centre is in another lane than before."""
+    """Indicator [T], 1 in the first frame in which a vehicle's centre is on another lane than before."""
     changed = np.diff(motion.strip, prepend=motion.strip[:1]) != 0
     return (changed & (np.diff(motion.vehicle, prepend=-1) == 0)).astype(np.int64)
 
@@ -122,7 +122,7 @@ def tracks(motion: Motion, layout: Layout, number: int) -> pl.DataFrame:
 def _lanelets(
     motion: Motion, layout: Layout
 ) -> tuple[Int[np.ndarray, " T"], Float[np.ndarray, " T"], Float[np.ndarray, " T"]]:
-    """Id of the lanelet that holds each row, how far along its strip it begins and how long it is [m]."""
+    """Id of each row's lanelet, its start along the strip [m] and its length [m]."""
     ident = np.full(len(motion.s), NONE)
     before, extent = np.zeros(len(motion.s)), np.zeros(len(motion.s))
     for piece in lanelets(layout):
@@ -135,7 +135,7 @@ def _lanelets(
 
 
 def _neighbours(motion: Motion, layout: Layout) -> dict[str, Int[np.ndarray, " ..."]]:
-    """Rows of the vehicles around each row's vehicle, -1 for nobody; alongside, up to MOST_ALONGSIDE of them."""
+    """Rows of the vehicles around each row's vehicle, -1 for none; up to MOST_ALONGSIDE of them alongside."""
     lanes = layout.lanes
     half = motion.size[motion.vehicle, 0] / 2
     rear, front = motion.s - half, motion.s + half
@@ -145,7 +145,7 @@ def _neighbours(motion: Motion, layout: Layout) -> dict[str, Int[np.ndarray, " .
     rows = np.arange(len(group))
 
     def ahead(target: np.ndarray, point: np.ndarray) -> Int[np.ndarray, " T"]:
-        """Place in the order of rear bumpers of the first one that is not behind a point of a lane."""
+        """Rank, among all rear bumpers, of the first one that is not behind a point of a lane."""
         return np.searchsorted(rears, target * FAR + point)
 
     def lead_and_rear(target: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -184,7 +184,7 @@ def _neighbours(motion: Motion, layout: Layout) -> dict[str, Int[np.ndarray, " .
 
 
 def _listed(rows: Int[np.ndarray, "T m"], motion: Motion) -> pl.Series:
-    """Ids of several vehicles in one text, separated by semicolons; empty for nobody."""
+    """Ids of several vehicles as text, separated by semicolons; empty for none."""
     text = np.where(rows[:, 0] == NONE, "", motion.vehicle[rows[:, 0]].astype(str)).astype(object)
     for row in np.flatnonzero(rows[:, 1] != NONE):
         text[row] = ";".join(str(motion.vehicle[other]) for other in rows[row] if other != NONE)
@@ -192,7 +192,7 @@ def _listed(rows: Int[np.ndarray, "T m"], motion: Motion) -> pl.Series:
 
 
 def tracks_meta(motion: Motion, number: int) -> pl.DataFrame:
-    """What each track is and when it is there."""
+    """The table of track metadata: class, size and frames of each track."""
     count = np.bincount(motion.vehicle)
     first = motion.frame[np.cumsum(count) - count]
     return pl.DataFrame(
@@ -210,7 +210,7 @@ def tracks_meta(motion: Motion, number: int) -> pl.DataFrame:
 
 
 def recording_meta(motion: Motion, layout: Layout, number: int) -> pl.DataFrame:
-    """Where, when and how the recording was made. Simulated days are Wednesdays."""
+    """The table of recording metadata, of one row. Simulated days are Wednesdays."""
     longitude, latitude = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True).transform(*layout.origin)
     vehicles = len(motion.size)
     return pl.DataFrame(
@@ -236,7 +236,7 @@ def recording_meta(motion: Motion, layout: Layout, number: int) -> pl.DataFrame:
 
 
 def write(motion: Motion, layout: Layout, number: int, folder: Path) -> list[Path]:
-    """Write the three files of recording ``number``, each of them whole or not at all."""
+    """Write the three files of recording ``number``, each atomically, and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     tables = {
         "tracks": tracks(motion, layout, number),

@@ -1,4 +1,4 @@
-"""Simulated recordings as data: simulated once, then extracted like any others."""
+"""The data module ``highway_sim``: recordings are simulated once and then extracted like any others."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class SimulatedHighway(RecordedData):
     """Scenes from traffic that is simulated on motorway ramps, by way of recordings in exiD's format.
 
     Args:
-        recordings: per layout.
-        minutes: that each of them lasts.
-        layouts: their ids; null for all.
-        dataset, windows, test, val_share, val_by, frame, scale, root, batch_size, share: as of
+        recordings: number of recordings per layout.
+        minutes: duration of each recording.
+        layouts: ids of the layouts; null for all.
+        dataset, windows, test, val_share, val_by, frame, scale, root, batch_size, share: as in
             :class:`~epo_lightning.data.recorded.recordings.RecordedData`.
         seed: of the traffic and of the splits, and of the batches' order where a run sets no other.
     """
@@ -63,7 +63,7 @@ class SimulatedHighway(RecordedData):
         )
 
     def sources(self) -> list[RecordingSource]:
-        """The recordings that the simulation makes, whether or not they are there already."""
+        """The recordings that the simulation makes, whether or not they exist already."""
         layouts = [str(layout) for layout in self.simulation["layouts"] for _ in range(self.simulation["recordings"])]
         return [RecordingSource(f"{number:02d}", layout, (), self._not_yet) for number, layout in enumerate(layouts)]
 
@@ -86,18 +86,18 @@ class SimulatedHighway(RecordedData):
         return shlex.join(["epo", "generate", *words])
 
     def recordings(self) -> list[RecordingSource]:
-        """The simulated recordings, as the reader of exiD's format finds them."""
+        """The simulated recordings, listed by the reader of exiD's format."""
         return super().sources()
 
     def _not_yet(self) -> Recording:
         raise ConfigError(f"this recording is not simulated yet: {self.command}")
 
     def identity(self, sources: Sequence[RecordingSource]) -> Any:
-        """The simulation: the same configuration makes the same recordings."""
+        """Configuration of the simulation: the same configuration makes the same recordings."""
         return self.simulation
 
     def generate(self, workers: int | None = None, progress: bool = True) -> Path:
-        """Simulate, then extract the scenes, each unless it is there already."""
+        """Simulate the recordings and extract the scenes, unless that was done before, and return the data set's folder."""
         if not self.folder.exists():
             simulate.make_recordings(self.folder_of_recordings, self.simulation, workers, progress)
         return super().generate(workers, progress)

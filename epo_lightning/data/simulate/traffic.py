@@ -1,8 +1,8 @@
-"""Traffic: SUMO drives vehicles through a layout's lanes and tells, step by step, where each of them is in its lane.
+"""Simulation of traffic on a layout with SUMO: the position of each vehicle in its lane at each step.
 
-SUMO sees a straight abstract network: one edge per carriageway and section, whose lanes are the layout's strips. Its
-sublane model (SL2015) moves vehicles sideways smoothly; its EIDM drivers follow. Drivers differ from vehicle type to
-vehicle type, and the mixture from recording to recording.
+SUMO simulates a straight abstract network with one edge per carriageway and section, whose lanes are the layout's strips.
+Lane changes follow its sublane model (SL2015), which moves vehicles sideways smoothly, and car following its EIDM. Drivers
+differ between vehicle types, and the mixture of types differs between recordings.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from epo_lightning.data.simulate.layout import Layout
 from epo_lightning.registry import ConfigError
 
 RATE = 25
-"""exiD's frame rate [Hz]."""
+"""Frame rate of exiD [Hz]."""
 WARM_UP = 90.0
-"""Time [s] in which the road fills; nothing of it is recorded."""
+"""Time [s] in which the road fills; it is not recorded."""
 MARGIN = 1.0
-"""Time [s] before and behind the recorded time that the smoothing looks into."""
+"""Time [s] before and after the recorded time that the smoothing needs."""
 UNLIMITED = 130 / 3.6
-"""Speed [m/s] that drivers' desires refer to where there is no limit."""
+"""Speed [m/s] to which desired speeds are relative where there is no limit."""
 RAMP_SPEED = 90 / 3.6
 """Speed limit on ramps [m/s]."""
 FASTEST = 60.0
-"""Nobody drives this fast [m/s]: who does was moved, not driven."""
+"""Largest speed [m/s]; a vehicle with more was moved by the simulator."""
 CLASSES = ("car", "van", "truck", "motorcycle")
-"""exiD's names of what vehicles are."""
+"""Vehicle classes of exiD."""
 
 
 @dataclass(frozen=True)
 class Traffic:
-    """What SUMO did. Rows are sorted by vehicle, and by step within a vehicle.
+    """Simulated positions. Rows are sorted by vehicle, and by step within a vehicle.
 
     Attributes:
         rate: steps per second [Hz].
         vehicle: index of each row's vehicle.
-        step: of the simulation, from the end of the warm-up.
+        step: simulation step, counted from the end of the warm-up.
         strip: index into ``layout.lanes`` of the lane whose middle is nearest.
         front: s of the front bumper [m].
         aside: offset from the middle of the strip, positive to the left [m].
@@ -66,10 +66,10 @@ class Traffic:
 
 
 def simulator() -> tuple[ModuleType, Path]:
-    """SUMO as a library, and the folder of its programs.
+    """The module of SUMO, and the folder of its programs.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: SUMO is not installed.
     """
     try:
         import libsumo
@@ -93,7 +93,7 @@ class _Edge:
 
 
 def _edges(layout: Layout) -> list[_Edge]:
-    """One edge per section and carriageway, downstream."""
+    """The edges of the network: one per section and carriageway, in downstream order."""
     lanes = layout.lanes
     cuts = [s for strip in lanes for s in (*strip.driven, strip.join, strip.leave)]
     edges = []
@@ -116,11 +116,11 @@ def _xml(path: Path, tag: str, children: Iterable[tuple[str, dict[str, Any]]]) -
 
 
 def _network(layout: Layout, edges: list[_Edge], programs: Path, folder: Path) -> Path:
-    """The layout as SUMO sees it: every edge straight, vehicles hop from its end to the beginning of the next."""
+    """Path of SUMO's network of a layout. Edges are straight; vehicles pass from the end of one to the start of the next."""
     height = {road: -50.0 * row for row, road in enumerate(dict.fromkeys(edge.road for edge in edges))}
     height["main"] = 0.0
 
-    # Ramp and road meet in a node of the road; elsewhere the two lie apart.
+    # Ramp and road share a node where they meet; elsewhere they are drawn apart.
     def node(edge: _Edge, s: float) -> tuple[str, float]:
         meeting = [other for other in edges if s in (other.begin, other.end) and set(other.strips) & set(edge.strips)]
         road = "main" if any(other.road == "main" for other in meeting) else edge.road
@@ -183,7 +183,7 @@ def _network(layout: Layout, edges: list[_Edge], programs: Path, folder: Path) -
 
 
 def _drivers(random: np.random.Generator, layout: Layout) -> list[dict[str, Any]]:
-    """Vehicle types of one recording: as many kinds of drivers as there are rows, each with its share of the traffic."""
+    """Vehicle types of one recording, each with its parameters and its share of the traffic."""
     speed = layout.limit or UNLIMITED
     heavy = random.uniform(0.08, 0.18)
     hurry, haste = random.uniform(0.97, 1.06), random.uniform(0.85, 1.15)
@@ -254,7 +254,7 @@ def _drivers(random: np.random.Generator, layout: Layout) -> list[dict[str, Any]
 def _demand(
     layout: Layout, edges: list[_Edge], random: np.random.Generator, until: float, path: Path
 ) -> list[dict[str, Any]]:
-    """Write who drives from where to where, and return the vehicle types."""
+    """Write the flows of vehicles between edges, and return the vehicle types."""
     drivers = _drivers(random, layout)
     busy = random.uniform(0.85, 1.05)
     roads = {road: [edge for edge in edges if edge.road == road] for road in dict.fromkeys(edge.road for edge in edges)}
@@ -263,7 +263,7 @@ def _demand(
     off = next((road for road in roads if road.startswith("off")), None)
     leaving = layout.off / (layout.main + layout.on)
     for source, rate in (("main", layout.main), (on, layout.on)):
-        # Who comes up the ramp leaves again on a weaving lane only, and there less often than others.
+        # Vehicles from the on-ramp leave again on weaving lanes only, and less often than others.
         weave = source == "main" or any(np.isfinite((strip.join, strip.leave)).all() for strip in layout.lanes)
         away = leaving * (1.0 if source == "main" else 0.4) if off and weave else 0.0
         if source:
@@ -294,15 +294,17 @@ def _demand(
 
 
 def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path, rate: int = RATE) -> Traffic:
-    """Drive for ``seconds`` after the road has filled.
+    """Simulated traffic of ``seconds`` after the warm-up.
 
     Args:
-        seed: of the drivers and of everything that SUMO draws.
+        layout: the road.
+        seed: of the drivers and of all random numbers of SUMO.
+        seconds: duration after the warm-up.
         folder: for SUMO's input files.
         rate: steps per second [Hz].
 
     Raises:
-        ConfigError: SUMO is not installed, or fails.
+        ConfigError: SUMO is not installed or fails.
     """
     libsumo, programs = simulator()
     random = np.random.default_rng(seed)
@@ -328,7 +330,7 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path, 
         "--xml-validation=never",
         f"--seed={random.integers(2**31)}",
     ]
-    rows = array("d")  # a list of tuples would take a gigabyte for a quarter of an hour
+    rows = array("d")  # a list of tuples would need a gigabyte for a quarter of an hour
     numbers: dict[str, int] = {}
     types: list[str] = []
     crashed: set[str] = set()
@@ -358,7 +360,7 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path, 
 def _sorted(
     rows: Float[np.ndarray, "T 6"], rate: int, drivers: list[dict[str, Any]], types: list[str], crashed: set[int]
 ) -> Traffic:
-    """Rows by vehicle instead of by step, without vehicles that do what vehicles cannot do."""
+    """Rows sorted by vehicle, without vehicles that collide or jump."""
     rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
     vehicle, step, strip = rows[:, :3].astype(np.int64).T
     front, aside = rows[:, 3] + rows[:, 4], rows[:, 5]

@@ -96,13 +96,13 @@ def test_a_folder_that_is_something_else_is_left_alone(tmp_path: Path):
 def test_too_many_accidents_are_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
     monkeypatch.setattr(generate, "MOST_DROPPED", -1.0)
-    with pytest.raises(ConfigError, match=r"recording 0 on layout diverge: 0 of \d+ vehicles move as none can"):
+    with pytest.raises(ConfigError, match=r"recording 0 on layout diverge: 0 of \d+ vehicles move implausibly"):
         generate.record(tmp_path, "", 0, LAYOUTS[2], 3, 2.0)
 
 
 def test_traffic_in_which_nobody_changes_lane_is_no_recording(tmp_path: Path):
     pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
-    with pytest.raises(ConfigError, match=r"nobody changes lane in 0\.04 s: use more minutes"):
+    with pytest.raises(ConfigError, match=r"no vehicle changes lane in 0\.04 s: use more minutes"):
         generate.record(tmp_path, "", 0, LAYOUTS[2], 3, 0.04)
 
 

@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 import shapely
 
-from epo_lightning.data.recorded.formats.exid import TRACKS, read_tracks, read_tracks_meta
+from epo_lightning.data.recorded.formats.exid_tables import TRACKS, read_tracks, read_tracks_meta
 from epo_lightning.data.recorded.lanes import lane_changes
 from epo_lightning.data.recorded.tracks import Recording
 from epo_lightning.data.simulate import realism, recording

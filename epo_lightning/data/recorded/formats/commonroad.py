@@ -1,4 +1,4 @@
-"""CommonRoad scenarios (.xml, 2018b and 2020a): traffic, recorded or simulated, on a map of lanelets.
+"""Reader of CommonRoad scenarios (.xml, 2018b and 2020a): recorded or simulated traffic on a map of lanelets.
 
 Althoff, Koschi and Manzinger, "CommonRoad: Composable Benchmarks for Motion Planning on Roads", IV 2017; the XML format is
 described at commonroad.in.tum.de. Time is in steps of ``timeStepSize`` [s]; metres, radians and m/s throughout.
@@ -22,33 +22,33 @@ from epo_lightning.registry import register
 from epo_lightning.scene import KINDS
 
 KIND_OF = {kind: kind for kind in KINDS} | {"taxi": "car"}
-"""What an obstacle's type is to us; every other type is ``other``."""
+"""Agent kinds by obstacle type; every other type is ``other``."""
 LEFT_OUT = {
     "staticObstacle": "static obstacles",
     "environmentObstacle": "environment obstacles",
     "phantomObstacle": "phantom obstacles",
 }
 SHOULDERS = {"shoulder", "border"}
-"""Types of lanelets beside the road proper."""
+"""Types of lanelets that are not driven on regularly."""
 SOLID = {"solid", "broad_solid", "solid_solid", "curb", "lowered_curb"}
-"""Markings that are crossed from neither side. Double markings are named from left to right."""
+"""Line markings that may not be crossed from either side. Double markings are named from left to right."""
 SPEED_SIGNS = {"274", "274.1", "R2-1", "r301", "3.24", "R15", "C43", "B14", "Ρ-32", "B31"}  # noqa: RUF001
-"""Signs that limit speed, in any country of the format; their additional value is in m/s."""
+"""Identifiers of speed-limit signs in all countries of the format; their additional value is in m/s."""
 LATEST = 10_000_000
-"""Time steps beyond this, days after the first, are a mistake."""
+"""Largest time step."""
 ALIKE_BY_ID, ALIKE = 12, 40
-"""Vehicles that drive so many steps at the same speeds, digit by digit, are one: with the same id, and with any."""
+"""Numbers of steps with identical speeds, digit by digit, that identify a vehicle: with the same id, and with any id."""
 
 
 @register("format", "commonroad")
 def commonroad(folder: Path) -> list[RecordingSource]:
-    """Every scenario below a folder.
+    """All scenarios below a folder.
 
-    Scenarios are cut out of longer recordings, and some overlap. Those that show the same stretch of a vehicle's drive form
-    one group, named after the first of them; all others are groups of their own.
+    Scenarios are cut out of longer recordings, and some overlap. Those that contain the same part of a vehicle's trajectory
+    form one group, named after the first of them; every other scenario is a group of its own.
 
     Raises:
-        RecordingError: no scenario, two of one name, or a file that cannot be read.
+        RecordingError: there is no scenario, two have the same name, or a file cannot be read.
     """
     paths = sorted(path for path in Path(folder).rglob("*.xml") if path.is_file())
     if not paths:
@@ -58,13 +58,13 @@ def commonroad(folder: Path) -> list[RecordingSource]:
         if first.setdefault(path.stem, path) != path:
             raise RecordingError(path, f"{first[path.stem]} has the same name: rename or remove one of the two")
     return [
-        RecordingSource(path.stem, paths[group].stem, (path,), partial(_read, path, paths[group].stem))
+        RecordingSource(path.stem, paths[group].stem, (path,), partial(_read_recording, path, paths[group].stem))
         for path, group in zip(paths, _groups(paths), strict=True)
     ]
 
 
 def _groups(paths: Sequence[Path]) -> list[int]:
-    """For each file, the first one that shows some of the same drives, directly or through others."""
+    """For each file, the index of the first file with which it shares part of a trajectory, directly or through others."""
     groups = list(range(len(paths)))
     seen: dict[int, int] = {}
     for index, path in enumerate(paths):
@@ -72,7 +72,7 @@ def _groups(paths: Sequence[Path]) -> list[int]:
             for key, length in ((vehicle, ALIKE_BY_ID), (None, ALIKE)):
                 for start in range(len(speeds) - length + 1):
                     run = speeds[start : start + length]
-                    # Standing or driving at one speed is no sign of anything.
+                    # Constant speeds do not identify a vehicle.
                     if 2 * len(set(run)) >= length:
                         here, there = groups[index], groups[seen.setdefault(hash((key, *run)), index)]
                         if here != there:
@@ -81,7 +81,7 @@ def _groups(paths: Sequence[Path]) -> list[int]:
 
 
 def _drives(path: Path) -> list[tuple[bytes, list[bytes]]]:
-    """The id of each obstacle and its speeds, as written: found without parsing, so that listing is cheap."""
+    """The id and the speeds of each obstacle as text, found without parsing, so that listing is cheap."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -99,8 +99,8 @@ def _drives(path: Path) -> list[tuple[bytes, list[bytes]]]:
     return drives
 
 
-def _read(path: Path, group: str) -> Recording:
-    """Read one scenario; one without traffic, a mere planning problem, has no rows and says so in ``dropped``."""
+def _read_recording(path: Path, group: str) -> Recording:
+    """The recording of one scenario. A scenario without traffic has no rows and is counted in ``dropped``."""
     root = xml.parse(path)
     known = {"lanelet", "dynamicObstacle", "obstacle", "planningProblem"}
     if root.tag != "commonRoad" or not known & {element.tag for element in root}:
@@ -120,7 +120,7 @@ def _read(path: Path, group: str) -> Recording:
 
 
 def _tracks(root: Element, path: Path, dropped: Counter[str]) -> TrackTable:
-    """What the obstacles that move do; obstacles that cannot be described are left out and counted."""
+    """Tracks of the moving obstacles; unsupported ones are left out and counted."""
     step = xml.number(root.get("timeStepSize"), "timeStepSize of commonRoad", path)
     if step <= 0:
         raise RecordingError(path, f"timeStepSize of commonRoad is {step}; a positive number of seconds was expected")
@@ -154,7 +154,7 @@ def _tracks(root: Element, path: Path, dropped: Counter[str]) -> TrackTable:
     agent = np.repeat(np.arange(len(counts)), counts)
     time, x, y, heading, speed = np.array(rows, dtype=float).reshape(-1, 5).T
     low, high = np.array(extents, dtype=float).reshape(-1, 2, 2).transpose(1, 0, 2)
-    # Obstacles have a point of reference, which need not be the centre of their shape.
+    # Positions refer to a point of the obstacle that need not be the centre of its shape.
     ahead, left = ((low + high) / 2)[agent].T
     cosine, sine = np.cos(heading), np.sin(heading)
     return TrackTable(
@@ -171,7 +171,7 @@ def _tracks(root: Element, path: Path, dropped: Counter[str]) -> TrackTable:
 
 
 def _moving(root: Element, path: Path, dropped: Counter[str]) -> Iterator[Element]:
-    """The obstacles that move: of their own tag since 2020a, by their role before."""
+    """The moving obstacles: by their tag since 2020a, by their role before."""
     for element in root:
         if element.tag == "dynamicObstacle":
             yield element
@@ -190,9 +190,9 @@ def _moving(root: Element, path: Path, dropped: Counter[str]) -> Iterator[Elemen
 
 
 def _state(state: Element, name: str, path: Path) -> tuple[float, float, float, float, float]:
-    """Time step, x, y, orientation and speed; the speed is NaN where there is none.
+    """Time step, x, y, orientation and speed; the speed is NaN if it is missing.
 
-    Values may be intervals and positions may be areas: their middle counts, rounded down to whole time steps.
+    Of intervals and areas the middle is taken; times are rounded down to whole steps.
     """
     time = _middle(_child(state, "time", name, path), f"time of {name}", path)
     if not 0 <= time <= LATEST:
@@ -214,7 +214,7 @@ def _state(state: Element, name: str, path: Path) -> tuple[float, float, float, 
 
 
 def _extent(area: Element, name: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the greatest x and y of a rectangle, circle or polygon."""
+    """Lower and upper bounds of x and y of a rectangle, circle or polygon."""
     if area.tag == "polygon":
         corners = _points(area, name, path)
         if len(corners) < 3:
@@ -236,7 +236,7 @@ def _extent(area: Element, name: str, path: Path) -> tuple[np.ndarray, np.ndarra
 
 
 def _lanes(root: Element, path: Path, dropped: Counter[str]) -> LaneGraph | None:
-    """The lanelets of a scenario, joined; None where there are none. What refers to nothing is left out and counted."""
+    """The lane graph of a scenario; None without lanelets. References to missing elements are left out and counted."""
     lanelets: dict[int, Element] = {}
     left: list[Polyline] = []
     right: list[Polyline] = []
@@ -269,7 +269,7 @@ def _lanes(root: Element, path: Path, dropped: Counter[str]) -> LaneGraph | None
     signs = _speed_signs(root, path)
 
     def lane(reference: Element, identity: int) -> int:
-        """The lane that an element of a lanelet refers to, -1 where there is none of that name."""
+        """Index of the lane that an element of a lanelet refers to; -1 if it does not exist."""
         to = index.get(xml.whole(reference.get("ref"), f"ref of {reference.tag} of lanelet {identity}", path), -1)
         if to < 0:
             dropped["lane references to lanes that do not exist"] += 1
@@ -329,7 +329,7 @@ def _lanes(root: Element, path: Path, dropped: Counter[str]) -> LaneGraph | None
 
 
 def _speed_signs(root: Element, path: Path) -> dict[int, list[float]]:
-    """The speeds [m/s] that each traffic sign allows (2020a)."""
+    """Speed limits [m/s] of each traffic sign (2020a)."""
     return {
         xml.whole(sign.get("id"), "the id of a trafficSign", path): [
             _speed(element.findtext("additionalValue"), f"additionalValue of trafficSign {sign.get('id')}", path)
@@ -359,7 +359,7 @@ def _text(element: Element | None) -> str:
 
 
 def _middle(element: Element, name: str, path: Path) -> float:
-    """The number that an element holds: exact, or the middle of an interval."""
+    """The number in an element: exact, or the middle of an interval."""
     exact = element.find("exact")
     if exact is not None:
         return xml.number(exact.text, name, path)

@@ -1,4 +1,4 @@
-"""exiD recordings (Moers et al., "The exiD Dataset", IV 2022), as its versions 2.0 and 2.1 lay them out.
+"""Reader of exiD recordings (Moers et al., "The exiD Dataset", IV 2022), versions 2.0 and 2.1.
 
 A data set is a folder with ``data/NN_tracks.csv``, ``NN_tracksMeta.csv`` and ``NN_recordingMeta.csv`` for each recording,
 and with a Lanelet2 map for each location under ``maps/lanelet2``. Lengths are in metres, times in seconds, angles in
@@ -7,10 +7,9 @@ degrees; x points east and y north from an origin in UTM zone 32.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -24,62 +23,29 @@ from jaxtyping import Float, Int
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats import lanelet2
+from epo_lightning.data.recorded.formats.exid_tables import (
+    RECORDING_META,
+    TRACKS,
+    TRACKS_META,
+    USED,
+    raise_first,
+    read_table,
+)
 from epo_lightning.data.recorded.lanes import LaneGraph
 from epo_lightning.data.recorded.tracks import FASTEST, Recording, RecordingSource, TrackTable
 from epo_lightning.registry import register
 from epo_lightning.scene import KINDS
 
-Types = Mapping[str, pl.DataType]
-
-INT, FLOAT, FLAG, TEXT = pl.Int64(), pl.Float64(), pl.Boolean(), pl.String()
-INTS, FLOATS = pl.List(INT), pl.List(FLOAT)
-
-TRACKS: Types = (
-    dict.fromkeys(("recordingId", "trackId", "frame", "trackLifetime"), INT)
-    | dict.fromkeys(("xCenter", "yCenter", "heading", "width", "length"), FLOAT)
-    | dict.fromkeys(("xVelocity", "yVelocity", "xAcceleration", "yAcceleration"), FLOAT)
-    | dict.fromkeys(("lonVelocity", "latVelocity", "lonAcceleration", "latAcceleration", "traveledDistance"), FLOAT)
-    | {"latLaneCenterOffset": FLOATS, "laneWidth": FLOATS, "laneletId": INTS, "laneChange": FLAG}
-    | {"lonLaneletPos": FLOATS, "laneletLength": FLOATS}
-    | dict.fromkeys(("leadDHW", "leadDV", "leadTHW", "leadTTC"), FLOAT)
-    | {"leadId": INT, "rearId": INT, "leftLeadId": INT, "leftRearId": INT, "leftAlongsideId": INTS}
-    | {"rightLeadId": INT, "rightRearId": INT, "rightAlongsideId": INTS}
-    | dict.fromkeys(("odrRoadId", "odrSectionNo", "odrLaneId"), INT)
-)
-"""Columns of a tracks file; lists, separated by semicolons, run over an agent's lanelets or the vehicles beside it."""
-TRACKS_META: Types = dict.fromkeys(("recordingId", "trackId", "initialFrame", "finalFrame", "numFrames"), INT) | {
-    "width": FLOAT,
-    "length": FLOAT,
-    "class": TEXT,
-}
-RECORDING_META: Types = (
-    {"recordingId": INT, "locationId": INT, "frameRate": FLOAT, "speedLimit": FLOAT, "weekday": TEXT, "startTime": TEXT}
-    | {"duration": FLOAT, "numTracks": INT, "numVehicles": INT, "numVrus": INT, "latLocation": FLOAT}
-    | {"lonLocation": FLOAT, "xUtmOrigin": FLOAT, "yUtmOrigin": FLOAT, "orthoPxToMeter": FLOAT, "exportVersion": TEXT}
-)
-OPTIONAL = {"odrRoadId", "odrSectionNo", "odrLaneId", "exportVersion"}
-"""Columns that some copies lack."""
-MISSING = (
-    dict.fromkeys(("leadDHW", "leadTHW", "leadTTC", "leadId", "rearId", "leftLeadId", "leftRearId"), -1)
-    | dict.fromkeys(("rightLeadId", "rightRearId", "leftAlongsideId", "rightAlongsideId", "laneletId"), -1)
-    | dict.fromkeys(("laneWidth", "lonLaneletPos", "laneletLength", "odrRoadId", "odrSectionNo"), -1)
-    | {"leadDV": -1000, "speedLimit": -1}
-)
-"""The number that stands for a missing value; where there is none, as for a lane offset of -1 m, another column tells."""
-TOLD_BY = {"latLaneCenterOffset": "laneletId", "odrLaneId": "odrRoadId"}
-"""Columns in which -1 is a value, and is missing where the other column is."""
-
-USED = ("recordingId", "trackId", "frame", "xCenter", "yCenter", "heading", "xVelocity", "yVelocity")
-"""What a :class:`TrackTable` is made of, beside the metadata."""
 TYPICAL = {"motorcycle": (2.2, 0.9), "bicycle": (1.8, 0.7), "pedestrian": (0.5, 0.5)}
-"""Length and width [m] of those whose size is not annotated (0, 0)."""
+"""Length and width [m] of agents whose size is not annotated (0, 0)."""
 LATEST = 10**9
-"""Frames beyond this are no frames."""
+"""Largest frame number."""
 ZONE = 32
+"""UTM zone of all locations."""
 FAR = 10.0
-"""A position farther than this from every line of every lane [m] is not on the map."""
+"""Smallest distance [m] from all lines of all lanes at which a position is not on the map."""
 SAMPLE = 5000
-"""So many positions tell whether a map fits."""
+"""Largest number of positions that are compared with the map."""
 
 
 @register("format", "exid")
@@ -87,7 +53,7 @@ def exid(folder: Path) -> list[RecordingSource]:
     """The recordings in a folder of exiD files, or in its folder ``data``.
 
     Raises:
-        RecordingError: no recording, a file of a recording is missing, its metadata is broken, or there is no map for it.
+        RecordingError: there is no recording, or one of them lacks a file, has broken metadata or has no map.
     """
     folder = Path(folder)
     home = folder / "data" if (folder / "data").is_dir() else folder
@@ -113,7 +79,7 @@ def exid(folder: Path) -> list[RecordingSource]:
 
 
 class _Files(NamedTuple):
-    """What a recording is read from."""
+    """The files of a recording."""
 
     tracks: Path
     tracks_meta: Path
@@ -122,7 +88,7 @@ class _Files(NamedTuple):
 
 
 class _Setting(NamedTuple):
-    """What the metadata of a recording say about all of it."""
+    """The metadata of a whole recording."""
 
     recording: int
     location: int
@@ -144,11 +110,11 @@ def _source(home: Path, name: str, roots: Sequence[Path]) -> RecordingSource:
             )
     setting = _setting(recording_meta)
     files = _Files(tracks, tracks_meta, recording_meta, _map_of(setting.location, roots, recording_meta))
-    return RecordingSource(name, str(setting.location), tuple(files), partial(_read, name, setting, files))
+    return RecordingSource(name, str(setting.location), tuple(files), partial(_read_recording, name, setting, files))
 
 
 def _map_of(location: int, roots: Sequence[Path], path: Path) -> Path:
-    """The map of a location: ``0_cologne_butzweiler/location0.osm``, or a flat ``0_cologne_butzweiler.osm``."""
+    """Path of a location's map: ``0_cologne_butzweiler/location0.osm``, or a flat ``0_cologne_butzweiler.osm``."""
     begins = re.compile(rf"(?:location)?0*{location}(?!\d)", re.ASCII)
     for root in roots:
         here = sorted(file for file in root.glob("*") if begins.match(file.name))
@@ -169,7 +135,7 @@ def _map_of(location: int, roots: Sequence[Path], path: Path) -> Path:
 
 def _setting(path: Path) -> _Setting:
     required = ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin")
-    table = _table(path, RECORDING_META, required, optional=set(RECORDING_META) - set(required) - {"speedLimit"})
+    table = read_table(path, RECORDING_META, required, optional=set(RECORDING_META) - set(required) - {"speedLimit"})
     if len(table) != 1:
         raise RecordingError(path, f"there are {len(table)} rows in it; one was expected: a recording has one setting")
     row = table.row(0, named=True)
@@ -193,7 +159,7 @@ def _setting(path: Path) -> _Setting:
     )
 
 
-def _read(name: str, setting: _Setting, files: _Files) -> Recording:
+def _read_recording(name: str, setting: _Setting, files: _Files) -> Recording:
     dropped: Counter[str] = Counter()
     tracks = _tracks(setting, files, dropped)
     _check_motion(tracks, setting, files)
@@ -204,10 +170,10 @@ def _read(name: str, setting: _Setting, files: _Files) -> Recording:
 
 
 def _tracks(setting: _Setting, files: _Files, dropped: Counter[str]) -> TrackTable:
-    rows = _table(files.tracks, {column: TRACKS[column] for column in USED}, USED)
-    meta = _table(files.tracks_meta, TRACKS_META, tuple(TRACKS_META))
+    rows = read_table(files.tracks, {column: TRACKS[column] for column in USED}, USED)
+    meta = read_table(files.tracks_meta, TRACKS_META, tuple(TRACKS_META))
     for path, recording in ((files.tracks, rows["recordingId"]), (files.tracks_meta, meta["recordingId"])):
-        _first(
+        raise_first(
             path,
             recording.to_numpy() != setting.recording,
             f"recordingId is not {setting.recording} as in {files.recording_meta.name}: files of several recordings are "
@@ -219,7 +185,7 @@ def _tracks(setting: _Setting, files: _Files, dropped: Counter[str]) -> TrackTab
         raise RecordingError(files.tracks_meta, f"trackId {twice[0]} has two rows: an id must belong to one track")
     track = rows["trackId"].to_numpy()
     agent = np.clip(np.searchsorted(ids, track), 0, len(ids) - 1)
-    _first(
+    raise_first(
         files.tracks,
         ids[agent] != track,
         lambda row: f"trackId {track[row]} is not in {files.tracks_meta.name}: copy both files again",
@@ -230,10 +196,10 @@ def _tracks(setting: _Setting, files: _Files, dropped: Counter[str]) -> TrackTab
             f"trackId {ids[unseen[0]]} of {files.tracks_meta.name} is not in it ({len(unseen)} of {len(ids)} are not): was "
             "the file cut off? Copy it again",
         )
-    _first(
+    raise_first(
         files.tracks, (frame < 0) | (frame > LATEST), lambda row: f"frame {frame[row]} was expected in 0 .. {LATEST}"
     )
-    _first(
+    raise_first(
         files.tracks,
         ~(np.abs(heading) <= 360.0),
         lambda row: f"heading is {heading[row]}; degrees from 0 to 360 were expected",
@@ -256,7 +222,7 @@ def _tracks(setting: _Setting, files: _Files, dropped: Counter[str]) -> TrackTab
 
 
 def _unwrapped(heading: Float[np.ndarray, " T"], agent: Int[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
-    """The same headings without jumps inside a track; each track begins where it did."""
+    """Headings without jumps of a turn within a track; the first heading of each track is kept."""
     step = np.diff(heading, prepend=heading[:1])
     turns = -np.round(step / (2 * np.pi))
     first = np.flatnonzero(np.diff(agent, prepend=-1))
@@ -284,7 +250,7 @@ def _sizes(meta: pl.DataFrame, dropped: Counter[str]) -> Float[np.ndarray, "A 2"
 
 
 def _check_frames(table: TrackTable, meta: pl.DataFrame, files: _Files, dropped: Counter[str]) -> None:
-    """Whether each track has the frames that its metadata promise; frames missing in between are counted."""
+    """Check that each track has the frames stated in its metadata; frames missing in between are counted."""
     first = np.flatnonzero(np.diff(table.agent, prepend=-1))
     last = np.append(first[1:], len(table)) - 1
     count = last - first + 1
@@ -304,7 +270,7 @@ def _check_frames(table: TrackTable, meta: pl.DataFrame, files: _Files, dropped:
 
 
 def _check_motion(table: TrackTable, setting: _Setting, files: _Files) -> None:
-    """Whether frames, positions, velocities and headings are of one rate and unit."""
+    """Check that frames, positions, velocities and headings are consistent in rate and unit."""
     if table.frame.max() > 1.05 * setting.duration * setting.rate + setting.rate:
         raise RecordingError(
             files.tracks,
@@ -338,13 +304,13 @@ def _check_motion(table: TrackTable, setting: _Setting, files: _Files) -> None:
         if aside > np.pi / 4:
             raise RecordingError(
                 files.tracks,
-                f"headings differ by {np.rad2deg(aside):.0f} degrees from where agents move: degrees counter-clockwise from "
-                "x were expected",
+                f"headings differ by {np.rad2deg(aside):.0f} degrees from the directions of motion: degrees "
+                "counter-clockwise from x were expected",
             )
 
 
 def _check_fit(table: TrackTable, lanes: LaneGraph, files: _Files) -> None:
-    """Whether most positions are near a lane."""
+    """Check that most positions are near a lane."""
     position = table.position[:: -(-len(table) // SAMPLE)]
     lines = [shapely.LineString(line) for line in (*lanes.left, *lanes.centre, *lanes.right)]
     near, _ = shapely.STRtree(lines).query(shapely.points(position), predicate="dwithin", distance=FAR)
@@ -355,120 +321,3 @@ def _check_fit(table: TrackTable, lanes: LaneGraph, files: _Files) -> None:
             f"{off:.0%} of the positions of {files.tracks.name} are more than {FAR:g} m from all of its lanes: the map or "
             f"xUtmOrigin, yUtmOrigin of {files.recording_meta.name} do not belong to the recording",
         )
-
-
-def read_tracks(path: Path) -> pl.DataFrame:
-    """All columns of a tracks file in the types of :data:`TRACKS`, in that order; missing values are null.
-
-    Raises:
-        RecordingError: no such file, a missing or repeated column, a row that is cut off, or text that is no number.
-    """
-    return _table(path, TRACKS, USED)
-
-
-def read_tracks_meta(path: Path) -> pl.DataFrame:
-    """All columns of a tracksMeta file, as :func:`read_tracks`."""
-    return _table(path, TRACKS_META, tuple(TRACKS_META))
-
-
-def read_recording_meta(path: Path) -> pl.DataFrame:
-    """All columns of a recordingMeta file, as :func:`read_tracks`."""
-    return _table(path, RECORDING_META, ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin"))
-
-
-def _table(
-    path: Path, types: Types, required: Iterable[str], optional: Iterable[str] = frozenset(OPTIONAL)
-) -> pl.DataFrame:
-    """Columns of a CSV file, in any order in the file, by name and type.
-
-    Args:
-        required: columns whose values must not be missing.
-        optional: columns that may be absent.
-    """
-    try:
-        data = path.read_bytes().rstrip(b"\r\n")
-    except OSError as error:
-        raise RecordingError(path, f"the file cannot be read: {error.strerror}") from error
-    header, _, body = data.partition(b"\n")
-    names = [name.strip(' \r"') for name in header.decode("utf-8-sig", errors="replace").split(",")]
-    if not body:
-        raise RecordingError(path, "there are no rows in it: was the file cut off? Copy it again")
-    for name in types:
-        if names.count(name) > 1:
-            raise RecordingError(path, f"there are {names.count(name)} columns called {name}: keep one of them")
-        if name not in names and name not in optional:
-            close = difflib.get_close_matches(name, set(names) - set(types), n=1)
-            raise RecordingError(path, f"there is no column {name}" + (f"; is it {close[0]!r}?" if close else ""))
-    _check_fields(path, data, body, len(names))
-    present = [name for name in types if name in names]
-    flat = {name: types[name] if types[name] in (INT, FLOAT) else TEXT for name in present}
-    try:
-        table = _parsed(body, names, flat)
-    except pl.exceptions.PolarsError as error:
-        try:
-            table = _parsed(body, names, dict.fromkeys(present, TEXT))
-        except pl.exceptions.PolarsError:
-            raise RecordingError(path, f"the file is no CSV table ({str(error).splitlines()[0]})") from error
-    table = pl.DataFrame([_typed(path, table[name], types[name]) for name in present])
-    for name in set(required) & set(present):
-        _first(path, table[name].is_null().to_numpy(), f"there is no {name}")
-    return table.with_columns(
-        pl.when(pl.col(other).is_null()).then(None).otherwise(pl.col(name)).alias(name)
-        for name, other in TOLD_BY.items()
-        if name in present and other in present
-    )
-
-
-def _check_fields(path: Path, data: bytes, body: bytes, expected: int) -> None:
-    """Whether all rows have as many fields as the header."""
-    characters = np.frombuffer(data, dtype=np.uint8)
-    rows = np.count_nonzero(characters == ord("\n")) + 1
-    if np.count_nonzero(characters == ord(",")) == rows * (expected - 1):
-        return
-    for row, line in enumerate(body.split(b"\n"), start=2):
-        if (fields := line.count(b",") + 1) != expected:
-            raise RecordingError(
-                path, f"{fields} fields where the header has {expected}: was the file cut off? Copy it again", row=row
-            )
-
-
-def _parsed(body: bytes, names: list[str], types: Types) -> pl.DataFrame:
-    """Columns of the rows of a CSV file, in these types."""
-    # Numbers as a header of our own: unlike the file's, they differ.
-    places = {name: str(names.index(name)) for name in types}
-    header = ",".join(map(str, range(len(names)))).encode()
-    table = pl.read_csv(
-        b"\n".join((header, body)),
-        columns=list(places.values()),
-        schema_overrides={places[name]: type for name, type in types.items()},
-        quote_char=None,
-    )
-    return table.select(pl.col(place).alias(name) for name, place in places.items())
-
-
-def _typed(path: Path, column: pl.Series, type: pl.DataType) -> pl.Series:
-    """A column in its type, with missing values as null."""
-    missing = MISSING.get(column.name)
-    if column.dtype == TEXT:
-        text = column.str.strip_chars('"').replace("", None)
-        column = text.str.split(";") if type.is_nested() else text
-        column = column.cast(INT, strict=False).cast(type) if type == FLAG else column.cast(type, strict=False)
-        broken = column.is_null() & text.is_not_null()
-        if type.is_nested():
-            broken |= column.list.eval(pl.element().is_null()).list.any().fill_null(False)
-        expected = {INT: "a whole number", FLAG: "0 or 1", FLOAT: "a number"}.get(
-            type, "numbers separated by semicolons"
-        )
-        _first(path, broken.to_numpy(), lambda row: f"{column.name} is {text[row]!r}; {expected} was expected")
-    if missing is None:
-        return column
-    alone = column.list.first().set(column.list.len() != 1, None) if type.is_nested() else column
-    absent = alone == missing
-    return pl.select(pl.when(absent.fill_null(False)).then(None).otherwise(column).alias(column.name)).to_series()
-
-
-def _first(path: Path, bad: np.ndarray, problem: str | Callable[[int], str]) -> None:
-    """Raise the problem with the first bad row of a CSV file; the header is its row 1."""
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise RecordingError(path, problem if isinstance(problem, str) else problem(row), row=row + 2)

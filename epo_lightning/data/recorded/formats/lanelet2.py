@@ -1,8 +1,8 @@
-"""Lanelet2 maps (.osm): lanes between a left and a right way, joined where they share nodes and ways.
+"""Reader of Lanelet2 maps (.osm): lanes between a left and a right way, connected by shared nodes and ways.
 
 The rules are those of the Lanelet2 library for vehicles (Poggenhans et al., "Lanelet2: A High-Definition Map Framework for
-the Future of Automated Driving", ITSC 2018), with emergency lanes kept as shoulders. Nodes, ways and relations have ids of
-their own, which may collide between these kinds.
+the Future of Automated Driving", ITSC 2018), with emergency lanes kept as shoulders. Ids are unique among nodes, among ways
+and among relations, but not across these kinds.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 from pyproj import Transformer
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats import xml
+from epo_lightning.data.recorded.formats.centreline import centreline
 from epo_lightning.data.recorded.lanes import FARTHEST, LANE, SHOULDER, LaneGraph, Polyline
 
 EMERGENCY_LANE = "emergency_lane"
 FOR_VEHICLES = frozenset({"", "road", "highway", "play_street", "bus_lane", "exit", EMERGENCY_LANE})
-"""Subtypes of lanelets on which vehicles drive, if only in an emergency."""
+"""Subtypes of lanelets on which vehicles drive, including emergency lanes."""
 WIDEST = 9.0
-"""A node farther than this from the meridian of its UTM zone [deg] does not belong to a map in that zone."""
+"""Largest distance [deg] of a node from the meridian of its UTM zone."""
 TO_LEFT, TO_RIGHT = 1, 2
 CROSSABLE = {"dashed": TO_LEFT | TO_RIGHT, "dashed_solid": TO_RIGHT, "solid_dashed": TO_LEFT}
-"""In which direction a painted line may be crossed, by its subtype, which names its two lines from left to right."""
+"""Directions in which a painted line may be crossed, by its subtype, which names double lines from left to right."""
 
 Tags = dict[str, str]
 
 
 class _Way(NamedTuple):
-    """A line of nodes, and the same line as points without repetitions [m]."""
+    """A way: its nodes, and their positions [m] without repetitions."""
 
     id: int
     nodes: tuple[int, ...]
@@ -45,7 +45,7 @@ class _Way(NamedTuple):
 
 
 class _Bound(NamedTuple):
-    """A way in the driving direction of a lanelet: as it is stored, or inverted."""
+    """A boundary of a lanelet: a way as it is stored, or inverted, so that it runs in driving direction."""
 
     way: _Way
     inverted: bool
@@ -62,14 +62,14 @@ class _Bound(NamedTuple):
 
     @property
     def key(self) -> tuple[int, bool]:
-        """Equal for the two lanelets that lie beside this bound in the same direction."""
+        """Identifier that is shared by the two lanelets beside this boundary if they have the same direction."""
         return self.way.id, self.inverted
 
     @property
     def crossable(self) -> int:
-        """In which direction vehicles may cross it: of TO_LEFT and TO_RIGHT, both, one or none.
+        """Directions in which vehicles may cross the boundary: a combination of the bits TO_LEFT and TO_RIGHT.
 
-        A virtual line is none that the library lets vehicles change lanes across; ``lane_change`` overrides the marking.
+        As in the library, virtual lines may not be crossed, and the tag ``lane_change`` overrides the marking.
         """
         tags = self.way.tags
         if "lane_change" in tags:
@@ -96,17 +96,17 @@ class _Lanelet:
 def read_map(
     path: Path | str, origin: tuple[float, float], zone: int | None = None, dropped: Counter[str] | None = None
 ) -> LaneGraph:
-    """The lanes for vehicles of a Lanelet2 map. A lanelet that is open both ways is a lane in the direction of its ways.
+    """The lanes for vehicles of a Lanelet2 map. A lanelet for both directions becomes one lane in the direction of its ways.
 
     Args:
         path: of the .osm file.
         origin: UTM coordinates of the local frame's origin [m].
-        zone: of UTM, 1 .. 60; None takes that of the middle of the map.
-        dropped: numbers of things left out, by reason, are added to these.
+        zone: UTM zone, 1 .. 60; None takes that of the middle of the map.
+        dropped: the numbers of items that are left out are added to it, by reason.
 
     Raises:
-        RecordingError: no such file, no Lanelet2 map, numbers that are missing or none, an id of one kind used twice, or
-            no lane in it.
+        RecordingError: there is no such file, it is not a Lanelet2 map, numbers are missing or invalid, an id is used
+            twice, or there is no lane.
     """
     root = xml.parse(path)
     if root.tag != "osm":
@@ -132,7 +132,7 @@ def read_map(
 
 
 def _elements(root: Element, kind: str, path: Path | str) -> dict[int, Element]:
-    """The nodes, ways or relations that are not deleted, by id."""
+    """Nodes, ways or relations by id, without deleted ones."""
     found: dict[int, Element] = {}
     for element in root.iterfind(kind):
         if element.get("action") == "delete":
@@ -160,7 +160,7 @@ def _projection(zone: int, north: bool) -> Transformer:
 def _positions(
     root: Element, origin: tuple[float, float], zone: int | None, path: Path | str
 ) -> dict[int, Float[np.ndarray, " 2"]]:
-    """Where each node is in the local frame [m]."""
+    """Positions of all nodes in the local frame [m]."""
     nodes = _elements(root, "node", path)
     if not nodes:
         raise RecordingError(path, "there is no node in it: is it a Lanelet2 map?")
@@ -189,7 +189,7 @@ def _positions(
 
 
 def _ways(root: Element, positions: dict[int, Float[np.ndarray, " 2"]], path: Path | str) -> dict[int, _Way]:
-    """The ways all of whose nodes are there."""
+    """Ways by id, without those that have missing nodes."""
     ways = {}
     for id, element in _elements(root, "way", path).items():
         nodes = tuple(xml.whole(node.get("ref"), f"a node of way {id}", path) for node in element.iterfind("nd"))
@@ -204,7 +204,7 @@ def _without_repetitions(line: Polyline) -> Polyline:
 
 
 def _for_vehicles(tags: Tags) -> bool:
-    """Whether the subtype is one for vehicles; tags that name participants decide where there are any."""
+    """Whether a lanelet is for vehicles: decided by its participant tags, or by its subtype if it has none."""
     participants = [key for key in tags if key.startswith("participant")]
     if participants:
         return any(key.startswith("participant:vehicle") and _yes(tags, key) for key in participants)
@@ -212,7 +212,7 @@ def _for_vehicles(tags: Tags) -> bool:
 
 
 def _lanelet(id: int, relation: Element, tags: Tags, ways: dict[int, _Way], path: Path | str) -> _Lanelet | str:
-    """A lanelet, or why it is left out."""
+    """A lanelet, or the reason why it is left out."""
     if not _for_vehicles(tags):
         return "lanelets that are not for vehicles"
     members = defaultdict(list)
@@ -241,14 +241,14 @@ def _lanelet(id: int, relation: Element, tags: Tags, ways: dict[int, _Way], path
 
 
 def _signed_distance(line: Polyline, point: Float[np.ndarray, " 2"]) -> float:
-    """Distance of a point from a line, positive on the left [m]."""
+    """Signed distance of a point from a line, positive on the left [m]."""
     step = np.diff(line, axis=0)
     share = np.clip(((point - line[:-1]) * step).sum(1) / (step**2).sum(1), 0.0, 1.0)
     distance = np.hypot(*(point - line[:-1] - share[:, None] * step).T)
     nearest = int(distance.argmin())
     left = _cross(step[nearest], point - line[nearest]) > 0
     if share[nearest] == 1.0 and nearest + 1 < len(step):
-        # Beside a corner, a point is left of the line if it is left of both its sides, or of one where it turns right.
+        # Next to a corner, a point is left of the line if it is left of both segments, or of one if the line turns right.
         turn = _cross(step[nearest], step[nearest + 1]) > 0
         left_of_next = _cross(step[nearest + 1], point - line[nearest + 1]) > 0
         left = left_of_next if left == turn else left
@@ -260,10 +260,10 @@ def _cross(a: Float[np.ndarray, " 2"], b: Float[np.ndarray, " 2"]) -> float:
 
 
 def _aligned(left: _Way, right: _Way) -> tuple[_Bound, _Bound]:
-    """Both boundaries in driving direction: each has the middle of the other one on the right side.
+    """Both boundaries in driving direction.
 
-    The left one is turned first, until the right one lies to its right; then the right one, until the left one lies to its
-    left (``lanelet::geometry::align`` in lanelet2_core).
+    The left one is inverted if the middle of the right one is not to its right; then the right one is inverted if the middle
+    of the left one is not to its left (``lanelet::geometry::align`` in lanelet2_core).
     """
 
     def middle(line: Polyline) -> Float[np.ndarray, " 2"]:
@@ -278,7 +278,7 @@ def _graph(lanelets: list[_Lanelet]) -> LaneGraph:
     starts: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
     for lane, lanelet in enumerate(lanelets):
         starts[lanelet.left.ends[0], lanelet.right.ends[0]].append(lane)
-    # Where lanelets lie over one another, the first of the file is the neighbour.
+    # Where lanelets overlap, the first one in the file is the neighbour.
     by_left = {lanelet.left.key: lane for lane, lanelet in reversed(list(enumerate(lanelets)))}
     by_right = {lanelet.right.key: lane for lane, lanelet in reversed(list(enumerate(lanelets)))}
     adjacent_left = np.array([by_right.get(lanelet.left.key, -1) for lanelet in lanelets])
@@ -298,128 +298,3 @@ def _graph(lanelets: list[_Lanelet]) -> LaneGraph:
         speed_limit=np.full(len(lanelets), np.nan),
         kind=np.array([lanelet.kind for lanelet in lanelets]),
     )
-
-
-@njit(cache=True)
-def _side(a: np.ndarray, b: np.ndarray, point: np.ndarray) -> float:
-    """Positive where a point is left of the line from a to b."""
-    return (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])
-
-
-@njit(cache=True)
-def _between(a: np.ndarray, b: np.ndarray, point: np.ndarray) -> bool:
-    """Whether a point of the line through a and b lies between them."""
-    return min(a[0], b[0]) <= point[0] <= max(a[0], b[0]) and min(a[1], b[1]) <= point[1] <= max(a[1], b[1])
-
-
-@njit(cache=True)
-def _meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> bool:
-    """Whether the segments from a to b and from c to d have a point in common."""
-    if max(a[0], b[0]) < min(c[0], d[0]) or max(c[0], d[0]) < min(a[0], b[0]):
-        return False
-    if max(a[1], b[1]) < min(c[1], d[1]) or max(c[1], d[1]) < min(a[1], b[1]):
-        return False
-    c_side, d_side = _side(a, b, c), _side(a, b, d)
-    a_side, b_side = _side(c, d, a), _side(c, d, b)
-    if (
-        (c_side == 0 and _between(a, b, c))
-        or (d_side == 0 and _between(a, b, d))
-        or (a_side == 0 and _between(c, d, a))
-        or (b_side == 0 and _between(c, d, b))
-    ):
-        return True
-    return (c_side > 0) != (d_side > 0) and (a_side > 0) != (b_side > 0) and c_side * d_side * a_side * b_side != 0
-
-
-@njit(cache=True)
-def _same(a: np.ndarray, b: np.ndarray) -> bool:
-    return a[0] == b[0] and a[1] == b[1]
-
-
-@njit(cache=True)
-def _clear(
-    last: np.ndarray, middle: np.ndarray, near: np.ndarray, far: np.ndarray, foot: np.ndarray, line: np.ndarray
-) -> bool:
-    """Whether a boundary is crossed neither on the way from ``last`` to ``middle`` nor, but at its foot, by the rung."""
-    for k in range(len(line) - 1):
-        a, b = line[k], line[k + 1]
-        if not _same(a, last) and _meet(last, middle, a, b):
-            return False
-        if not _same(a, foot) and not _same(b, foot) and _meet(near, far, a, b):
-            return False
-    return True
-
-
-@njit(cache=True)
-def _connects(last: np.ndarray, near: np.ndarray, far: np.ndarray, near_line: np.ndarray, far_line: np.ndarray) -> bool:
-    """Whether a rung from ``near`` on one boundary to ``far`` on the other one crosses neither of them elsewhere, nor does
-    the centreline on its way from its ``last`` point to the middle of the rung."""
-    middle = 0.5 * (near + far)
-    return _clear(last, middle, near, far, near, near_line) and _clear(last, middle, near, far, far, far_line)
-
-
-@njit(cache=True)
-def _next_rung(
-    last: np.ndarray, near_line: np.ndarray, near: int, far_line: np.ndarray, far: int, gates: np.ndarray
-) -> tuple[int, float]:
-    """The nearest point after number ``far`` of one boundary that a rung can connect to point ``near`` of the other one,
-    and the length of that rung; -1 where there is none. ``gates`` are entry and exit, each with the lanelet to its right."""
-    lengths = np.empty(len(far_line))
-    lengths[: far + 1] = np.inf
-    for k in range(far + 1, len(far_line)):
-        lengths[k] = np.hypot(far_line[k, 0] - near_line[near, 0], far_line[k, 1] - near_line[near, 1])
-    for _ in range(far + 1, len(far_line)):
-        k = int(lengths.argmin())
-        middle = 0.5 * (near_line[near] + far_line[k])
-        leaves = False
-        for gate in range(2):
-            if _side(gates[gate, 0], gates[gate, 1], middle) > 0 and _meet(
-                last, middle, gates[gate, 0], gates[gate, 1]
-            ):
-                leaves = True
-        if not leaves and _connects(last, near_line[near], far_line[k], near_line, far_line):
-            return k, lengths[k]
-        lengths[k] = np.inf
-    return -1, np.inf
-
-
-@njit(cache=True)
-def _climb(left: np.ndarray, right: np.ndarray, touching: bool) -> np.ndarray:
-    """The centreline; see :func:`centreline`."""
-    gates = np.empty((2, 2, 2))
-    gates[0, 0], gates[0, 1] = right[0], left[0]
-    gates[1, 0], gates[1, 1] = left[-1], right[-1]
-    centre = np.empty((len(left) + len(right), 2))
-    centre[0] = 0.5 * (left[0] + right[0])
-    count = 1
-    at_left, at_right = int(touching), 0
-    while True:
-        last = centre[count - 1]
-        next_left, left_length = _next_rung(last, right, at_right, left, at_left, gates)
-        next_right, right_length = _next_rung(last, left, at_left, right, at_right, gates)
-        if next_left < 0 and next_right < 0:
-            break
-        if left_length <= right_length:
-            at_left = next_left
-        else:
-            at_right = next_right
-        centre[count] = 0.5 * (left[at_left] + right[at_right])
-        count += 1
-    if at_left < len(left) - 1 or at_right < len(right) - 1:
-        centre[count] = 0.5 * (left[-1] + right[-1])
-        count += 1
-    return centre[:count]
-
-
-def centreline(left: Polyline, right: Polyline, touching: bool = False) -> Polyline:
-    """The line midway between two boundaries, as the Lanelet2 library draws it (lanelet2_core, Lanelet.cpp).
-
-    It climbs the lanelet like a ladder. From the rung between the current points of both boundaries, one foot steps on: to
-    the nearest later point whose rung crosses no boundary, on the side where that rung is shorter. The middles of the
-    rungs are the centreline.
-
-    Args:
-        left, right: boundaries in driving direction [m].
-        touching: both begin at the same node.
-    """
-    return _climb(np.ascontiguousarray(left), np.ascontiguousarray(right), touching)

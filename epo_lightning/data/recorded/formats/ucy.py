@@ -1,7 +1,7 @@
-"""UCY pedestrians: one ``obsmat.txt`` per place, without a map.
+"""Reader of UCY pedestrians: one ``obsmat.txt`` per place, without a map.
 
 Lerner, Chrysanthou and Lischinski, "Crowds by Example", Eurographics 2007. The columns are frame, pedestrian, x, z, y, vx,
-vz and vy, in metres and m/s; z is up. Frames count a video of 25 Hz, of which every tenth or so is annotated.
+vz and vy, in metres and m/s; z is up. Frames are those of a video of 25 Hz, of which about every tenth is annotated.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ VIDEO_RATE = 25.0
 """Frames per second of the videos [Hz]."""
 COLUMNS = ("frame", "pedestrian", "x", "z", "y", "vx", "vz", "vy")
 LARGEST = 1e9
-"""Frames and ids beyond this are a mistake."""
+"""Largest frame number or id."""
 DIAMETER = 0.5
-"""Length and width of a pedestrian [m]; the format knows none."""
+"""Length and width of a pedestrian [m]; the format has none."""
 
 
 @register("format", "ucy")
 def ucy(folder: Path) -> list[RecordingSource]:
-    """Every ``obsmat.txt`` below a folder, named after the folder that it is in.
+    """All ``obsmat.txt`` below a folder, each named after its own folder.
 
     Raises:
-        RecordingError: no such file, or two of one name.
+        RecordingError: there is no such file, or two have the same name.
     """
     paths = sorted(path for path in Path(folder).rglob("obsmat.txt") if path.is_file())
     if not paths:
@@ -41,10 +41,10 @@ def ucy(folder: Path) -> list[RecordingSource]:
         if name in first:
             raise RecordingError(path, f"{first[name]} is in a folder of the same name: rename one of the two")
         first[name] = path
-    return [RecordingSource(name, name, (path,), partial(_read, path, name)) for name, path in first.items()]
+    return [RecordingSource(name, name, (path,), partial(_read_recording, path, name)) for name, path in first.items()]
 
 
-def _read(path: Path, name: str) -> Recording:
+def _read_recording(path: Path, name: str) -> Recording:
     table = _table(path)
     table = table[np.lexsort((table[:, 0], table[:, 1]))]
     ids, agent = np.unique(table[:, 1].astype(int), return_inverse=True)
@@ -59,8 +59,8 @@ def _read(path: Path, name: str) -> Recording:
         row = int(np.flatnonzero(frame % usual)[0])
         raise RecordingError(
             path,
-            f"frame {video_frame[row]} of pedestrian {ids[agent[row]]} is none of those annotated, which are "
-            f"{usual} apart: correct or remove it",
+            f"frame {video_frame[row]} of pedestrian {ids[agent[row]]} is not annotated: annotated frames are "
+            f"{usual} apart; correct or remove it",
         )
     velocity = table[:, [5, 7]]
     tracks = TrackTable(
@@ -78,7 +78,7 @@ def _read(path: Path, name: str) -> Recording:
 
 
 def _table(path: Path) -> Float[np.ndarray, "T 8"]:
-    """The numbers of a file."""
+    """The numbers of a file, checked."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -103,7 +103,7 @@ def _table(path: Path) -> Float[np.ndarray, "T 8"]:
 
 
 def _number(cell: str) -> float:
-    """What is no number is NaN; Python would also take 1_000 for one."""
+    """The number in a cell; NaN for other text and for 1_000, which Python would read as a number."""
     try:
         return np.nan if "_" in cell else float(cell)
     except ValueError:
@@ -111,7 +111,7 @@ def _number(cell: str) -> float:
 
 
 def _heading(agent: Int[np.ndarray, " T"], velocity: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, " T"]:
-    """Pedestrians face where they walk; while standing, where they walked last; before they have walked, along x."""
+    """Headings [rad]: the direction of walking; while standing, that of the last walking; before any walking, zero."""
     moving = (velocity != 0).any(axis=1)
     rows = np.arange(len(agent))
     before = np.maximum.accumulate(np.where(moving, rows, 0))

@@ -1,4 +1,4 @@
-"""XML from outside: parsed without entities, so that a small file cannot become a large one or open another."""
+"""Safe parsing of XML files: entities are refused, so that a small file cannot expand or include another one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def parse(path: Path | str) -> Element:
         RecordingError: no such file, or it is empty, not well-formed, in an unknown encoding, or it declares a document
             type or entities.
     """
-    # The parser is Python's own and slow; elements from the C builder make up for it, and survive any depth.
+    # This parser is pure Python and slow; building elements in C compensates for it and works at any depth.
     parser = DefusedXMLParser(target=TreeBuilder(), forbid_dtd=True)
     try:
         return defused_parse(path, parser=parser).getroot()
@@ -32,7 +32,7 @@ def parse(path: Path | str) -> Element:
         raise RecordingError(path, f"the file cannot be read: {error.strerror}") from error
     except DefusedXmlException as error:
         raise RecordingError(
-            path, "the file declares a document type or entities, which may hide a bomb: remove the declaration"
+            path, "the file declares a document type or entities, which can expand to any size: remove the declaration"
         ) from error
     except ParseError as error:
         raise RecordingError(
@@ -46,12 +46,12 @@ def number(text: str | None, what: str, path: Path | str) -> float:
     """The finite number that a required text or attribute holds.
 
     Args:
-        text: None where it is missing.
-        what: the name of the number and of the element it belongs to, for error messages.
+        text: None if it is missing.
+        what: name of the number and its element, for error messages.
         path: of the file, for error messages.
 
     Raises:
-        RecordingError: it is missing, or no finite number.
+        RecordingError: it is missing or not a finite number.
     """
     try:
         value = float(_digits(text))
@@ -74,10 +74,10 @@ def whole(text: str | None, what: str, path: Path | str) -> int:
 
 
 def _digits(text: str | None) -> str:
-    """What float and int may read: Python would also take 1_000 for a number."""
+    """The text for float and int, empty if it has underscores: Python would read 1_000 as a number."""
     return "" if text is None or "_" in text else text
 
 
 def _quote(text: str | None) -> str:
-    """A text as messages show it, at most a line of it."""
+    """The beginning of a text, quoted for error messages."""
     return "missing" if text is None else repr(text if len(text) <= 40 else text[:40] + "...")

@@ -12,7 +12,8 @@ import pytest
 
 from data.recorded.formats.exid_files import ORIGIN, SETTING, drive, road, write
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.formats.exid import USED, exid
+from epo_lightning.data.recorded.formats.exid import exid
+from epo_lightning.data.recorded.formats.exid_tables import USED
 from epo_lightning.data.recorded.formats.lanelet2 import read_map
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error")]

@@ -12,7 +12,8 @@ import shapely
 
 from data.recorded.formats.exid_files import BORDER, DASHED, ORIGIN, SOLID, Osm, globe, road, shared
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.formats.lanelet2 import centreline, read_map
+from epo_lightning.data.recorded.formats.centreline import centreline
+from epo_lightning.data.recorded.formats.lanelet2 import read_map
 from epo_lightning.data.recorded.lanes import LANE, SHOULDER
 
 FZI = "data/maps/fzi_mapping_example.osm"
