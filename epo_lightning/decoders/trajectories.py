@@ -9,7 +9,7 @@ from epo_lightning.decoders.mlp import MLP
 
 
 class Trajectories(nn.Module):
-    """M futures of an agent and their logits from the agent's feature z_i, one network for all agents.
+    """M futures of an agent and their probabilities from the agent's feature z_i, one network for all agents.
 
     Args:
         width: size of the agent features.
@@ -28,7 +28,8 @@ class Trajectories(nn.Module):
 
     def forward(
         self, z: Float[Tensor, "B N D"], current: Float[Tensor, "B N 2"]
-    ) -> tuple[Float[Tensor, "B M N K 2"], Float[Tensor, "B M N"]]:
-        """Positions [m], and logits of each agent's own modes."""
+    ) -> tuple[Float[Tensor, "B M N K 2"], Float[Tensor, "B M N"], Float[Tensor, "B M N"]]:
+        """Positions [m], and probabilities and logits of each agent's own modes."""
         travelled = (self.scale * self.positions(z)).unflatten(-1, (self.modes, self.horizon, 2)).transpose(1, 2)
-        return current[:, None, :, None] + travelled, self.logits(z).transpose(1, 2)
+        logits = self.logits(z)
+        return current[:, None, :, None] + travelled, logits.softmax(-1).transpose(1, 2), logits.transpose(1, 2)

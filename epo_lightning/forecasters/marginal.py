@@ -52,9 +52,9 @@ class Marginal(Forecaster):
 
     def forward(self, scene: Scene) -> JointForecast:
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
-        positions, logits = self.decoder(self.backbone(scene), current[..., :2])
+        positions, probabilities, logits = self.decoder(self.backbone(scene), current[..., :2])
         states = _with_motion(positions, current, scene.dt)
-        states, probabilities, logits = marginal_to_joint(states, logits.softmax(1), logits)
+        states, probabilities, logits = marginal_to_joint(states, probabilities, logits)
         # The product of probabilities, as a sum of logarithms: over many agents it is smaller than any float32 number.
         of_agents = log_probabilities(probabilities, logits, 1)
         joint = of_agents.where(scene.agent_mask[:, None], 0.0).sum(-1)
