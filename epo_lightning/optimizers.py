@@ -26,7 +26,7 @@ class Adam:
     Attributes:
         lr: learning rate.
         schedule: ``constant`` or ``cosine``.
-        clip: largest norm of the gradient of a step; None for no limit.
+        clip: largest norm of the gradient; longer gradients are scaled down to it (gradient clipping); None for no limit.
     """
 
     lr: float = 5e-5
@@ -42,7 +42,7 @@ class Adam:
             raise ConfigError(f"unknown optimizer.schedule {self.schedule!r}: {nearest(self.schedule, _SCHEDULES)}")
 
     def configure(self, parameters: Iterable[nn.Parameter], total_steps: float) -> dict[str, Any]:
-        """What Lightning's ``configure_optimizers`` returns; the schedule runs over ``total_steps`` steps."""
+        """Optimizer and schedule for Lightning's ``configure_optimizers``; the schedule lasts ``total_steps`` steps."""
         adam = torch.optim.Adam(parameters, lr=self.lr)
         shape = _SCHEDULES[self.schedule]
         schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: shape(step / total_steps))

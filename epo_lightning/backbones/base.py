@@ -1,4 +1,4 @@
-"""What a backbone is: a module from scenes to agent features; and what the paper's three have in common."""
+"""The interface of backbones, which map scenes to agent features, and the common part of the paper's three."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class Backbone(nn.Module):
 
 @dataclass(eq=False, repr=False)
 class PolylineBackbone(Backbone):
-    """Histories and lanes as polyline features of one width; how they interact is left to the subclass.
+    """Backbone base that encodes histories and lanes as polyline features; subclasses define their interaction.
 
-    The fields are what each of the paper's backbones is configured with; a subclass may add some of its own.
+    The fields are the configuration of the paper's backbones; a subclass may add its own.
 
     Attributes:
         history_width: size of the history encoder's features.
         history_depth: number of its layers.
         width: size of the features z that leave the global interaction graph.
         lane_width, lane_depth: size and number of the lane encoder's layers.
-        dropout: share of the histories' features, and of what attention gathers, that is left out in training.
+        dropout: dropout rate of the histories' features and of the attention's output in training.
         scale: metres that an input of one stands for.
         goal_input: whether a given goal is also an input of the network (``goal=all``), not of the energy alone.
         map_input: whether the data has a map.
@@ -49,7 +49,7 @@ class PolylineBackbone(Backbone):
     def __post_init__(self) -> None:
         super().__init__()
         if not self.scale > 0:
-            raise ValueError(f"scale must be positive, not {self.scale}: the metres that an input of one stands for")
+            raise ValueError(f"scale must be positive, not {self.scale}: metres at a network input of one")
         history = self.history_encoder()
         lanes = LanePolylines(self.lane_width, self.lane_depth, self.scale) if self.map_input else None
         self.history = history
@@ -60,18 +60,18 @@ class PolylineBackbone(Backbone):
         self.left_out = nn.Dropout(self.dropout)
 
     def history_encoder(self) -> LSTMHistory | TransformerHistory:
-        """What reads the agents' histories: an LSTM, unless a subclass says otherwise."""
+        """The encoder of the agents' histories: an LSTM, unless a subclass overrides it."""
         return LSTMHistory(self.history_width, self.history_depth, self.scale)
 
     def agent_features(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
-        """What each agent did, and its goal where that is given to the network."""
+        """Features of each agent's history, and of its goal where that is an input of the network."""
         features = self.to_graph(self.left_out(self.history(scene)))
         if self.goal_to_graph is not None:
             features = features + self.goal_to_graph(given_goals(scene) / self.scale)
         return features
 
     def lane_features(self, scene: Scene) -> tuple[Float[Tensor, "B L {self.width}"], Bool[Tensor, "B L"]]:
-        """Every lane, and which of them exist; no lane at all where the data has no map.
+        """Features of every lane and the mask of existing lanes; empty where the data has no map.
 
         Raises:
             ValueError: the backbone was built for data with a map and the scene has none.

@@ -1,4 +1,4 @@
-"""HiVT-M: transformer histories; agents look at the map first and then at each other (after Zhou et al. 2022)."""
+"""HiVT-M: transformer histories, attention to the map and then among agents (after Zhou et al. 2022)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from epo_lightning.scene import Scene
 @register("backbone", "hivt_m")
 @dataclass(eq=False, repr=False)
 class HiVTM(PolylineBackbone):
-    """Hierarchical Vector Transformer, modified: each agent alone through a transformer, then VIBES's two stages.
+    """Hierarchical Vector Transformer, modified: a transformer per agent, then VIBES's two stages of attention.
 
     In HiVT itself the transformer already sees lanes and other agents; the paper moves both to the global graph (Appendix
     C.1, "Agent History Encoder").

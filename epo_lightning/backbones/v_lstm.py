@@ -1,4 +1,4 @@
-"""V-LSTM: LSTM histories and a single attention over everything (Ettinger et al. 2021, as the paper uses it)."""
+"""V-LSTM: LSTM histories and one attention over agents and lanes (Ettinger et al. 2021, as the paper uses it)."""
 
 from __future__ import annotations
 
@@ -27,5 +27,5 @@ class VLSTM(PolylineBackbone):
         """Features z_i of all agents."""
         agents = self.agent_features(scene)
         lanes, drawn = self.lane_features(scene)
-        everything, exists = torch.cat((agents, lanes), 1), torch.cat((scene.agent_mask, drawn), 1)
-        return self.interaction(agents, everything, exists)
+        sources, exist = torch.cat((agents, lanes), 1), torch.cat((scene.agent_mask, drawn), 1)
+        return self.interaction(agents, sources, exist)

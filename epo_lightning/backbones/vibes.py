@@ -1,4 +1,4 @@
-"""VIBES: LSTM histories; agents look at the map first and then at each other."""
+"""VIBES: LSTM histories, attention to the map and then among agents."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The multilayer perceptron that all decoders are made of."""
+"""The multilayer perceptron of all decoders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 
 class _Sum(torch.autograd.Function):
-    """The sum of a tensor over all processes, for which each of them is a part of one loss."""
+    """Differentiable sum of a tensor over all processes, whose losses are summed as well."""
 
     @staticmethod
     def forward(ctx: Any, tensor: Tensor) -> Tensor:
@@ -28,9 +28,9 @@ class _Sum(torch.autograd.Function):
 
 
 class _MaskedBatchNorm(nn.BatchNorm1d):
-    """Batch normalisation whose statistics are those of existing agents alone, and of all processes of a training.
+    """Batch normalisation with statistics of existing agents only, over all processes of a training.
 
-    Rows may be spread over processes in any way: the result is that of one process with all of them.
+    The result does not depend on how rows are spread over processes.
     """
 
     def forward(self, features: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -47,7 +47,7 @@ class _MaskedBatchNorm(nn.BatchNorm1d):
         return normalised.view_as(features)
 
     def _together(self, rows: Tensor) -> Tensor:
-        """What ``nn.BatchNorm1d`` does with the rows of all processes, for those of this one."""
+        """The rows of this process, normalised as ``nn.BatchNorm1d`` does with the rows of all processes."""
         assert self.running_mean is not None
         assert self.running_var is not None
         assert self.num_batches_tracked is not None
@@ -57,8 +57,8 @@ class _MaskedBatchNorm(nn.BatchNorm1d):
         count = values.new_full((1,), len(values))
         own = values.sum(0) / count.clamp_min(1)
         parts = torch.cat([count, own, (values - own).square().sum(0)])
-        # One exchange: everybody adds their part to zeros in their own row. Means and squares around them are put together
-        # afterwards, because a difference of large sums would lose the digits that this is about.
+        # One exchange: every process fills its own row of a table and adds zeros to the others. Means and squares around
+        # them are combined afterwards, because a difference of large sums would lose digits.
         table = _Sum.apply(torch.stack([parts if r == rank else torch.zeros_like(parts) for r in range(world)]))
         counts, means, squares = table.split([1, values.shape[1], values.shape[1]], 1)
         total = counts.sum().clamp_min(1)
@@ -80,7 +80,7 @@ class MLP(nn.Module):
         width: size of the hidden features.
         layers: number of linear layers.
         norm: ``batch`` or ``layer`` normalisation of hidden features.
-        bias: whether the output has one; a softmax over rows takes no notice of it.
+        bias: whether the output layer has a bias, which has no effect on a softmax over rows.
     """
 
     def __init__(
@@ -94,21 +94,21 @@ class MLP(nn.Module):
         self.norms = nn.ModuleList(normalisation(size) for size in sizes[1:])
         self.output = nn.Linear(sizes[-1], outputs, bias=bias)
         if norm == "batch":
-            # Batch normalisation takes away what a bias adds: the bias's gradient is zero but for rounding errors. Adam
-            # would make steps of full length of these, and the running means, which lag behind, would let them be seen.
+            # Batch normalisation removes a bias, whose gradient is then rounding error. Adam would turn it into steps of
+            # full length, which show in evaluation because the running means lag behind.
             for linear in hidden:
                 linear.bias.requires_grad_(False)
 
     def forward(
         self, features: Float[Tensor, "*batch inputs"], mask: Bool[Tensor, "*batch"] | None = None
     ) -> Float[Tensor, "*batch outputs"]:
-        """Apply the layers to every row; ``mask`` tells which rows count for batch normalisation."""
+        """The output for every row; ``mask`` marks the rows that count for batch normalisation."""
         return self.after_first(self.hidden[0](features), mask)
 
     def after_first(
         self, features: Float[Tensor, "*batch width"], mask: Bool[Tensor, "*batch"] | None = None
     ) -> Float[Tensor, "*batch outputs"]:
-        """What follows the first linear layer, for those who have a cheaper way to compute that one."""
+        """The output from the result of the first linear layer, for callers that compute it in a cheaper way."""
         for norm, linear in zip(self.norms, [*self.hidden[1:], self.output], strict=True):
             features = norm(features, mask) if isinstance(norm, _MaskedBatchNorm) else norm(features)
             features = linear(features.relu())

@@ -1,4 +1,4 @@
-"""Agent history encoders: from what an agent did to one feature vector."""
+"""Agent history encoders: one feature vector from the observed states of an agent."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from torch import Tensor, nn
 from epo_lightning.scene import Scene
 
 VECTOR = 5
-"""Features of a history vector: where it starts, where it ends (x, y each) and when it ends."""
+"""Entries of a history vector: start and end position (x, y each) and time of its end."""
 
 
 def history_vectors(scene: Scene, scale: float = 1.0) -> tuple[Float[Tensor, "B N V 5"], Bool[Tensor, "B N V"]]:
-    """Every agent's history as V = H - 1 vectors, oldest first, and which of them were observed at both ends.
+    """Every agent's history as V = H - 1 vectors, oldest first, and the mask of those observed at both ends.
 
-    A vector holds the 2-D positions in which a step starts and ends, in units of ``scale`` metres, and the time [s] at which
-    it ends, as in VectorNet. An agent that was seen at t0 alone has one vector, which starts where it ends.
+    A vector holds the 2-D positions at which a step starts and ends, in units of ``scale`` metres, and the time [s] of its
+    end, as in VectorNet. An agent observed at t0 alone has one vector of length zero.
 
     Raises:
-        ValueError: a history of a single state, which shows no motion.
+        ValueError: a history of a single state, from which no motion can be read.
     """
     if scene.history.shape[2] < 2:
         raise ValueError("scene.history holds H = 1 state per agent; reading a motion takes at least 2")
@@ -37,9 +37,9 @@ def history_vectors(scene: Scene, scale: float = 1.0) -> tuple[Float[Tensor, "B 
 
 
 class LSTMHistory(nn.Module):
-    """Reads an agent's history as a polyline of vectors, oldest first (Appendix C.1, "Agent History Encoder").
+    """LSTM over the vectors of an agent's history, oldest first (Appendix C.1, "Agent History Encoder").
 
-    Vectors of unobserved steps are left out: the others close ranks, so that any padding gives the same feature.
+    Vectors of unobserved steps are removed and the others moved together, so that any padding gives the same feature.
 
     Args:
         width: size of the hidden state.
@@ -53,13 +53,13 @@ class LSTMHistory(nn.Module):
         self.lstm = nn.LSTM(VECTOR, width, num_layers=depth, batch_first=True)
 
     def forward(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
-        """The feature of every agent; what it holds for absent agents is of no meaning.
+        """The feature of every agent; for absent agents its value has no meaning.
 
         Raises:
             ValueError: a history of a single state.
         """
         vectors, observed = (part.flatten(0, 1) for part in history_vectors(scene, self.scale))
-        # A stable sort moves the observed vectors to the front. The LSTM is causal: what stands behind them cannot matter.
+        # A stable sort moves the observed vectors to the front. The LSTM is causal, so the vectors after them do not matter.
         order = (~observed).to(torch.uint8).argsort(dim=1, stable=True)
         states, _ = self.lstm(vectors.gather(1, order[..., None].expand_as(vectors)))
         last = observed.sum(1) - 1
@@ -67,34 +67,34 @@ class LSTMHistory(nn.Module):
 
 
 class TransformerHistory(nn.Module):
-    """Reads an agent's history by self-attention among its vectors (Appendix C.1, after HiVT's temporal encoder).
+    """Transformer over the vectors of an agent's history (Appendix C.1, after HiVT's temporal encoder).
 
-    Vectors are told apart by a sinusoidal encoding of their own age, and only observed ones are attended to, so that any
-    padding gives the same feature: that of the newest observed vector.
+    Each vector carries a sinusoidal encoding of its age, and attention is masked to observed vectors, so that any padding
+    gives the same feature: that of the newest observed vector.
 
     Args:
         width: size of the tokens and of the feature.
         depth: number of layers.
-        heads: of the attention; a divisor of ``width``.
+        heads: number of attention heads; ``width`` must be a multiple of twice as many.
         scale: metres that an input of one stands for.
 
     Raises:
-        ValueError: a width that the heads cannot share, or no layer.
+        ValueError: a width that is not a multiple of twice the heads, or no layer.
     """
 
     def __init__(self, width: int = 64, depth: int = 3, heads: int = 4, scale: float = 1.0) -> None:
         super().__init__()
         if heads < 1 or width % (2 * heads):
-            raise ValueError(f"a width of {width} is not a multiple of twice the {heads} heads that share it")
+            raise ValueError(f"history_width must be a multiple of twice the number of heads ({heads}), not {width}")
         if depth < 1:
-            raise ValueError(f"a transformer takes one layer or more, not {depth}")
+            raise ValueError(f"history_depth must be 1 or more, not {depth}")
         self.width, self.scale = width, scale
         self.embed = nn.Linear(VECTOR, width)
         self.layers = nn.ModuleList(_TransformerLayer(width, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
 
     def forward(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
-        """The feature of every agent; what it holds for absent agents is of no meaning.
+        """The feature of every agent; for absent agents its value has no meaning.
 
         Raises:
             ValueError: a history of a single state.
@@ -105,7 +105,7 @@ class TransformerHistory(nn.Module):
         newest = torch.where(observed, age, len(age)).argmin(1)
         for layer in self.layers[:-1]:
             tokens = layer(tokens, tokens, observed)
-        # Of the last layer's tokens only the newest is read.
+        # Only the newest token of the last layer is read.
         reader = tokens[torch.arange(len(newest), device=newest.device), newest][:, None]
         return self.norm(self.layers[-1](reader, tokens, observed)).view(*scene.agent_mask.shape, self.width)
 
@@ -125,7 +125,7 @@ class _TransformerLayer(nn.Module):
     def forward(
         self, readers: Float[Tensor, "A R D"], tokens: Float[Tensor, "A V D"], observed: Bool[Tensor, "A V"]
     ) -> Float[Tensor, "A R D"]:
-        """What the readers, which are some of the tokens, become after reading the observed tokens."""
+        """Features of the readers, which are some of the tokens, after attention to the observed tokens."""
         query = self.query(self.read_norm(readers)).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         key, value = self.key_value(self.read_norm(tokens)).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
         scores = query @ key.mT / math.sqrt(query.shape[-1])

@@ -1,4 +1,4 @@
-"""Global interaction: every agent looks at every other one, and at the lanes."""
+"""Global interaction: attention of every agent to all agents and lanes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Attention(nn.Module):
 
     Args:
         width: size of the features, in and out.
-        dropout: share of what is gathered that is left out in training.
+        dropout: dropout rate of the attention's output in training.
     """
 
     def __init__(self, width: int = 128, dropout: float = 0.0) -> None:
@@ -28,20 +28,20 @@ class Attention(nn.Module):
     def forward(
         self, features: Float[Tensor, "B N D"], sources: Float[Tensor, "B S D"], mask: Bool[Tensor, "B S"]
     ) -> Float[Tensor, "B N D"]:
-        """Features after each has gathered from the sources that ``mask`` says exist; unchanged where none does."""
+        """Features after attention to the sources that exist by ``mask``; unchanged in scenes without any source."""
         scores = self.query(features) @ self.key(sources).mT * self.scale
-        # A large negative number instead of -inf keeps a scene without any source finite.
+        # A large negative number instead of -inf keeps the softmax finite in a scene without any source.
         gathered = scores.masked_fill(~mask[:, None, :], -1e9).softmax(-1) @ self.value(sources)
         return features + torch.where(mask.any(-1)[:, None, None], self.left_out(gathered), 0.0)
 
 
 class TwoStageAttention(nn.Module):
-    """Agents look at the lanes first and then, knowing them, at each other (Appendix C.1, "Global Interaction").
+    """Attention of agents to the lanes, followed by attention to each other (Appendix C.1, "Global Interaction").
 
     Args:
         width: size of the features, in and out.
-        map_input: whether there are lanes to look at; without them the second stage is all there is.
-        dropout: of both stages.
+        map_input: whether the data has lanes; without them there is only the second stage.
+        dropout: dropout rate of both stages.
     """
 
     def __init__(self, width: int = 128, map_input: bool = True, dropout: float = 0.0) -> None:
@@ -56,7 +56,7 @@ class TwoStageAttention(nn.Module):
         lanes: Float[Tensor, "B L D"],
         drawn: Bool[Tensor, "B L"],
     ) -> Float[Tensor, "B N D"]:
-        """Features of agents after both stages; ``present`` and ``drawn`` say which agents and lanes exist."""
+        """Features of agents after both stages; ``present`` and ``drawn`` are the masks of agents and lanes."""
         if self.to_lanes is not None:
             agents = self.to_lanes(agents, lanes, drawn)
         return self.to_agents(agents, agents, present)

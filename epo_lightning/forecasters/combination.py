@@ -1,7 +1,7 @@
-"""Which energies, minimisers, derivatives and objectives work together: the paper's Table 1, with its empty cells.
+"""Combinations of energy, minimiser, derivative and objective that work together: the paper's Table 1, with its empty cells.
 
-Every part declares what it needs of the others and what it provides. What follows from that is said before anything runs:
-why a combination cannot work, and which single change would make it work.
+Every part declares what it needs of the others and what it provides. A combination that cannot work is refused before
+anything runs, with the reason and the single changes that would make it work.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ KINDS = ("energy", "solver", "backward", "objective")
 
 @dataclass(frozen=True)
 class Combination:
-    """One choice of each kind, parts or their classes, which declare the same.
+    """One part of each kind, or their classes, which carry the same declarations.
 
     Attributes:
-        names: of the parts, by kind.
+        names: names of the parts, by kind.
     """
 
     energy: Any
@@ -43,42 +43,42 @@ class Combination:
 
     @classmethod
     def of(cls, **chosen: Any) -> Combination:
-        """That of four parts."""
+        """Build from the four parts."""
         return cls(**chosen, names={kind: _name(kind, part) for kind, part in chosen.items()})
 
     @property
     def obstacle(self) -> str | None:
-        """Why it cannot work; None where it can."""
+        """The reason why the combination cannot work; None where it can."""
         energy, solver, backward, objective = (f"{kind}={self.names[kind]}" for kind in KINDS)
-        for who, needed in (
+        for part, needed in (
             (solver, self.solver.needs),
             (backward, self.backward.of_energy),
             (objective, self.objective.of_energy),
         ):
             if lacking := needed - self.energy.offers:
-                return f"{who} needs an energy with {_and(lacking)}, which {energy} does not offer"
-        for who, needed in ((backward, self.backward.needs), (objective, self.objective.needs)):
+                return f"{part} needs an energy with {_and(lacking)}, which {energy} does not offer"
+        for part, needed in ((backward, self.backward.needs), (objective, self.objective.needs)):
             if needed and not needed & self.solver.provides:
-                return f"{who} needs {_or(needed)}, and {solver} provides {_or(self.solver.provides)}"
+                return f"{part} needs {_or(needed)}, and {solver} provides {_or(self.solver.provides)}"
         if self.objective.through_solution and not self.backward.teaches:
-            return f"{objective} learns through the solution, which with {backward} has no derivative"
+            return f"{objective} learns through the solution, which has no derivative with {backward}"
         if self.backward.teaches and not self.objective.through_solution:
-            return f"{objective} learns from energies: the derivative of the solution, {backward}, would serve nothing"
+            return f"{objective} learns from energies, so the derivative of the solution, {backward}, would be unused"
         return None
 
     @property
     def neighbours(self) -> Iterator[tuple[str, Combination]]:
-        """What differs from it in one part, with the word that makes the change."""
+        """Combinations that differ in one part, each with the override that makes the change."""
         for kind in KINDS:
             for name, part in parts(kind).items():
                 if name != self.names[kind]:
-                    # Derivatives need no setting, and some of them say what they need once they have theirs.
+                    # Derivatives have defaults for all settings, and the needs of some depend on a setting.
                     changed = part() if kind == "backward" else part
                     word = f"an energy named {name}" if kind == "energy" else f"{kind}={name}"
                     yield word, replace(self, **{kind: changed}, names={**self.names, kind: name})
 
     def check(self) -> None:
-        """Refuse what cannot work.
+        """Refuse a combination that cannot work.
 
         Raises:
             ConfigError: the reason, and the changes with which it would work.
@@ -99,7 +99,7 @@ class Combination:
 
 
 def _name(kind: str, part: Any) -> str:
-    """What a part is registered as."""
+    """The registered name of a part."""
     return next((name for name, known in parts(kind).items() if type(part) is known), type(part).__name__)
 
 

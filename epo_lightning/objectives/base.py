@@ -1,4 +1,4 @@
-"""What an objective is: what a forecaster's network is trained to do (the paper's Table 1, column 3)."""
+"""The interface of objectives: the training losses of a forecaster's network (the paper's Table 1, column 3)."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Objective(ABC):
     """The interface of all objectives: weighted, named terms from a scene with its future and a forecast of it.
 
     Attributes:
-        terms: names of the weights lambda that a configuration gives.
-        through_solution: whether it learns through the derivative of the minimiser's solution, or from energies alone.
-        needs: of what a minimiser may provide, any one is enough; nothing if empty.
-        of_energy: what the energy has to offer.
+        terms: names of the weights lambda in the configuration.
+        through_solution: whether it needs the derivative of the minimiser's solution, or energies alone.
+        needs: properties of a minimiser (:mod:`epo_lightning.solvers.base`) of which it needs any one; none if empty.
+        of_energy: properties of an energy (:mod:`epo_lightning.game.energy`), all of which it needs.
     """
 
     terms: ClassVar[tuple[str, ...]]
@@ -38,9 +38,9 @@ class Objective(ABC):
         """The terms of a batch.
 
         Args:
-            scene: with its future.
-            forecast: of the scene, with ``parameters``, ``solution`` and ``initial_states``.
-            energy: that was minimised.
+            scene: the scene with its future.
+            forecast: the forecast with ``parameters``, ``solution`` and ``initial_states``.
+            energy: the energy that was minimised.
             step: number of optimisation steps so far.
 
         Raises:
@@ -51,15 +51,15 @@ class Objective(ABC):
 def checked_weights(
     weights: Mapping[str, float], names: tuple[str, ...], key: str = "objective.weights"
 ) -> dict[str, float]:
-    """The weights lambda: all of them and no others, each a finite number of 0 or more.
+    """The weights lambda: all of ``names`` and no others, each a finite number of 0 or more, not all of them 0.
 
     Args:
-        weights: as configured.
-        names: of the terms.
-        key: where the configuration has them, for messages.
+        weights: the configured weights.
+        names: names of the terms.
+        key: key of the weights in the configuration, for messages.
 
     Raises:
-        ConfigError: a missing or an unknown name, or a value that is no weight.
+        ConfigError: a missing or unknown name, a value that is not a weight, or only weights of 0.
     """
     if set(weights) != set(names):
         raise ConfigError(f"{key} must name {list(names)}, not {sorted(weights)}")
@@ -67,4 +67,6 @@ def checked_weights(
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not 0 <= value < math.inf:
             raise ConfigError(f"{key}.{name} must be a number, 0 or more, not {value!r}")
+    if not any(weights.values()):
+        raise ConfigError(f"{key} are all 0, so nothing would be learned: give one of {list(names)} a positive weight")
     return dict(weights)

@@ -1,4 +1,4 @@
-"""Conditional density estimation over candidates: what was observed becomes likely among what could have been."""
+"""Conditional density estimation: the likelihood of the observed choices among candidate strategies."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ GOAL = 0.1
 
 @register("objective", "conditional")
 class Conditional(Objective):
-    """-log p(k*) with p(k) = exp(-E(k)) / Z, and k*_i agent i's candidate that is closest to what it did.
+    """-log p(k*) with p(k) = exp(-E(k)) / Z, where k*_i is agent i's candidate closest to its observed future.
 
     - ``joint`` (JFP, Luo et al., CoRL 2022): -log p(k*_1, ..., k*_N) = E(k*) + log Z, the joint assignment of a scene.
     - ``marginal`` (DSDNet, Zeng et al., ECCV 2020): -log p(k*_i), averaged over agents.
 
-    Agents of whom nothing was observed are summed over in the joint density, which is then that of the others, and do not
-    count in the rest; scenes of which nothing was observed cost nothing. k* is chosen among the candidates that the energy
-    allows. Where it allows each k*_i but not all of them together, or where energies are no numbers, the scene costs as much
-    as the smallest probability of its precision, and teaches nothing: an infinite energy has no derivative.
+    Unobserved agents are summed out of the joint density, which is then that of the other agents, and do not count in the
+    other terms; scenes without observations cost nothing. k* is chosen among the candidates with a finite energy. Where
+    every k*_i is allowed but their combination is not, or where energies are NaN, the scene costs as much as the smallest
+    probability of its precision and has no gradient: an infinite energy has no derivative.
 
-    In the joint density, log Z is a sum over more assignments than that of the observed ones, both exact where all can be
-    looked at (:func:`~.assignments.partition`), whichever solver chose the modes: a probability is 1 at most, and the loss
-    0 at least. Where there are too many, ten rounds of messages give both. Bethe's log Z is no bound on the true one, so
-    hard pair energies can make the loss negative there.
+    In the joint density, log Z sums over all assignments and the numerator over those of the observed choices. Both are
+    exact where all assignments can be enumerated (:func:`~epo_lightning.solvers.discrete.assignments.partition`), for any
+    solver: the probability is 1 at most and the loss 0 at least. For larger games, ten rounds of messages give both. Bethe's
+    log Z is no bound on the true one, so hard pair energies can make the loss negative there.
 
     Args:
         weights: lambda of ``density``; of ``marginal``, the cross entropy of every agent's candidates by their own energies
-            alone, exp(-E_i) (JFP's auxiliary loss); and of ``regression``, the distance of the closest candidate, which
-            moves it where candidates are learned, and elsewhere tells how well they cover what happened; and of ``goal``,
-            which teaches goals where they are decoded, and is idle elsewhere (0.1 where it is not named).
+            alone, exp(-E_i) (JFP's auxiliary loss); of ``regression``, the distance of the closest candidate, which trains
+            decoded candidates and elsewhere measures how well the candidates cover the observed futures; and of ``goal``
+            (unused where no goal is decoded; 0.1 where it is not named).
         density: ``joint`` or ``marginal``.
     """
 
@@ -66,9 +66,12 @@ class Conditional(Objective):
         """
         tables = None if forecast.solution is None else forecast.solution.tables
         if tables is None:
-            raise ValueError("learning a density takes forecast.solution.tables: choose a solver over candidates")
+            raise ValueError(
+                "a density over candidates needs forecast.solution.tables, which is None: use solver=enumeration or "
+                "solver=sum_product"
+            )
         future, mask = observed_future(scene)
-        # What is no number must not even be differentiated.
+        # NaN energies are replaced before they enter any derivative.
         known = tables.log_partition.isfinite()
         unary = torch.where(known[:, None, None], tables.unary, 0.0)
         pair = torch.where(known[:, None, None, None], tables.pair, 0.0)
@@ -93,7 +96,7 @@ class Conditional(Objective):
 
 
 def _joint(unary: Tensor, pair: Tensor, present: Tensor, closest: Tensor, observed: Tensor) -> Tensor:
-    """log of the sum of exp(-E) over all assignments in which everyone observed takes its closest candidate."""
+    """Logarithm of the sum of exp(-E) over all assignments in which observed agents take their closest candidates."""
     candidate = torch.arange(unary.shape[2], device=unary.device)
     other = observed[..., None] & (candidate != closest[..., None])
     _, log_sum = assignments.partition(torch.where(other, torch.inf, unary), pair, present)

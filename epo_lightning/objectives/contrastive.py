@@ -1,11 +1,11 @@
-"""Learning from energies of what happened and of what the energy itself would have: EBIOC's analysis (arXiv 1904.05453).
+"""Contrastive learning: energy of the observed strategy against that of a sample, as EBIOC's analysis (arXiv 1904.05453).
 
 The negative log-likelihood of p(u | o) = exp(-E(u; o)) / Z(o) has the gradient
 
     dE(u_obs) / dtheta - < dE(u_s) / dtheta >,   u_s ~ p(u | o),
 
-so what was observed becomes cheaper, and what the energy wrongly prefers dearer. Samples are constants: nothing is learned
-through how they were found.
+which lowers the energy of observed strategies and raises that of strategies that the energy wrongly prefers. Samples are
+constants: no gradient flows through their computation.
 """
 
 from __future__ import annotations
@@ -29,13 +29,12 @@ from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
 
 @register("objective", "contrastive")
 class Contrastive(Objective):
-    """Energy of the demonstration minus that of the forecast, in the mode that came closest to what happened.
+    """Energy of the demonstration minus that of the forecast, in the mode closest to the observed future.
 
-    Every mode is a game of its own with one sample. The one whose forecast is closest to the observed future answers for a
-    scene, and alone is taught; the others would only learn to dislike what they forecast. The controls that were observed
-    are found by tracking (:mod:`~epo_lightning.game.tracking`). Those after an agent's last observed step are not known:
-    they are filled in with the sample's, so that both energies are of a whole game, and a scene of which nothing was
-    observed teaches nothing.
+    Every mode is a game of its own with one sample. Only the mode whose forecast is closest to the observed future is
+    trained; the others would only learn to avoid their own forecasts. The observed controls are found by tracking
+    (:mod:`~epo_lightning.game.tracking`). The controls after an agent's last observed step are unknown and are filled in
+    with the sample's, so that both energies are of a whole game; a scene without observations has no gradient.
 
     Besides the weighted terms, ``tracking`` is logged: the distance [m] between observed positions and those of the
     controls that stand for them.
@@ -43,8 +42,8 @@ class Contrastive(Objective):
     Args:
         weights: lambda of ``contrastive``; of ``magnitude``, the squares of both energies, which keeps them from drifting
             away together; of ``initial``, the distance between initial strategies and samples (cooperative training: the
-            network that proposes where chains start learns where they end); of ``goal`` (idle where no goal is decoded)
-            and of ``probability``, of the mode that answers.
+            network that proposes the start of the chains learns their end); of ``goal`` (unused where no goal is decoded)
+            and of ``probability``, the cross entropy of the closest mode.
     """
 
     terms = ("contrastive", "magnitude", "initial", "goal", "probability")

@@ -1,0 +1,48 @@
+"""The suite of minimisers, for all built-in ones."""
+
+from __future__ import annotations
+
+from suites import SolverSuite
+
+from epo_lightning.registry import parts
+
+
+class TestLevenbergMarquardt(SolverSuite):
+    config = {"name": "levenberg_marquardt", "steps": 2, "step_size": 0.3, "damping": 10.0, "backend": "pytorch"}
+    converged = {"steps": 40, "step_size": 1.0, "damping": 1e-3, "adaptive": True}
+
+
+class TestCompiledLevenbergMarquardt(TestLevenbergMarquardt):
+    config = {**TestLevenbergMarquardt.config, "backend": "auto"}
+
+
+class TestGradientDescent(SolverSuite):
+    config = {"name": "gradient_descent", "steps": 4, "step_size": 0.05}
+    converged = {"steps": 200}
+    remaining = 0.1
+
+
+class TestLBFGS(SolverSuite):
+    config = {"name": "lbfgs"}
+    tolerance = 1e-5
+
+
+class TestNewton(SolverSuite):
+    config = {"name": "newton"}
+    tolerance = 1e-6
+
+
+class TestLangevin(SolverSuite):
+    config = {"name": "langevin", "steps": 4}
+
+
+class TestEnumeration(SolverSuite):
+    config = {"name": "enumeration", "candidates": 4}
+
+
+class TestSumProduct(SolverSuite):
+    config = {"name": "sum_product", "candidates": 4}
+
+
+def test_every_built_in_minimiser_has_its_suite():
+    assert {suite.config["name"] for suite in SolverSuite.__subclasses__()} >= set(parts("solver"))
