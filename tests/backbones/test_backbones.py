@@ -70,9 +70,9 @@ def test_a_larger_unit_and_a_larger_world_look_the_same(name):
     [
         ({"scale": 0.0}, "scale must be positive"),
         ({"dropout": 1.5}, "dropout probability has to be between 0 and 1"),
-        ({"lane_depth": 0}, "one layer or more"),
-        ({"name": "hivt_m", "history_heads": 5}, "not a multiple of twice the 5 heads"),
-        ({"name": "hivt_m", "history_depth": 0}, "one layer or more"),
+        ({"lane_depth": 0}, "lane_depth must be 1 or more"),
+        ({"name": "hivt_m", "history_heads": 5}, r"must be a multiple of twice the number of heads \(5\)"),
+        ({"name": "hivt_m", "history_depth": 0}, "history_depth must be 1 or more"),
     ],
 )
 def test_sizes_that_cannot_work_are_refused(changes, message):
