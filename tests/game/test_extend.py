@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from games import leaves_of, random_game, random_scene
+from suites import FeatureSuite
 
 from epo_lightning.game import features
 from epo_lightning.game.dynamics import Unicycle
@@ -27,7 +28,7 @@ def documented():
     before, pairs = dict(features.OWN_FEATURES), dict(features.PAIR_FEATURES)
     section = PAGE.read_text().split("## An energy feature")[1].split("\n## ")[0]
     blocks = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     for block in blocks:
         exec(block, {})
     yield set(features.OWN_FEATURES) - set(before)
@@ -38,11 +39,11 @@ def documented():
 
 
 def test_documented_features_work_in_the_layer(documented):
-    assert documented == {"latacc", "hurry"}
+    assert documented == {"curvature", "latacc", "hurry"}
     scene = random_scene(3, 2, history=2, dtype=torch.float64)
     scene.history[..., 3] += 29.5
     scene.history[..., 2] = 0.0  # side by side
-    own = ("goal", "acc", "turnr", "latacc", "hurry")
+    own = ("goal", "acc", "turnr", "curvature", "latacc", "hurry")
     parameters = random_game(scene, own=own)
     parameters.pair_weights["comfort"] = parameters.pair_weights["proximity"]
     leaves = leaves_of(parameters)
@@ -68,3 +69,13 @@ def test_documented_features_work_beside_networks(documented):
     assert (solution.energy < solution.initial_energy).all()
     solution.controls.square().sum().backward()
     assert leaves.own_weights["latacc"].grad.abs().max() > 0
+
+
+class TestDocumentedFeature(FeatureSuite):
+    """The page's own test, with its feature registered for as long as it runs."""
+
+    own = "curvature"
+
+    @pytest.fixture(autouse=True)
+    def registered(self, documented):
+        assert self.own in documented
