@@ -21,7 +21,7 @@ project = "epo_lightning"
 author = copyright = "the epo_lightning contributors"
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.apidoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["conf.py", "configuration_reference.py"]
+exclude_patterns = ["conf.py", "configuration_reference.py", "reference/api/modules.rst"]
 html_theme = "furo"
 html_title = project
 html_copy_source = False
@@ -51,7 +51,6 @@ autodoc_inherit_docstrings = False  # those of Lightning and PyTorch refer to pa
 napoleon_use_ivar = True
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
-python_use_unqualified_type_names = True
 
 
 def plain(app: Sphinx, kind: str, name: str, item: object, options: object, lines: list[str]) -> None:

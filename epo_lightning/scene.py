@@ -2,15 +2,15 @@
 
 All shapes are written in one alphabet:
 
-====  =========================  ======  ================================================================
-B     scenes in a batch          P       pairs of agents i < j, P = N (N - 1) / 2
-M     joint modes                G       goal candidates of an agent
-N     agents                     X = 4   state: x, y [m], heading [rad], speed [m/s]
-H     history steps              U = 2   control: acceleration [m/s^2], turn rate [rad/s]
-K     future steps               S       optimisation steps
-R     reference lines, residuals Q       points of a reference line
-L     lane polylines             V       vectors of a lane polyline
-====  =========================  ======  ================================================================
+====  ==========================  ======  ================================================================
+B     scenes in a batch           P       pairs of agents i < j, P = N (N - 1) / 2
+M     joint modes                 G       goal candidates of an agent
+N     agents                      X = 4   state: x, y [m], heading [rad], speed [m/s]
+H     history steps               U = 2   control: acceleration [m/s^2], turn rate [rad/s]
+K     future steps                S       optimisation steps
+R     reference lines, residuals  Q       points of a reference line
+L     lane polylines              V       vectors of a lane polyline
+====  ==========================  ======  ================================================================
 """
 
 from __future__ import annotations

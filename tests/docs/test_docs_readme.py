@@ -1,0 +1,58 @@
+"""The commands of the README in order, in an empty folder, at the smallest size; then its Python on what they made."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from docs.pages import ROOT, blocks, lines
+from experiment.conftest import epo  # noqa: F401 - a fixture
+
+README = ROOT / "README.md"
+DATA = ["data.games=10", "data.placements=1"]
+CHEAPER = {
+    "epo generate": [*DATA, "workers=1", "progress=false"],
+    "epo train experiment=rpi/v_lstm_epo budget=long": [
+        *DATA,
+        "budget=smoke",
+        "callbacks.progress=none",
+        "run_dir=runs/rpi/v_lstm_epo/long-s0",
+    ],
+    "epo sweep rpi_main budget=long": [*DATA, "budget=smoke", "callbacks.progress=none", "seed=0", "runs=swept"],
+    "epo sweep status rpi_main": ["runs=swept"],
+    "epo report rpi_main": ["runs=swept"],
+}
+"""Words that make a command cheap; later words win. The sweep has its own folder, as the first run has other settings."""
+NOT_RUN = {
+    "make run": "installs, and takes minutes",
+    "make test": "these tests",
+    ". .venv/bin/activate": "tests run in an environment",
+    "epo generate data=highway_sim": "minutes of simulation; tests/data/simulate",
+    "epo train experiment=highway/vibes_epo data=highway_sim budget=short": "needs that set; make smoke trains the row",
+}
+
+
+def test_the_readme_from_top_to_bottom(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("EPO_CACHE", str(tmp_path / "cache"))
+    commands = [line for block in blocks(README) if block.language != "python" for line in lines(block.text)]
+    assert set(CHEAPER) | set(NOT_RUN) <= set(commands)
+    for command in commands:
+        if command not in NOT_RUN:
+            words = [word for word in shlex.split(command)[1:] if word != "budget=long"]
+            assert epo(*words, *CHEAPER.get(command, [])) == 0, command
+    assert (tmp_path / "runs/rpi/v_lstm_epo/long-s0/metrics.json").is_file()
+    assert (tmp_path / "predictions/figures").is_dir()
+    (page,) = tmp_path.glob("swept/sweeps/*/report/index.html")
+    assert "V-LSTM + EPO" in page.read_text()
+
+    names: dict = {}
+    exec([block.text for block in blocks(README) if block.language == "python"][1], names)
+    assert names["forecast"].states.shape == (1, 2, 2, 40, 4)
+    exec(next(block.text for block in blocks(ROOT / "docs" / "reports.md") if block.language == "python"), {})
+    assert (tmp_path / "report" / "index.html").is_file()
