@@ -3,6 +3,7 @@
 # make test        install everything and run the tests      make test-slow   the tests that take minutes
 # make lint        check style and types
 # make smoke       train every experiment for a few steps on drawn scenes (a minute)
+# make docs        build the documentation as a site, with references of API and configuration, in build/docs
 # make checkpoint  train the checkpoint that ships with the package anew (half an hour on 2 cores)
 # make wheel       build a package for this platform, with the compiled layer, in dist/
 # make clean       remove what these made, except the data in cache/ and the runs in runs/
@@ -20,7 +21,7 @@ EPO := $(BIN)/epo
 INSTALLED := $(VENV)/.installed
 TESTABLE := $(VENV)/.testable
 
-.PHONY: run install test test-slow smoke lint checkpoint wheel clean
+.PHONY: run install test test-slow smoke lint docs checkpoint wheel clean
 
 install: $(INSTALLED)
 
@@ -69,6 +70,11 @@ lint: $(TESTABLE)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# -W: a reference that leads nowhere ends it.
+docs: $(INSTALLED)
+	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m sphinx -q -W --keep-going -j auto -b html docs build/docs
 
 checkpoint: $(INSTALLED)
 	$(BIN)/python -m epo_lightning.pretrained.make
