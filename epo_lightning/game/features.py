@@ -4,7 +4,8 @@ An own feature is a *signal* of the trajectory (a control, its rate of change, t
 a line or a goal), taken as it is, or as the amount by which it leaves its bounds (names that end in ``b``: the paper's soft
 constraints max(0, g(z))), or through a custom elementwise function. A pair feature is an elementwise function of the
 distance between two agents, or any function of their states and sizes. The *source* of a signal is declared; it fixes the
-structure of the signal's Jacobian, which is all that a solver needs to know (:mod:`.feature_derivatives`).
+structure of the signal's Jacobian, which is all that a solver needs to know
+(:mod:`~epo_lightning.game.feature_derivatives`).
 
 A custom feature needs no declaration: any differentiable function of the trajectory works, at lower speed::
 
@@ -123,7 +124,7 @@ class PairFeature:
 
     @cached_property
     def asymmetry(self) -> tuple[float, float] | None:
-        """Costs of two agents in one order and in the other, if they differ (:mod:`.symmetry`); None if they do not."""
+        """Costs of two agents in both orders if they differ (:mod:`~epo_lightning.game.symmetry`); None if they do not."""
         if self.declared:
             return None
         return symmetry.difference(self.function, sizes=self.needs == "size")

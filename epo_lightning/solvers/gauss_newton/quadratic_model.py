@@ -1,12 +1,13 @@
 """The quadratic model of an energy around an iterate: value, gradient, and the structured Gauss-Newton or exact matrix.
 
-In the unknowns z of :mod:`.iterate`, positions contribute to the matrix at (l, l') with l >= l'
+In the unknowns z of :mod:`~epo_lightning.solvers.gauss_newton.iterate`, positions contribute to the matrix at (l, l') with l >= l'
 
     M_l^T [dt^2 sum_{k>l} Q_k] M_l',   Q_k the second derivatives by p_k,
 
 so one thin matrix product gives the whole lower triangle. Everything else is a band: controls are first differences of z,
 their rates second ones, speeds stand on the diagonal, and steering angles couple a turn rate with the speed before it. The
-model holds these second derivatives ("stiffness" below); :mod:`.blocks` assembles and factorises them.
+model holds these second derivatives ("stiffness" below); :mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and
+factorises them.
 
 Pairs are a list of E edges between agents, numbered s N + i through all samples.
 """
