@@ -34,7 +34,7 @@ class Candidates(Minimiser):
 
     Attributes:
         candidates: number C of strategies of every agent.
-        apart: distance [m] between modes where possible (:func:`~epo_lightning.solvers.discrete.assignments.best`); 0 to take
+        apart: distance [m] between modes where possible (:func:`~epo_lightning.solvers.discrete.assignments.best`); 0 for
             the best assignments.
         modes: number M of joint modes, set by the forecaster.
     """

@@ -1,8 +1,8 @@
 """The normal equations of a feature energy as dense matrices: J^T r and J^T J, differentiable by the game's parameters.
 
 The layer's own factorisation (:mod:`~epo_lightning.solvers.gauss_newton.blocks`) never forms J^T J and has no determinant to
-differentiate; objectives that need both (:mod:`epo_lightning.objectives.laplace`) take this. Residuals of an agent depend on its own controls alone, and
-those of a pair on the controls of its two agents, so the matrix is assembled from small blocks.
+differentiate; objectives that need both (:mod:`epo_lightning.objectives.laplace`) take this. Residuals of an agent depend on
+its own controls alone, and those of a pair on the controls of its two agents, so the matrix is assembled from small blocks.
 
 Rows are ordered by channel: agent by agent, all accelerations before all turn rates.
 """

@@ -1,6 +1,7 @@
 """The quadratic model of an energy around an iterate: value, gradient, and the structured Gauss-Newton or exact matrix.
 
-In the unknowns z of :mod:`~epo_lightning.solvers.gauss_newton.iterate`, positions contribute to the matrix at (l, l') with l >= l'
+In the unknowns z of :mod:`~epo_lightning.solvers.gauss_newton.iterate`, positions contribute to the matrix at (l, l') with
+l >= l'
 
     M_l^T [dt^2 sum_{k>l} Q_k] M_l',   Q_k the second derivatives by p_k,
 
