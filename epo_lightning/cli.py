@@ -105,9 +105,20 @@ def parse(words: Sequence[str]) -> Arguments:
         else:
             # Hydra would take a bare nan for the number.
             found.overrides.append("debug='nan'" if word == "debug=nan" else word)
+    _refuse_repeated(found.overrides)
     if found.stop_on_failure and found.verb != "sweep":
         raise ConfigError("--stop-on-failure belongs to epo sweep")
     return found
+
+
+def _refuse_repeated(overrides: Sequence[str]) -> None:
+    """Refuse a key that is set twice: Hydra would take the last value without a word."""
+    seen: dict[str, str] = {}
+    for word in overrides:
+        key, equals, _ = word.lstrip("+").partition("=")
+        if equals and key in seen:
+            raise ConfigError(f"{key} is set twice, by {seen[key]} and by {word}: leave one of them out")
+        seen[key] = word
 
 
 def main(words: Sequence[str] | None = None) -> None:

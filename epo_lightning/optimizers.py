@@ -34,8 +34,8 @@ class Adam:
     clip: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.lr > 0:
-            raise ConfigError(f"optimizer.lr must be positive, not {self.lr}")
+        if not 0 < self.lr < float("inf"):
+            raise ConfigError(f"optimizer.lr must be positive and finite, not {self.lr}")
         if self.clip is not None and not self.clip > 0:
             raise ConfigError(f"optimizer.clip must be positive or null, not {self.clip}")
         if self.schedule not in _SCHEDULES:

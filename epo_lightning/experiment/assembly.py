@@ -27,7 +27,8 @@ from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings, check_part
 from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.forecasters import SUPPLIED, build_forecaster
-from epo_lightning.registry import ConfigError
+from epo_lightning.metrics.forecast import COLUMNS
+from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.task import Task
 
@@ -64,7 +65,22 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
     data = build_data(settings.data)
     data.order_seed = settings.seed
     check_share(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)
-    return data, build_model(settings, data)
+    forecaster = build_model(settings, data)
+    check_monitor(settings.callbacks.monitor, data.task)
+    return data, forecaster
+
+
+def check_monitor(monitor: str, task: Task) -> None:
+    """Refuse a validation score that no forecaster has; others may still turn out not to be logged, after an epoch.
+
+    Raises:
+        ConfigError: an unknown name, with the nearest known one.
+    """
+    known = [f"val/{name}" for name in COLUMNS] + [
+        f"val/{subset}/{name}" for subset in task.subsets for name in COLUMNS
+    ]
+    if monitor not in known and not monitor.startswith("train/"):
+        raise ConfigError(f"unknown callbacks.monitor {monitor!r}: {nearest(monitor, known)}")
 
 
 def build_model(settings: Settings, data: Any) -> LightningModule:

@@ -1,4 +1,4 @@
-"""What watches a training run: its best and last epoch, when to stop, random states and progress."""
+"""Callbacks of a training run: checkpoints of its best and last epoch, early stopping, random states and progress."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from lightning.pytorch import callbacks as of_lightning
 from lightning.pytorch.callbacks import TQDMProgressBar
 
 from epo_lightning.experiment.config.settings import CallbackSettings
+from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder, write_json
 
 
@@ -67,7 +68,11 @@ class RandomStates(Callback):
 
 
 class ModelCheckpoint(of_lightning.ModelCheckpoint):
-    """Knows its best epoch also in a run folder that was moved, where Lightning's own would begin to look for it again."""
+    """Lightning's own, which also knows its best epoch in a run folder that was moved."""
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        _require_logged(self.monitor, trainer)
+        super().on_validation_end(trainer, pl_module)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         def here(path: str) -> str:
@@ -82,10 +87,26 @@ class ModelCheckpoint(of_lightning.ModelCheckpoint):
 
 
 class EarlyStopping(of_lightning.EarlyStopping):
-    """Stops for good: a run that was killed right after it had stopped does not go on when it is continued."""
+    """Lightning's own, but a run that was killed right after it had stopped makes no further step when it is continued."""
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        _require_logged(self.monitor, trainer)
+        super().on_validation_end(trainer, pl_module)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         trainer.should_stop = trainer.should_stop or self.wait_count >= self.patience
+
+
+def _require_logged(monitor: str | None, trainer: Trainer) -> None:
+    """Refuse a monitored score that this forecaster does not log.
+
+    Raises:
+        ConfigError: the message names the scores that it does log.
+    """
+    if monitor is not None and monitor not in trainer.callback_metrics and not trainer.sanity_checking:
+        raise ConfigError(
+            f"callbacks.monitor={monitor} is no score of this forecaster: {nearest(monitor, trainer.callback_metrics)}"
+        )
 
 
 class EpochLines(Callback):
@@ -120,7 +141,7 @@ class EpochLines(Callback):
 
 
 class Progress(Callback):
-    """Tell whoever looks at the run folder how far the training is: ``progress.json``, every few seconds."""
+    """``progress.json`` in the run folder, which says every few seconds how far the training is."""
 
     def __init__(self, run: RunFolder, every: float = 2.0) -> None:
         self._run, self._every = run, every

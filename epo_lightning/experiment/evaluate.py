@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +14,24 @@ from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings, read
 from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, discover, write_json
+from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
+
+TOLERANCE = 1e-5
+"""Relative difference below which two scores are the same: machines and batch sizes change the last digits."""
 
 
-def evaluate(config: dict[str, Any]) -> list[tuple[RunFolder, dict[str, float]]]:
-    """Score one run, or all runs below a folder, and write each one's metrics file.
+def evaluate(config: dict[str, Any]) -> list[tuple[RunFolder, Path, dict[str, float]]]:
+    """Score one run, or all runs below a folder, and write each one's scores to a file.
+
+    Returns:
+        run, file and scores of every run.
 
     Raises:
         ConfigError: no run, a run that is not finished, changed data, or a checkpoint that does not fit.
     """
     assembly.quiet()
     settings = read(EvaluateSettings, config)
-    return [(run, score(run, settings)) for run in _chosen(settings)]
+    return [(run, *score(run, settings)) for run in _chosen(settings)]
 
 
 def _chosen(settings: EvaluateSettings) -> list[RunFolder]:
@@ -45,8 +53,8 @@ def score(
     settings: EvaluateSettings,
     machine: TrainerSettings | None = None,
     devices: int | list[int] = 1,
-) -> dict[str, float]:
-    """Score one run and write its metrics file.
+) -> tuple[Path, dict[str, float]]:
+    """Score one run and write its scores to a file, see :func:`keep`.
 
     Args:
         run: a finished run.
@@ -84,15 +92,52 @@ def score(
     with assembly.signals():
         (scores,) = trainer.test(forecaster, dataloaders=loader, verbose=False)
     metrics = {name.removeprefix("test/"): float(value) for name, value in scores.items()}
-    write_json(
-        run.metrics_file(settings.split),
-        {
-            "split": settings.split,
-            "data_digest": data.digest,
-            "checkpoint": settings.checkpoint if settings.checkpoint in ("best", "last") else checkpoint.name,
-            "metrics": metrics,
-        },
-    )
-    if settings.split == "test":
+    scored = {
+        "split": settings.split,
+        "data_digest": data.digest,
+        "checkpoint": settings.checkpoint if settings.checkpoint in ("best", "last") else checkpoint.name,
+        "metrics": metrics,
+    }
+    file = keep(run, scored, checkpoint)
+    if file == run.metrics_file():
         logs.publish(run)
-    return metrics
+    return file, metrics
+
+
+def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
+    """Write scores without ever replacing others, and return the file that holds them.
+
+    The scores of the best checkpoint are ``metrics.json`` (``metrics-val.json`` on the validation split). If that file holds
+    the same scores already it stays as it is. Scores of another checkpoint, and scores that differ from those in the file,
+    go to ``scores-<split>-<checkpoint>-<digest>.json``, which records the digest of the checkpoint as well as of the data.
+    """
+    file = run.metrics_file(scored["split"])
+    if scored["checkpoint"] == "best":
+        if not _readable(file):
+            write_json(file, scored)
+        if _same(read_json(file), scored):
+            return file
+    digest = hashlib.sha256(checkpoint.read_bytes()).hexdigest()[:16]
+    other = run.path / f"scores-{scored['split']}-{Path(scored['checkpoint']).stem}-{digest[:8]}.json"
+    if not other.is_file():
+        write_json(other, {**scored, "checkpoint_digest": digest})
+    return other
+
+
+def _readable(file: Path) -> bool:
+    """Whether there are scores in a file; one that is damaged is written again."""
+    try:
+        return isinstance(read_json(file).get("metrics"), dict)
+    except ConfigError:
+        return False
+
+
+def _same(stored: dict[str, Any], scored: dict[str, Any]) -> bool:
+    """Whether two sets of scores are of the same data and checkpoint, and equal up to the last digits."""
+    if any(stored.get(key) != scored[key] for key in ("split", "data_digest", "checkpoint")):
+        return False
+    pairs = [(stored["metrics"].get(name, math.inf), value) for name, value in scored["metrics"].items()]
+    return len(pairs) == len(stored["metrics"]) and all(
+        math.isclose(one, other, rel_tol=TOLERANCE, abs_tol=1e-9) or (math.isnan(one) and math.isnan(other))
+        for one, other in pairs
+    )

@@ -28,12 +28,12 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
 
 NOT_IN_COMMAND = ("sweep=", "existing=", "runs=", "run_dir=", "resume=")
-"""Words of a command line that say nothing of what was trained."""
+"""Overrides that do not change what is trained, and are left out of the recorded command."""
 PACKAGES = ("epo_lightning", "torch", "lightning", "hydra-core", "omegaconf", "torchmetrics", "numpy", "numba")
 
 
 class Diverged(ConfigError):
-    """A training that came to nothing."""
+    """Error for a training without a single finite validation score."""
 
 
 def folder_for(settings: Settings) -> RunFolder:

@@ -88,9 +88,13 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     settings = check("evaluate", config)
     from epo_lightning.experiment.evaluate import evaluate as score
 
-    for run, metrics in score(config):
+    for run, file, metrics in score(config):
         shown = ", ".join(f"{name} {metrics[name]:.4f}" for name in HEADLINE if name in metrics)
         print(f"{run.path} ({settings.split}): {shown}")
+        if file != run.metrics_file(settings.split):
+            print(
+                f"  in {file}: {run.metrics_file(settings.split).name} is for the best checkpoint, and is never replaced"
+            )
     print(f"next: epo report runs={settings.runs or settings.run} out=report")
 
 

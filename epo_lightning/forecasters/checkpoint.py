@@ -33,7 +33,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     except Exception as error:  # zipfile, zlib, pickle and torch raise half a dozen kinds for damaged files
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(f"{path} is not a checkpoint that epo_lightning wrote, or is damaged ({reason})") from error
-    if not isinstance(content, dict) or not {"state_dict", "configuration"} <= set(content):
+    parts = [content.get(key) for key in ("state_dict", "configuration")] if isinstance(content, dict) else [None]
+    if not all(isinstance(part, dict) for part in parts):
         raise ConfigError(f"{path} is not a checkpoint that epo_lightning wrote: it lacks state_dict or configuration")
     for name, value in content["state_dict"].items():
         if value.is_floating_point() and not value.isfinite().all():

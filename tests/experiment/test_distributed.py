@@ -157,7 +157,7 @@ def test_the_jobs_of_a_sweep_train_in_workers(epo: Epo) -> None:
     sweep(epo, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
 
 
-LONG = ("train", "experiment=rpi/v_lstm_sc", *QUIET, *RPI, DOUBLE, "optimizer.lr=5e-5", "trainer.max_epochs=40")
+LONG = ("train", "experiment=rpi/v_lstm_sc", *QUIET, *RPI, DOUBLE, "optimizer.lr=5e-5")
 
 
 def test_a_run_on_one_device_goes_on_on_two(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,7 +184,7 @@ def test_followers_end_when_the_leader_raises(epo: Epo, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(RandomStates, "on_train_epoch_start", stop)
     with pytest.raises(ZeroDivisionError, match="a mistake"):
-        epo(*LONG, "run_dir=run", TWO)
+        epo(*LONG, "run_dir=run", TWO, "trainer.max_epochs=40")
     assert len(seen) == 1
     assert not alive(seen[0])
     assert RunFolder(Path("run")).state == "failed"
@@ -200,7 +200,7 @@ def test_the_leader_fails_when_a_follower_is_killed(epo: Epo) -> None:
     assassin = threading.Thread(target=kill)
     assassin.start()
     with pytest.raises(RuntimeError, match="process 1 of the run's 2 was killed by signal 9"):
-        epo(*LONG, "run_dir=run", TWO)
+        epo(*LONG, "run_dir=run", TWO, "trainer.max_epochs=40")
     assassin.join()
     assert "killed by signal 9" in RunFolder(Path("run")).record["error"]
 

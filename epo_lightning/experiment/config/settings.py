@@ -7,6 +7,7 @@ are dataclasses here. Nothing is built from ``_target_`` or any other path to co
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,9 @@ from epo_lightning.registry import ConfigError, check, lookup, nearest
 Measured = Literal["test", "val", "time"]
 """What may be measured of a run: its scores on a split, or the time of a forecast."""
 PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective", "optimizer")
+MOST_PROCESSES = 1024
+"""Most threads, devices or workers that a configuration may ask for: beyond that a number is a slip of the hand, which the
+operating system answers with a crash."""
 PRECISIONS = ("32-true", "64-true")
 """Lightning's names of those that solvers take."""
 
@@ -51,9 +55,14 @@ class TrainerSettings:
                 f"trainer.precision must be one of {', '.join(PRECISIONS)}, not {self.precision!r}: games are solved by "
                 "factorisations, which have too few digits in 16 bits"
             )
-        for name in ("threads", "devices", "share", "validate_every", "log_every"):
+        if self.max_steps < -1:
+            raise ConfigError(f"trainer.max_steps must be 0 or more, or -1 for no limit, not {self.max_steps}")
+        for name in ("share", "validate_every", "log_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"trainer.{name} must be 1 or more, not {getattr(self, name)}")
+        for name in ("threads", "devices"):
+            if not 1 <= getattr(self, name) <= MOST_PROCESSES:
+                raise ConfigError(f"trainer.{name} must be between 1 and {MOST_PROCESSES}, not {getattr(self, name)}")
         if self.validate_steps is not None and self.validate_steps < 1:
             raise ConfigError(f"trainer.validate_steps must be 1 or more, or null, not {self.validate_steps}")
         if self.overfit_batches < 0 or (self.overfit_batches and self.devices > 1):
@@ -80,6 +89,10 @@ class CallbackSettings:
     def __post_init__(self) -> None:
         if self.patience is not None and self.patience < 1:
             raise ConfigError(f"callbacks.patience must be 1 or more, or null for never, not {self.patience}")
+        if not 0 <= self.min_delta < math.inf:
+            raise ConfigError(f"callbacks.min_delta must be finite and 0 or more, not {self.min_delta}")
+        if self.refresh < 1:
+            raise ConfigError(f"callbacks.refresh must be 1 or more, not {self.refresh}")
 
 
 @dataclass(frozen=True)
@@ -101,9 +114,9 @@ class DashboardSettings:
     patience: float = 10.0
 
     def __post_init__(self) -> None:
-        if self.pictures < 0 or self.patience < 0:
+        if self.pictures < 0 or not 0 <= self.patience < math.inf:
             raise ConfigError(
-                "pictures and patience of a logger must be 0 or more, "
+                "pictures and patience of a logger must be 0 or more, and finite, "
                 f"not pictures={self.pictures}, patience={self.patience:g}"
             )
 
@@ -207,8 +220,10 @@ class GenerateSettings:
     progress: bool = True
 
     def __post_init__(self) -> None:
-        if self.workers is not None and self.workers < 1:
-            raise ConfigError(f"workers must be 1 or more, or null for one per core, not {self.workers}")
+        if self.workers is not None and not 1 <= self.workers <= MOST_PROCESSES:
+            raise ConfigError(
+                f"workers must be between 1 and {MOST_PROCESSES}, or null for one per core, not {self.workers}"
+            )
 
 
 @dataclass(frozen=True)
@@ -305,7 +320,7 @@ def fits(value: Any, hint: Any) -> bool:
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
     if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
+        return isinstance(value, int | float) and not isinstance(value, bool) and value == value  # not nan
     if hint is str:
         return isinstance(value, str)
     kind = origin or hint
