@@ -5,6 +5,7 @@
 # make smoke       train every experiment for a few steps on drawn scenes (a minute)
 # make docs        build the documentation as a site, with references of API and configuration, in build/docs
 # make checkpoint  train the checkpoint that ships with the package anew (half an hour on 2 cores)
+# make asan        test the kernel with the sanitizers of addresses and undefined behaviour (GCC, Linux)
 # make wheel       build a package for this platform, with the compiled layer, in dist/
 # make clean       remove what these made, except the data in cache/ and the runs in runs/
 #
@@ -21,7 +22,7 @@ EPO := $(BIN)/epo
 INSTALLED := $(VENV)/.installed
 TESTABLE := $(VENV)/.testable
 
-.PHONY: run install test test-slow smoke lint docs checkpoint wheel clean
+.PHONY: run install test test-slow smoke asan lint docs checkpoint wheel clean
 
 install: $(INSTALLED)
 
@@ -65,6 +66,16 @@ test-slow: $(TESTABLE)
 
 smoke: $(TESTABLE)
 	$(BIN)/python -m pytest tests/experiment/test_smoke.py
+
+# The kernel under AddressSanitizer and UndefinedBehaviorSanitizer, in a library of its own. One test limits the address space,
+# of which the sanitizers reserve terabytes.
+KERNEL_FOLDER := epo_lightning/solvers/gauss_newton/kernel
+asan: $(TESTABLE)
+	$(BIN)/python -m epo_lightning.solvers.gauss_newton.kernel.build --sanitize
+	EPO_KERNEL=$(CURDIR)/$(KERNEL_FOLDER)/epo_kernel.sanitized.so.1 \
+	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so)" \
+	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+	$(BIN)/python -m pytest -n 0 tests/solvers/gauss_newton -k "not too_little_memory"
 
 lint: $(TESTABLE)
 	$(BIN)/ruff check .

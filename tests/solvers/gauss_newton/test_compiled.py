@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import os
 import platform
 import re
@@ -15,13 +16,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from backends import BackendSuite, gradients
-from games import ALL, BOUNDS, leaves_of, random_game, random_scene
+from backends import BackendSuite, gradients, stacked
+from games import ALL, BOUNDS, leaves_of, nearest_points_held, random_game, random_scene
 
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Status
-from epo_lightning.solvers.gauss_newton import compiled
+from epo_lightning.solvers.gauss_newton import compiled, structured
 from epo_lightning.solvers.gauss_newton.kernel import build, interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -189,6 +190,35 @@ def test_a_scene_that_changed_before_the_backward_pass_is_noticed():
         getattr(scene, name)[0] = getattr(scene, name)[1].clone()
         with pytest.raises(RuntimeError, match="modified by an inplace operation"):
             solution.controls.sum().backward()
+
+
+def test_a_step_is_as_exact_as_its_matrix_allows():
+    """Beside a QR factorisation of (J, sqrt(lambda) I), in units of eps cond(H) |d|; PyTorch solves a stiffer system."""
+    own = ("goal", "lane", "steer", "vel", "acc", "turnacc", "turnrb", "turnaccb")
+    scene, damping = random_scene(8, 2, history=2, size=0.01, dtype=torch.float64), 1e-3
+    parameters = random_game(scene, horizon=5, own=own, spread=0.1)
+    energy, raised = FeatureEnergy(own, bounds=BOUNDS), torch.full((8, 2), damping, dtype=torch.float64)
+    for _ in range(3):
+        start = parameters.initial_controls
+        with nearest_points_held():
+            jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(start)  # noqa: B023
+        jacobian = jacobian.permute(1, 2, 0, 3, 4, 5).flatten(3)
+        ridge = damping**0.5 * torch.eye(jacobian.shape[-1], dtype=torch.float64).expand(8, 2, -1, -1)
+        matrix = torch.cat([jacobian, ridge], -2)
+        residual = stacked(energy, scene, parameters, start)
+        right = torch.nn.functional.pad(residual, (0, ridge.shape[-1]))[..., None]
+        q, triangle = torch.linalg.qr(matrix)
+        step = -torch.linalg.solve_triangular(triangle, q.mT @ right, upper=True).view_as(start)
+        singular = torch.linalg.svdvals(matrix)
+        unit = (
+            torch.finfo(torch.float64).eps
+            * (singular[..., 0] / singular[..., -1]).square()
+            * step.abs().amax((2, 3, 4))
+        )
+        for solve, most in ((compiled.solve, 5.0), (structured.solve, 1000.0)):
+            found = solve(energy, scene, parameters, 1, 1.0, raised).controls
+            assert ((found - start - step).abs().amax((2, 3, 4)) / unit).max() < most
+        parameters = dataclasses.replace(parameters, initial_controls=start + step)
 
 
 _FORK = """
