@@ -121,6 +121,8 @@ def make_pool(
     with cache.locked(folder):
         with cache.writing(folder):
             folder.mkdir(exist_ok=True)
+            for rest in folder.glob(".game-*"):  # of a process that was killed while it wrote
+                rest.unlink()
         _solve_missing(paths, config, workers, progress)
     games = [_read_game(path, name) for path in paths]
     broken = [path for path, game in zip(paths, games, strict=True) if game is None]
