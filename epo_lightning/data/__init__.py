@@ -1,1 +1,1 @@
-"""Where scenes come from."""
+"""Data sets: sources of scenes, their cache and their data modules."""

@@ -177,7 +177,7 @@ def test_the_shares_of_ranks_are_the_batches_of_one_process(monkeypatch, shuffle
         assert len(sampler) == len(whole)
         shares.append([batch.tolist() for batch in sampler])
         assert all(len(batch) == 8 // world for batch in shares[-1][:6])
-        assert all(shares[-1]), "nobody is given an empty batch"
+        assert all(shares[-1]), "a rank is given an empty batch"
     for number, batch in enumerate(whole):
         parts = [index for share in shares if number < len(share) for index in share[number]]
         assert sorted(batch) == sorted(parts)

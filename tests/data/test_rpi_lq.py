@@ -68,7 +68,7 @@ def test_one_player_feedback_game_is_the_minimum():
 
 
 # Two agents that face each other on a line, with a proximity cost that acts at any distance and no active bounds: along
-# the line dynamics are linear and costs quadratic, and by symmetry nobody has a reason to turn. State (x1, v1, x2, v2).
+# the line dynamics are linear and costs quadratic, and by symmetry no agent turns. State (x1, v1, x2, v2).
 LINE = dataclasses.replace(GameConstants(), radius=50.0, bound=0.0)
 STEPS, WEIGHT = 30, 2.0
 START = np.array([-3.0, 0.0, 0.0, 0.3, 3.0, 0.0, 0.0, -0.2])

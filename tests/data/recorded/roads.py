@@ -1,4 +1,4 @@
-"""Roads and traffic to reason about: parallel lanes, straight or on an arc; vehicles that keep or change lane."""
+"""Simple roads and traffic: parallel lanes, straight or on an arc; vehicles that keep or change lane."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def traffic(place, vehicles, seconds: float = 10.0, rate: float = 25.0) -> Track
 
 
 FOUR = ((7, 60.0, 0, 24.0, 2.0), (3, 80.0, 1, 25.0, None), (9, 40.0, 2, 26.0, None), (4, 100.0, 0, 24.0, None))
-"""Four neighbours of whom the first changes lane."""
+"""Four neighbours, the first of which changes lane."""
 
 
 def recording(place=None, vehicles=FOUR, lanes: int = 3, name: str = "road", **about) -> Recording:

@@ -1,4 +1,4 @@
-"""Where agents are on lanes, who changes, who follows whom: against loops that anybody can check."""
+"""Lanes of agents, lane changes and leaders, compared with plain loops."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def scenes_of(of, config=WindowConfig(), frame="fixed"):  # noqa: B008 - frozen
 
 
 def crowd(seed: int, count: int = 9):
-    """Vehicles all over the road, some of whom change lane."""
+    """Vehicles all over the road, some of which change lane."""
     random = np.random.default_rng(seed)
     return [
         (

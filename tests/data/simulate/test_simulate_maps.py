@@ -109,7 +109,7 @@ def test_neighbours_and_successors_are_those_of_the_lanelet2_library(
 
     for index, ident in enumerate(lanes.ids.tolist()):
         if lanes.kind[index] == SHOULDER:
-            continue  # its routing graph is for vehicles, who do not drive there
+            continue  # its routing graph is for vehicles, which do not drive there
         lane = loaded.laneletLayer[ident]
         assert ours(lanes.left_of[index]) == number(graph.left(lane))
         assert ours(lanes.right_of[index]) == number(graph.right(lane))

@@ -1,4 +1,4 @@
-"""Pedestrians of UCY: the columns, the raster of time, where those who stand look, and bad files."""
+"""UCY pedestrians: the columns, the time step, headings of standing pedestrians, and bad files."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_columns(tmp_path):
     assert tracks.velocity[1].tolist() == [0.0, -1.0]
     assert tracks.size.tolist() == [[0.5, 0.5]] * 3
     assert [KINDS[kind] for kind in tracks.kind] == ["pedestrian"] * 3
-    # The one who stops still faces where he walked; where the one who starts will go nobody knows, nor of the third.
+    # A pedestrian that stops keeps its heading; one that starts has none before, nor has one that never walks.
     walked = np.arctan2(0.5, 1.0)
     np.testing.assert_allclose(tracks.heading, [0.0, -np.pi / 2, 0.0, walked, walked, walked])
 
