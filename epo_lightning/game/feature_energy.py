@@ -220,6 +220,7 @@ class FeatureEnergy(Energy):
         for name, pair in self.pair_features.items():
             if pair.declared:
                 value, slope, _ = pair_derivatives(pair, distance, self.reach(scene)[:, None, :, None])
+                assert slope is not None
                 change = slope * closing
             else:
                 sizes = [self.size(scene)[:, None, members, None] for members in (first, second) if pair.needs]

@@ -210,6 +210,7 @@ def _of_pairs(
         weight = energy.pair_weight(scene, parameters, name)[..., None]
         if pair.declared:
             value, slope, _ = pair_derivatives(pair, distance, energy.reach(scene)[:, None, :, None])
+            assert slope is not None
             force = weight * torch.where(exists, slope, 0.0)
             apart = energy.at_pair_steps(moved[..., :2][:, :, :, ends])
             change = torch.cat((force, -force), 2) * (torch.cat((normal, normal), 2) * apart).sum(-1)
