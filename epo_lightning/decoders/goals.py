@@ -40,13 +40,13 @@ class Goals:
         return None if self.logits is None else self.logits.softmax(-1).where(self.logits > NO_CANDIDATE, 0.0)
 
     @property
-    def log_probability(self) -> Float[Tensor, "B M"]:
-        """Log-probability of every mode's joint choice of goals, zero where goals are not chosen; without a gradient.
+    def log_probability(self) -> Float[Tensor, "B _"]:
+        """Log-probability [B, M] of every mode's joint choice of goals, without a gradient; [B, 1] zeros for given goals.
 
         Goals are trained by the agents' final positions, not by the mode that came closest.
         """
         if self.logits is None or self.chosen is None:
-            return torch.zeros((), device=self.exist.device)
+            return torch.zeros(len(self.exist), 1, device=self.exist.device)
         choices = self.logits.detach().log_softmax(-1).gather(-1, self.chosen.transpose(1, 2))
         return torch.where(self.exist[..., None], choices, 0.0).sum(1)
 
