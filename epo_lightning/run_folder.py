@@ -29,7 +29,7 @@ import secrets
 import socket
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -52,21 +52,23 @@ HEADER = "# The resolved configuration of this run.\n"
 def whole_file(path: Path, suffix: str = "") -> Iterator[Path]:
     """A new, empty file beside ``path``, which replaces ``path`` at the end and is deleted after an exception.
 
-    It has the permissions that the umask leaves.
+    It has the permissions that the umask leaves. Every OSError names ``path``.
 
     Args:
         path: of the final file; its folder is made.
         suffix: of the temporary name, for programs that choose a format by it.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}-{secrets.token_hex(4)}{suffix}")
-    try:
-        temporary.touch(0o666, exist_ok=False)
-        yield temporary
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with errors_naming(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            temporary.touch(0o666, exist_ok=False)
+            yield temporary
+            temporary.replace(path)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager
@@ -84,7 +86,7 @@ def write_bytes(path: Path, content: bytes | memoryview) -> None:
     Raises:
         OSError: the folder is read-only or the disk is full; it names ``path``.
     """
-    with errors_naming(path), whole_file(path) as temporary, temporary.open("wb") as file:
+    with whole_file(path) as temporary, temporary.open("wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())

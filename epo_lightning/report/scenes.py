@@ -6,6 +6,7 @@ agents have their size.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +52,7 @@ PALE = 0.3
 """Strength of the colour with which a forecast begins."""
 ANIMATION_DPI = 100
 COLORS = 128
-"""Of a GIF."""
+"""Palette size of a GIF."""
 
 
 def highway_scene(scene: Scene, forecast: JointForecast, path: str | Path, title: str = "") -> Path:
@@ -496,7 +497,9 @@ def _write_gif(figure: Figure, frames: Iterator[float], seconds: float, path: Pa
     first, *rest = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     durations = [round(1000 * seconds)] * len(images)
     durations[-1] = round(1000 * HOLD)
-    first.save(path, format="GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
+    animation = io.BytesIO()  # a full disk would be an encoder's error without a file's name
+    first.save(animation, format="GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
+    path.write_bytes(animation.getbuffer())
 
 
 def _write_mp4(figure: Figure, frames: Iterator[float], seconds: float, path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import resource
 import shlex
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -163,3 +165,72 @@ def test_an_old_command_with_an_unbalanced_quote_stops_no_report(tmp_path: Path,
     run.update(command="epo train title='it's trainer.max_epochs=3")
     assert epo("report", "runs=runs") == 0
     assert "trainer.max_epochs=3" in Path("report/results.md").read_text()
+
+
+# Full disks and read-only folders
+
+
+@contextmanager
+def files_of_at_most(count: int) -> Iterator[None]:
+    """A disk on which larger files find no place."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (count, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("epo: ")
+    return line
+
+
+def content(folder: str) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in Path(folder).rglob("*") if path.is_file() and path.name != ".lock"}
+
+
+@pytest.mark.skipif(not Path("/sys").is_dir(), reason="a folder in which not even root can write")
+def test_a_read_only_folder_is_named_in_one_line(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.3))
+    commands = (
+        ("train", ROW, *TINY, "run_dir=/sys/here"),
+        ("sweep", "rpi_main", *TINY, "runs=/sys/here"),
+        ("report", "runs=runs", "out=/sys/here"),
+    )
+    for words in commands:
+        capsys.readouterr()
+        assert epo(*words) == 1
+        assert "/sys/here" in one_line(capsys)
+
+
+def test_a_disk_that_is_full_while_a_report_is_written_keeps_the_report_of_before(
+    epo: Epo, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.3))
+    assert epo("report", "runs=runs") == 0
+    before = content("report")
+    make_run(Path("runs/b"), "V-LSTM", "marginal", scores(0.4), seed=1)
+    capsys.readouterr()
+    with files_of_at_most(1000):
+        assert epo("report", "runs=runs") == 1
+    assert "File too large: report/" in one_line(capsys)
+    assert content("report") == before
+
+
+def test_a_full_disk_fails_the_runs_of_a_sweep_that_find_no_place_and_no_other(
+    epo: Epo, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test")
+    assert epo(*words, "experiment=rpi/const_vel") == 0
+    before = content("runs/rpi")
+    assert before
+    with files_of_at_most(50_000):
+        assert epo(*words) == 1
+    said = capsys.readouterr()
+    assert said.out.count("FAILED, OSError: [Errno 27] File too large: 'runs/rpi/") == 3
+    assert "Traceback" not in said.out + said.err
+    assert {path: text for path, text in content("runs/rpi").items() if path in before} == before
+    assert epo(*words) == 0
+    assert "4 runs: 4 done" in capsys.readouterr().out
