@@ -302,7 +302,7 @@ def test_interrupts_leave_no_thread_that_writes_to_released_memory():
     program = [sys.executable, "-c", _INTERRUPTS.format(path=path)]
     found = subprocess.run(program, check=True, timeout=300, capture_output=True, text=True)
     interrupted, overwritten = map(int, found.stdout.split())
-    assert interrupted > 100
+    assert interrupted > 20
     assert overwritten == 0
 
 
