@@ -34,6 +34,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from epo_lightning import pretrained
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 
@@ -141,12 +142,12 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
-        """The run in ``path``.
+        """The run in ``path``; or the run of that name that ships with the package, where there is no such path.
 
         Raises:
             ConfigError: there is no run; the message names the runs nearby.
         """
-        run = cls(Path(path).expanduser())
+        run = cls(pretrained.folder_of(path) or Path(path).expanduser())
         if not run.path.is_dir():
             raise ConfigError(f"no run folder {run.path}: the folder does not exist")
         if not run.config_file.is_file() or not run.record_file.is_file():

@@ -16,7 +16,8 @@ FLOORS = {
     "task": {"registry"},
     "identity": set(),
     "masking": set(),
-    "run_folder": {"registry", "masking"},
+    "pretrained": {"scene"},
+    "run_folder": {"registry", "masking", "pretrained"},
     "optimizers": {"registry"},
     "losses": set(),
     "game": {"scene", "registry"},
@@ -39,6 +40,7 @@ FLOORS = {
         "metrics",
         "losses",
         "optimizers",
+        "pretrained",
     },
     "report": {"scene", "registry", "metrics", "run_folder", "identity", "masking"},
 }

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Trainer, seed_everything
 
+from epo_lightning import pretrained
 from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings, read
 from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
@@ -54,7 +55,7 @@ def score(
     machine: TrainerSettings | None = None,
     devices: int | list[int] = 1,
 ) -> tuple[Path, dict[str, float]]:
-    """Score one run and write its scores to a file, see :func:`keep`.
+    """Score one run and write its scores to a file, see :func:`keep`; nothing is written for a run that ships.
 
     Args:
         run: a finished run.
@@ -92,6 +93,8 @@ def score(
     with assembly.signals():
         (scores,) = trainer.test(forecaster, dataloaders=loader, verbose=False)
     metrics = {name.removeprefix("test/"): float(value) for name, value in scores.items()}
+    if pretrained.ships(run.path):
+        return run.metrics_file(settings.split), metrics
     scored = {
         "split": settings.split,
         "data_digest": data.digest,

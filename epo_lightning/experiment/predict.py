@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
+from epo_lightning import pretrained
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import PredictSettings, Settings, read
 from epo_lightning.experiment.opening import open_checkpoint, open_data
-from epo_lightning.experiment.pictures import choose, draw, forecast_of
+from epo_lightning.experiment.pictures import choose, draw, forecast_of, spread
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_bytes, write_json
 from epo_lightning.scene import KINDS, JointForecast, Scene
@@ -65,7 +67,7 @@ def predict(settings: PredictSettings) -> list[Path]:
         raise ConfigError(f"{out} holds forecasts already: nothing is overwritten; choose another out=<folder>")
     of_run = read(Settings, run.config())
     forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
-    scenes, origins = choose(open_data(run, of_run), settings.split, settings.scenes)
+    scenes, origins = _scenes_of(run, of_run, settings)
     forecast = forecast_of(forecaster, scenes)
     tensors = dict(_tensors(scenes, forecast))
     out.mkdir(parents=True, exist_ok=True)
@@ -88,6 +90,24 @@ def predict(settings: PredictSettings) -> list[Path]:
         index["provenance"] = origins
     write_json(index_file, index)
     return [tensors_file, index_file, *(file for file, _ in pictures)]
+
+
+def _scenes_of(
+    run: RunFolder, of_run: Settings, settings: PredictSettings
+) -> tuple[Scene, list[dict[str, Any]] | None]:
+    """The scenes to forecast; where a shipped run's data set is not on this machine, the examples that ship with it.
+
+    Raises:
+        ConfigError: the data is missing or has changed.
+    """
+    try:
+        return choose(open_data(run, of_run), settings.split, settings.scenes)
+    except ConfigError as error:
+        if not pretrained.ships(run.path):
+            raise
+        scenes = pretrained.examples(run.path)
+        print(f"{error}\nForecasting the {len(scenes.history)} example scenes that ship with {run.path.name} instead.")
+        return spread(scenes, settings.scenes), None
 
 
 def _tensors(scenes: Scene, forecast: JointForecast) -> Iterable[tuple[str, Tensor]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from epo_lightning import pretrained
 from epo_lightning.experiment.config.settings import (
     EvaluateSettings,
     GenerateSettings,
@@ -95,7 +96,8 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str]) -> None:
             print(
                 f"  in {file}: {run.metrics_file(settings.split).name} is for the best checkpoint, and is never replaced"
             )
-    print(f"next: epo report runs={settings.runs or settings.run} out=report")
+    if settings.run not in pretrained.names():
+        print(f"next: epo report runs={settings.runs or settings.run} out=report")
 
 
 def predict(config: dict[str, Any], overrides: Sequence[str]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from epo_lightning import pretrained
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.registry import ConfigError, build, check, nearest, parameters
@@ -98,9 +99,14 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
 def load(checkpoint: str | Path) -> Forecaster:
     """A trained forecaster from a checkpoint alone, in evaluation mode: no configuration tree, no pickled code.
 
+    Args:
+        checkpoint: path of a ``.ckpt`` file, or the name of a forecaster that ships with the package: ``load("rpi")``.
+
     Raises:
         ConfigError: as :func:`~epo_lightning.forecasters.checkpoint.read_checkpoint`, or weights of another architecture.
     """
+    shipped = pretrained.folder_of(checkpoint)
+    checkpoint = shipped / "checkpoints" / "best.ckpt" if shipped else checkpoint
     content = read_checkpoint(checkpoint)
     forecaster = build_forecaster(content["configuration"])
     try:

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from epo_lightning.pretrained import names
 from epo_lightning.registry import ConfigError
 
 
@@ -23,7 +24,10 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     if not path.is_file():
-        raise ConfigError(f"no checkpoint at {path}: give the path of a .ckpt file, such as RUN/checkpoints/best.ckpt")
+        raise ConfigError(
+            f"no checkpoint at {path}: give the path of a .ckpt file, such as RUN/checkpoints/best.ckpt, or the name of a "
+            f"forecaster that ships with the package ({', '.join(names())})"
+        )
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()

@@ -108,6 +108,17 @@ def test_sweeps_list_their_runs(sweep: str) -> None:
     assert len(listed) > 1 or sweep.endswith("_search")
 
 
+def test_the_first_table_is_small_hard_and_shows_the_remedy_first() -> None:
+    configs = [compose("train", job) for job in jobs("train", ["sweeps=first_table"])]
+    remedies = [
+        config["objective" if config["forecaster"]["name"] == "epo" else "forecaster"].get("relaxation")
+        for config in configs
+    ]
+    assert [config["experiment"] for config in configs][2] == "rpi/v_lstm_epo_relaxed"
+    assert [bool(remedy) for remedy in remedies] == [True, True, True, False, False]
+    assert all(config["data"]["split"] == "hard" and config["data"]["placements"] == 8 for config in configs)
+
+
 def test_searches_learn_from_scores_and_keep_what_they_learned() -> None:
     with hydra() as instance:
         config = instance.compose_config("train", ["sweeps=rpi_search"], run_mode=RunMode.MULTIRUN)

@@ -48,5 +48,7 @@ def test_an_installed_wheel_works_from_any_folder(tmp_path: Path) -> None:
     assert "title: V-LSTM + EPO" in epo("config", "experiment=rpi/v_lstm_epo")
     assert "is sound" in epo("config", "check", "experiment=rpi/v_lstm_epo_goal", "budget=reduced")
     assert "rpi_main" in epo("train", "--help")
+    assert "title: VIBES + EPO" in epo("config", "experiment=us101/vibes_epo")
     assert {"page.html.j2", "page.css", "page.js"} <= {path.name for path in (site / "epo_lightning/report").iterdir()}
     assert not list(elsewhere.iterdir())
+    assert "wrote predictions/forecasts.safetensors" in epo("predict", "run=rpi", "scenes=4", "figures=1")

@@ -1,0 +1,47 @@
+"""A plain installation is enough for `make run`: no module needs a package that only an extra brings."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import epo_lightning
+
+PACKAGE = Path(epo_lightning.__file__).parent
+PROJECT = PACKAGE.parent / "pyproject.toml"
+MODULES = {"hydra-core": "hydra", "pillow": "PIL"}
+"""Packages that are imported under another name."""
+OF_DEPENDENCIES = {"yaml", "hatchling"}
+"""PyYAML comes with OmegaConf."""
+
+
+def imported_at_once(tree: ast.AST) -> Iterator[str]:
+    """Names of the packages that a module imports when it is imported, outside functions and type checking."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            continue
+        if isinstance(node, ast.Import):
+            yield from (name.name.partition(".")[0] for name in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield str(node.module).partition(".")[0]
+        else:
+            yield from imported_at_once(node)
+
+
+def test_modules_import_nothing_that_only_extras_bring() -> None:
+    project = tomllib.loads(PROJECT.read_text())["project"]
+    names = [re.split(r"[^\w.-]", text)[0] for text in project["dependencies"]]
+    known = {MODULES.get(name, name) for name in names} | OF_DEPENDENCIES | sys.stdlib_module_names | {"epo_lightning"}
+    foreign = {
+        f"{path.relative_to(PACKAGE)}: {name}"
+        for path in PACKAGE.rglob("*.py")
+        for name in imported_at_once(ast.parse(path.read_text()))
+        if name not in known
+    }
+    assert not foreign
