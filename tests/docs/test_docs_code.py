@@ -2,33 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from docs.pages import PAGES, ROOT, blocks
-from games import random_scene
-
-from epo_lightning import registry
-from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.compose import compose
-from epo_lightning.experiment.config.settings import Settings, read
 
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
 ELSEWHERE = {
-    "README.md": {1: "needs a trained run: test_docs_readme.py"},
-    "extend.md": {
-        0: "test_the_backbone_of_extend",
-        1: "a test file of the backbone's suite",
-        2: "tests/game/test_extend.py",
-        3: "tests/game/test_extend.py",
-        4: "tests/game/test_extend.py",
-        5: "tests/data/test_extend.py",
-    },
-    "reports.md": {0: "needs runs: test_docs_readme.py"},
-    "tutorial.md": {0: "test_docs_tutorial.py", 1: "test_docs_tutorial.py"},
+    ("README.md", "epo_lightning.load("): "needs a trained run: test_docs_readme.py",
+    ("reports.md", "Report.of_folder"): "needs runs: test_docs_readme.py",
+    ("tutorial.md", ""): "test_docs_tutorial.py",
+    ("extend.md", ""): "test_documented_backbone.py, tests/game/test_extend.py, tests/data/test_extend.py",
 }
-"""Blocks that other tests run, by page and number."""
+"""Blocks that other tests run, by page and a word in them."""
 CHEAPER = {
     "repeats=7": "repeats=1",
     '"cache/highway_sim-recordings-..."': repr(str(FIXTURE)),
@@ -39,7 +24,7 @@ BLOCKS = {
     f"{page.name}-{number}": block.text
     for page in PAGES
     for number, block in enumerate(block for block in blocks(page) if block.language == "python")
-    if number not in ELSEWHERE.get(page.name, {})
+    if not any(page.name == other and word in block.text for other, word in ELSEWHERE)
 }
 
 
@@ -60,21 +45,3 @@ def test_blocks_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
         torch.set_num_threads(threads)
     if "solution" in names:
         assert (names["solution"].energy < names["solution"].initial_energy).all()
-
-
-def test_the_backbone_of_extend(tmp_path: Path) -> None:
-    page = ROOT / "docs" / "extend.md"
-    code = next(block.text for block in blocks(page) if block.language == "python")
-    settings = next(block.text for block in blocks(page) if block.language == "yaml")
-    (tmp_path / "backbone").mkdir()
-    (tmp_path / "backbone" / "mean_pool.yaml").write_text(settings)
-    registry.parts("backbone")
-    try:
-        exec(code, {"__name__": "mean_pool"})
-        scene = random_scene(3, 2, history=2)
-        backbone = registry.build("backbone", {"name": "mean_pool", "width": 8})
-        assert backbone(scene).shape == (len(scene.history), scene.history.shape[1], 8)
-        words = ["experiment=rpi/v_lstm_epo", "backbone=mean_pool", "title=MeanPool + EPO"]
-        assembly.check(read(Settings, compose("train", words, [str(tmp_path)])))
-    finally:
-        registry._PARTS["backbone"].pop("mean_pool", None)

@@ -24,8 +24,8 @@ NOT_RUN = {
 }
 OF_EXAMPLES = {
     "mine": "of the tutorial, which test_docs_tutorial.py runs",
-    "mean_pool": "of extend.md, whose code test_docs_code.py runs",
-    "latacc": "of extend.md, whose code tests/game/test_extend.py runs",
+    "gru": "of extend.md, whose code tests/backbones/test_documented_backbone.py runs",
+    "curvature": "of extend.md, whose code tests/game/test_extend.py runs",
     "my_conf": "of extend.md",
 }
 MAKEFILE = (ROOT / "Makefile").read_text()

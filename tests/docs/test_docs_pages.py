@@ -15,7 +15,7 @@ from epo_lightning.experiment.config.compose import tree
 FOLDERS = "docs|tests|conf|sweeps|benchmarks|epo_lightning|docker"
 GENERATED = ROOT / "docs" / "reference"
 """What building the site makes from the code."""
-EXAMPLES = {"mine", "mean_pool", "test_mean_pool", "latacc", "plain_csv"}
+EXAMPLES = {"mine", "gru", "test_gru", "curvature", "test_curvature", "plain_csv"}
 """Files that the pages tell a reader to write."""
 
 
