@@ -105,17 +105,22 @@ def parse(words: Sequence[str]) -> Arguments:
         else:
             # Hydra would take a bare nan for the number.
             found.overrides.append("debug='nan'" if word == "debug=nan" else word)
-    _refuse_repeated(found.overrides)
+    _refuse_without_effect(found.overrides)
     if found.stop_on_failure and found.verb != "sweep":
         raise ConfigError("--stop-on-failure belongs to epo sweep")
     return found
 
 
-def _refuse_repeated(overrides: Sequence[str]) -> None:
-    """Refuse a key that is set twice: Hydra would take the last value without a word."""
+def _refuse_without_effect(overrides: Sequence[str]) -> None:
+    """Refuse a key set twice, of which Hydra takes the last value, and an empty mapping, which changes nothing."""
     seen: dict[str, str] = {}
     for word in overrides:
-        key, equals, _ = word.lstrip("+").partition("=")
+        key, equals, value = word.lstrip("+").partition("=")
+        if value.strip() == "{}" and not word.startswith("+"):
+            raise ConfigError(
+                f"{word} would change nothing: Hydra merges an empty mapping into the keys that are there. Set single keys, "
+                f"as {key}.<name>=<value>, or remove one, as ~{key}.<name>"
+            )
         if equals and key in seen:
             raise ConfigError(f"{key} is set twice, by {seen[key]} and by {word}: leave one of them out")
         seen[key] = word

@@ -122,3 +122,10 @@ def test_a_key_may_be_set_only_once(words: str) -> None:
         "~seed",
         "data.seed=1",
     ]
+
+
+def test_an_empty_mapping_that_changes_nothing_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"objective\.weights=\{\} would change nothing: .*~objective\.weights\.<name>"
+    ):
+        parse(["train", "experiment=rpi/v_lstm_epo", "objective.weights={}"])
