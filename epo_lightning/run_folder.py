@@ -4,7 +4,7 @@
 
     <run folder>/
         config.yaml            the resolved configuration: all that is needed to continue or evaluate the run
-        run.json               who, what, when: title, experiment, budget, seed, data digest, versions, parameters, status;
+        run.json               record: title, experiment, budget, seed, data digest, versions, parameters, status;
                                `identity` is what makes it this run and no other, `row` the same without its seed
         checkpoints/best.ckpt  the epoch with the smallest validation minSADE
         checkpoints/last.ckpt  the last finished epoch, with everything that continuing needs
@@ -13,7 +13,7 @@
         metrics-val.json       the same on the validation split, if asked for
         runtime.json           how long one joint forecast takes, if asked for
         progress.json          how far the training is, and where it runs; there while it does
-        .lock                  locked as long as a process works on the run, by whoever dies released
+        .lock                  locked as long as a process works on the run; the system releases it when the process dies
 
 Files are replaced as a whole: a reader, or a kill at any moment, never meets half of one. ``metrics.json`` holds no time,
 path or version, so that two equal runs give the same bytes.
@@ -187,7 +187,7 @@ class RunFolder:
 
     @property
     def exists(self) -> bool:
-        """Whether anything was written here; not what somebody leaves who was killed before the run had begun."""
+        """Whether anything was written here; a config.yaml alone, left by a kill before the run began, does not count."""
         if not self.path.is_dir():
             return self.path.exists()
         entries = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}
@@ -206,7 +206,7 @@ class RunFolder:
 
     @property
     def state(self) -> State:
-        """What has become of the run."""
+        """State of the run."""
         if not self.record_file.is_file():
             return "running" if self.path.is_dir() and self.locked else "waiting"
         status = self.record.get("status")
@@ -218,7 +218,7 @@ class RunFolder:
 
     @property
     def progress(self) -> dict[str, Any]:
-        """How far it is, as the process that trains it last said; empty where none did."""
+        """Progress as last written by the process that trains the run; empty where there is none."""
         try:
             return read_json(self.progress_file)
         except ConfigError:
@@ -240,13 +240,13 @@ class RunFolder:
 
     @contextmanager
     def lock(self, wait: float | None = 2.0) -> Iterator[None]:
-        """Keep every other process away from the run; a process that dies in whatever way lets go.
+        """Keep every other process away from the run; the lock of a process that dies is released.
 
         Args:
             wait: seconds to wait for one that works on it; None waits as long as it takes.
 
         Raises:
-            ConfigError: somebody else works on it still.
+            ConfigError: another process still works on it.
         """
         from filelock import FileLock, Timeout
 

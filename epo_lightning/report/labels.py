@@ -1,4 +1,4 @@
-"""What rows of the same title are called apart: the title, and the settings in which they differ."""
+"""Labels of rows that share a title: the title, and the settings in which they differ."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def natural(settings: Mapping[str, Any]) -> tuple[tuple[int, float, str], ...]:
 
 
 def _rounded(value: Any) -> Any:
-    """What a search drew has more digits than anybody reads."""
+    """A number with few digits: a search draws more than a label needs."""
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 

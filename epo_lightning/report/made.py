@@ -1,4 +1,4 @@
-"""How every row of a report was made: what somebody needs to trust its numbers, and to make them again."""
+"""Provenance of every row of a report: what is needed to check its numbers and to make them again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from epo_lightning.run_folder import RunFolder
 
 @dataclass(frozen=True)
 class MadeRun:
-    """What one run's records say, as text; empty where they say nothing.
+    """Provenance of one run as text; empty where its records have no entry.
 
     Attributes:
         seed, folder, command, commit, data_digest, parameters, steps, seconds, began: of the run.

@@ -22,12 +22,12 @@ class EvaluatedRun:
 
     Attributes:
         path: the run folder.
-        name: how its row is called in tables.
+        name: label of its row in tables.
         seed: of the run.
-        data: what its data set is called.
+        data: name of its data set.
         backbone, forecaster: names of its parts.
         experiment: the configuration file it was made from, empty for none.
-        goal: who knows a given goal, ``energy`` or ``all``.
+        goal: which parts know a given goal, ``energy`` or ``all``.
         budget: name of its budget.
         split: which part of the data it was evaluated on.
         checkpoint: which of its checkpoints was evaluated.

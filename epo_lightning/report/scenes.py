@@ -41,11 +41,11 @@ MOST_MODES = 6
 MOST_NAMED = len(VEHICLES)
 """Agents that the legend names at most: beyond, colours repeat."""
 LANE_WIDTH = 3.1
-"""Of the band that stands for a lane [m]: a little less than lanes have, so that lanes side by side stay apart."""
+"""Width of the band that stands for a lane [m]: a little less than lanes have, so that lanes side by side stay apart."""
 CAR = (4.5, 1.8)
 """Length and width of an agent of unknown size [m]."""
 WIDTH, LEFT, TITLE, AXIS, ROW = 8.6, 0.5, 0.27, 0.42, 0.2
-"""Of a picture, of the margin left of a panel, above and below it, and of a line of the legend [inch]."""
+"""Width of a picture, margins left of, above and below a panel, height of a line of the legend [inch]."""
 FRAME, HOLD = 0.1, 1.2
 """Longest time between two frames of an animation, and how long its last one stays [s]."""
 PALE = 0.3
@@ -368,7 +368,7 @@ def _draw_future(axes: Axes, ground: _Ground, future: _Future) -> None:
 
 
 def _note(axes: Axes, ground: _Ground, future: _Future) -> str:
-    """What a panel does not show."""
+    """Note on what a panel does not show."""
     broken = [i for i in range(len(future.states)) if not np.isfinite(future.states[i]).all()]
     now = ground.states[ground.seen[:, ground.now], ground.now, :2]
     low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])

@@ -37,7 +37,7 @@ from epo_lightning.run_folder import RunFolder, write_text
 
 @dataclass(frozen=True)
 class Report:
-    """What is reported on.
+    """Subject of a report.
 
     Attributes:
         title: above everything.
@@ -214,7 +214,7 @@ def _best(runs: Sequence[EvaluatedRun]) -> tuple[list[BestSetting], str]:
 
 
 def _how_made(rows: Sequence[Made], report: Report) -> str:
-    """What somebody needs to judge the tables, and to make them again."""
+    """The section on how the runs of the tables were made, as Markdown."""
     header = ("method", "of", "budget", "seeds", "commit", "data digest", "parameters", "n")
     entries = tuple(
         (row.name, row.what, row.budget, row.seeds, row.commits, row.digests, row.parameters, str(len(row.runs)))

@@ -21,14 +21,14 @@ from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Row
 from epo_lightning.masking import mask
 
 BEHIND = 20_000
-"""So many rows a dashboard may be behind: less than a hundred megabytes."""
+"""Largest number of rows in a dashboard's queue: less than a hundred megabytes."""
 
 
 class Aside(Logger):
     """A dashboard as a Lightning logger that never raises and never waits, but at the end.
 
     Args:
-        dashboard: whom to tell.
+        dashboard: receives the rows.
         patience: seconds that the end of the run waits for it.
         past: rows that were logged before this process began.
     """

@@ -9,18 +9,18 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 Row = tuple[int, Mapping[str, float]]
-"""An optimisation step and what was measured at it."""
+"""An optimisation step and the metrics logged at it."""
 ARTIFACTS = ("config.yaml", "run.json", "checkpoints/best.ckpt")
-"""What can be given to a dashboard that keeps files."""
+"""Files that are sent to a dashboard that keeps files."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """Who a run is.
+    """Name, identity and configuration of a run.
 
     Args:
-        id: the same for all processes that work on the run, and nobody else's.
-        name: how people call it.
+        id: the same for all processes that work on the run, and for no other run.
+        name: for people: title and seed.
         group: the label of the sweep that it belongs to.
         config: the resolved configuration, as far as it describes the run and not the place where it lies.
         tags: what a table needs behind a number: identity, data_digest, commit.
@@ -48,7 +48,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
 
 @dataclass(frozen=True)
 class Ending:
-    """What is left to say when a run ends: its scores, its pictures, and whether it failed."""
+    """End of a run: its scores, its pictures, and whether it failed."""
 
     failed: bool = False
     summary: Mapping[str, float] = field(default_factory=dict)
@@ -60,7 +60,7 @@ class Dashboard(ABC):
 
     label: ClassVar[str]
     every: ClassVar[float] = 0.0
-    """Seconds of which the rows are told together, where telling is dear."""
+    """Seconds for which rows are collected before they are sent together, where a request is slow."""
 
     def __init__(self, facts: Facts) -> None:
         self.facts = facts

@@ -1,4 +1,4 @@
-"""Workers whose sweep has died end as well; what they trained goes on from its last epoch at the next start."""
+"""Workers end when the process of their sweep has died; their runs continue from the last epoch at the next start."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def end_with(driver: int) -> None:
     """If this process is a child of the ``driver``, do not outlive it.
 
     Pools of processes (joblib's) otherwise work on, wait for more for ever, and hold the terminal. Jobs of a cluster are
-    nobody's children and go on.
+    no children of the sweep and go on.
     """
 
     def watch() -> None:

@@ -60,7 +60,7 @@ class Job:
         overrides: what it was started with.
         run: where it lies.
         identity: what makes it this run.
-        title, seed: how to call it.
+        title, seed: its name.
         measures: what is measured when it is trained.
         data: name of its data set; empty in records of older versions.
     """
@@ -178,7 +178,7 @@ class Sweep:
         }
 
     def state(self, job: Job) -> State:
-        """What has become of a run, its scores included; a damaged folder has failed."""
+        """State of a run, its scores included; a damaged folder has failed."""
         try:
             state = job.run.state
         except ConfigError:
@@ -252,7 +252,7 @@ class Sweep:
         write_json(self.folder / "sweep.json", content)
 
     def lost(self, job: Job) -> None:
-        """Note that a run's process has died without a word."""
+        """Record that the process of a run died without an error message."""
         write_text(self._failure(job.run), "its process died, again and again (out of memory?)\n")
 
     def work(self, config: Mapping[str, Any], overrides: Sequence[str]) -> float | None:
