@@ -7,8 +7,11 @@ and exit status 2; ``--traceback`` shows where it came from.
 from __future__ import annotations
 
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,6 +55,8 @@ epo sweep                                list the sweeps
   --stop-on-failure   begin no further run when one has failed
 """
 
+TERMINATED = 128 + signal.SIGTERM
+"""Exit status of a program that was ended by SIGTERM."""
 VERBS = {
     "generate": "make a data set and print its report",
     "train": "train a forecaster into a run folder",
@@ -127,11 +132,12 @@ def _refuse_without_effect(overrides: Sequence[str]) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run a command line and exit: 0 done, 1 failed, 2 a mistake in what was asked for, 130 interrupted."""
+    """Run a command line and exit: 0 done, 1 failed, 2 a mistake in the command line, 130 interrupted, 143 terminated."""
     words = list(sys.argv[1:] if words is None else words)
     trace = "--traceback" in words
     try:
-        _run([word for word in words if word != "--traceback"])
+        with _termination():
+            _run([word for word in words if word != "--traceback"])
     except ConfigError as error:
         if trace:
             raise
@@ -147,11 +153,40 @@ def main(words: Sequence[str] | None = None) -> None:
         print(f"epo: {error.strerror or error}{where}", file=sys.stderr)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
-        again = (
-            "the same command goes on" if "sweep" in words[:1] else "a run goes on with `epo train resume=<run folder>`"
-        )
-        print(f"epo: interrupted; {again}", file=sys.stderr)
+        print(f"epo: interrupted; {_way_on(words)}", file=sys.stderr)
         raise SystemExit(130) from None
+    except SystemExit as ending:
+        if ending.code == TERMINATED:
+            print(f"epo: terminated; {_way_on(words)}", file=sys.stderr)
+        raise
+
+
+def _way_on(words: Sequence[str]) -> str:
+    """How to go on with a command that was stopped."""
+    if "train" in words:
+        return "a run goes on with `epo train resume=<run folder>`"
+    return "nothing half-written is left, and the same command goes on"
+
+
+@contextmanager
+def _termination() -> Iterator[None]:
+    """Context in which SIGTERM ends the program as Ctrl-C does: files and locks are left in order. Training has its own."""
+    program = os.getpid()
+
+    def end(number: int, _: object) -> None:
+        if os.getpid() == program:
+            raise SystemExit(TERMINATED)
+        signal.signal(number, signal.SIG_DFL)  # a worker that was forked ends as it would have
+        os.kill(os.getpid(), number)
+
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    if ours:
+        signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _run(words: Sequence[str]) -> None:
@@ -209,15 +244,22 @@ def _help(arguments: Arguments) -> None:
                 "data",
                 "backbone",
                 "forecaster",
+                "dynamics",
+                "energy",
+                "solver",
+                "backward",
+                "objective",
+                "optimizer",
                 "logger",
                 "debug",
+                "hydra/launcher",
                 "sweeps",
             ):
                 options = options_of(instance, group)
                 if group == "experiment":  # the rows on highways once, and not for each data set again
                     options = [name for name in options if name.partition("/")[0] not in HIGHWAYS]
                 words = " | ".join(options)
-                print(fill(words, 120, initial_indent=f"  {group + '=':<14}", subsequent_indent=" " * 16))
+                print(fill(words, 120, initial_indent=f"  {group + '=':<16}", subsequent_indent=" " * 18))
 
 
 def _config(arguments: Arguments) -> None:

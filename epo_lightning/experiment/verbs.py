@@ -52,7 +52,8 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     dataset = settings.data.get("dataset", "rpi")
     row = f"{dataset}/v_lstm_epo"
     if dataset in HIGHWAYS or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
-        words = [f"experiment={row}", *(o for o in overrides if o.startswith("data."))]
+        kept = (word for word in overrides if word.startswith(("data=", "data.")) and word != f"data={dataset}")
+        words = [f"experiment={row}", *kept]
     else:
         words = [f"experiment={'exid' if data.task.map else 'ucy'}/v_lstm_epo", *overrides]
     print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")

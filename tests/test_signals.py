@@ -1,0 +1,42 @@
+"""Every verb that is stopped by SIGTERM or Ctrl-C ends in one line with the exit status of that signal."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from epo_lightning import cli
+
+
+@pytest.mark.parametrize("verb", ["generate", "train", "evaluate", "predict", "report", "sweep", "config"])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_verb_that_is_stopped_says_so(
+    verb: str,
+    number: signal.Signals,
+    status: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(cli, "_run", lambda words: os.kill(os.getpid(), number) or signal.pause())
+    with pytest.raises(SystemExit) as ended:
+        cli.main([verb])
+    assert ended.value.code == status
+    message = capsys.readouterr().err
+    assert message.startswith(("epo: terminated; ", "epo: interrupted; "))
+    assert message.count("\n") == 1
+    assert ("resume=" in message) == (verb == "train")
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_signal_handler_of_a_caller_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda sent, _: heard.append(sent))
+    monkeypatch.setattr(cli, "_run", lambda words: os.kill(os.getpid(), signal.SIGTERM))
+    try:
+        cli.main(["train"])
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert heard == [signal.SIGTERM]
