@@ -8,7 +8,6 @@ from docs.pages import PAGES, ROOT, blocks
 
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
 ELSEWHERE = {
-    ("README.md", "epo_lightning.load("): "needs a trained run: test_docs_readme.py",
     ("reports.md", "Report.of_folder"): "needs runs: test_docs_readme.py",
     ("tutorial.md", ""): "test_docs_tutorial.py",
     ("extend.md", ""): "test_documented_backbone.py, tests/game/test_extend.py, tests/data/test_extend.py",
