@@ -33,7 +33,7 @@ def mask(value: Value) -> Value:
     if isinstance(value, Mapping):
         return {key: mask(entry) for key, entry in value.items()}  # type: ignore[return-value]
     if isinstance(value, list | tuple):
-        return type(value)(map(mask, value))  # type: ignore[return-value, call-arg]
+        return type(value)(map(mask, value))
     return value
 
 
