@@ -28,6 +28,7 @@ CHEAPER = {
 NOT_RUN = {
     "make run": "installs, and takes minutes",
     "make test": "these tests",
+    "epo train resume=runs/rpi/v_lstm_epo/long-s0": "the run is finished here; tests/experiment/test_resume.py kills one",
     ". .venv/bin/activate": "tests run in an environment",
     "epo generate data=highway_sim": "minutes of simulation; tests/data/simulate",
     "epo train experiment=highway/vibes_epo data=highway_sim budget=short": "needs that set; make smoke trains the row",
