@@ -78,6 +78,8 @@ def errors_naming(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if error.errno is None:  # not from the system: its text says all
+            raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 

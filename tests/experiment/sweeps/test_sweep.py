@@ -22,7 +22,7 @@ from epo_lightning.experiment.config.compose import compose, jobs
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
 from epo_lightning.experiment.sweeps.watch import names_of, result
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, discover, write_json
+from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
 
 SWEEP = ("sweep", "rpi_main", *TINY, "seed=0,1", "score=test")
 ROWS = ("const_vel", "v_lstm", "v_lstm_sc", "v_lstm_epo")
@@ -352,7 +352,11 @@ def test_a_sweep_killed_ten_times_ends_with_the_same_table(tmp_path: Path) -> No
     interrupted = 0
     for _ in range(10):
         process = subprocess.Popen([*words, "runs=parts"], cwd=tmp_path, env=environment, start_new_session=True)
-        time.sleep(rng.uniform(0.2, 0.7) * lasted)
+        while not (record := list((tmp_path / "parts").glob("sweeps/*/sweep.json"))) or (
+            read_json(record[0])["process"] != process.pid
+        ):
+            time.sleep(0.05)
+        time.sleep(rng.uniform(0.0, 0.15) * lasted)
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
         for path in (tmp_path / "parts").glob("rpi/*/*/metrics.json"):
