@@ -5,7 +5,7 @@
 # make smoke       train every experiment for a few steps on drawn scenes (a minute)
 # make docs        build the documentation as a site, with references of API and configuration, in build/docs
 # make checkpoint  train the checkpoint that ships with the package anew (five minutes)
-# make asan        test the kernel with the sanitizers of addresses and undefined behaviour (GCC, Linux)
+# make asan        test the kernel with the sanitizers of addresses and undefined behaviour (Clang, Linux)
 # make wheel       build a package for this platform, with the compiled layer, in dist/
 # make clean       remove what these made, except the data in cache/ and the runs in runs/
 #
@@ -67,13 +67,13 @@ test-slow: $(TESTABLE)
 smoke: $(TESTABLE)
 	$(BIN)/python -m pytest tests/experiment/test_smoke.py
 
-# The kernel under AddressSanitizer and UndefinedBehaviorSanitizer, in a library of its own. One test limits the address space,
-# of which the sanitizers reserve terabytes.
+# The kernel under AddressSanitizer and UndefinedBehaviorSanitizer, in a library of its own, built by Clang. One test limits the
+# address space, of which the sanitizers reserve terabytes.
 KERNEL_FOLDER := epo_lightning/solvers/gauss_newton/kernel
 asan: $(TESTABLE)
 	$(BIN)/python -m epo_lightning.solvers.gauss_newton.kernel.build --sanitize
 	EPO_KERNEL=$(CURDIR)/$(KERNEL_FOLDER)/epo_kernel.sanitized.so.1 \
-	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so)" \
+	LD_PRELOAD="$$(clang++ -print-file-name=libclang_rt.asan-$$(uname -m).so)" \
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	$(BIN)/python -m pytest -n 0 tests/solvers/gauss_newton -k "not too_little_memory"
 

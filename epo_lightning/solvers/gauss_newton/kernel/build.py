@@ -36,7 +36,8 @@ _FLAGS = [
     "-Wno-psabi",
 ]
 _FAST = ["-O3"]
-_SANITIZE = ["-O1", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+# Clang only: with its sanitizers on, GCC 12 compiles vector types to wrong gradients.
+_SANITIZE = ["-O1", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-shared-libsan"]
 
 
 def fingerprint() -> int:
@@ -69,12 +70,14 @@ def load(path: Path | None = None) -> ctypes.CDLL:
 
 def _compiler() -> list[str]:
     chosen = shlex.split(os.environ.get("CXX", ""))
-    if chosen:
-        return chosen
-    found = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+    return chosen or [_found("c++", "g++", "clang++")]
+
+
+def _found(*names: str) -> str:
+    found = next(filter(None, map(shutil.which, names)), None)
     if found is None:
-        raise OSError("no C++ compiler: neither $CXX nor c++, g++ or clang++ was found")
-    return [found]
+        raise OSError(f"no C++ compiler: {' or '.join(names)} was not found, and $CXX names none")
+    return found
 
 
 def _run(commands: list[list[str]]) -> None:
@@ -102,9 +105,10 @@ def build(target: Path = LIBRARY) -> None:
             return
         except OSError:
             pass  # missing or stale: it is replaced once the new one has been built
-    compiler = _compiler()
-    x86 = platform.machine().lower() in ("x86_64", "amd64")
-    levels = _LEVELS if x86 else {"epo_plain": []}
+    compiler = [_found("clang++")] if sanitized else _compiler()
+    x86 = platform.machine().lower() in ("x86_64", "amd64") and not sanitized
+    # A sanitized library runs where it was built: one level of instructions, the machine's own.
+    levels = _LEVELS if x86 else {"epo_plain": ["-march=native"] if sanitized else []}
     options = [*_FLAGS, *(_SANITIZE if sanitized else _FAST)]
     with tempfile.TemporaryDirectory() as folder:
         compile_ = [*compiler, *options, f"-DEPO_FINGERPRINT={fingerprint()}", *(["-DEPO_X86"] if x86 else []), "-c"]
