@@ -193,7 +193,8 @@ def test_what_the_disk_refuses_is_one_message(epo: Epo, tmp_path: Path, capsys: 
     (tmp_path / "file").touch()
     assert epo("generate", "data=rpi_reduced", "data.root=file/cache", "progress=false") == 1
     message = capsys.readouterr().err.strip()
-    assert message.startswith("epo: Not a directory: file/cache"), message
+    assert message.startswith("epo: cannot write (Not a directory)"), message
+    assert message.endswith("file/cache"), message
 
 
 def test_help_and_configurations_are_printed(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811

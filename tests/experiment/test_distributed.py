@@ -28,7 +28,7 @@ from epo_lightning.run_folder import RunFolder, read_json
 ROOT = Path(__file__).parents[2]
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
 RPI = ("data.games=6", "data.placements=1")
-HIGHWAY = (f"data.folder={FIXTURE}", "data.batch_size=4", "trainer.limit_val_batches=1.0")
+HIGHWAY = (f"data.folder={FIXTURE}", "data.batch_size=4")
 QUIET = ("budget=smoke", "callbacks.progress=none", "trainer.limit_val_batches=1.0")
 DOUBLE = "trainer.precision=64-true"
 TWO = "trainer.devices=2"
@@ -41,7 +41,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("EPO_CACHE", str(folder))
         cli.main(["generate", "data=rpi", *RPI, "workers=1", "progress=false"])
-        cli.main(["generate", "data=exid", *HIGHWAY[:2], "workers=1", "progress=false"])
+        cli.main(["generate", "data=exid", *HIGHWAY, "workers=1", "progress=false"])
         yield folder
 
 

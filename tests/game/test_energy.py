@@ -123,6 +123,7 @@ def test_normal_equations_equal_automatic_differentiation(agents, modes, horizon
     torch.manual_seed(seed)
     scene = random_scene(2, agents, history=2, size=size, dtype=torch.float64)
     parameters = random_game(scene, modes, horizon)
+    stride = min(stride, horizon)
     energy = FeatureEnergy(sorted(own), bounds=BOUNDS, dynamics=Unicycle(integrator), pair_stride=stride)
     controls = parameters.initial_controls
     jacobian = dense_jacobian(energy, scene, parameters, controls)

@@ -204,7 +204,7 @@ def test_a_feature_of_ones_own_works_in_every_energy(kind):
 def test_a_feature_must_not_be_called_like_a_term():
     try:
         own_feature("neural")(lambda states, controls: controls[..., 0])
-        with pytest.raises(ConfigError, match="'neural', like a term"):
+        with pytest.raises(ConfigError, match="the feature 'neural' has the name of this energy's network term"):
             KINDS["neural"](own=["neural"])
     finally:
         OWN_FEATURES.pop("neural", None)

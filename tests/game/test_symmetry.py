@@ -51,7 +51,7 @@ SYMMETRIC = {
 @pytest.mark.parametrize("name", ASYMMETRIC)
 def test_what_depends_on_the_order_is_refused(name):
     pair_feature(name)(ASYMMETRIC[name])
-    with pytest.raises(ConfigError, match=f"pair feature '{name}' is not symmetric.*not a potential game.*a_i > 0"):
+    with pytest.raises(ConfigError, match=f"pair feature '{name}' is not symmetric.*no potential game.*a_i > 0"):
         FeatureEnergy(["acc"], [name])
     with pytest.raises(ConfigError, match=f"'{name}' is not symmetric"):
         NeuralEnergy(Unicycle(), 4, 5, 1.0, pair=["proximity", name])
@@ -85,7 +85,7 @@ def test_the_built_in_features_are_symmetric():
 def test_a_function_that_fails_is_named():
     pair_feature("wrong")(lambda first: first[..., 0])
     with pytest.raises(
-        ConfigError, match=r"'wrong' fails on a trial: TypeError: .*takes the states \[\.\., K, 4\] of two"
+        ConfigError, match=r"'wrong' fails on trial inputs: TypeError: .*takes the states \[\.\., K, 4\] of two"
     ):
         FeatureEnergy(["acc"], ["wrong"])
     pair_feature("far")(lambda first, second: first[..., 999, :2] - second[..., 999, :2])

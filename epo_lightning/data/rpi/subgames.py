@@ -6,6 +6,8 @@ gives one record: the history until k, and the modes of the future.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 

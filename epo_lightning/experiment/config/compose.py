@@ -150,6 +150,7 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
     """The overrides of every job that Hydra's basic sweeper would launch; empty for sweepers that choose as they go."""
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.override_parser.overrides_parser import OverridesParser
+    from omegaconf import OmegaConf
 
     with hydra(extra) as instance:
         config = _composed(instance, name, overrides, multirun=True)
@@ -157,7 +158,8 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
         if not str(sweeper.get("_target_", "")).endswith("BasicSweeper"):
             return []
         params = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
-        arguments = [*params, *config.hydra.overrides.task]
+        # Not resolved here: run_dir=one-${seed} must be resolved in each job, with the job's own seed.
+        arguments = [*params, *OmegaConf.to_container(config.hydra.overrides.task, resolve=False)]
         parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(arguments)
         batches = BasicSweeper.split_arguments(parsed, None)
         return [[str(text) for text in job] for batch in batches for job in batch]
