@@ -255,7 +255,7 @@ def test_candidates_that_are_learned_are_drawn_to_what_was_observed():
 def test_what_is_missing_is_said():
     scene = scene_of()
     objective = Conditional(WEIGHTS)
-    with pytest.raises(ValueError, match="solver over candidates"):
+    with pytest.raises(ValueError, match="a density over candidates needs"):
         objective(scene, forecast_of(None), ENERGY)
     with pytest.raises(ValueError, match=r"scene\.future"):
         future_less = dataclasses.replace(scene, future=None, future_mask=None)
