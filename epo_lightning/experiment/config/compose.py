@@ -159,7 +159,9 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
             return []
         params = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
         # Not resolved here: run_dir=one-${seed} must be resolved in each job, with the job's own seed.
-        arguments = [*params, *OmegaConf.to_container(config.hydra.overrides.task, resolve=False)]
+        task = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
+        assert isinstance(task, list)
+        arguments = [*params, *task]
         parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(arguments)
         batches = BasicSweeper.split_arguments(parsed, None)
         return [[str(text) for text in job] for batch in batches for job in batch]
