@@ -38,6 +38,7 @@ def test_epo_layer_compares_the_implementations(tmp_path, capsys):
     assert line["forward_backward_ms"] > 0
 
 
+@pytest.mark.slow
 def test_epo_layer_scales(tmp_path, capsys, monkeypatch):
     axes = [(title, setting, axis, (2, 3)) for title, setting, axis, _ in scaling.AXES]
     monkeypatch.setattr(scaling, "AXES", axes)

@@ -89,7 +89,7 @@ def test_a_function_that_fails_is_named():
     ):
         FeatureEnergy(["acc"], ["wrong"])
     pair_feature("far")(lambda first, second: first[..., 999, :2] - second[..., 999, :2])
-    with pytest.raises(ConfigError, match="'far' fails on a trial: IndexError"):
+    with pytest.raises(ConfigError, match="'far' fails on trial inputs: IndexError"):
         FeatureEnergy(["acc"], ["far"])
     pair_feature("number")(lambda first, second: 1.0)
     with pytest.raises(ConfigError, match="'number' fails on a trial"):
