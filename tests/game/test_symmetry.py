@@ -92,7 +92,7 @@ def test_a_function_that_fails_is_named():
     with pytest.raises(ConfigError, match="'far' fails on trial inputs: IndexError"):
         FeatureEnergy(["acc"], ["far"])
     pair_feature("number")(lambda first, second: 1.0)
-    with pytest.raises(ConfigError, match="'number' fails on a trial"):
+    with pytest.raises(ConfigError, match="'number' fails on trial inputs"):
         FeatureEnergy(["acc"], ["number"])
 
 
