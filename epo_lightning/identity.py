@@ -1,4 +1,4 @@
-"""What makes two runs the same run: their resolved configuration, as far as it decides on the result, and their data.
+"""Identity of a run: its resolved configuration, as far as it decides on the result, and its data.
 
 Names, places and machines are left out: how a row is called, where its files lie, what logs it, how many threads, devices or
 processes compute it. The data's digest takes the place of paths to it.

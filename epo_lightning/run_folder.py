@@ -183,7 +183,7 @@ class RunFolder:
         return self.path / "progress.json"
 
     def metrics_file(self, split: str = "test") -> Path:
-        """Where the scores on a split are; the measured time of a forecast for ``time``."""
+        """File of the scores on a split; the measured time of a forecast for ``time``."""
         names = {"test": "metrics.json", "time": "runtime.json"}
         return self.path / names.get(split, f"metrics-{split}.json")
 

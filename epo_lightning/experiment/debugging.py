@@ -1,4 +1,4 @@
-"""What helps when training does not: few batches to learn by heart, where the time goes, where the first bad number is."""
+"""Tools for a training that fails: few batches to learn by heart, where the time goes, where the first bad number is."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ GRACE = 10.0
 
 @dataclass(frozen=True)
 class Place:
-    """Which of a run's processes this is.
+    """Rank of this process among a run's processes.
 
     Attributes:
         rank: 0 leads.
@@ -240,7 +240,7 @@ class _Processes(_Launcher):
                 return
 
     def _failure(self) -> RuntimeError | None:
-        """What became of the first follower that failed."""
+        """Exit of the first follower that failed."""
         for rank, (process, errors) in enumerate(self._followers, 1):
             code = process.poll()
             if code:

@@ -1,4 +1,4 @@
-"""Which GPU a run gets, where several runs share a machine: the first one that has a place left.
+"""Choice of a GPU for a run where several runs share a machine: the first one that has a place left.
 
 Runs of a parallel sweep, and runs from several terminals, know nothing of each other; files that are locked for as long as
 their process lives tell them which places are taken.

@@ -1,4 +1,4 @@
-"""What a run has left behind, opened again: its forecaster and its data."""
+"""A run opened again: its forecaster and its data."""
 
 from __future__ import annotations
 

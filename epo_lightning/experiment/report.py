@@ -91,7 +91,7 @@ def of_sweep(sweep: Sweep) -> Report:
 
 
 def preface(runs: Sequence[EvaluatedRun]) -> str:
-    """What a reader has to know before the scores of runs: that the budget was not the paper's, and how to use that."""
+    """Note before the scores of runs: the budget was not the paper's, and how to use the paper's."""
     budgets = sorted({run.budget for run in runs} - {"paper"})
     words = [word for run in runs for word in _words(run.command)]
     changed = sorted({word for word in words if word.lstrip("+").startswith(("trainer.", "data.")) and _matters(word)})

@@ -1,4 +1,4 @@
-"""What each verb of the command line does, and what it says when it is done."""
+"""The verbs of the command line, with the lines that they print at their end."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
 
 
 def _print_windows(report: dict[str, Any], splits: list[str]) -> None:
-    """What became of all windows of recorded data, split by split: where they come from, where they went, what is left."""
+    """Counts of all windows of recorded data, split by split: their origin, the reasons for drops, and what is left."""
     names = {name: None for split in splits for name in report[split]}
     counts = [name for name in names if isinstance(report[splits[0]].get(name, 0), int)]
     lost = sorted((name for name in counts if name not in ("windows", "scenes")), key=str)

@@ -1,4 +1,4 @@
-"""What a report draws of many runs: figures with a title, a caption and the numbers behind them, for files and the page."""
+"""Figures of many runs for a report, with a title, a caption and the numbers behind them, for files and the page."""
 
 from __future__ import annotations
 

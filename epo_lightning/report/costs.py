@@ -1,4 +1,4 @@
-"""What every row of a report costs: its training, its parameters, and a forecast where that was timed."""
+"""Costs of every row of a report: its training, its parameters, and a forecast where that was timed."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _line(row: Row, timings: Sequence[Timing], labels: dict[str, str]) -> tuple[
 
 
 def _note(header: Sequence[str], labels: dict[str, str]) -> str:
-    """What the columns of a sheet are, and where forecasts were timed."""
+    """Explanation of a sheet's columns, and of the machine on which forecasts were timed."""
     training = "Training: until the last step, validation included; divided by the steps, ms per step."
     where = [
         f"{label.removeprefix('forecast')} on {machine}".strip() for machine, label in labels.items() if label in header

@@ -22,7 +22,7 @@ from epo_lightning.report.tables import Row
 from epo_lightning.run_folder import read_log
 
 METRIC = "val/minSADE"
-"""What training watches."""
+"""Score that a training monitors."""
 SIZE = (7.4, 3.7)
 """Width and height of a chart [inch]."""
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))

@@ -76,7 +76,7 @@ def joint_predictions(
 
 
 def _draw_scene(axes: Axes, scene: Scene, other: Tensor | None, agents: Sequence[str]) -> None:
-    """What is known and what happened: one scene (B = 1)."""
+    """Histories and observed futures of one scene (B = 1)."""
     centre = np.mean([np.concatenate(_observed(scene, i)).mean(0) for i in _present(scene)], axis=0)
     for i in _present(scene):
         history, future = _observed(scene, i)

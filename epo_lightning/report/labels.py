@@ -18,7 +18,7 @@ PLAIN, OTHER = re.compile(r"[\w./-]+", re.ASCII), re.compile(r"[-\d._e]+|true|fa
 
 
 def varying(configs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Of every configuration, the settings that are not the same in all of them, seeds apart.
+    """Settings of every configuration that are not the same in all of them, seeds apart.
 
     Returns:
         As many mappings from a setting's dotted key to its value, all with the same keys in the same order.

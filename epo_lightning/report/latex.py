@@ -73,7 +73,7 @@ def _caption(title: str, caveat: str, legend: str) -> str:
 
 
 def _legend(table: Table) -> str:
-    """What a reader has to know of a table's numbers, as :func:`~epo_lightning.report.render.legend` says it."""
+    """Legend of a table's numbers, as :func:`~epo_lightning.report.render.legend` says it."""
     text = legend([table], "below", r"\textbf{Bold}", r"\underline{underlined}")
     return text.replace("±", r"$\pm$").replace("n seeds", "$n$ seeds")
 
@@ -107,7 +107,7 @@ def comparisons_to_latex(comparisons: Comparisons, label: str | None = None, cav
 
 
 def behind(rows: Sequence[Row]) -> list[str]:
-    """What the numbers of rows stand on, one text per line: n, seeds, data, commits and commands."""
+    """Provenance of the numbers of rows, one text per line: n, seeds, data, commits and commands."""
     lines = []
     for row in rows:
         seeds = " ".join(map(str, row.seeds))

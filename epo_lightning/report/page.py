@@ -136,7 +136,7 @@ def _table(table: Table, cells: list[dict[str, Any]], place: Any) -> dict[str, A
 
 
 def _behind(row: Row) -> dict[str, Any]:
-    """What the page says of every cell of a row."""
+    """Cells of a row as the page shows them."""
     return {
         "name": row.name,
         "runs": [

@@ -1,4 +1,4 @@
-"""What the paper reports, as data: the values that tables and figures show beside ours.
+"""Results of the paper as data: the values that tables and figures show beside ours.
 
 Keys are (data, backbone, forecaster) in this project's names. Displacements in m, overlap rates as rates, runtimes in s.
 """
@@ -74,7 +74,7 @@ PARTS = {
     "backward": "unrolled",
     "objective": "imitation",
 }
-"""What the paper's own row is made of, its "Ours"; other methods of its Table 1 share the forecaster."""
+"""Parts of the paper's own row, its "Ours"; other methods of its Table 1 share the forecaster."""
 
 
 def is_papers(forecaster: str, config: Mapping[str, Any]) -> bool:

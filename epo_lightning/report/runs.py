@@ -207,7 +207,7 @@ def _entry(content: Any, file: Path, remedy: str, *keys: str) -> Any:
 
 
 def _sound(read: Callable[[], dict[str, Any]], remedy: str) -> dict[str, Any]:
-    """What ``read`` reads of a file; if it cannot, its error with what to do about it."""
+    """Result of ``read`` on a file; an error is extended by what to do about it."""
     try:
         return read()
     except ConfigError as error:

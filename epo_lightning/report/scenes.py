@@ -134,7 +134,7 @@ class _Future:
 
 @dataclass(frozen=True)
 class _Ground:
-    """What is known of one scene, in the frame of its picture: the main direction to the right, the agents around zero.
+    """One scene in the frame of its picture: the main direction to the right, the agents around zero.
 
     Agents that do not exist are left out. The history and the future are one sequence of T steps, in which ``now`` is t0.
     """
@@ -522,7 +522,7 @@ def _mixed(start: Color, end: Color, share: float) -> Color:
 
 
 def _explained(ground: _Ground, futures: Sequence[_Future], moving: bool) -> list[Artist]:
-    """What the lines and boxes mean, as entries of a legend."""
+    """Legend entries of lines and boxes."""
     handles: list[Artist] = [Line2D([], [], color=HISTORY, lw=1.2, label="history")]
     if ground.seen[:, ground.now + 1 :].any():
         truth = Line2D(

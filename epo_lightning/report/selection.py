@@ -18,7 +18,7 @@ SEARCHED = ("optimizer", "backbone", "forecaster")
 
 @dataclass(frozen=True)
 class BestSetting:
-    """Which setting of an experiment is best.
+    """The best setting of an experiment.
 
     Attributes:
         row: its runs and scores.
@@ -44,7 +44,7 @@ class BestSetting:
 
 
 def best_settings(runs: Iterable[EvaluatedRun], split: str = "val", metric: str = "minSADE") -> list[BestSetting]:
-    """Of every experiment with several settings, the one with the lowest mean over seeds.
+    """The setting with the lowest mean over seeds, for every experiment with several settings.
 
     A sweep over the optimisation steps, or over the number of modes, is no search. A setting with fewer seeds than
     another is no candidate: a mean over one lucky seed must not win.

@@ -49,7 +49,7 @@ class Comparison:
 
     @property
     def seeds(self) -> list[int]:
-        """Those that both rows have."""
+        """Seeds that both rows have."""
         return sorted({*self.one.seeds} & {*self.other.seeds})
 
 

@@ -25,7 +25,7 @@ ROAD, LANE = "#ECECEC", "#CFCFCF"
 """Lanes, and the line in the middle of each."""
 HISTORY, TRUTH, OTHER = "#8A8A8A", "#111111", "#8A8A8A"
 AGENTS = ("robot", "pedestrian")
-"""What the agents of the RPI environment are called."""
+"""Names of the agents of the RPI environment."""
 DPI = 150
 
 STYLE: dict[Any, Any] = {

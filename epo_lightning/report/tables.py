@@ -127,7 +127,7 @@ class Row:
 
     @property
     def title(self) -> str:
-        """What it shares with rows that differ in settings only."""
+        """Title shared with rows that differ in settings only."""
         return self.runs[0].name
 
     @property
@@ -141,7 +141,7 @@ class Row:
 
     @property
     def identity(self) -> str:
-        """What its runs share, and with no other row."""
+        """Identity that its runs share with each other and with no other row."""
         return self.runs[0].row
 
     @property
@@ -155,7 +155,7 @@ class Row:
 
     @property
     def commits(self) -> list[str]:
-        """Of the code that made its runs; one, or it was changed in between."""
+        """Commits of the code that made its runs; several if the code changed in between."""
         return sorted({run.git_commit for run in self.runs})
 
     @property

@@ -132,7 +132,7 @@ def over_modes(timings: Sequence[Timing]) -> tuple[tuple[int, int | None], dict[
 
 
 def timing_sheet(where: str, timings: Sequence[Timing]) -> Sheet:
-    """What was measured at one place, by sizes, with the paper's values where it has them, and methods by their titles."""
+    """Times measured on one machine by sizes, with the paper's values where it has them, and methods by their titles."""
     lines = []
     named = len({timing.method for timing in timings}) > 1
     for t in sorted(timings, key=lambda t: (t.agents, t.steps or 0, t.modes)):

@@ -1,4 +1,4 @@
-"""What the games that were inferred look like: the weights of their energies."""
+"""Weights of the inferred games' energies."""
 
 from __future__ import annotations
 

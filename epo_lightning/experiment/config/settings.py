@@ -1,4 +1,4 @@
-"""What a configuration may say: its sections and their types, checked before anything is loaded or written.
+"""Sections of a configuration and their types, checked before anything is loaded or written.
 
 Sections that choose a registered part (data, backbone, ...) are checked against the part's own constructor; the others
 are dataclasses here. Nothing is built from ``_target_`` or any other path to code.
@@ -17,7 +17,7 @@ from typing import Any, Literal
 from epo_lightning.registry import ConfigError, check, lookup, nearest
 
 Measured = Literal["test", "val", "time"]
-"""What may be measured of a run: its scores on a split, or the time of a forecast."""
+"""Measurements of a run: its scores on a split, or the time of a forecast."""
 PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective", "optimizer")
 MOST_PROCESSES = 1024
 """Most threads, devices or workers that a configuration may ask for: beyond that a number is a slip of the hand, which the
@@ -78,7 +78,7 @@ class TrainerSettings:
 
 @dataclass(frozen=True)
 class CallbackSettings:
-    """What watches the training (``conf/callbacks``)."""
+    """Callbacks of a training (``conf/callbacks``)."""
 
     monitor: str = "val/minSADE"
     patience: int | None = 10
@@ -108,7 +108,7 @@ class CSVSettings:
 
 @dataclass(frozen=True)
 class DashboardSettings:
-    """What all dashboards can be told."""
+    """Settings that all dashboards have."""
 
     pictures: int = 0
     patience: float = 10.0
@@ -150,7 +150,7 @@ class MLflowSettings(DashboardSettings):
 
 @dataclass(frozen=True)
 class LoggerSettings:
-    """Where the log goes besides the CSV file; None is not chosen."""
+    """Dashboards that get the log besides the CSV file; None is not chosen."""
 
     csv: CSVSettings = field(default_factory=CSVSettings)
     tensorboard: TensorBoardSettings | None = None
@@ -160,7 +160,7 @@ class LoggerSettings:
 
 @dataclass(frozen=True)
 class BudgetSettings:
-    """Which budget was chosen; what it sets lies in the other sections."""
+    """Name of the chosen budget, whose settings lie in the other sections."""
 
     name: str = "paper"
 
@@ -201,12 +201,12 @@ class Settings:
 
     @property
     def measures(self) -> tuple[Measured, ...]:
-        """What ``score`` asks for."""
+        """Measurements that ``score`` asks for."""
         return measures(self.score)
 
 
 def measures(score: str | Sequence[str] | None) -> tuple[Measured, ...]:
-    """What ``score`` asks for, however it says so: each once, in one order, and nothing for null."""
+    """Measurements that ``score`` asks for, each once and in one order; none for null."""
     asked = (score,) if isinstance(score, str) else score or ()
     return tuple(which for which in typing.get_args(Measured) if which in asked)
 

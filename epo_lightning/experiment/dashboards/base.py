@@ -1,4 +1,4 @@
-"""What a dashboard is told about a run, and what it has to be able to do."""
+"""Interface of a dashboard, and the facts that it gets about a run."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ QUIET = {
     "x_transaction_log_flush_interval": 1.0,  # seconds of which a kill may take the rows
     "finish_timeout_raises": True,
 }
-"""What W&B would do by itself and what costs time at every start, or prints into other runs' lines."""
+"""Features of W&B that are switched off because they cost time at every start, or print into other runs' lines."""
 
 
 class WandB(Dashboard):
@@ -135,7 +135,7 @@ class WandB(Dashboard):
 
 
 def server() -> str:
-    """Where W&B is, from the environment or what ``wandb login --host`` has noted."""
+    """Address of W&B, from the environment or what ``wandb login --host`` has noted."""
     if "WANDB_BASE_URL" in os.environ:
         return os.environ["WANDB_BASE_URL"]
     import wandb

@@ -95,7 +95,7 @@ def how_far(job: Job) -> str:
 
 
 def result(job: Job) -> str:
-    """What a finished run has come to: its best validation score and how long it took, and how long a forecast takes."""
+    """Summary of a finished run: its best validation score and how long it took, and how long a forecast takes."""
     told = []
     if job.measures != ("time",):
         record = job.run.record

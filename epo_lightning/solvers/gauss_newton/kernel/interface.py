@@ -40,6 +40,8 @@ Address, Integer, Real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
 
 class Game(ctypes.Structure):
+    """The game as the kernel reads it: sizes, addresses and strides of its tensors, in `EpoGame`'s order."""
+
     _fields_ = (
         *((name, Integer) for name in ("B", "M", "N", "K", "lines", "points", "pair_stride")),
         ("dt", Real),
@@ -59,6 +61,8 @@ class Game(ctypes.Structure):
 
 
 class Run(ctypes.Structure):
+    """The arguments and outputs of a solve, in `EpoRun`'s order."""
+
     _fields_ = (
         ("steps", Integer),
         ("step_size", Real),
@@ -73,6 +77,8 @@ class Run(ctypes.Structure):
 
 
 class Gradients(ctypes.Structure):
+    """Cotangents that the adjoint reads and gradients that it adds to, in `EpoGradients`' order."""
+
     _fields_ = (
         ("controls", Address),
         ("iterates", Address),
