@@ -1,7 +1,7 @@
-"""Identity of a run: its resolved configuration, as far as it decides on the result, and its data.
+"""Identity of a run: a hash of the settings that decide on its result, and of its data.
 
-Names, places and machines are left out: how a row is called, where its files lie, what logs it, how many threads, devices or
-processes compute it. The data's digest takes the place of paths to it.
+Settings that only say how a run is named, where its files lie, where it is logged and on what it is computed (threads,
+devices, processes) are left out. The digest of the data replaces its path.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ SECTIONS = (
     *("data", "backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective", "optimizer"),
     *("trainer", "callbacks", "goal", "seed"),
 )
-"""Everything else in a configuration says what a run is called, where it is written, or who watches it."""
+"""Sections of a configuration that decide on the result. The others only name, place or log a run."""
 ELSEWHERE = (
     *("data.root", "data.folder"),
     *(
@@ -28,15 +28,15 @@ ELSEWHERE = (
     ),
     *("callbacks.progress", "callbacks.refresh"),
 )
-"""Keys of those sections that say where the data lies, or on what and how visibly it is computed."""
+"""Keys of those sections that do not decide on the result: folders of data, the machine, logging and progress."""
 
 
 SHARES = ("trainer.limit_train_batches", "trainer.limit_val_batches")
-"""Keys of which a whole number says something else than the same number with a point: one batch, or all of them."""
+"""Keys for which 1 and 1.0 differ: a whole number is a number of batches, a number with a point a share of all batches."""
 
 
 def essence(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a resolved configuration that decides on the result, as plain JSON values, each number in one way."""
+    """The part of a resolved configuration that decides on the result, as plain JSON values; 2.0 and 2 are the same."""
     return {section: _plain(config.get(section), section) for section in SECTIONS}
 
 
@@ -57,7 +57,7 @@ def identity(config: Mapping[str, Any], data_digest: str) -> str:
 
 
 def row_identity(config: Mapping[str, Any], data_digest: str) -> str:
-    """The identity of a table's row: that of its runs without their seed."""
+    """Identity of a row of a table: the identity of its runs computed without the seed, and so the same for all of them."""
     return _hash({**essence(config), "seed": None, "data_digest": data_digest})
 
 
@@ -69,7 +69,7 @@ def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[
 
 
 def canonical(content: Any) -> str:
-    """Equal for equal values of equal types; Python takes 1 and true for the same."""
+    """JSON text that is the same for equal values of equal types. (Python's ``==`` takes 1 and True for equal.)"""
     return json.dumps(content, sort_keys=True)
 
 

@@ -5,18 +5,18 @@
     <run folder>/
         config.yaml            the resolved configuration: all that is needed to continue or evaluate the run
         run.json               record: title, experiment, budget, seed, data digest, versions, parameters, status;
-                               `identity` is what makes it this run and no other, `row` the same without its seed
+                               `identity`, a hash of everything that decides on the result; `row`, the same without seed
         checkpoints/best.ckpt  the epoch with the smallest validation minSADE
         checkpoints/last.ckpt  the last finished epoch, with everything that continuing needs
         logs/                  metrics.csv: what was logged while training; TensorBoard's and W&B's files lie beside it
         metrics.json           scores on the test split, written by ``evaluate`` ({"split", "data", "checkpoint", "metrics"})
-        metrics-val.json       the same on the validation split, if asked for
-        runtime.json           how long one joint forecast takes, if asked for
-        progress.json          how far the training is, and where it runs; there while it does
+        metrics-val.json       scores on the validation split, where `score` or `epo evaluate` asks for them
+        runtime.json           time of one joint forecast, where `score` asks for it
+        progress.json          step and machine of the training; exists only while it runs
         .lock                  locked as long as a process works on the run; the system releases it when the process dies
 
-Files are replaced as a whole: a reader, or a kill at any moment, never meets half of one. ``metrics.json`` holds no time,
-path or version, so that two equal runs give the same bytes.
+Files are replaced as a whole, so a reader never sees an incomplete one, whenever the writing process is killed.
+``metrics.json`` holds no time, path or version, so that two equal runs give the same bytes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from epo_lightning.registry import ConfigError
 
 TRAINING, FINISHED, FAILED = "training", "finished", "failed"
 State = Literal["waiting", "running", "interrupted", "failed", "finished"]
-"""Waiting: nothing is there yet. Interrupted: it was begun, nobody works on it, and it says of no error."""
+"""State of a run. Waiting: it has not begun. Interrupted: it has begun, no process works on it, and no error is recorded."""
 SILENCE = 600.0
 """Seconds without a sign of life after which a run on another machine, whose locks may not be seen here, is interrupted."""
 
@@ -74,7 +74,7 @@ def whole_file(path: Path, suffix: str = "") -> Iterator[Path]:
 
 @contextmanager
 def errors_naming(path: Path) -> Iterator[None]:
-    """Let every OSError name ``path``: that of a full disk names no file."""
+    """Context in which every OSError names ``path``; the system's own error for a full disk names no file."""
     try:
         yield
     except OSError as error:
@@ -116,7 +116,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
     except ValueError as error:
-        raise ConfigError(f"{path} is not JSON ({error}); was it edited or copied by half?") from error
+        raise ConfigError(f"{path} is not JSON ({error}); was it edited, or copied incompletely?") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path} holds no JSON object")
     return content
@@ -144,10 +144,10 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
-        """The run in ``path``; or the run of that name that ships with the package, where there is no such path.
+        """The run in the folder ``path``. If there is no such folder, ``path`` may be the name of a run in the package.
 
         Raises:
-            ConfigError: there is no run; the message names the runs nearby.
+            ConfigError: there is no run; the message names the runs below ``path``.
         """
         run = cls(pretrained.folder_of(path) or Path(path).expanduser())
         if not run.path.is_dir():
@@ -175,7 +175,7 @@ class RunFolder:
         return self.path / "logs"
 
     def checkpoint(self, which: str = "best") -> Path:
-        """The checkpoint called ``which``: best, last, or a path of its own."""
+        """Path of a checkpoint: ``which`` is best, last, or the path itself."""
         return self.checkpoints / f"{which}.ckpt" if which in ("best", "last") else Path(which).expanduser()
 
     @property
@@ -183,7 +183,7 @@ class RunFolder:
         return self.path / "progress.json"
 
     def metrics_file(self, split: str = "test") -> Path:
-        """File of the scores on a split; the measured time of a forecast for ``time``."""
+        """File of the scores on the split ``test`` or ``val``; for ``time``, the file of the time of a forecast."""
         names = {"test": "metrics.json", "time": "runtime.json"}
         return self.path / names.get(split, f"metrics-{split}.json")
 
@@ -234,7 +234,7 @@ class RunFolder:
         try:
             with self.lock(wait=0.0):
                 pass
-        except (ConfigError, OSError):  # taken, or not ours to take
+        except (ConfigError, OSError):  # another process holds the lock, or the file belongs to another user
             return True
         progress = self.progress
         elsewhere = progress.get("host", socket.gethostname()) != socket.gethostname()
@@ -245,7 +245,7 @@ class RunFolder:
         """Keep every other process away from the run; the lock of a process that dies is released.
 
         Args:
-            wait: seconds to wait for one that works on it; None waits as long as it takes.
+            wait: seconds to wait for a process that holds the lock; None waits without a limit.
 
         Raises:
             ConfigError: another process still works on it.
@@ -279,7 +279,7 @@ class RunFolder:
             raise ConfigError(f"cannot read {self.config_file}: {error.strerror}") from error
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise ConfigError(
-                f"{self.config_file} is not YAML ({' '.join(str(error).split())}); was it edited or copied by half?"
+                f"{self.config_file} is not YAML ({' '.join(str(error).split())}); was it edited, or copied incompletely?"
             ) from error
         if not isinstance(content, dict):
             raise ConfigError(f"{self.config_file} holds no configuration")

@@ -37,7 +37,10 @@ class Diverged(ConfigError):
 
 
 def folder_for(settings: Settings) -> RunFolder:
-    """``<runs>/<experiment>/<budget>-s<seed>``, and its variant where it is not just that experiment and budget."""
+    """The run's folder, ``<runs>/<experiment>/<budget>-s<seed>``; ``run_dir`` replaces it.
+
+    A run with other settings than its experiment and budget have gets ``-<variant>`` at the end, a hash of its settings.
+    """
     if settings.run_dir:
         return RunFolder(Path(settings.run_dir).expanduser())
     group = settings.experiment or f"custom/{settings.forecaster['name']}"
@@ -46,12 +49,12 @@ def folder_for(settings: Settings) -> RunFolder:
 
 
 def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolder | None = None) -> RunFolder:
-    """Train what ``config`` describes, and score it if the configuration says so.
+    """Train a forecaster as ``config`` describes, and score it if the configuration asks for it.
 
     Args:
-        config: the resolved configuration of ``epo train``.
-        overrides: what the user changed; written to run.json.
-        begun: a run to continue, whose own configuration ``config`` is.
+        config: the resolved configuration of ``epo train`` as plain values; the code reads it as checked ``settings``.
+        overrides: the user's overrides, recorded in run.json.
+        begun: a run to continue; ``config`` is then the configuration in its folder. None for a new run.
 
     Raises:
         ConfigError: the configuration cannot work, its data is missing, the folder holds a run already, or another process
@@ -67,8 +70,8 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
     if begun is None:
         refuse_occupied(settings, run)
     if not run.finished:
-        data.setup("fit")  # missing data is said before a folder is made
-    # In a sweep, another process that works on the run may finish it.
+        data.setup("fit")  # raises an error for missing data before a run folder is made
+    # In a sweep, another process may be training this run: wait until it has finished. Otherwise wait two seconds.
     patience = None if settings.sweep and begun is None else 2.0
     with run.lock(wait=patience), gpus.placed(settings.trainer) as devices:
         if run.record_file.is_file():
@@ -76,7 +79,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
             if not run.finished:
                 run.update(status=TRAINING, error=None)
         else:
-            refuse_occupied(settings, run)
+            refuse_occupied(settings, run)  # again, now under the lock: another process may have begun the run
             run.begin(config, _record(settings, config, data.digest, overrides))
         if not run.finished:
             with _errors_recorded(run), assembly.signals():
@@ -114,7 +117,7 @@ def fit(
     step = _steps_in(last, forecaster) if last else 0
     learned = assembly.parameters(forecaster)
     learns = learned > 0 and settings.trainer.max_steps != 0
-    timer = Timer()  # it is kept in the checkpoint: the time of a killed process counts
+    timer = Timer()  # its state is part of the checkpoint, so the time before a kill is counted as well
     watchers = [*callbacks.watchers(settings.callbacks, run, f"{settings.title}, seed {settings.seed}"), timer]
     strategy = None
     if settings.trainer.devices > 1:
@@ -132,7 +135,7 @@ def fit(
         best = _best_score(run, trainer, settings.callbacks.monitor)
     run.update(
         status=FINISHED,
-        epochs=trainer.fit_loop.epoch_progress.current.ready,  # current_epoch lags where there was no step left to make
+        epochs=trainer.fit_loop.epoch_progress.current.ready,  # current_epoch is too small if the last epoch made no step
         steps=trainer.global_step,
         best={settings.callbacks.monitor: best},
         seconds=round(timer.time_elapsed() if learns else time.monotonic() - started, 3),
@@ -141,7 +144,7 @@ def fit(
 
 @contextlib.contextmanager
 def _errors_recorded(run: RunFolder) -> Iterator[None]:
-    """Context of a training, whose error is also left in run.json."""
+    """Context that records an error of the training in run.json and raises it again."""
     try:
         yield
     except Exception as error:
@@ -164,10 +167,10 @@ def measure(run: RunFolder, settings: Settings, which: Measured, devices: int | 
 
 
 def refuse_other(run: RunFolder, config: dict[str, Any], data_digest: str) -> None:
-    """A run goes on with the configuration and the data that it began with.
+    """Refuse to continue a run with another configuration or other data than it began with.
 
     Raises:
-        ConfigError: one of them has changed; the message names the difference.
+        ConfigError: the configuration or the data has changed; the message names the difference.
     """
     if differing := differences(run.config(), config):
         shown = ", ".join(f"{key}: {there!r} there, {here!r} here" for key, there, here in differing[:5])
@@ -179,7 +182,7 @@ def refuse_other(run: RunFolder, config: dict[str, Any], data_digest: str) -> No
 
 
 def _keep_unlearned(trainer: Trainer, model: LightningModule, data: Any, run: RunFolder) -> None:
-    """Validate a forecaster without parameters or without steps once, and keep it like any other."""
+    """Validate a forecaster once that has nothing to learn (no parameters, or zero steps), and write its checkpoints."""
     trainer.validate(model, data, verbose=False)
     run.checkpoints.mkdir(parents=True, exist_ok=True)
     trainer.save_checkpoint(run.checkpoint("last"))
@@ -190,7 +193,7 @@ def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:
     """The smallest validation score.
 
     Raises:
-        Diverged: there is no finite one.
+        Diverged: no validation score is finite.
     """
     watchers = [w for w in trainer.checkpoint_callbacks if isinstance(w, callbacks.ModelCheckpoint) and w.monitor]
     best = [w.best_model_score for w in watchers]
@@ -205,6 +208,11 @@ def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:
 
 
 def _steps_in(path: Path, model: LightningModule) -> int:
+    """Number of optimisation steps of a checkpoint, after a check that its weights have the shapes of ``model``.
+
+    Raises:
+        ConfigError: the checkpoint is damaged or belongs to another architecture.
+    """
     content = read_checkpoint(path)
     shapes = {key: tuple(value.shape) for key, value in content["state_dict"].items()}
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
@@ -218,10 +226,10 @@ def _steps_in(path: Path, model: LightningModule) -> int:
 
 
 def refuse_occupied(settings: Settings, run: RunFolder) -> None:
-    """Nothing is ever overwritten.
+    """Refuse a folder whose contents a new run would overwrite.
 
     Raises:
-        ConfigError: the folder holds something, and it is not a run that ``settings`` may continue.
+        ConfigError: the folder holds something other than a run that ``settings`` may continue (``existing=continue``).
     """
     if run.exists and not (settings.existing == "continue" and run.record_file.is_file()):
         raise ConfigError(_occupied(run))

@@ -10,7 +10,7 @@ where the last term is shared by both agents. The game is therefore an exact pot
 the own costs plus the shared term once.
 
 Sources: the paper's appendix. The constants that it does not print are those of GameInference.jl (Peters, 2020), except for
-the radius of the proximity cost: with its 1.5 m, agents of 0.25 m never come near each other.
+the radius of the proximity cost: with GameInference's 1.5 m, agents of radius 0.25 m would never come near each other.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class MainGame:
     """One main game at one placement of the pedestrian.
 
     Attributes:
-        game, placement: its indices.
+        game, placement: index of the main game, and of the pedestrian's start position in it.
         weight: w, drawn once per main game and the same for both agents.
         phi: angle [rad] from the robot's start to the pedestrian's, seen from the middle; also the pedestrian's heading.
         start: joint start state, 2 x (x, y, heading, speed).

@@ -25,11 +25,11 @@ DISC_DIAMETER = 0.5
 
 
 class RPIDataset:
-    """Scenes of one split.
+    """Scenes of one split, indexed by whole batches.
 
-    A record has one history and one or two modes. ``targets`` selects the futures to learn: ``executed`` (the mode that the
-    agents followed), ``both`` (one sample per mode) or ``sampled`` (one of the record's modes, drawn in every epoch from
-    (seed, epoch, index)).
+    A record has one history and one or two modes: the executed one and, if it exists, the alternative one. ``targets``
+    selects the futures to learn: ``executed`` (the mode that the agents followed), ``both`` (one sample per mode) or
+    ``sampled`` (one of the record's modes, drawn in every epoch from (seed, epoch, index)).
 
     Args:
         records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``states`` [R, 2 modes, 2, 40, 4] and ``modes`` [R].

@@ -16,7 +16,7 @@ from epo_lightning.data.rpi.game import generator
 
 RULES = ("paper", "hard")
 PAPER_SIZES = (47822, 6228, 6228)
-"""Printed numbers of records of training, validation and test."""
+"""Numbers of records of training, validation and test that the paper prints."""
 HARD_SECTOR = (75.0, 105.0)
 """Range of |phi| [degrees] whose records the rule ``hard`` assigns to the test split."""
 

@@ -1,7 +1,7 @@
-"""Hydra, with its errors in one sentence each.
+"""Composition of configurations by Hydra; each of its errors becomes one sentence.
 
 The configuration tree lies beside the package in a checkout and inside it in an installed wheel. A configuration is
-composed here and checked before anything else happens, so that a misspelt word costs a second and leaves no folder.
+composed and checked before anything else happens, so that a misspelt word is reported at once and leaves no folder.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def hydra(extra: Sequence[str] = ()) -> Iterator[Hydra]:
     for source in (TreeSource, SweepsSource):
         SourcesRegistry.instance().register(source)
     path = create_config_search_path(f"{TreeSource.scheme()}://{root / 'conf'}")
-    # The group `sweeps` lies beside conf/, where somebody looks who wants a table of the paper.
+    # The folder `sweeps` lies beside conf/, because users look for the tables of the paper there.
     path.append("sweeps", f"{SweepsSource.scheme()}://{root}", SearchPathQuery(provider="main"))
     for folder in reversed(extra):
         if not Path(folder).is_dir():
@@ -90,13 +90,13 @@ def compose(name: str, overrides: Sequence[str] = (), extra: Sequence[str] = ())
 
 
 def resolve(config: DictConfig) -> dict[str, Any]:
-    """Plain Python values, with every interpolation replaced and without Hydra's own part.
+    """A configuration as plain Python values, with every interpolation replaced and without the section ``hydra``.
 
-    Adds ``experiment``, and ``variant``: empty where nothing that matters differs from the experiment as it is written, at
-    its budget, and else six digits of a hash of what the run is without its seed.
+    Adds ``experiment``, and ``variant``: empty if the settings that decide on the result are those of the experiment's file
+    and the budget's file, otherwise six digits of a hash of these settings without the seed.
 
     Raises:
-        ConfigError: an interpolation that leads nowhere, or a value that is still missing.
+        ConfigError: an interpolation of a key that does not exist, or a value that is still missing.
     """
     choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
     values = _plain_values(config)
@@ -119,7 +119,10 @@ def _search_path() -> tuple[str, ...]:
 
 @cache
 def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> str | None:
-    """The essence of an experiment at its budget, without a seed; None where it cannot stand alone."""
+    """The essence (:func:`~epo_lightning.identity.essence`) of the options ``words`` alone, without a seed, as JSON text.
+
+    None if they do not compose without further overrides.
+    """
     from hydra.core.global_hydra import GlobalHydra
     from hydra.types import RunMode
 
@@ -127,7 +130,7 @@ def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> str | N
     try:
         config = loader.load_configuration("train", list(words), run_mode=RunMode.RUN)
         return canonical(essence({**_plain_values(config), "seed": None}))
-    except Exception:  # it needs a value that only the run at hand brings
+    except Exception:  # a mandatory value is given by the overrides of this run only
         return None
 
 
@@ -147,7 +150,7 @@ def _plain_values(config: DictConfig) -> dict[str, Any]:
 
 
 def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list[list[str]]:
-    """The overrides of every job that Hydra's basic sweeper would launch; empty for sweepers that choose as they go."""
+    """The overrides of every job that Hydra's basic sweeper would launch; empty for sweepers that search (Optuna)."""
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from omegaconf import OmegaConf
@@ -168,7 +171,7 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
 
 
 def trials(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> int | None:
-    """How many runs a searching sweeper is asked for; None where it does not say."""
+    """Number of runs that a searching sweeper makes (``n_trials``); None for sweepers without that setting."""
     with hydra(extra) as instance:
         return _composed(instance, name, overrides, multirun=True).hydra.sweeper.get("n_trials")
 
@@ -255,7 +258,7 @@ def _one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Itera
 
 
 def _missing_option(instance: Hydra, missing: str, message: str) -> str:
-    """``experiment/rpi/v_lst`` is no file: name the files that are."""
+    """The error message for an option without a file, such as ``experiment/rpi/v_lst``; names the options that exist."""
     if missing.removesuffix(".yaml") in PLUGINS:
         package = PLUGINS[missing.removesuffix(".yaml")]
         return (
@@ -276,7 +279,7 @@ def options_of(instance: Hydra, group: str) -> list[str]:
 
 
 def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str]) -> str:
-    """Find the level at which ``key`` leaves the configuration, and the names known there."""
+    """The error message for an unknown key: names its first unknown part, the section, and the keys of that section."""
     from hydra.types import RunMode
     from omegaconf import DictConfig
 
@@ -287,7 +290,7 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
                 config_name=name, overrides=kept, run_mode=RunMode.RUN, with_log_configuration=False
             )
             break
-        except Exception:  # the other overrides are wrong as well; the plain tree still tells the names
+        except Exception:  # other overrides are wrong as well: without any of them, the tree still has the names
             continue
     walked: list[str] = []
     for word in key.replace("/", ".").split("."):
