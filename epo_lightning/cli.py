@@ -1,7 +1,7 @@
 """``epo <verb> [overrides]``: the command line.
 
-Nothing heavy is imported before it is needed, so that help comes at once. Every error that a user can cause is one message
-and exit status 2; ``--traceback`` shows where it came from.
+Heavy packages are imported only when they are needed, so that help appears at once. A mistake in the command line or the
+configuration gives one message and exit status 2; ``--traceback`` shows where it was raised.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ USAGE = """\
 epo - energy-based potential games for multi-agent motion forecasting
 
   epo generate                               make the data set
-  epo train experiment=rpi/v_lstm_epo        train a row of the paper's table
-  epo sweep rpi_main                         train and score all rows, with seeds, or what is missing of them
-  epo sweep status rpi_main                  how far they are
+  epo train experiment=rpi/v_lstm_epo        train one method (a row of the paper's table)
+  epo sweep rpi_main                         train and score all rows with several seeds; skips finished runs
+  epo sweep status rpi_main                  show the state of all these runs
   epo train resume=<run folder>              continue after a kill
   epo evaluate runs=runs                     score finished runs on the test split
   epo predict run=<run folder> out=<folder>  write and draw forecasts
-  epo report rpi_main                        the table beside the paper's values, figures, and a page of it all
+  epo report rpi_main                        write the table with the paper's values, figures, and one HTML page
   epo config experiment=rpi/v_lstm_epo       print the resolved configuration
   epo config check experiment=...            check it, without loading anything
 
@@ -40,19 +40,19 @@ Everything after the verb is a Hydra override, key=value. `epo <verb> --help` li
 
 Options
   -m, --multirun        run every combination of comma-separated values (epo train -m seed=0,1,2)
-  --stop-on-failure     epo sweep: begin no further run when one has failed
+  --stop-on-failure     epo sweep: start no more runs after one has failed
   --config-dir FOLDER   look for configurations here first
-  --traceback           show where an error came from
+  --traceback           show the Python traceback of an error
   --version
   -h, --help
 """
 
 SWEEP_USAGE = """\
-epo sweep <name> [key=value ...]         train and score all runs of a sweep, or what is missing of them
-epo sweep status [<name or label>]       what has become of them
+epo sweep <name> [key=value ...]         train and score all runs of a sweep that are not finished yet
+epo sweep status [<name or label>]       show the state of its runs
 epo sweep                                list the sweeps
 
-  --stop-on-failure   begin no further run when one has failed
+  --stop-on-failure   start no more runs after one has failed
 """
 
 TERMINATED = 128 + signal.SIGTERM
@@ -60,7 +60,7 @@ TERMINATED = 128 + signal.SIGTERM
 VERBS = {
     "generate": "make a data set and print its report",
     "train": "train a forecaster into a run folder",
-    "sweep": "train and score all runs of a table or figure; `epo sweep status` looks at them",
+    "sweep": "train and score all runs of a table or figure; `epo sweep status` shows their state",
     "evaluate": "score runs on the test split",
     "predict": "write and draw a run's forecasts",
     "report": "tables and figures of evaluated runs",
@@ -70,7 +70,13 @@ VERBS = {
 
 @dataclass
 class Arguments:
-    """A command line, taken apart."""
+    """A parsed command line.
+
+    Attributes:
+        verb: the first word, one of ``VERBS``; empty if there is none.
+        overrides: the words after the verb, mostly Hydra overrides.
+        extra: folders of ``--config-dir``.
+    """
 
     verb: str
     overrides: list[str] = field(default_factory=list)
@@ -81,7 +87,7 @@ class Arguments:
 
 
 def parse(words: Sequence[str]) -> Arguments:
-    """Take a command line apart.
+    """Parse a command line.
 
     Raises:
         ConfigError: an unknown verb or option.
@@ -108,7 +114,7 @@ def parse(words: Sequence[str]) -> Arguments:
                 raise ConfigError(f"unknown verb {word!r}: {nearest(word, VERBS)}")
             found.verb = word
         else:
-            # Hydra would take a bare nan for the number.
+            # Hydra would read the word nan as a floating-point number.
             found.overrides.append("debug='nan'" if word == "debug=nan" else word)
     _refuse_without_effect(found.overrides)
     if found.stop_on_failure and found.verb != "sweep":
@@ -117,7 +123,7 @@ def parse(words: Sequence[str]) -> Arguments:
 
 
 def _refuse_without_effect(overrides: Sequence[str]) -> None:
-    """Refuse a key set twice, of which Hydra takes the last value, and an empty mapping, which changes nothing."""
+    """Refuse a key that is set twice (Hydra would silently use the last value) and an empty mapping (it changes nothing)."""
     seen: dict[str, str] = {}
     for word in overrides:
         key, equals, value = word.lstrip("+").partition("=")
@@ -162,21 +168,24 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def _way_on(words: Sequence[str]) -> str:
-    """How to go on with a command that was stopped."""
+    """Hint how to continue a command that was interrupted."""
     if "train" in words:
-        return "a run goes on with `epo train resume=<run folder>`"
-    return "nothing half-written is left, and the same command goes on"
+        return "continue the run with `epo train resume=<run folder>`"
+    return "no incomplete file was left; the same command continues"
 
 
 @contextmanager
 def _termination() -> Iterator[None]:
-    """Context in which SIGTERM ends the program as Ctrl-C does: files and locks are left in order. Training has its own."""
+    """Context in which SIGTERM ends the program as Ctrl-C does: temporary files are deleted and locks released.
+
+    During a training, :func:`epo_lightning.experiment.assembly.signals` handles SIGTERM instead.
+    """
     program = os.getpid()
 
     def end(number: int, _: object) -> None:
         if os.getpid() == program:
             raise SystemExit(TERMINATED)
-        signal.signal(number, signal.SIG_DFL)  # a worker that was forked ends as it would have
+        signal.signal(number, signal.SIG_DFL)  # a forked worker process: end it by the default action
         os.kill(os.getpid(), number)
 
     ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
@@ -211,7 +220,7 @@ def _run(words: Sequence[str]) -> None:
 
 
 def _help(arguments: Arguments) -> None:
-    """The verb's own configuration file is its help: every line of it is commented."""
+    """Print the help of a verb: its configuration file, in which every line has a comment, and the options of groups."""
     from textwrap import fill
 
     from epo_lightning.experiment.config.compose import hydra, options_of, tree
@@ -256,7 +265,7 @@ def _help(arguments: Arguments) -> None:
                 "sweeps",
             ):
                 options = options_of(instance, group)
-                if group == "experiment":  # the rows on highways once, and not for each data set again
+                if group == "experiment":  # list rows on highways once, not once per data set
                     options = [name for name in options if name.partition("/")[0] not in HIGHWAYS]
                 words = " | ".join(options)
                 print(fill(words, 120, initial_indent=f"  {group + '=':<16}", subsequent_indent=" " * 18))
@@ -281,7 +290,7 @@ def _config(arguments: Arguments) -> None:
         from epo_lightning.experiment.verbs import check
 
         check(verb, config)
-        print(f"{verb}: the configuration is sound")
+        print(f"{verb}: the configuration is valid")
         return
     from epo_lightning.experiment import assembly, train
     from epo_lightning.experiment.config.settings import Settings, read
@@ -289,7 +298,7 @@ def _config(arguments: Arguments) -> None:
     settings = read(Settings, config)
     data, model = assembly.check(settings)
     run = train.folder_for(settings)
-    print(f"{settings.title}: the configuration is sound")
+    print(f"{settings.title}: the configuration is valid")
     print(f"  parameters  {assembly.parameters(model)}")
     print(f"  data        {settings.data['name']}, digest {data.digest}")
     print(f"  run folder  {run.path}" + (" (exists)" if run.exists else ""))
@@ -341,13 +350,13 @@ def _multirun(arguments: Arguments) -> None:
         print(f"{len(listed)} runs")
         for done in compose.launch("train", arguments.overrides, listed, job_of_sweep, arguments.extra):
             if isinstance(done._return_value, Exception):
-                raise done._return_value  # its property would first print the overrides
+                raise done._return_value  # Hydra's `done.return_value` would print the overrides before it raises
         return
     compose.multirun("train", arguments.overrides, job_of_sweep, arguments.extra)
 
 
 def _sweep(arguments: Arguments) -> None:
-    """See ``SWEEP_USAGE``."""
+    """Run, show or list sweeps, as ``SWEEP_USAGE`` describes."""
     from textwrap import fill
 
     from epo_lightning.experiment.sweeps import sweeping
@@ -362,7 +371,9 @@ def _sweep(arguments: Arguments) -> None:
     known = sweeping.known(arguments.extra)
     if name is None:
         if words:
-            raise ConfigError(f"which sweep? `epo sweep <name> {' '.join(words)}`; known: {', '.join(known)}")
+            raise ConfigError(
+                f"the sweep's name is missing: `epo sweep <name> {' '.join(words)}`; known: {', '.join(known)}"
+            )
         for option, says in known.items():
             print(fill(says, 120, initial_indent=f"  {option:<22}", subsequent_indent=" " * 24))
         return
@@ -373,10 +384,10 @@ def _sweep(arguments: Arguments) -> None:
 
 
 def job_of_sweep(config: DictConfig) -> float | None:
-    """One job of a sweep; at module level, so that launchers can send it to other processes.
+    """Train one run of a sweep or multirun. At module level, so that launchers can send it to other processes.
 
     Returns:
-        the best validation score, which is what sweepers that search minimise.
+        the best validation score, which a searching sweeper (Optuna) minimises.
     """
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf

@@ -1,4 +1,4 @@
-"""Secrets in addresses, replaced by ``***`` in everything that is written: ``postgresql://me:***@host/db?sslkey=***``."""
+"""Masking of secrets in addresses, for all files and messages: ``postgresql://me:***@host/db?sslkey=***``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Value = TypeVar("Value")
 
 
 def mask(value: Value) -> Value:
-    """The same value with the secrets of all addresses in it masked: passwords, tokens as user names or in queries.
+    """A copy of a value in which the secrets of all addresses are masked: passwords, and tokens in user names or queries.
 
     Args:
         value: text, or mappings and lists with text in them; other values are left as they are.
@@ -38,7 +38,7 @@ def mask(value: Value) -> Value:
 
 
 def is_masked(text: str) -> bool:
-    """Whether text has lost a secret."""
+    """Whether a secret in the text has been masked."""
     return MASK in text and mask(text) == text
 
 

@@ -1,13 +1,13 @@
-"""Named parts: every backbone, energy or forecaster is chosen by name, and its constructor is its schema.
+"""Registry of named parts: backbones, energies, solvers, forecasters and others are chosen by name in the configuration.
 
 A part is registered where it is written::
 
     @register("backbone", "v_lstm")
     class VLSTM(nn.Module): ...
 
-and built from a mapping whose ``name`` selects it and whose other keys are its constructor's arguments. Packages outside
-this project add parts through the entry-point group ``epo_lightning.parts``: each entry point names a module whose import
-registers them.
+and built from a mapping whose ``name`` selects the part and whose other keys are the arguments of its constructor. Other
+packages add parts through the entry-point group ``epo_lightning.parts``: an entry point names a module, and importing that
+module registers its parts.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ _HOMES = {
     "optimizer": "optimizers",
     "solver": "solvers",
 }
-"""Module or folder of this package whose files register the parts of a kind: a new part is a new file there."""
+"""Module or folder of this package that holds the parts of each kind. A new file in the folder is found by itself."""
 
 
 @cache
 def _load(kind: str) -> None:
-    """Import whatever registers parts of a kind, when the first of them is asked for."""
+    """Import all modules that may register parts of a kind; called when a part of the kind is looked up first."""
     if kind in _HOMES:
         home = import_module(f"epo_lightning.{_HOMES[kind]}")
         for module in pkgutil.walk_packages(getattr(home, "__path__", []), f"{home.__name__}."):
@@ -133,7 +133,7 @@ def build(kind: str, config: Mapping[str, Any], **supplied: Any) -> Any:
     Args:
         kind: the kind of part.
         config: ``name`` and the part's keyword arguments.
-        supplied: further arguments, of which the constructor is given those that it names.
+        supplied: further arguments; the constructor gets those that are in its signature.
 
     Raises:
         ConfigError: as :func:`check`, or a value that the part refuses.

@@ -1,4 +1,4 @@
-"""The task that a data set sets: sizes and units of its scenes, which every forecaster is built for."""
+"""The task of a data set: sizes and units of its scenes. A forecaster is built for one task."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Task:
     Attributes:
         horizon: number K of future steps.
         dt: length of a time step [s].
-        subsets: names of the subsets that ``Scene.subset`` counts; metrics are also reported for each of them.
+        subsets: names of the subsets; ``Scene.subset`` holds indices of them. Metrics are also reported for each subset.
         shape: agents' outline in the overlap rates, ``disc`` or ``box``.
-        candidates: number G of goal candidates per agent. One is a given goal; where there are more, scenes also bring
-            reference lines, the line of each candidate, and reference speeds.
-        map: whether scenes bring lanes.
-        scale: metres that an input or output of one stands for.
+        candidates: number G of goal candidates per agent: 0 for data without goals, 1 for a given goal. Scenes with more
+            candidates also have reference lines, the line of each candidate, and reference speeds.
+        map: whether scenes have lanes.
+        scale: unit [m] of positions at inputs and outputs of networks.
 
     Raises:
         ConfigError: a size or unit that no scene can have.

@@ -34,7 +34,7 @@ from epo_lightning.task import Task
 
 
 def build_data(section: Mapping[str, Any]) -> Any:
-    """The data module of a configuration; it looks at no data yet.
+    """The data module of a configuration; no data is read yet.
 
     Raises:
         ConfigError: an unknown part or key, or a value that it refuses.
@@ -49,13 +49,16 @@ def build_data(section: Mapping[str, Any]) -> Any:
 
 
 def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
-    """The model's configuration: all that a forecaster is built from, as plain values that a checkpoint can store."""
+    """The model's configuration as plain values, which checkpoints store: all parts except ``data``, ``goal`` and the task.
+
+    It is the argument of :func:`~epo_lightning.forecasters.build_forecaster`.
+    """
     sections = {kind: dict(getattr(settings, kind)) for kind in PARTS if kind != "data"}
     return {**sections, "goal": settings.goal, **data.task.to_config()}
 
 
 def build(settings: Settings) -> tuple[Any, LightningModule]:
-    """The data module and the forecaster of a run, the weights drawn from the global random state. Reads no data.
+    """The data module and the forecaster of a run. Initial weights are drawn from the global random state; no data is read.
 
     Raises:
         ConfigError: a part, key or value that cannot work, or sizes that do not fit together, in one sentence.
@@ -71,7 +74,9 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
 
 
 def check_monitor(monitor: str, task: Task) -> None:
-    """Refuse a validation score that no forecaster has; others may still turn out not to be logged, after an epoch.
+    """Refuse to monitor a score that no forecaster logs.
+
+    A score that only this forecaster does not log is refused after the first validation (:mod:`.callbacks`).
 
     Raises:
         ConfigError: an unknown name, with the nearest known one.
@@ -86,7 +91,7 @@ def check_monitor(monitor: str, task: Task) -> None:
 def build_model(settings: Settings, data: Any) -> LightningModule:
     """The forecaster of a configuration for the task of ``data``, see :func:`build`."""
     model = describe_model(settings, data)
-    for kind in PARTS[1:]:
+    for kind in PARTS[1:]:  # all but "data", which was checked when it was built
         check_part(kind, model[kind], SUPPLIED[kind])
     try:
         forecaster = build_forecaster(model)
@@ -96,7 +101,7 @@ def build_model(settings: Settings, data: Any) -> LightningModule:
         raise ConfigError(
             f"the forecaster cannot be built{_suspects(model)}: {' '.join(str(error).split())}"
         ) from error
-    # Lightning converts it too, but only after it has read a checkpoint into it.
+    # Lightning converts the model as well, but only after it has loaded a checkpoint into the model.
     return forecaster.double() if settings.trainer.precision == "64-true" else forecaster
 
 
@@ -106,7 +111,7 @@ def parameters(model: torch.nn.Module) -> int:
 
 
 def check(settings: Settings) -> tuple[Any, LightningModule]:
-    """Build data module and forecaster only to see that they can be built: random states and warnings stay as they are.
+    """Check that data module and forecaster can be built, without an effect on random states and without warnings.
 
     Raises:
         ConfigError: as :func:`build`.
@@ -116,7 +121,7 @@ def check(settings: Settings) -> tuple[Any, LightningModule]:
 
 
 def _suspects(model: Mapping[str, Any]) -> str:
-    """Settings below one, which constructors rarely name in their messages."""
+    """Whole numbers below 1 in the model's configuration: a likely cause of an error whose message names no setting."""
     sections = ((kind, model[kind]) for kind in PARTS[1:])
     small = [
         f"{kind}.{key}={value}"
@@ -128,7 +133,7 @@ def _suspects(model: Mapping[str, Any]) -> str:
 
 
 def quiet() -> None:
-    """Silence the notes of Lightning that concern its own defaults."""
+    """Silence hints and warnings of Lightning about defaults that this project chooses on purpose."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
     for text in (
@@ -146,7 +151,7 @@ def quiet() -> None:
 
 
 class Double(DoublePrecision):
-    """Double precision of scenes, which are frozen data classes: Lightning's own refuses these."""
+    """Lightning's double precision, extended to scenes: its own conversion refuses frozen data classes."""
 
     def convert_input(self, data: Any) -> Any:
         return data.to(torch.double)
@@ -165,10 +170,10 @@ def build_trainer(
     Args:
         settings: the section ``trainer``.
         run: where Lightning may write.
-        callbacks: of the run, among them the progress bar if there is one; those of debugging are added.
-        loggers: of the run.
-        devices: as :func:`.gpus.placed` yields them.
-        strategy: how to train on several devices.
+        callbacks: callbacks of the run, including a progress bar if one is wanted; debugging callbacks are added here.
+        loggers: loggers of the run.
+        devices: number or indices of devices, as :func:`.gpus.placed` yields them.
+        strategy: strategy for several devices; None for one device.
 
     Raises:
         ConfigError: a device or precision that this machine does not have.
@@ -181,7 +186,7 @@ def build_trainer(
             accelerator=settings.accelerator,
             devices=devices,
             strategy=strategy or "auto",
-            # Lightning's own idea of a Slurm job is one that catches its signals and counts its tasks.
+            # In a Slurm job, Lightning would otherwise install its signal handlers and compare the number of tasks.
             plugins=[
                 WholeCheckpoints(),
                 *([LightningEnvironment()] if strategy is None else []),
@@ -207,7 +212,7 @@ def build_trainer(
 
 @contextmanager
 def naming(settings: TrainerSettings, run: RunFolder) -> Iterator[None]:
-    """Context in which Lightning's trainer is made: its messages do not name the setting that they are about.
+    """Context that names the settings in errors of Lightning's Trainer, whose own messages do not.
 
     Raises:
         ConfigError: a device or precision that this machine does not have.
@@ -217,17 +222,17 @@ def naming(settings: TrainerSettings, run: RunFolder) -> Iterator[None]:
     except (MisconfigurationException, ValueError, RuntimeError) as error:
         raise ConfigError(
             f"this machine has no device for trainer.accelerator={settings.accelerator}, trainer.precision="
-            f"{settings.precision} ({' '.join(str(error).split())}): trainer.accelerator=cpu works everywhere; "
-            f"that of a run which has begun stands in {run.config_file}"
+            f"{settings.precision} ({' '.join(str(error).split())}): trainer.accelerator=cpu works everywhere "
+            f"(for a run that has begun, change it in {run.config_file})"
         ) from error
 
 
 @contextmanager
 def signals() -> Iterator[None]:
-    """Around Lightning's trainer, which answers Ctrl-C with a silent exit, and SIGTERM with one that says all is well.
+    """Context in which an interrupted training ends with an error: Ctrl-C as KeyboardInterrupt, SIGTERM as exit status 143.
 
-    Lightning looks between two batches whether a SIGTERM has come; here it is heard before the first one and in the last
-    one, too.
+    Lightning's Trainer ends silently after Ctrl-C, and after SIGTERM with the exit status of success. It checks for a
+    SIGTERM only between two batches; here one that arrives before the first or during the last batch counts as well.
     """
     main = threading.current_thread() is threading.main_thread()
     told = False
@@ -235,7 +240,7 @@ def signals() -> Iterator[None]:
     def end(*_: object) -> None:
         nonlocal told
         told = True
-        if signal.getsignal(signal.SIGTERM) is end:  # else Lightning's handler is there, and has called this one
+        if signal.getsignal(signal.SIGTERM) is end:  # otherwise Lightning's handler is installed and calls this one
             raise SIGTERMException(128 + signal.SIGTERM)
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)} if main else {}

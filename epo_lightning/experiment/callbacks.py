@@ -24,16 +24,17 @@ from epo_lightning.run_folder import RunFolder, write_json
 
 
 class RandomStates(Callback):
-    """Keep the random number generators in the checkpoint, so that a continued run draws what it would have drawn.
+    """Callback that stores the states of all random number generators in checkpoints and restores them.
 
-    Lightning restores weights, optimiser and loops, but not these.
+    A continued run then draws the same random numbers as an uninterrupted one. Lightning itself restores weights, optimiser
+    and loops only.
     """
 
     def __init__(self) -> None:
         self._restored: dict[str, Any] | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        name, keys, position, has_gauss, gauss = numpy.random.get_state()  # noqa: NPY002 - the global one is meant
+        name, keys, position, has_gauss, gauss = numpy.random.get_state()  # noqa: NPY002 - numpy's global generator
         return {
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
@@ -51,7 +52,7 @@ class RandomStates(Callback):
         self._restored = state_dict
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """The checkpoint was written at the end of an epoch: restore right before the next one draws its order."""
+        """Restore the states. The checkpoint was written at the end of an epoch; this epoch's order is not drawn yet."""
         if self._restored is None:
             return
         states, self._restored = self._restored, None
@@ -64,11 +65,11 @@ class RandomStates(Callback):
         random.setstate((version, tuple(internal), gauss_next))
 
 
-# These two keep the names of Lightning's own, because a checkpoint calls their states by them.
+# The two classes below have the names of Lightning's classes, because checkpoints store callback states under these names.
 
 
 class ModelCheckpoint(of_lightning.ModelCheckpoint):
-    """Lightning's own, which also knows its best epoch in a run folder that was moved."""
+    """Lightning's ModelCheckpoint, whose stored paths follow a run folder that was moved."""
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         _require_logged(self.monitor, trainer)
@@ -87,7 +88,7 @@ class ModelCheckpoint(of_lightning.ModelCheckpoint):
 
 
 class EarlyStopping(of_lightning.EarlyStopping):
-    """Lightning's own, but a run that was killed right after it had stopped makes no further step when it is continued."""
+    """Lightning's EarlyStopping, which also stops a continued run that had run out of patience before it was killed."""
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         _require_logged(self.monitor, trainer)
@@ -105,12 +106,12 @@ def _require_logged(monitor: str | None, trainer: Trainer) -> None:
     """
     if monitor is not None and monitor not in trainer.callback_metrics and not trainer.sanity_checking:
         raise ConfigError(
-            f"callbacks.monitor={monitor} is no score of this forecaster: {nearest(monitor, trainer.callback_metrics)}"
+            f"callbacks.monitor={monitor} is not logged by this forecaster: {nearest(monitor, trainer.callback_metrics)}"
         )
 
 
 class EpochLines(Callback):
-    """One line per validated epoch: progress for log files and for several runs that share a terminal."""
+    """Callback that prints one line per validated epoch, for log files and for several runs in one terminal."""
 
     def __init__(self, title: str, monitor: str) -> None:
         self._title, self._monitor = title, monitor
@@ -141,7 +142,7 @@ class EpochLines(Callback):
 
 
 class Progress(Callback):
-    """``progress.json`` in the run folder, which says every few seconds how far the training is."""
+    """Callback that writes the current step to ``progress.json`` in the run folder every few seconds."""
 
     def __init__(self, run: RunFolder, every: float = 2.0) -> None:
         self._run, self._every = run, every
@@ -173,15 +174,15 @@ class Progress(Callback):
             "process": os.getpid(),
             "time": time.time(),
         }
-        with contextlib.suppress(OSError):  # what matters says itself when the disk is full
+        with contextlib.suppress(OSError):  # a full disk is reported when a checkpoint or the log is written
             write_json(self._run.progress_file, content)
 
 
 def watchers(settings: CallbackSettings, run: RunFolder, title: str) -> list[Callback]:
     """The callbacks of a run.
 
-    The best checkpoint is chosen when a validation ends. The last one is written at the end of the epoch, after all
-    other callbacks, because only there everything that the next epoch needs has its final value.
+    The checkpoint ``best`` is written when a validation ends. The checkpoint ``last`` is written at the end of the epoch,
+    after all other callbacks: only then everything that the next epoch needs has its final value.
     """
     best = ModelCheckpoint(
         run.checkpoints,

@@ -1,7 +1,7 @@
-"""Checkpoints that are whole or not there.
+"""Checkpoints that are written completely or not at all.
 
-Lightning writes a checkpoint to the system's folder of temporary files and moves it; where that lies on another file system
-the move is a copy, and a kill in the middle of it leaves a run that cannot go on.
+Lightning writes a checkpoint to the system's temporary folder and then moves it. If that folder is on another file system,
+the move is a copy, and a kill during the copy leaves a broken checkpoint, from which the run could not continue.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from epo_lightning.run_folder import write_bytes
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Writes beside the file that is to be, and renames."""
+    """Checkpoint writer that writes a temporary file in the same folder and renames it."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
-        content = io.BytesIO()  # torch hides a full disk behind a complaint of its own
+        content = io.BytesIO()  # writing to the disk itself, torch would not report a full disk as an OSError
         torch.save(checkpoint, content)
         write_bytes(Path(path), content.getbuffer())

@@ -53,7 +53,7 @@ class CSVLog(Logger):
         return str(self.file.parent)
 
     def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing: config.yaml in the run folder holds the configuration."""
+        """Does nothing: config.yaml in the run folder holds the configuration."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         values = {name: value.item() if isinstance(value, Tensor) else value for name, value in metrics.items()}
@@ -62,10 +62,10 @@ class CSVLog(Logger):
             self.save()
 
     def save(self) -> None:
-        """Write all rows that wait.
+        """Write all rows that were logged since the last call.
 
         Raises:
-            OSError: the disk is full, say; the file then is as it was, and the rows wait on.
+            OSError: the disk is full, for instance; the file is unchanged then, and the next call tries the rows again.
         """
         if not self._waiting:
             return

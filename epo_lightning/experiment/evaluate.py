@@ -1,4 +1,4 @@
-"""Score a run on a split that its training never saw."""
+"""Scores of trained runs on the test or validation split."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def score(
     machine: TrainerSettings | None = None,
     devices: int | list[int] = 1,
 ) -> tuple[Path, dict[str, float]]:
-    """Score one run and write its scores to a file, see :func:`keep`; nothing is written for a run that ships.
+    """Score one run and write its scores to a file (:func:`keep`), except for runs that ship with the package.
 
     Args:
         run: a finished run.
@@ -128,7 +128,7 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
 
 
 def _readable(file: Path) -> bool:
-    """Whether there are scores in a file; one that is damaged is written again."""
+    """Whether a file holds scores. The caller replaces a missing or damaged file."""
     try:
         return isinstance(read_json(file).get("metrics"), dict)
     except ConfigError:

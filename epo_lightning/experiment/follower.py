@@ -1,4 +1,4 @@
-"""A follower of a training on several devices: a process that computes what the leader (:mod:`.distributed`) tells it."""
+"""Followers of a training on several devices: processes that train the run of the leader process (:mod:`.distributed`)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from epo_lightning.run_folder import RunFolder
 
 
 def followed(devices: int, run: RunFolder) -> bool:
-    """Whether this process is one of the followers that Slurm has started, and has now done its part of the run.
+    """Train as a follower if Slurm started this process as one; returns whether it did.
 
     Raises:
         ConfigError: see :func:`here` and :func:`follow`.
@@ -34,13 +34,14 @@ def followed(devices: int, run: RunFolder) -> bool:
 
 
 def follow(place: Place, run: RunFolder | None = None) -> None:
-    """Train what the leader trains.
+    """Train the leader's run together with it. The leader sends the configuration.
 
     Args:
-        run: where the leader may also turn out to have nothing to do.
+        place: rank of this process, number of processes, and port of the leader.
+        run: the run's folder, if known: if the run is finished already, there is no leader to wait for.
 
     Raises:
-        ConfigError: there is no leader.
+        ConfigError: no leader answers.
     """
     store = _find(place, run)
     if store is None:
@@ -51,7 +52,7 @@ def follow(place: Place, run: RunFolder | None = None) -> None:
     seed_everything(settings.seed, workers=True, verbose=False)
     data, model = assembly.build(settings)
     watchers = callbacks.watchers(settings.callbacks, run, settings.title)
-    # Those that decide, or belong to the checkpoint; none that writes or prints.
+    # Callbacks that decide when to stop or have a state in the checkpoint. Only the leader writes files and prints.
     deciding = [w for w in watchers if isinstance(w, Checkpoint | EarlyStopping | callbacks.RandomStates)]
     trainer = assembly.build_trainer(
         settings.trainer, run, deciding, devices=settings.trainer.devices, strategy=DDP(place, store)
@@ -60,7 +61,11 @@ def follow(place: Place, run: RunFolder | None = None) -> None:
 
 
 def _find(place: Place, run: RunFolder | None) -> dist.TCPStore | None:
-    """The leader's store; None if the run is over without one."""
+    """The leader's key-value store; None if the run is finished, so that there is no leader.
+
+    Raises:
+        ConfigError: no leader answers in time.
+    """
     deadline = time.monotonic() + PATIENCE
     while True:
         try:

@@ -1,7 +1,7 @@
-"""Choice of a GPU for a run where several runs share a machine: the first one that has a place left.
+"""Choice of a GPU for a run where several runs share a machine: the first GPU that has a free place.
 
-Runs of a parallel sweep, and runs from several terminals, know nothing of each other; files that are locked for as long as
-their process lives tell them which places are taken.
+Runs of a parallel sweep and runs from several terminals do not communicate. A process therefore locks a file for the place
+that it uses; the system releases the lock when the process ends.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from epo_lightning.experiment.config.settings import TrainerSettings
 
 @contextmanager
 def placed(settings: TrainerSettings) -> Iterator[int | list[int]]:
-    """Hold a place on a GPU if the run wants just one, and wait until there is one.
+    """Context that holds a place on a GPU for a run on one GPU, after waiting for a free one.
 
     Yields:
-        the argument ``devices`` of Lightning's trainer: the GPU with the place, or a number of devices.
+        the argument ``devices`` of Lightning's Trainer: the index of that GPU in a list, or a number of devices for runs on
+        a CPU or on several devices.
     """
     if settings.accelerator == "cpu" or settings.devices > 1 or not torch.cuda.is_available():
         yield settings.devices
         return
     count = torch.cuda.device_count()
-    # By their own names: two jobs of a cluster may both see their GPU as number 0.
+    # GPUs are identified by UUID: two jobs of a cluster may both see their GPU as number 0.
     names = [str(torch.cuda.get_device_properties(number).uuid) for number in range(count)]
     with place(names, settings.share) as number:
         yield [number]
@@ -37,15 +38,15 @@ def placed(settings: TrainerSettings) -> Iterator[int | list[int]]:
 
 @contextmanager
 def place(names: Sequence[str], share: int, folder: Path | None = None) -> Iterator[int]:
-    """Hold one of ``share`` places on one of the GPUs; an empty GPU comes before one with company.
+    """Context that holds one of the ``share`` places on one of the GPUs; GPUs with fewer runs are tried first.
 
     Args:
-        names: of the GPUs.
-        share: how many runs a GPU takes at once.
-        folder: of the lock files; one of this user in the system's folder of temporary files by default.
+        names: names of the GPUs.
+        share: number of runs that a GPU takes at once.
+        folder: folder of the lock files; by default a folder of this user in the system's temporary folder.
 
     Yields:
-        the position in ``names`` of the GPU.
+        the index of the GPU in ``names``.
     """
     from filelock import FileLock, Timeout
 

@@ -1,7 +1,7 @@
-"""A run's log: ``logs/metrics.csv`` in its folder, which is the truth, and the dashboards that are told the same.
+"""Logging of a run: ``logs/metrics.csv`` in its folder, and copies of it in dashboards (TensorBoard, W&B, MLflow).
 
-Only the CSV file may fail a run (a full disk, say). Dashboards are told aside (:mod:`.dashboards.aside`), and what one of
-them has missed can be told again from the folder (:func:`publish`).
+Only an error of the CSV file (a full disk, for instance) ends a run. Dashboards are served by threads of their own
+(:mod:`.dashboards.aside`); rows that a dashboard missed can be sent again from the run folder (:func:`publish`).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def rows(run: RunFolder) -> list[Row]:
 
 
 def scores(run: RunFolder, monitor: str) -> dict[str, float]:
-    """A run in a few numbers: ``best/...``, the validation scores where ``monitor`` was smallest, and ``test/...``."""
+    """Summary of a run: ``best/...``, its validation scores in the epoch with the smallest ``monitor``, and ``test/...``."""
     validated = [metrics for _, metrics in rows(run) if monitor in metrics and metrics[monitor] == metrics[monitor]]
     best = min(validated, key=lambda metrics: metrics[monitor], default={})
     found = {f"best/{name[4:]}": value for name, value in best.items() if name.startswith("val/")}
@@ -50,9 +50,9 @@ def scores(run: RunFolder, monitor: str) -> dict[str, float]:
 
 @contextmanager
 def open_logs(settings: Settings, config: Mapping[str, Any], run: RunFolder, step: int = 0) -> Iterator[list[Logger]]:
-    """The loggers of a run, the CSV file first; closed at the end, as failed where an exception ended it.
+    """Context with the loggers of a run, the CSV file first. At its end they are closed; after an exception, as failed.
 
-    Of several processes that train one run together, only the first has any.
+    If several processes train one run together, only the first one has loggers.
 
     Args:
         config: the resolved configuration.
@@ -71,13 +71,13 @@ def open_logs(settings: Settings, config: Mapping[str, Any], run: RunFolder, ste
         failed = False
     finally:
         if failed:
-            with suppress(OSError):  # what went wrong first is the better message
+            with suppress(OSError):  # an error here must not hide the exception that ended the training
                 file.save()
         _close(dashboards, settings, run, failed)
 
 
 def publish(run: RunFolder) -> None:
-    """Tell a run's dashboards again all that its folder holds: after an evaluation, or when a dashboard was away."""
+    """Send everything in the run folder to the run's dashboards: after an evaluation, or if one was not reachable before."""
     config = run.config()
     settings = read(Settings, config)
     _close(_dashboards(settings, config, run), settings, run, failed=False)
@@ -101,7 +101,7 @@ def _dashboards(settings: Settings, config: Mapping[str, Any], run: RunFolder) -
 def _facts(settings: Settings, config: Mapping[str, Any], run: RunFolder) -> Facts:
     record = run.record
     key = record.get("identity") or identity(config, str(record.get("data_digest")))
-    # Together with the second in which it began: the same run begun again, say with corrected code, is another line.
+    # The id also has the second in which the run began: if it is begun again (with corrected code), it is a new curve.
     began = "".join(filter(str.isdigit, str(record.get("began", ""))))
     sweep = Path(settings.sweep).name if settings.sweep else None
     return Facts(
@@ -130,7 +130,7 @@ def _close(dashboards: Sequence[Aside], settings: Settings, run: RunFolder, fail
 
 
 def _pictures(settings: Settings, run: RunFolder, count: int) -> list[Path]:
-    """Forecasts of the best checkpoint on the validation split, in ``logs/figures``; drawn once."""
+    """Pictures of forecasts of the best checkpoint on the validation split, in ``logs/figures``; existing ones are kept."""
     if drawn := sorted((run.logs / "figures").glob("*.png")):
         return drawn
     try:
@@ -139,6 +139,6 @@ def _pictures(settings: Settings, run: RunFolder, count: int) -> list[Path]:
         scenes, _ = choose(data, "val", max(64, count))
         request = PredictSettings(run=str(run.path), out=str(run.logs), split="val", figures=count)
         return [path for path, _ in draw(request, settings.title, forecaster, scenes, forecast_of(forecaster, scenes))]
-    except Exception as error:  # pictures are for people to look at: no run fails for them
+    except Exception as error:  # a run must not fail because a picture cannot be drawn
         print(f"{run.path}: no pictures ({type(error).__name__}: {error})", file=sys.stderr)
         return []

@@ -49,7 +49,7 @@ def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None)
 
 
 def refuse_changed(run: RunFolder, digest: str) -> None:
-    """A run is continued and scored with the data that it began with.
+    """Refuse to continue or score a run with other data than it began with.
 
     Raises:
         ConfigError: the data has another digest now.
@@ -58,7 +58,7 @@ def refuse_changed(run: RunFolder, digest: str) -> None:
     if began_with != digest:
         raise ConfigError(
             f"the data of {run.path} has changed since the run began (digest {began_with}, now {digest}): "
-            "bring back the data, or train a new run"
+            "restore the data of that digest, or train a new run"
         )
 
 

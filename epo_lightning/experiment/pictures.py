@@ -18,7 +18,7 @@ from epo_lightning.scene import HEADING, JointForecast, Scene, X, Y
 
 
 def choose(data: Any, split: str, count: int | None) -> tuple[Scene, list[dict[str, Any]] | None]:
-    """``count`` scenes at even distances, and which piece of which recording each one is, where the data set knows."""
+    """``count`` scenes at even distances in a split, and the recording, frame and tracks of each if the data have them."""
     loader = split_of(data, split)
     if not isinstance(data, SceneDataModule):
         return spread(gather(loader), count), None
@@ -31,10 +31,9 @@ def choose(data: Any, split: str, count: int | None) -> tuple[Scene, list[dict[s
 def draw(
     settings: PredictSettings, title: str, forecaster: Any, scenes: Scene, forecast: JointForecast
 ) -> list[tuple[Path, list[int]]]:
-    """Pictures and animations below ``out``, each with the rows of the scenes that it shows.
+    """Draw pictures and animations into ``out``; returns each file with the rows of the scenes that it shows.
 
-    Vehicles, and agents that are said to be something, are drawn one scene at a time; where all are equal discs (RPI), a
-    few scenes share a picture.
+    Scenes with lanes, boxes or classes of agents get a picture each. Scenes of equal discs (RPI) share one picture.
     """
     folder = Path(settings.out).expanduser() / "figures"
     ids = list(range(len(scenes.history))) if scenes.id is None else scenes.id.tolist()
@@ -65,14 +64,14 @@ def draw(
 
 
 def is_traffic(scenes: Scene, shape: str) -> bool:
-    """Whether scenes have lanes, boxes, or agents of which something is known."""
+    """Whether scenes have lanes, classes of agents, or box-shaped agents."""
     return scenes.lanes is not None or scenes.kind is not None or shape == "box"
 
 
 def eventful(scenes: Scene, count: int) -> list[int]:
-    """Rows of ``count`` scenes spread over all, of their neighbours those in which agents' sideways motions differ most.
+    """Rows of ``count`` scenes, one from each of ``count`` equal parts: the scene whose sideways motions differ most.
 
-    Differ, because in a bend everyone moves sideways, but few at a time change lane.
+    The difference between agents is compared, because in a bend all agents move sideways, while few change lane at a time.
     """
     steps, mask = scenes.history, scenes.history_mask
     if scenes.future is not None:
@@ -102,19 +101,22 @@ def gather(loader: Iterable[Scene]) -> Scene:
 
 
 def even(total: int, count: int | None) -> Tensor:
-    """Indices of ``count`` of ``total`` at even distances; all where there are fewer."""
+    """``count`` indices at even distances in 0 .. ``total`` - 1; all indices if there are fewer or ``count`` is None."""
     if count is None or count >= total:
         return torch.arange(total)
     return torch.linspace(0, total - 1, count).round().long()
 
 
 def spread(scenes: Scene, count: int | None) -> Scene:
-    """``count`` scenes at even distances; all where there are fewer."""
+    """``count`` scenes at even distances; all scenes if there are fewer."""
     return scenes[even(len(scenes.history), count)]
 
 
 def pairs(scenes: Scene, count: int) -> tuple[Tensor, Tensor | None]:
-    """Rows of scenes worth drawing, those with two known futures first, and the rows of the other futures."""
+    """Rows of ``count`` scenes, and the rows of the same records with the alternative future.
+
+    Only records with two futures are taken if there are any (RPI). Otherwise scenes at even distances and None.
+    """
     total = len(scenes.history)
     if scenes.id is None or scenes.subset is None:
         return even(total, count), None

@@ -26,7 +26,7 @@ PLACES = {"runs": "runs", "run_dir": None, "sweep": None, "resume": None}
 
 
 def ship(run: RunFolder, folder: Path) -> Path:
-    """Copy what forecasting needs of ``run`` into ``folder``: weights without the optimizer's state, and example scenes.
+    """Pack a run for shipping into ``folder``: its weights without the optimizer's state, its scores, and example scenes.
 
     Raises:
         ConfigError: the run is not finished or not scored on the test split, or its data is missing or has changed.

@@ -1,4 +1,4 @@
-"""How long one joint forecast takes: network and layer, one scene at a time, as it would be deployed."""
+"""Time of one joint forecast: network and layer, one scene at a time, as in a deployment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from epo_lightning.experiment.opening import open_checkpoint, open_data
 from epo_lightning.run_folder import RunFolder, write_json
 
 SAMPLES, WARM_UP = 100, 10
-"""Scenes that are measured, as in the paper, and forecasts before that, while caches and compilers settle."""
+"""Number of measured scenes, as in the paper; and number of forecasts before them, which are not measured (warm-up)."""
 
 
 def measure(run: RunFolder, settings: Settings, forecaster: Any = None) -> dict[str, Any]:
@@ -26,8 +26,8 @@ def measure(run: RunFolder, settings: Settings, forecaster: Any = None) -> dict[
 
     Args:
         run: a finished run, trained or not.
-        settings: of the run.
-        forecaster: to measure instead of the run's best checkpoint.
+        settings: settings of the run.
+        forecaster: forecaster to measure instead of the run's best checkpoint.
 
     Raises:
         ConfigError: the checkpoint or the data is missing or has changed.
@@ -38,7 +38,7 @@ def measure(run: RunFolder, settings: Settings, forecaster: Any = None) -> dict[
     forecaster = forecaster.to(device).eval()
     data = open_data(run, settings)
     split = data.dataset("test")
-    # A split with fewer scenes than samples is gone through more than once.
+    # If the split has fewer scenes than SAMPLES, some are measured more than once.
     scenes = [split[torch.tensor([index % len(split)])].to(device) for index in range(SAMPLES)]
     seconds = []
     with torch.no_grad():
@@ -76,7 +76,7 @@ def _device(accelerator: str) -> torch.device:
 
 
 def _wait(device: torch.device) -> None:
-    """A GPU works on while Python is ahead of it."""
+    """Wait until a GPU has finished: its kernels run asynchronously, so the clock would stop too early."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
