@@ -1,4 +1,4 @@
-"""Tools for a training that fails: few batches to learn by heart, where the time goes, where the first bad number is."""
+"""Debugging of a training: overfitting a few batches, profiling steps, locating the first number that is not finite."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from epo_lightning.run_folder import RunFolder, write_text
 from epo_lightning.scene import Scene
 
 WARM_UP, PROFILED = 5, 10
-"""Training steps before the profile begins, and how many it covers."""
+"""Number of training steps before the profile begins, and number that it covers."""
 ROWS = 40
-"""Most rows of the profile's table."""
+"""Largest number of rows in the profile's table."""
 MOST_SCENES = 16
-"""Most scenes that a message names."""
+"""Largest number of scenes that a message names."""
 
 
 def watchers(settings: TrainerSettings, run: RunFolder) -> list[Callback]:
-    """The callbacks of the debugging that a configuration asks for."""
+    """Debugging callbacks that a configuration asks for."""
     found: list[Callback] = []
     if settings.profiler:
         found.append(Profile(run.path / "profile"))
@@ -44,11 +44,11 @@ def watchers(settings: TrainerSettings, run: RunFolder) -> list[Callback]:
 
 
 class FewBatches(LightningDataModule):
-    """The first batches of the training split, the same ones in every epoch, for training and for validation.
+    """Data module with the first batches of the training split in every epoch, for training and for validation.
 
     Args:
-        data: whose batches.
-        batches: how many.
+        data: data module whose batches are taken.
+        batches: number of batches.
     """
 
     def __init__(self, data: LightningDataModule, batches: int) -> None:
@@ -63,10 +63,10 @@ class FewBatches(LightningDataModule):
 
 
 class Profile(Callback):
-    """PyTorch's profile of a few training steps, as a table of the most expensive operations and a trace.
+    """Callback that profiles a few training steps: a table of the most expensive operations, and a trace.
 
     Args:
-        folder: where ``operations.txt`` and ``trace.json.gz`` are written.
+        folder: folder for ``operations.txt`` and ``trace.json.gz``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -91,7 +91,7 @@ class Profile(Callback):
             print(f"profile: none, the training has {self._steps} steps and the profile begins after {WARM_UP}")
 
     def _write(self) -> None:
-        """End the profile, and say where it is."""
+        """End the profile, write its files, and print their paths."""
         if self._running is None:
             return
         running, self._running = self._running, None
@@ -109,10 +109,10 @@ class Profile(Callback):
 
 
 class NonFinite(Callback):
-    """Stop at the first number of a training step that is not finite: in a module's output, in the loss or in a gradient.
+    """Callback that stops at the first number that is not finite: in the data, a module's output, the loss or a gradient.
 
     Raises:
-        ConfigError: from the step in which it happens; names the step, the module, loss term or parameter, and the scenes.
+        ConfigError: in that training step; names the step, the module, loss term or parameter, and the scenes.
     """
 
     def __init__(self) -> None:
@@ -123,7 +123,7 @@ class NonFinite(Callback):
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         for name, module in pl_module.named_modules():
             if not isinstance(module, Metric):
-                # A module's own parts return before it does: the first complaint comes from where it begins.
+                # Submodules return before their parent, so the first error names the innermost module.
                 self._hooks.append(module.register_forward_hook(partial(self._look, name or "the forecaster")))
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -135,7 +135,7 @@ class NonFinite(Callback):
         self._scene, self._step = batch, trainer.global_step
         broken = (~batch.finite).nonzero().flatten().tolist()
         if broken:
-            self._stop("the data holds numbers that are not finite", broken)
+            self._stop("the data contain numbers that are not finite", broken)
 
     def _look(self, name: str, module: nn.Module, _: Any, output: Any) -> None:
         if not module.training or self._scene is None:
@@ -161,14 +161,14 @@ class NonFinite(Callback):
             self._stop(f"the gradient of {guilty[-1]}{more} is not finite{self._operation(pl_module)}")
 
     def _operation(self, forecaster: LightningModule) -> str:
-        """The operation whose derivative is the first that is no number, found by doing the step once more."""
+        """The operation whose derivative is the first that is nan, found by repeating the step in anomaly mode."""
         try:
             with torch.autograd.set_detect_anomaly(True), warnings.catch_warnings(record=True) as noted:
                 warnings.simplefilter("always")
                 terms = forecaster.losses(self._scene, forecaster(self._scene))  # type: ignore[operator]
                 torch.stack([weight * value for weight, value in terms.values()]).sum().backward()
         except RuntimeError as error:
-            # PyTorch warns of the lines of code that led to the operation; the last one is where it was done.
+            # PyTorch warns with the traceback of the forward call; its last line is the operation.
             places = [line.strip() for each in noted for line in str(each.message).splitlines() if "File " in line]
             return f": {str(error).splitlines()[0].rstrip('.')}" + (f" ({places[-1]})" if places else "")
         return ""
@@ -185,7 +185,7 @@ class NonFinite(Callback):
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:
-    """All tensors in what a module returns."""
+    """All tensors in a module's output: nested mappings, sequences and data classes."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, Mapping):
@@ -200,7 +200,7 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 
 
 def _rows(tensor: Tensor, scenes: int) -> list[int] | None:
-    """The scenes of the batch in which a tensor is not finite; None if it does not count scenes first."""
+    """Indices of scenes in which a tensor is not finite; None if its first dimension does not enumerate scenes."""
     if tensor.dim() == 0 or len(tensor) % scenes:
         return None
     bad = ~tensor.isfinite().reshape(scenes, -1).all(1)

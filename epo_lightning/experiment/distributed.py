@@ -1,12 +1,12 @@
-"""Training on several devices of one machine: a process for each, and together the numbers of one.
+"""Training on several devices of one machine, one process per device, with the numbers of a single process.
 
-The leader, rank 0, is the process that was asked to train: a command line, a job of a sweep, a worker of any launcher. It
-starts the followers itself and tells them, through the store at which all meet, what to train; so they need neither Hydra
-nor the leader's command line. Followers only compute: the run folder, its lock, the logs and the terminal are the leader's.
-They end when it ends, in whatever way, and it fails when one of them does. Nothing is left behind for the next job of the
-same process: no variable of the environment, no port, no process group.
+The leader, rank 0, is the process that was asked to train: a command line, a job of a sweep or a worker of a launcher. It
+starts the followers, and sends them the configuration through a shared TCP store, so they need neither Hydra nor the
+leader's command line. Followers only compute: the leader alone writes the run folder, its lock, the logs and the terminal.
+Followers end when the leader ends or dies, and the leader fails when a follower fails. Afterwards the leader's process is
+as before: no environment variable, port or process group remains for the next job.
 
-Where Slurm has started a task for each device, these tasks are the processes.
+If Slurm has started one task per device, these tasks are the processes.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from epo_lightning.run_folder import RunFolder
 
 HOST = "127.0.0.1"
 PATIENCE = 600.0
-"""Seconds until processes that do not find each other give up."""
+"""Longest wait for the other processes to connect to the store [s]."""
 GRACE = 10.0
-"""Seconds that a process has to end on its own, or to be seen dead."""
+"""Longest wait for followers to exit by themselves, or for a failure of one to show [s]."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Place:
     """Rank of this process among a run's processes.
 
     Attributes:
-        rank: 0 leads.
+        rank: rank of this process; 0 is the leader.
         world: number of processes.
-        port: where they meet; 0 if the leader may choose, because it starts the others.
+        port: port of the store; 0 if the leader starts the others, and so may take any free port.
     """
 
     rank: int = 0
@@ -61,10 +61,10 @@ class Place:
 
 
 def here(devices: int) -> Place:
-    """The place of this process in a run on so many devices: the leader's, except in the further tasks of a Slurm step.
+    """The place of this process in a run on ``devices`` devices: rank 0, except in the further tasks of a Slurm step.
 
     Raises:
-        ConfigError: Slurm has started another number of tasks, or some on other machines.
+        ConfigError: Slurm has started another number of tasks, or tasks on several nodes.
     """
     tasks = int(os.environ.get("SLURM_STEP_NUM_TASKS", "1"))
     if devices == 1 or tasks == 1:
@@ -78,11 +78,11 @@ def here(devices: int) -> Place:
 
 
 def strategy(devices: int, run: RunFolder, config: Mapping[str, Any], last: Path | None) -> DDP | None:
-    """The leader's way to train on ``devices``; None on one.
+    """Lightning strategy of the leader for training on ``devices`` devices; None for one device.
 
     Args:
-        config: the resolved configuration, which followers build the same forecaster and data from.
-        last: the checkpoint that the run continues from.
+        config: the resolved configuration, from which followers build the same forecaster and data.
+        last: checkpoint from which the run continues; None for a new run.
     """
     if devices == 1:
         return None
@@ -91,11 +91,12 @@ def strategy(devices: int, run: RunFolder, config: Mapping[str, Any], last: Path
 
 
 class DDP(DDPStrategy):
-    """Lightning's DDP, among processes that meet at a store of their own.
+    """Lightning's DDP for processes that connect through their own TCP store.
 
     Args:
-        store: where to meet; the leader opens one.
-        task: what the leader tells the followers.
+        place: rank of this process.
+        store: the leader's store, for a follower; None for the leader, which opens it.
+        task: run folder, configuration and checkpoint as JSON, which the leader sends to the followers.
     """
 
     def __init__(self, place: Place, store: dist.TCPStore | None = None, task: str = "") -> None:
@@ -107,7 +108,7 @@ class DDP(DDPStrategy):
         self._launcher = self.processes
 
     def setup_distributed(self) -> None:
-        """Meet. Unlike Lightning's own this leaves the random state as it is, and the environment too."""
+        """Join the process group. Unlike Lightning's own method, this changes neither random state nor environment."""
         self.set_world_ranks()
         self._process_group_backend = self._get_process_group_backend()
         on_gpu = self.root_device.type != "cpu"
@@ -122,7 +123,7 @@ class DDP(DDPStrategy):
 
 
 class _Machine(ClusterEnvironment):
-    """Ranks from the place, nothing from the environment."""
+    """Cluster environment with the ranks of a place; environment variables are not read."""
 
     def __init__(self, place: Place) -> None:
         super().__init__()
@@ -159,7 +160,7 @@ class _Machine(ClusterEnvironment):
 
 
 class _Processes(_Launcher):
-    """Starts the followers around a training, and ends them after it."""
+    """Launcher that starts the followers before a training, and ends them after it."""
 
     is_interactive_compatible = True
 
@@ -169,10 +170,10 @@ class _Processes(_Launcher):
         self._over = threading.Event()
 
     def launch(self, function: Callable[..., Any], *args: Any, trainer: Any = None, **kwargs: Any) -> Any:
-        """Call ``function`` in company.
+        """Result of ``function``, called while the followers run.
 
         Raises:
-            RuntimeError: one of the others has failed.
+            RuntimeError: a follower has failed.
         """
         try:
             if self._place.leads:
@@ -180,37 +181,39 @@ class _Processes(_Launcher):
             result = function(*args, **kwargs)
             self._wait()
             return result
-        except (RuntimeError, ValueError) as error:  # what torch raises when the others fall silent
+        except (RuntimeError, ValueError) as error:  # raised by torch when other processes stop answering
             self._wait(patience=1.0)
             raise (self._failure() or error) from error
         finally:
             self._end()
 
     def kill(self, signum: Any) -> None:
-        """Lightning's handler of SIGTERM asks for it. It would then broadcast amid whatever is under way, and never end."""
+        """Raise at once on SIGTERM: Lightning's handler would broadcast during another collective call and hang."""
         raise SIGTERMException(128 + int(signum))
 
     def meet(self) -> dist.TCPStore:
-        """The store, as soon as everybody is there.
+        """The store, once all processes have connected to it.
 
         Raises:
-            RuntimeError: somebody does not come.
+            RuntimeError: a process failed, or did not connect in time.
         """
         assert self._store is not None
         self._store.set(f"here/{self._place.rank}", "")
-        everybody = [f"here/{rank}" for rank in range(self._place.world)]
+        ranks = [f"here/{rank}" for rank in range(self._place.world)]
         deadline = time.monotonic() + PATIENCE
-        while not self._store.check(everybody):
+        while not self._store.check(ranks):
             if failure := self._failure():
                 raise failure
             if time.monotonic() > deadline:
-                raise RuntimeError(f"not all {self._place.world} processes of the run came within {PATIENCE:.0f} s")
+                raise RuntimeError(
+                    f"not all {self._place.world} processes of the run connected within {PATIENCE:.0f} s"
+                )
             time.sleep(0.02)
         return self._store
 
     def _start(self) -> None:
         """Open the store, and start the followers unless Slurm did."""
-        # Bound before anybody is told of it, so two runs never choose the same port.
+        # The port is bound before followers learn its number, so two runs never choose the same port.
         self._store = dist.TCPStore(
             HOST, self._place.port, is_master=True, wait_for_workers=False, timeout=timedelta(seconds=PATIENCE)
         )
@@ -222,25 +225,25 @@ class _Processes(_Launcher):
             words = [str(rank), str(self._place.world), str(self._store.port)]
             process = subprocess.Popen(
                 [sys.executable, "-m", "epo_lightning.experiment.follower", *words],
-                # Lightning and W&B look at LOCAL_RANK for who may speak. The path finds what was found here.
+                # Lightning and W&B log only where LOCAL_RANK is 0. PYTHONPATH: followers import the same modules.
                 env={**os.environ, "LOCAL_RANK": str(rank), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-                stdin=subprocess.PIPE,  # it ends when this is closed, as it is when this process dies
+                stdin=subprocess.PIPE,  # closed when this process dies; the follower then ends
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
-                start_new_session=True,  # Ctrl-C is for the leader
+                start_new_session=True,  # Ctrl-C reaches the leader only
             )
             self._followers.append((process, errors))
         threading.Thread(target=self._watch, args=(self._over,), daemon=True, name="epo-followers").start()
 
     def _watch(self, over: threading.Event) -> None:
-        """NCCL, other than gloo, does not notice by itself that a process has died."""
+        """Abort NCCL when a follower has failed: unlike gloo, it does not notice the death of a process."""
         while not over.wait(1.0):
             if self._failure() and dist.is_initialized() and dist.get_backend() == "nccl":
                 torch.distributed.distributed_c10d._get_default_group().abort()
                 return
 
     def _failure(self) -> RuntimeError | None:
-        """Exit of the first follower that failed."""
+        """Error with exit status and last line of the first follower that failed; None if none has."""
         for rank, (process, errors) in enumerate(self._followers, 1):
             code = process.poll()
             if code:
@@ -252,7 +255,7 @@ class _Processes(_Launcher):
         return None
 
     def _wait(self, patience: float = GRACE) -> None:
-        """Give followers time to end, or one of them to turn out to have failed."""
+        """Wait until all followers have ended, one has failed, or ``patience`` seconds have passed."""
         deadline = time.monotonic() + patience
         while time.monotonic() < deadline and not self._failure():
             if all(process.poll() is not None for process, _ in self._followers):
@@ -260,7 +263,7 @@ class _Processes(_Launcher):
             time.sleep(0.02)
 
     def _end(self) -> None:
-        """Leave the process as it was before."""
+        """End followers, process group and store, so that the process is as before."""
         self._over.set()
         for process, errors in self._followers:
             process.kill()

@@ -1,4 +1,4 @@
-"""The verbs of the command line, with the lines that they print at their end."""
+"""Verbs of the command line, and the lines that they print at their end."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def check(verb: str, config: dict[str, Any]) -> Any:
     """The settings of a verb other than train.
 
     Raises:
-        ConfigError: what is wrong with them.
+        ConfigError: an unknown key, a missing key or a value that is not allowed.
     """
     settings: Any = read(SCHEMAS[verb], config)
     if isinstance(settings, GenerateSettings):
@@ -39,7 +39,7 @@ def check(verb: str, config: dict[str, Any]) -> Any:
 
 
 def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
-    """Make the data set, unless it is there already, and print its report."""
+    """Make the data set unless it exists, and print its report."""
     settings = check("generate", config)
     from epo_lightning.experiment import assembly
     from epo_lightning.experiment.config.compose import tree
@@ -60,14 +60,14 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
 
 
 def train(config: dict[str, Any], overrides: Sequence[str]) -> float | None:
-    """Train a run and say where it is."""
+    """Train a run, and print its best score and its folder. Returns the best score."""
     from epo_lightning.experiment import train as training
 
     return _trained(training.train(config, overrides))
 
 
 def resume(run: RunFolder) -> float | None:
-    """Continue a run and say where it is."""
+    """Continue a run, and print its best score and its folder. Returns the best score."""
     from epo_lightning.experiment import train as training
 
     training.resume(run)
@@ -86,7 +86,7 @@ def _trained(run: RunFolder) -> float | None:
 
 
 def evaluate(config: dict[str, Any], overrides: Sequence[str]) -> None:
-    """Score runs and print the headline metrics."""
+    """Score runs, and print the headline metrics."""
     settings = check("evaluate", config)
     from epo_lightning.experiment.evaluate import evaluate as score
 
@@ -102,7 +102,7 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str]) -> None:
 
 
 def predict(config: dict[str, Any], overrides: Sequence[str]) -> None:
-    """Write and draw forecasts."""
+    """Write forecasts and figures, and print their paths."""
     settings = check("predict", config)
     from epo_lightning.experiment.predict import predict as forecast
 
@@ -111,7 +111,7 @@ def predict(config: dict[str, Any], overrides: Sequence[str]) -> None:
 
 
 def report(config: dict[str, Any], overrides: Sequence[str]) -> None:
-    """Tables and figures of all evaluated runs below a folder."""
+    """Write tables and figures of all evaluated runs below a folder, and print the path of the page."""
     settings = check("report", config)
     from epo_lightning.experiment.report import report as write
 
@@ -137,7 +137,7 @@ def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
 
 
 def _print_windows(report: dict[str, Any], splits: list[str]) -> None:
-    """Counts of all windows of recorded data, split by split: their origin, the reasons for drops, and what is left."""
+    """Print a table of recorded data: recordings, windows, dropped windows by reason and scenes of every split."""
     names = {name: None for split in splits for name in report[split]}
     counts = [name for name in names if isinstance(report[splits[0]].get(name, 0), int)]
     lost = sorted((name for name in counts if name not in ("windows", "scenes")), key=str)

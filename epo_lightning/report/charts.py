@@ -1,4 +1,4 @@
-"""Figures of many runs for a report, with a title, a caption and the numbers behind them, for files and the page."""
+"""Figures of a report over many runs, each with a title, a caption and the numbers that it shows."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class Chart:
     """One figure.
 
     Attributes:
-        section: where it belongs.
-        name: of its file.
-        title, caption: what it shows, and how to read it.
-        draw: of a size [inch], with or without a legend.
-        wide, narrow: sizes for a page and for a phone.
-        legend: entry i is the line whose id is ``row<i>-line``.
-        header, numbers: the data behind it, as text.
-        notes: what is missing.
+        section: section of the page that shows the figure.
+        name: stem of the figure's file name.
+        title, caption: what the figure shows, and how to read it.
+        draw: function that draws the figure, given its size [inch] and whether it has a legend.
+        wide, narrow: sizes [inch] for a wide page and for a phone.
+        legend: legend entries; entry i describes the line whose id is ``row<i>-line``.
+        header, numbers: the plotted data as text.
+        notes: notes on missing data.
     """
 
     section: str
@@ -67,12 +67,12 @@ LEARNING, STEPS, RUNTIMES = "Learning curves", "S curve", "Runtime"
 
 
 def charts_of(tables: Sequence[Table], timings: Sequence[Timing]) -> list[Chart]:
-    """All that can be drawn of these tables and timings."""
+    """All figures that these tables and timings allow."""
     return [*_learning(tables), *_steps(tables), *_runtimes(timings)]
 
 
 def _learning(tables: Sequence[Table]) -> Iterable[Chart]:
-    """One chart per data set."""
+    """Learning curves, one chart per data set."""
     by_data = trained_rows(tables)
     for data, rows in by_data.items():
         curves, notes = learning_curves(rows)
@@ -94,6 +94,7 @@ def _learning(tables: Sequence[Table]) -> Iterable[Chart]:
 
 
 def _summary(curve: Curve) -> tuple[str, ...]:
+    """Last and best scores of a learning curve."""
     best = min(range(len(curve.x)), key=lambda i: curve.mean[i])
     return (
         curve.name,
@@ -106,13 +107,13 @@ def _summary(curve: Curve) -> tuple[str, ...]:
 
 
 def _steps(tables: Sequence[Table]) -> Iterable[Chart]:
+    """Charts over the solver's steps S, one per curve."""
     curves = steps_curves(distinct(tables))
     for number, curve in enumerate(curves, 1):
-        first = curve.split
         yield Chart(
             section=STEPS,
             name="steps" + (f"_{number}" if len(curves) > 1 else ""),
-            title=f"{curve.name} over optimisation steps, {first}",
+            title=f"{curve.name} over optimisation steps, {curve.split}",
             caption="minSADE of what the game's solution predicts (optimised) and of what the network alone predicts "
             "(initial): mean over seeds, with a band from the best to the worst."
             + (" Dashed: the paper's figure, on its RPI validation split." if curve.paper else ""),
@@ -121,11 +122,11 @@ def _steps(tables: Sequence[Table]) -> Iterable[Chart]:
             narrow=(4.0, 3.3),
             legend=tuple(Key(*entry) for entry in steps_names(curve)),
             header=("S", "seeds", "optimised [m]", "initial [m]"),
-            numbers=tuple(_of_steps(curve)),
+            numbers=tuple(_steps_numbers(curve)),
         )
 
 
-def _of_steps(curve: StepsCurve) -> Iterable[tuple[str, ...]]:
+def _steps_numbers(curve: StepsCurve) -> Iterable[tuple[str, ...]]:
     initial = {} if curve.initial is None else dict(zip(curve.initial.x, curve.initial.mean, strict=True))
     for steps, mean, seeds in zip(curve.optimised.x, curve.optimised.mean, curve.seeds, strict=True):
         yield (
@@ -137,12 +138,13 @@ def _of_steps(curve: StepsCurve) -> Iterable[tuple[str, ...]]:
 
 
 def _runtimes(timings: Sequence[Timing]) -> Iterable[Chart]:
+    """Heat map over N and S, and line over M, for every machine and method with several sizes."""
     found = [(where, same) for where, members in places(timings).items() for same in methods(members)]
     found = [(where, same) for where, same in found if len({(t.agents, t.steps, t.modes) for t in same}) > 1]
     for number, (where, members) in enumerate(found, 1):
         suffix = f"_{number}" if len(found) > 1 else ""
         header = ("N", "S", "M", "mean", "median", "10% to 90%", "samples", "run")
-        numbers = tuple(_of_timing(timing) for timing in sorted(members, key=_position))
+        numbers = tuple(_timing_numbers(timing) for timing in sorted(members, key=_position))
         modes, seconds = grid(members)
         if len(seconds) > 1:
             yield Chart(
@@ -181,7 +183,7 @@ def _position(timing: Timing) -> tuple[int, int, int, str]:
     return timing.agents, timing.steps or 0, timing.modes, str(timing.run.path)
 
 
-def _of_timing(timing: Timing) -> tuple[str, ...]:
+def _timing_numbers(timing: Timing) -> tuple[str, ...]:
     return (
         str(timing.agents),
         "-" if timing.steps is None else str(timing.steps),
@@ -195,5 +197,5 @@ def _of_timing(timing: Timing) -> tuple[str, ...]:
 
 
 def _word(text: str) -> str:
-    """A piece of a file's name."""
+    """Text with everything but letters, digits and underscores replaced, for a file name."""
     return re.sub(r"\W+", "_", text)

@@ -1,6 +1,6 @@
-r"""Tables -> LaTeX with booktabs, with what is behind the numbers as comments above.
+r"""Tables as LaTeX with booktabs; comments above each table give the provenance of its numbers.
 
-A document needs ``\usepackage{booktabs,graphicx}``: a table that is wider than its column is made smaller.
+Documents need ``\usepackage{booktabs,graphicx}``; graphicx shrinks tables that are wider than their column.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from epo_lightning.report.tables import MISSING, Column, Row, Table
 
 SPECIAL = {
     **{letter: rf"\{letter}" for letter in "&%$#_{}"},
-    **{letter: f"{{{letter}}}" for letter in "[]*"},  # at the beginning of a line they would belong to the line before
+    **{letter: f"{{{letter}}}" for letter in "[]*"},  # at the start of a row, LaTeX reads them as an argument of \\
     **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", '"': "''"},
     **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", "±": r"$\pm$", "…": r"\dots{}"},
     **{"\N{MULTIPLICATION SIGN}": r"$\times$", "\N{MINUS SIGN}": "$-$", "\N{EN DASH}": "--"},
@@ -35,22 +35,22 @@ COMPARISON_CAPTION = (
 
 
 def latex_text(text: str) -> str:
-    """Text in which nothing is a command; letters that pdflatex does not know are given by their number."""
+    """Text with LaTeX's special characters escaped; characters unknown to pdflatex are written as code points."""
     return "".join(SPECIAL.get(letter) or _letter(letter) for letter in " ".join(text.split()))
 
 
 def _letter(letter: str) -> str:
-    base = unicodedata.normalize("NFD", letter)[0]  # a letter with an accent is known where the letter is
+    base = unicodedata.normalize("NFD", letter)[0]  # pdflatex knows an accented letter if it knows the base
     known = (letter.isascii() and letter.isprintable()) or (ord(letter) < 256 and base.isascii() and base.isalpha())
     return letter if known or letter in "ßæøÆØ" else f"{{[}}U+{ord(letter):04X}{{]}}"
 
 
 def to_latex(table: Table, label: str | None = None, caveat: str = "") -> str:
-    """The main kind of table: rows x metrics, rules between the groups.
+    """A table of rows and metrics as LaTeX, with rules between the groups of rows.
 
     Args:
-        label: what ``\\ref`` calls it; made of the title if not given.
-        caveat: text without markup that has to be known before the numbers are used.
+        label: name for ``\\ref``; by default derived from the title.
+        caveat: plain text, printed in bold before the legend.
     """
     lines = []
     for row, last in with_ends(table.rows):
@@ -73,7 +73,7 @@ def _caption(title: str, caveat: str, legend: str) -> str:
 
 
 def _legend(table: Table) -> str:
-    """Legend of a table's numbers, as :func:`~epo_lightning.report.render.legend` says it."""
+    """LaTeX form of a table's legend (:func:`~epo_lightning.report.render.legend`)."""
     text = legend([table], "below", r"\textbf{Bold}", r"\underline{underlined}")
     return text.replace("±", r"$\pm$").replace("n seeds", "$n$ seeds")
 
@@ -81,11 +81,11 @@ def _legend(table: Table) -> str:
 def sheet_to_latex(
     sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", label: str | None = None, caveat: str = ""
 ) -> str:
-    """A table of plain text.
+    """A sheet of plain text as a LaTeX table.
 
     Args:
-        rows: those that are behind its numbers, named in the comments.
-        caption: LaTeX that follows the title; the sheet's note if not given.
+        rows: rows whose provenance goes into the comments.
+        caption: LaTeX text after the title; by default the sheet's note.
         label, caveat: as in :func:`to_latex`.
     """
     lines = []
@@ -101,7 +101,7 @@ def sheet_to_latex(
 
 
 def comparisons_to_latex(comparisons: Comparisons, label: str | None = None, caveat: str = "") -> str:
-    """The paired comparisons of a table; label and caveat as in :func:`to_latex`."""
+    """The paired comparisons of a table as LaTeX; label and caveat as in :func:`to_latex`."""
     rows = {row.identity: row for pair in comparisons.pairs for row in (pair.one, pair.other)}
     return sheet_to_latex(comparison_sheet(comparisons), list(rows.values()), COMPARISON_CAPTION, label, caveat)
 
@@ -134,7 +134,7 @@ def _cell(row: Row, column: Column) -> str:
 
 
 def _minus(text: str) -> str:
-    """Text in which the sign of a number is one."""
+    """Text with the minus signs of its numbers in mathematics mode."""
     return re.sub(r"(?<![^\We])-(?=\d)", "$-$", text)
 
 

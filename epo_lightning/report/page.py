@@ -1,4 +1,4 @@
-"""The report as one HTML file, which needs nothing else: no network, no other file, no server."""
+"""The report as one self-contained HTML file, without network, other files or server."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from epo_lightning.report.style import svg
 from epo_lightning.report.tables import Row, Table, distinct
 
 WIDEST, COLORS = 1500, 128
-"""Pictures are scaled down to this many pixels and reduced to this many colours: a page should be small enough to mail."""
+"""Largest width [pixels] and palette size of pictures: a page should be small enough to mail."""
 
 SCENES, WEIGHTS = "Scenes", "Learned weights"
 
 
 @dataclass(frozen=True)
 class Content:
-    """All that a page shows.
+    """Content of a page.
 
     Attributes:
-        title: of the page.
-        command: that writes it again.
-        preface, legend, comparison_legend: Markdown, of which bold, underlined and code is understood.
-        tables, costs, comparisons, settings: in their order; the latter three as text in columns.
-        charts: with their section.
+        title: title of the page.
+        command: command that writes the page again.
+        preface, legend, comparison_legend: Markdown; only bold, underline and code are rendered.
+        tables, costs, comparisons, settings: shown in this order; the latter three are text in columns.
+        charts: figures, grouped by their section.
         pictures: PNG files.
-        made: how every row was made.
-        left_out: run folders that were left out, and why.
-        notes: on what could not be shown.
-        sweep: the command that began the sweep, if the page is of one.
+        made: provenance of every row.
+        left_out: run folders that were left out, each with the reason.
+        notes: notes on what could not be shown.
+        sweep: command that began the sweep; empty if the page shows no sweep.
     """
 
     title: str
@@ -58,7 +58,7 @@ class Content:
 
 
 def page(content: Content) -> str:
-    """The whole page. Equal runs give equal pages: its date is that of the newest run."""
+    """The HTML of the page. Equal runs give equal bytes, because the page's date is that of the newest run."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -97,7 +97,7 @@ def page(content: Content) -> str:
 
 
 def _table(table: Table, cells: list[dict[str, Any]], place: Any) -> dict[str, Any]:
-    """Rows of cells; what stands behind a cell goes to ``cells``, where the page finds it by its number."""
+    """Rows of a table for the template; details of each cell are appended to ``cells`` and found by their index."""
     rows = []
     for row, last in with_ends(table.rows):
         shown: list[dict[str, Any] | None] = []
@@ -136,7 +136,7 @@ def _table(table: Table, cells: list[dict[str, Any]], place: Any) -> dict[str, A
 
 
 def _behind(row: Row) -> dict[str, Any]:
-    """Cells of a row as the page shows them."""
+    """Name and runs of a row, for the details that the page shows on a click."""
     return {
         "name": row.name,
         "runs": [
@@ -154,6 +154,7 @@ def _behind(row: Row) -> dict[str, Any]:
 
 
 def _drawn(chart: Chart) -> dict[str, Any]:
+    """A chart with its two SVG drawings."""
     from markupsafe import Markup
 
     return {
@@ -164,7 +165,7 @@ def _drawn(chart: Chart) -> dict[str, Any]:
 
 
 def picture_uri(path: Path) -> str:
-    """A PNG as a data URI, small enough for a page."""
+    """A PNG, reduced in size and colours, as a data URI."""
     from PIL import Image
 
     with Image.open(path) as image:

@@ -1,6 +1,6 @@
-"""Results of the paper as data: the values that tables and figures show beside ours.
+"""Results of the paper, which tables and figures show beside ours.
 
-Keys are (data, backbone, forecaster) in this project's names. Displacements in m, overlap rates as rates, runtimes in s.
+Keys are (data, backbone, forecaster) by their registered names. Displacements in m, overlap rates in [0, 1], runtimes in s.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ PAPER: dict[tuple[str, str, str], tuple[float, ...]] = {
     ("exid", "hivt_m", "scene_consistent"): (0.78, 1.90, 1.04, 2.57, 0.008),
     ("exid", "hivt_m", "epo"): (0.83, 1.97, 1.03, 2.48, 0.007),
 }
-"""The paper defines its overlap rate as JFP does, so its value stands beside ``overlap_jfp``; the authors' later code
-counts as ``overlap_authors``, which is half of that for two agents."""
+"""Values by row, in the order of ``METRICS``. The paper defines its overlap rate as JFP does, so its value stands beside
+``overlap_jfp``; the authors' later code computes ``overlap_authors``, which is half of that for two agents."""
 
 
 ABLATIONS: dict[str, tuple[float, ...]] = {
-    # Table 4. Its text says V-LSTM, but its row "Ours (full)" is that of VIBES in Table 3.
+    # Table 4. The text of the paper says V-LSTM, but the row "Ours (full)" equals that of VIBES in Table 3.
     "exid/v_lstm_epo_no_init": (0.89, 2.04, 1.01, 2.47, 0.007),
     "exid/v_lstm_epo_no_goal": (0.89, 2.13, 1.10, 2.64, 0.009),
 }
-"""Rows that are told apart by their experiment alone."""
+"""Rows whose backbone and forecaster equal those of a main row: only the experiment tells them apart."""
 
 
 STEPS: dict[int, dict[str, float]] = {
@@ -45,7 +45,7 @@ STEPS: dict[int, dict[str, float]] = {
     4: {"minSADE": 0.038, "initial/minSADE": 0.065},
     8: {"minSADE": 0.038, "initial/minSADE": 0.066},
 }
-"""The figure over the solver's steps S: optimised and initial strategies of V-LSTM + Ours, RPI validation split."""
+"""Figure over the solver's steps S: optimised and initial strategies of V-LSTM + Ours, RPI validation split."""
 
 TABLE_STEPS = 2
 """S of the paper's tables."""
@@ -62,10 +62,10 @@ RUNTIME: dict[tuple[int, int], float] = {
     }.items()
     for agents, seconds in zip((2, 4, 8, 12), row, strict=True)
 }
-"""The runtime heat map: mean seconds of a forecast by (N, S), 100 exiD samples, M = 4."""
+"""Runtime heat map: mean seconds of a forecast by (N, S), 100 exiD samples, M = 4."""
 
 RUNTIME_MODES: dict[int, float] = {1: 0.169, 2: 0.170, 4: 0.172, 8: 0.174, 12: 0.175}
-"""Its second part: seconds by M with S = 2 and N = 4. At M = 4 it disagrees with the heat map's 0.12."""
+"""Lower panel of the runtime figure: seconds by M, S = 2, N = 4. Its value at M = 4 differs from the heat map's 0.12."""
 
 
 PARTS = {
@@ -74,11 +74,11 @@ PARTS = {
     "backward": "unrolled",
     "objective": "imitation",
 }
-"""Parts of the paper's own row, its "Ours"; other methods of its Table 1 share the forecaster."""
+"""Parts of the paper's own method ("Ours"); other methods of the paper's Table 1 share its forecaster."""
 
 
 def is_papers(forecaster: str, config: Mapping[str, Any]) -> bool:
-    """Whether a row is made of the parts of the paper's; runs of older versions do not name all of them."""
+    """Whether a row uses the parts of the paper's method; parts that older runs do not name count as the paper's."""
     if forecaster != "epo":
         return True
     return all((config.get(kind) or {}).get("name", name) == name for kind, name in PARTS.items())
@@ -93,11 +93,11 @@ def paper_values(
     split: str = "test",
     steps: int | None = None,
 ) -> dict[str, float]:
-    """The paper's row, empty where it has none: it gives a known goal to the energy only.
+    """The paper's values of a row by metric; empty where the paper has none, as it gives known goals to the energy only.
 
     Args:
-        split: the tables are of the test split, the figure over S is of the validation split.
-        steps: the solver's steps S, where the forecaster has a solver.
+        split: ``test`` for the tables, ``val`` for the figure over S.
+        steps: the solver's steps S; None for a forecaster without a solver.
     """
     if goal != "energy":
         return {}

@@ -1,4 +1,4 @@
-"""How long a forecast takes, drawn beside the paper's figure: a map over agents N and steps S, a line over modes M."""
+"""Figures of the runtime of a forecast beside the paper's: a heat map over agents N and steps S, a line over modes M."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from epo_lightning.report.style import MODES, style
 from epo_lightning.report.timings import time
 
 BLUES = LinearSegmentedColormap.from_list("calm", ["#EEF5FB", "#C6DBEF", "#6BAED6", "#2171B5", "#0B3F7A"])
-"""Light for fast, dark for slow, as in the paper."""
+"""Colour map from light (fast) to dark (slow), as in the paper."""
 
 
 def heat_map(
@@ -23,23 +23,23 @@ def heat_map(
     paper: Mapping[tuple[int, int], float] = RUNTIME,
     size: tuple[float, float] = (6.4, 4.4),
 ) -> Figure:
-    """Runtime over agents (across) and steps (downwards): ours and, where it has one, the paper's below it.
+    """Heat map of the runtime over agents (x axis) and steps (y axis), with the paper's values below ours.
 
     Args:
-        seconds: (N, S) -> mean; S is None for a forecaster without a game.
-        paper: the same from the paper.
-        size: width and height [inch].
+        seconds: mean seconds by (N, S); S is None for a forecaster without a game.
+        paper: the paper's seconds by (N, S).
+        size: width and largest height [inch].
 
     Raises:
         ValueError: there is no timing.
     """
     if not seconds:
-        raise ValueError("a heat map of no timing: nothing to draw")
+        raise ValueError("heat map without timings: nothing to draw")
     agents = sorted({n for n, _ in seconds})
     steps: list[int | None] = sorted({s for _, s in seconds}, key=lambda s: -1 if s is None else s)
     values = np.array([[seconds.get((n, s), math.nan) for n in agents] for s in steps])
     low, high = np.nanmin(values), np.nanmax(values)
-    if high < 2 * low:  # equal runtimes should look equal
+    if high < 2 * low:  # keep nearly equal runtimes nearly equal in colour
         low, high = low / 2, high * 2
     norm = LogNorm(low, high)
     with style():
@@ -98,13 +98,18 @@ def draw_modes(
     size: tuple[float, float] = (6.4, 2.9),
     legend: bool = True,
 ) -> Figure:
-    """Runtime over the number of modes M, the paper's dashed beside it where it has one.
+    """Line plot of the runtime over the number of modes M, with the paper's values dashed.
+
+    Args:
+        seconds, paper: mean seconds by M, ours and the paper's; the latter may be empty.
+        size: width and height [inch].
+        legend: whether the figure has a legend.
 
     Raises:
         ValueError: there is no timing.
     """
     if not seconds:
-        raise ValueError("runtime over modes of no timing: nothing to draw")
+        raise ValueError("runtime over modes without timings: nothing to draw")
     with style():
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots()

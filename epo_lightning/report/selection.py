@@ -1,4 +1,4 @@
-"""The best setting of a search: chosen by validation scores alone, and how to train with it."""
+"""Selection of the best setting of a search by validation scores, with the overrides that train with it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from epo_lightning.report.runs import EvaluatedRun
 from epo_lightning.report.tables import Row, plain_rows, require_comparable
 
 SEARCHED = ("optimizer", "backbone", "forecaster")
-"""Sections with settings that are searched for the best; others are varied to see what they bring."""
+"""Sections whose settings are searched for the best value; settings of other sections are varied for comparison."""
 
 
 @dataclass(frozen=True)
@@ -21,10 +21,10 @@ class BestSetting:
     """The best setting of an experiment.
 
     Attributes:
-        row: its runs and scores.
-        metric: by which it was chosen, on the validation split.
+        row: runs and scores of the setting.
+        metric: metric on the validation split that chose it.
         words: overrides that train with it: ``experiment=rpi/v_lstm optimizer.lr=0.0005``.
-        candidates: how many settings it was chosen from.
+        candidates: number of settings compared.
         left_out: labels of settings that lack seeds or have no finite score.
     """
 
@@ -46,20 +46,20 @@ class BestSetting:
 def best_settings(runs: Iterable[EvaluatedRun], split: str = "val", metric: str = "minSADE") -> list[BestSetting]:
     """The setting with the lowest mean over seeds, for every experiment with several settings.
 
-    A sweep over the optimisation steps, or over the number of modes, is no search. A setting with fewer seeds than
-    another is no candidate: a mean over one lucky seed must not win.
+    A sweep over the optimisation steps, or over the number of modes, is not a search. A setting with fewer seeds than
+    another is left out: a mean over one lucky seed must not win.
 
     Args:
-        runs: of a search; scores on other splits are not looked at.
-        split: the validation split, no other.
-        metric: the lowest is the best.
+        runs: evaluated runs of a search; scores on other splits are ignored.
+        split: must be ``val``.
+        metric: score to minimise.
 
     Raises:
-        ConfigError: another split, no score of the metric, settings that cannot be compared, or none of them complete.
+        ConfigError: ``split`` is not ``val``, a run lacks the metric, settings are not comparable, or none is complete.
     """
     if split != "val":
         raise ConfigError(
-            f"settings are chosen on the validation split, not on split={split}: whatever is chosen on the test split has "
+            f"settings are chosen on the validation split, not on split={split}: a setting chosen on the test split has "
             "seen it; score the runs with `epo evaluate runs=<folder> split=val`"
         )
     experiments: dict[tuple[str, str, str], list[EvaluatedRun]] = {}
@@ -67,7 +67,7 @@ def best_settings(runs: Iterable[EvaluatedRun], split: str = "val", metric: str 
         if run.split == split:
             experiments.setdefault((run.data, run.experiment, run.name), []).append(run)
     if not experiments:
-        raise ConfigError("no run was scored on the validation split: epo evaluate runs=<folder> split=val does it")
+        raise ConfigError("no run was scored on the validation split: run `epo evaluate runs=<folder> split=val`")
     searched = [(members, plain_rows(members)) for _, members in sorted(experiments.items())]
     return [_best(members, rows, metric) for members, rows in searched if any(map(_is_searched, rows[0].settings))]
 
@@ -81,7 +81,7 @@ def _best(runs: list[EvaluatedRun], rows: list[Row], metric: str) -> BestSetting
     for row in rows:
         if metric not in row.cells:
             raise ConfigError(
-                f"{row.runs[0].path} was not scored by {metric}, which shall choose the setting; it has "
+                f"{row.runs[0].path} has no score {metric}, which is needed to choose the setting; it has "
                 f"{', '.join(row.cells)}"
             )
     seeds = {seed for row in rows for seed in row.seeds}

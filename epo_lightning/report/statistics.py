@@ -1,7 +1,7 @@
-"""Is the difference between two rows more than luck? Paired comparisons over the seeds that both rows have.
+"""Paired comparisons of two rows over the seeds that both have.
 
-Seed by seed, two rows see the same batches in the same order, so the differences of their scores say more than the
-difference of their means. The test is Student's paired t-test, two-sided.
+With the same seed, two rows see the same batches in the same order, so differences within pairs vary less than scores
+between seeds. The test is Student's two-sided paired t-test.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from epo_lightning.report.tables import Column, Row, Table
 
 CONFIDENCE = 0.95
 EQUAL = 1e-9
-"""Differences that vary less than this, relative to the scores, vary by rounding only."""
+"""Largest spread of differences, relative to the scores, that counts as rounding."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How much smaller or larger one row's score is than another's.
+    """Mean paired difference of two rows' scores, with its confidence interval and p-value.
 
     Attributes:
         n: number of pairs, one for each seed that both rows have.
-        mean: of the differences, one minus other: negative where the one is better. None without a pair.
-        low, high: bounds of its 95 % confidence interval.
+        mean: mean of one minus other, negative where the first row is better; None without a pair.
+        low, high: bounds of the 95 % confidence interval of the mean.
         p: two-sided p-value of the paired t-test.
-        reason: why there is no interval and no p-value; empty where there are.
+        reason: why there is no interval and no p-value; empty if there are.
     """
 
     n: int
@@ -41,7 +41,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One row against another, metric by metric."""
+    """Differences between two rows, by metric."""
 
     one: Row
     other: Row
@@ -63,10 +63,10 @@ class Comparisons:
 
 
 def compare(one: Sequence[float], other: Sequence[float]) -> Difference:
-    """Compare scores that come in pairs.
+    """Mean difference of paired scores, with its confidence interval and p-value.
 
     Args:
-        one, other: as many scores each; those at the same place are a pair.
+        one, other: scores of equal number; those with the same index are a pair.
     """
     differences = [a - b for a, b in zip(one, other, strict=True)]
     n = len(differences)
@@ -79,7 +79,7 @@ def compare(one: Sequence[float], other: Sequence[float]) -> Difference:
         return Difference(n, mean, reason="one common seed, two are needed")
     if max(differences) - min(differences) <= EQUAL * max(map(abs, (*one, *other))):
         return Difference(n, mean, reason="equal for every seed")
-    from scipy.special import stdtr, stdtrit  # distribution of Student's t and its quantiles; a slow import
+    from scipy.special import stdtr, stdtrit  # Student's t distribution and its quantiles; slow to import
 
     error = statistics.stdev(differences) / math.sqrt(n)
     reach = error * float(stdtrit(n - 1, (1 + CONFIDENCE) / 2))
@@ -87,7 +87,7 @@ def compare(one: Sequence[float], other: Sequence[float]) -> Difference:
 
 
 def compare_rows(one: Row, other: Row, metrics: Sequence[str]) -> Comparison:
-    """Compare two rows over the seeds that both have, in every metric that both have."""
+    """Comparison of two rows over the seeds and metrics that both have."""
     scores = [{run.seed: run.metrics for run in row.runs} for row in (one, other)]
     seeds = sorted({*scores[0]} & {*scores[1]})
     return Comparison(
@@ -102,7 +102,7 @@ def compare_rows(one: Row, other: Row, metrics: Sequence[str]) -> Comparison:
 
 
 def build_comparisons(tables: Sequence[Table]) -> list[Comparisons]:
-    """For every main table: each +EPO row against each +SC row of its group, which share backbone and goal."""
+    """Comparisons of each +EPO row with each +SC row of the same backbone and goal, for every main table."""
     found = []
     for table in (table for table in tables if table.main):
         metrics = [column.metric for column in table.columns]

@@ -1,4 +1,4 @@
-"""How long a forecast takes, read from runs that were timed, over agents N, optimisation steps S and modes M."""
+"""Runtimes of a forecast, read from runs that were timed, by agents N, optimisation steps S and modes M."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from epo_lightning.run_folder import RunFolder, read_json
 
 METHOD = ("forecaster", "dynamics", "energy", "solver", "backward", "objective")
 SIZES = ("modes", "steps", "test_steps")
-"""Sections of the configuration that make a method, and their keys that are sizes of it."""
+"""Sections of the configuration that define a method, and their keys that are only sizes of it."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How long one trained row takes for a forecast.
+    """Measured runtime of one run's forecasts.
 
     Attributes:
-        where: what was timed and on what: timings with the same words compare.
-        machine: the second of these: processor, device, threads and batch.
-        method: what timings whose sizes alone differ share; empty for a forecaster that solves no game.
+        where: data, backbone and machine; only timings with equal ``where`` are compared.
+        machine: processor, device, threads and batch size.
+        method: canonical parts of the method without its sizes; empty for a forecaster that solves no game.
         agents, steps, modes: N, S (None for a forecaster that solves no game) and M.
-        samples: how often it was measured.
-        mean, median, p10, p90: seconds.
+        samples: number of measurements.
+        mean, median, p10, p90: runtime of a forecast [s].
         run: the run folder.
     """
 
@@ -50,7 +50,7 @@ class Timing:
 
 
 def read_timings(runs: Iterable[RunFolder]) -> tuple[list[Timing], list[str]]:
-    """Every runtime.json of the runs that have one, and a note for each that cannot be read."""
+    """Timings of the runs that have a runtime.json, and an error message for each file that cannot be read."""
     timings, notes = [], []
     for run in runs:
         if run.metrics_file("time").is_file():
@@ -62,6 +62,11 @@ def read_timings(runs: Iterable[RunFolder]) -> tuple[list[Timing], list[str]]:
 
 
 def _read(run: RunFolder) -> Timing:
+    """The timing of a run.
+
+    Raises:
+        ConfigError: its runtime.json is damaged.
+    """
     file = run.metrics_file("time")
     content, config = read_json(file), run.config()
     try:
@@ -91,9 +96,9 @@ def _read(run: RunFolder) -> Timing:
 
 
 def _method(config: Mapping[str, Any]) -> str:
-    """The parts of a configuration that make a method, without the sizes that a figure of the runtime varies.
+    """The parts of a configuration that define a method, without the sizes that a runtime figure varies.
 
-    Forecasters that solve no game have none of these parts, and stand in the figures of those that do.
+    Empty for forecasters that solve no game: they appear in the figures of all methods.
     """
     if config["forecaster"]["name"] != "epo":
         return ""
@@ -103,7 +108,7 @@ def _method(config: Mapping[str, Any]) -> str:
 
 
 def places(timings: Sequence[Timing]) -> dict[str, list[Timing]]:
-    """Timings that compare with each other, by what was timed and on what."""
+    """Timings grouped by data, backbone and machine (``where``), in sorted order."""
     found: dict[str, list[Timing]] = {}
     for timing in timings:
         found.setdefault(timing.where, []).append(timing)
@@ -111,20 +116,20 @@ def places(timings: Sequence[Timing]) -> dict[str, list[Timing]]:
 
 
 def methods(timings: Sequence[Timing]) -> list[list[Timing]]:
-    """Timings whose sizes alone differ, together: of these a figure can be drawn."""
+    """Timings grouped by method, one figure each; timings without a game are in every group."""
     games = list(dict.fromkeys(timing.method for timing in timings if timing.method)) or [""]
     return [[timing for timing in timings if timing.method in ("", method)] for method in games]
 
 
 def grid(timings: Sequence[Timing]) -> tuple[int, dict[tuple[int, int | None], float]]:
-    """The number of modes that was timed with the most (N, S), and the mean seconds of each of these."""
+    """The number of modes M that was timed with the most pairs (N, S), and mean seconds by (N, S) for that M."""
     sizes = Counter(modes for modes, _, _ in {(t.modes, t.agents, t.steps) for t in timings})
     modes = max(sizes, key=lambda m: (sizes[m], m))
     return modes, _means({t: (t.agents, t.steps) for t in timings if t.modes == modes})
 
 
 def over_modes(timings: Sequence[Timing]) -> tuple[tuple[int, int | None], dict[int, float]]:
-    """The (N, S) that was timed with the most numbers of modes, and the mean seconds for each M."""
+    """The pair (N, S) that was timed with the most values of M, and mean seconds by M for that pair."""
     sizes = Counter((n, s) for _, n, s in {(t.modes, t.agents, t.steps) for t in timings})
     n, s = max(sizes, key=lambda key: (sizes[key], key[0], key[1] or 0))
     found = _means({t: t.modes for t in timings if (t.agents, t.steps) == (n, s)})
@@ -132,7 +137,7 @@ def over_modes(timings: Sequence[Timing]) -> tuple[tuple[int, int | None], dict[
 
 
 def timing_sheet(where: str, timings: Sequence[Timing]) -> Sheet:
-    """Times measured on one machine by sizes, with the paper's values where it has them, and methods by their titles."""
+    """Sheet of the times measured on one machine, sorted by sizes, with the paper's values; titles if methods differ."""
     lines = []
     named = len({timing.method for timing in timings}) > 1
     for t in sorted(timings, key=lambda t: (t.agents, t.steps or 0, t.modes)):
@@ -148,7 +153,7 @@ def timing_sheet(where: str, timings: Sequence[Timing]) -> Sheet:
 
 
 def _means(keys: Mapping[Timing, Any]) -> dict[Any, float]:
-    """Mean over the runs with the same key: seeds."""
+    """Mean seconds over the timings with the same key, which differ in their seed."""
     groups: dict[Any, list[float]] = {}
     for timing, key in keys.items():
         groups.setdefault(key, []).append(timing.mean)
@@ -156,7 +161,7 @@ def _means(keys: Mapping[Timing, Any]) -> dict[Any, float]:
 
 
 def duration(seconds: float) -> str:
-    """``75 s``, ``12 min``, ``3 h 10 min``"""
+    """A duration as text: ``75 s``, ``12 min``, ``3 h 10 min``."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -164,7 +169,7 @@ def duration(seconds: float) -> str:
 
 
 def time(seconds: float) -> str:
-    """Seconds as people say them: two digits, from microseconds to seconds."""
+    """A time as text with two significant digits and its unit: ``1.2 ms``, ``35 µs``."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         # Two digits may round up to a thousand: 0.9996 s are 1 s.
         if float(f"{seconds:.2g}") >= size or unit == "µs":

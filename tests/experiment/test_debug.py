@@ -139,7 +139,7 @@ def test_data_is_looked_at_first() -> None:
         ids.append(int(batches[1].id[2]))
 
     message = watched(poison)
-    assert f"step 1: the data holds numbers that are not finite; scenes of the training split: {ids[0]};" in message
+    assert f"step 1: the data contain numbers that are not finite; scenes of the training split: {ids[0]};" in message
 
 
 def test_the_module_and_its_scene_are_named() -> None:

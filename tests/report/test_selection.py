@@ -87,7 +87,7 @@ def test_an_unfinished_search_chooses_nothing(tmp_path: Path) -> None:
 
 def test_a_metric_that_was_not_scored_is_named(tmp_path: Path) -> None:
     search(tmp_path, {(0.1, 64): [0.3], (0.01, 64): [0.2]})
-    with pytest.raises(ConfigError, match=r"was not scored by minXYZ.*minADE"):
+    with pytest.raises(ConfigError, match=r"has no score minXYZ.*minADE"):
         best_settings(collect(tmp_path), metric="minXYZ")
 
 

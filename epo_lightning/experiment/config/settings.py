@@ -1,7 +1,7 @@
-"""Sections of a configuration and their types, checked before anything is loaded or written.
+"""Sections of a configuration as typed data classes, checked before anything is loaded or written.
 
-Sections that choose a registered part (data, backbone, ...) are checked against the part's own constructor; the others
-are dataclasses here. Nothing is built from ``_target_`` or any other path to code.
+Sections that choose a registered part (data, backbone, ...) are checked against the signature of the part's constructor.
+Objects are never built from ``_target_`` or another path to code.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ Measured = Literal["test", "val", "time"]
 """Measurements of a run: its scores on a split, or the time of a forecast."""
 PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective", "optimizer")
 MOST_PROCESSES = 1024
-"""Most threads, devices or workers that a configuration may ask for: beyond that a number is a slip of the hand, which the
-operating system answers with a crash."""
+"""Largest number of threads, devices or workers: a larger one is a typing error, which would otherwise end in a crash of
+the process without a clear message."""
 PRECISIONS = ("32-true", "64-true")
-"""Lightning's names of those that solvers take."""
+"""Precisions that the solvers support, by Lightning's names."""
 
 
 @dataclass(frozen=True)
 class TrainerSettings:
-    """How long and on what (``conf/trainer``)."""
+    """Length of a training and its hardware (``conf/trainer``)."""
 
     max_epochs: int | None = 100
     max_steps: int = -1
@@ -52,8 +52,8 @@ class TrainerSettings:
             raise ConfigError("trainer.max_epochs and trainer.max_steps are both open: the run would never end")
         if self.precision not in PRECISIONS:
             raise ConfigError(
-                f"trainer.precision must be one of {', '.join(PRECISIONS)}, not {self.precision!r}: games are solved by "
-                "factorisations, which have too few digits in 16 bits"
+                f"trainer.precision must be one of {', '.join(PRECISIONS)}, not {self.precision!r}: solvers factorise "
+                "matrices, for which 16 bits are too few"
             )
         if self.max_steps < -1:
             raise ConfigError(f"trainer.max_steps must be 0 or more, or -1 for no limit, not {self.max_steps}")
@@ -78,7 +78,7 @@ class TrainerSettings:
 
 @dataclass(frozen=True)
 class CallbackSettings:
-    """Callbacks of a training (``conf/callbacks``)."""
+    """Checkpoints, early stopping and progress of a training (``conf/callbacks``)."""
 
     monitor: str = "val/minSADE"
     patience: int | None = 10
@@ -97,7 +97,7 @@ class CallbackSettings:
 
 @dataclass(frozen=True)
 class CSVSettings:
-    """``conf/logger/csv.yaml``"""
+    """Settings of the CSV log (``conf/logger/csv.yaml``)."""
 
     flush: int = 1
 
@@ -123,14 +123,14 @@ class DashboardSettings:
 
 @dataclass(frozen=True)
 class TensorBoardSettings(DashboardSettings):
-    """``conf/logger/tensorboard.yaml``"""
+    """Settings of TensorBoard (``conf/logger/tensorboard.yaml``)."""
 
     hyperparameters: bool = True
 
 
 @dataclass(frozen=True)
 class WandbSettings(DashboardSettings):
-    """``conf/logger/wandb.yaml``"""
+    """Settings of Weights & Biases (``conf/logger/wandb.yaml``)."""
 
     project: str = "epo_lightning"
     mode: Literal["auto", "offline", "online"] = "auto"
@@ -141,7 +141,7 @@ class WandbSettings(DashboardSettings):
 
 @dataclass(frozen=True)
 class MLflowSettings(DashboardSettings):
-    """``conf/logger/mlflow.yaml``"""
+    """Settings of MLflow (``conf/logger/mlflow.yaml``)."""
 
     uri: str | None = None
     experiment: str = "epo_lightning"
@@ -150,7 +150,7 @@ class MLflowSettings(DashboardSettings):
 
 @dataclass(frozen=True)
 class LoggerSettings:
-    """Dashboards that get the log besides the CSV file; None is not chosen."""
+    """The CSV log and the chosen dashboards (``conf/logger``); None for a dashboard that is not chosen."""
 
     csv: CSVSettings = field(default_factory=CSVSettings)
     tensorboard: TensorBoardSettings | None = None
@@ -160,14 +160,14 @@ class LoggerSettings:
 
 @dataclass(frozen=True)
 class BudgetSettings:
-    """Name of the chosen budget, whose settings lie in the other sections."""
+    """Name of the chosen budget (``conf/budget``); its settings are values of the other sections."""
 
     name: str = "paper"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """One training run, whole."""
+    """Configuration of one training run (``conf/train.yaml``)."""
 
     data: Mapping[str, Any]
     backbone: Mapping[str, Any]
@@ -206,14 +206,14 @@ class Settings:
 
 
 def measures(score: str | Sequence[str] | None) -> tuple[Measured, ...]:
-    """Measurements that ``score`` asks for, each once and in one order; none for null."""
+    """Measurements that ``score`` asks for, without repetition and in a fixed order; empty for None."""
     asked = (score,) if isinstance(score, str) else score or ()
     return tuple(which for which in typing.get_args(Measured) if which in asked)
 
 
 @dataclass(frozen=True)
 class GenerateSettings:
-    """``epo generate``"""
+    """Configuration of ``epo generate``."""
 
     data: Mapping[str, Any]
     workers: int | None = None
@@ -228,7 +228,7 @@ class GenerateSettings:
 
 @dataclass(frozen=True)
 class EvaluateSettings:
-    """``epo evaluate``"""
+    """Configuration of ``epo evaluate``."""
 
     run: str | None = None
     runs: str | None = None
@@ -238,14 +238,14 @@ class EvaluateSettings:
 
     def __post_init__(self) -> None:
         if (self.run is None) == (self.runs is None):
-            raise ConfigError("say what to evaluate: run=<run folder>, or runs=<folder> for all runs below it")
+            raise ConfigError("choose what to evaluate: run=<run folder>, or runs=<folder> for all runs below it")
         if self.batch_size < 1:
             raise ConfigError(f"batch_size must be 1 or more, not {self.batch_size}")
 
 
 @dataclass(frozen=True)
 class PredictSettings:
-    """``epo predict``"""
+    """Configuration of ``epo predict``."""
 
     run: str
     out: str = "predictions"
@@ -265,7 +265,7 @@ class PredictSettings:
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """``epo report``"""
+    """Configuration of ``epo report``."""
 
     runs: str = "runs"
     sweep: str | None = None
@@ -276,7 +276,7 @@ Section = typing.TypeVar("Section")
 
 
 def read(schema: type[Section], values: Mapping[str, Any], where: str = "") -> Section:
-    """Make a ``schema`` of ``values``, as closed as it is typed.
+    """An instance of the data class ``schema`` from a section of the configuration.
 
     Raises:
         ConfigError: an unknown key (with the nearest known one), a missing key or a value of another type.
@@ -307,7 +307,7 @@ def _read(hint: Any, value: Any, where: str) -> Any:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Whether ``value``, as YAML gives it, can stand for a type. Types that YAML cannot write always fit."""
+    """Whether a value read from YAML matches a type annotation. Types that YAML cannot express always match."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return any(fits(value, option) for option in arguments)
@@ -334,7 +334,7 @@ def fits(value: Any, hint: Any) -> bool:
 
 
 def describe(hint: Any) -> str:
-    """A type in words for people who write YAML."""
+    """Description of a type for messages about YAML files, such as ``a whole number``."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(describe(option) for option in arguments)
@@ -352,7 +352,7 @@ def describe(hint: Any) -> str:
 
 
 def check_part(kind: str, values: Any, supplied: Sequence[str] = ()) -> None:
-    """Compare a part's section with its constructor: names by :func:`registry.check`, types by its annotations.
+    """Check the section of a part against its constructor: keys by :func:`registry.check`, types by its annotations.
 
     Raises:
         ConfigError: as :func:`registry.check`, or a value of another type.
