@@ -55,7 +55,7 @@ def draw(
         path = joint_predictions(scenes[rows], forecasts, folder / "joint_predictions.png", other)
         drawn.append((path, rows.tolist()))
     if settings.animate:
-        from epo_lightning.report.scenes import animate
+        from epo_lightning.report.animation import animate
 
         for row in eventful(scenes, settings.animate):
             path, name = folder / f"scene_{ids[row]}.gif", f"{title}, scene {ids[row]}"

@@ -3,89 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
-from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
-from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch, Polygon
 from PIL import Image
 from torch import Tensor
 
-from epo_lightning.registry import ConfigError
 from epo_lightning.report import scenes as pictures
-from epo_lightning.report.scenes import LONGEST, animate, highway_comparison, highway_scene
+from epo_lightning.report.scene_view import LONGEST
+from epo_lightning.report.scenes import highway_comparison, highway_scene
 from epo_lightning.report.style import TRUTH, VEHICLES
-from epo_lightning.scene import KINDS, GameParameters, JointForecast, Scene
+from epo_lightning.scene import KINDS, JointForecast, Scene
 
-HISTORY, FUTURE, DT, LANE = 10, 20, 0.2, 3.6
-STEPS = HISTORY + FUTURE
-SIZES = torch.tensor([[4.6, 1.9], [5.4, 2.0], [16.0, 2.5], [4.4, 1.8]])
-PLACES = torch.tensor([0.0, -28.0, 30.0, 12.0])
-SPEEDS = torch.tensor([30.0, 33.0, 24.0, 26.0])
-LATERAL = torch.tensor([0.0, LANE, 0.0, -LANE])
-
-
-def states(places: Tensor, speeds: Tensor, lateral: Tensor) -> Tensor:
-    """Straight ahead along x at constant speeds, [1, N, H + K, 4]."""
-    time = DT * torch.arange(1 - HISTORY, FUTURE + 1)
-    x = places[:, None] + speeds[:, None] * time
-    y, zero, speed = lateral[:, None].expand_as(x), torch.zeros_like(x), speeds[:, None].expand_as(x)
-    return torch.stack([x, y, zero, speed], -1)[None]
-
-
-def road(lanes: int = 3) -> Tensor:
-    """Lanes along x, [1, lanes, V, 4]."""
-    x = torch.arange(-300.0, 400.0, 20.0)
-    y = LANE * (torch.arange(lanes) - 1)[:, None].expand(-1, len(x))
-    points = torch.stack([x.expand_as(y), y], -1)
-    return torch.cat([points[:, :-1], points[:, 1:]], -1)[None]
-
-
-def traffic() -> Scene:
-    """Four vehicles on three lanes; the first one changes lane."""
-    track = states(PLACES, SPEEDS, LATERAL)
-    track[0, 0, HISTORY:, 1] = torch.linspace(0, LANE, FUTURE)
-    kinds = [KINDS.index(kind) for kind in ("car", "van", "truck", "car")]
-    return Scene(
-        history=track[:, :, :HISTORY],
-        future=track[:, :, HISTORY:],
-        dt=DT,
-        size=SIZES[None],
-        kind=torch.tensor([kinds]),
-        lanes=road(),
-    )
-
-
-def short() -> Scene:
-    """The same for a second and a half: animations take their time."""
-    scene = traffic()
-    return dataclasses.replace(
-        scene,
-        history=scene.history[:, :, -3:],
-        history_mask=scene.history_mask[:, :, -3:],
-        future=scene.future[:, :, :6],
-        future_mask=scene.future_mask[:, :, :6],
-    )
-
-
-def forecast(scene: Scene, modes: int = 3) -> JointForecast:
-    """Modes that drift apart, the last one the most likely; every agent's goal is its last position."""
-    steps = FUTURE if scene.future is None else scene.future.shape[2]
-    time = DT * torch.arange(1, steps + 1)
-    start = scene.current[:, None, :, None].repeat(1, modes, 1, steps, 1)
-    start[..., 0] += start[..., 3] * time
-    start[..., 1] += 0.4 * torch.arange(modes)[:, None, None] * time
-    likely = torch.arange(1.0, modes + 1)
-    game = GameParameters({}, {}, torch.zeros(*start.shape[:-1], 2), goals=start[..., -1, :2].clone())
-    return JointForecast(start, (likely / likely.sum())[None], parameters=game)
+from .traffic_scenes import DT, HISTORY, LANE, SIZES, STEPS, boxes, forecast, road, states, traffic
 
 
 def moved(values: Tensor, angle: float, shift: tuple[float, float]) -> Tensor:
@@ -113,29 +49,10 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     return figures
 
 
-def boxes(axes: Axes, color: str, filled: bool = True) -> list[np.ndarray]:
-    """Corners of the boxes and discs of one colour: agents at t0, or outlines."""
-    patches = [patch for patch in axes.patches if isinstance(patch, Polygon)]
-    if filled:
-        chosen = [p for p in patches if p.get_facecolor()[3] == 1 and to_hex(p.get_facecolor()) == color.lower()]
-    else:
-        chosen = [p for p in patches if p.get_facecolor()[3] == 0 and to_hex(p.get_edgecolor()) == color.lower()]
-    return [patch.get_xy()[:-1] for patch in chosen]
-
-
 def pixels(path: Path) -> np.ndarray:
     with Image.open(path) as image:
         assert image.format == "PNG"
         return np.asarray(image.convert("RGB"))
-
-
-def frames(path: Path) -> Iterator[tuple[np.ndarray, int]]:
-    """Pixels and milliseconds of the frames of a GIF."""
-    with Image.open(path) as image:
-        assert image.format == "GIF"
-        for index in range(image.n_frames):
-            image.seek(index)
-            yield np.asarray(image.convert("RGB")), image.info["duration"]
 
 
 def test_a_panel_for_each_mode_the_most_likely_first(tmp_path: Path, drawn: list[Figure]) -> None:
@@ -234,7 +151,7 @@ def test_other_modes_give_other_pixels_and_the_same_ones_the_same_bytes(tmp_path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png", "c.png"]
 
 
-def test_what_stands_behind_a_mask_is_not_drawn(tmp_path: Path) -> None:
+def test_masked_values_are_not_drawn(tmp_path: Path) -> None:
     written = []
     for garbage in (torch.nan, 1e9):
         scene = traffic()
@@ -259,18 +176,6 @@ def test_what_stands_behind_a_mask_is_not_drawn(tmp_path: Path) -> None:
         written.append(highway_scene(masked, predicted, tmp_path / "masked.png").read_bytes())
     assert written[0] == written[1]
     assert written[0] != highway_scene(traffic(), forecast(traffic()), tmp_path / "whole.png").read_bytes()
-
-
-def test_what_stands_behind_a_mask_does_not_move(tmp_path: Path) -> None:
-    written = []
-    for garbage in (torch.nan, 1e9):
-        scene = short()
-        predicted = forecast(scene)
-        scene.agent_mask[0, 1] = scene.history_mask[0, 0, 0] = scene.future_mask[0, 2, 2] = False
-        scene.history[0, 1] = scene.history[0, 0, 0] = scene.future[0, 1] = scene.future[0, 2, 2] = garbage
-        predicted.states[0, :, 1] = garbage
-        written.append(animate(scene, predicted, tmp_path / "masked.gif").read_bytes())
-    assert written[0] == written[1]
 
 
 def test_unobserved_steps_are_gaps(tmp_path: Path, drawn: list[Figure]) -> None:
@@ -301,9 +206,6 @@ def test_a_forecast_that_is_not_finite_is_said_to_be(tmp_path: Path, drawn: list
         predicted, states=predicted.states * torch.nan, probabilities=torch.full((1, 3), torch.nan)
     )
     pixels(highway_scene(scene, nothing, tmp_path / "nothing.png"))
-    few = short()
-    lost = JointForecast(forecast(few).states * torch.nan, torch.ones(1, 3) / 3)
-    assert animate(few, lost, tmp_path / "nothing.gif").stat().st_size > 1000
     assert all(np.isfinite(axes.get_xlim() + axes.get_ylim()).all() for axes in drawn[1].axes)
 
 
@@ -327,9 +229,6 @@ def test_a_scene_of_which_little_is_known(tmp_path: Path, drawn: list[Figure]) -
     assert not boxes(axes, TRUTH, filled=False)
     labels = {text.get_text() for legend in drawn[0].legends for text in legend.get_texts()}
     assert labels == {"history", "forecast", *(f"agent {i}" for i in range(1, 5))}
-    few = Scene(short().history, DT)
-    seconds = JointForecast(forecast(short(), modes=1).states, torch.ones(1, 1))
-    assert len(list(frames(animate(few, seconds, tmp_path / "scene.gif")))) == 17
 
 
 def test_pedestrians_are_discs_in_their_own_frame(tmp_path: Path, drawn: list[Figure]) -> None:
@@ -384,94 +283,14 @@ def test_forecasters_side_by_side(tmp_path: Path, drawn: list[Figure]) -> None:
     assert pixels(path).shape[0] > 300
 
 
-def test_an_animation_runs_in_real_time_and_stays_small(tmp_path: Path) -> None:
-    scene = traffic()
-    path = animate(scene, forecast(scene), tmp_path / "scene.gif", "EPO")
-    assert path.stat().st_size < 500_000
-    shown = list(frames(path))
-    assert len(shown) == 2 * (STEPS - 1) + 1
-    assert sum(duration for _, duration in shown[:-1]) == pytest.approx(1000 * DT * (STEPS - 1))
-    assert shown[-1][1] > 1000
-    assert all(not np.array_equal(one, other) for (one, _), (other, _) in pairwise(shown))
-
-
-def test_an_animation_shows_its_forecast_from_t0_on(tmp_path: Path) -> None:
-    scene = short()
-    predicted = forecast(scene)
-    path = animate(scene, predicted, tmp_path / "scene.gif")
-    assert path.read_bytes() == animate(scene, predicted, tmp_path / "again.gif").read_bytes()
-    states = predicted.states.clone()
-    states[:, 2, 0, :, 0] -= 3.0
-    other = animate(scene, dataclasses.replace(predicted, states=states), tmp_path / "other.gif")
-    pairs = zip(frames(path), frames(other), strict=True)
-    apart = [np.abs(one.astype(int) - two).max() > 64 for (one, _), (two, _) in pairs]
-    assert apart == [False] * 5 + [True] * 12
-
-
-def test_in_every_frame_vehicles_are_where_they_are_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = short()
-    predicted = forecast(scene)
-    seen: dict[float, tuple[np.ndarray, list[np.ndarray]]] = {}
-    original = pictures._moving
-
-    def moving(axes: Axes, *rest: object) -> Iterator[float]:
-        for time in original(axes, *rest):
-            (vehicle,) = boxes(axes, VEHICLES[0])
-            seen[round(time, 3)] = vehicle.mean(0), [corners.mean(0) for corners in boxes(axes, TRUTH, filled=False)]
-            yield time
-
-    monkeypatch.setattr(pictures, "_moving", moving)
-    animate(scene, predicted, tmp_path / "scene.gif")
-    centre = scene.current[0, :, :2].numpy().mean(0)
-    for step in range(-2, 7):
-        vehicle, outlines = seen[round(step * DT, 3)]
-        expected = scene.history[0, 0, step - 1] if step <= 0 else predicted.states[0, 2, 0, step - 1]
-        np.testing.assert_allclose(vehicle + centre, expected[:2], atol=1e-4)
-        assert len(outlines) == (0 if step <= 0 else 4)
-        if step > 0:
-            np.testing.assert_allclose(outlines + centre, scene.future[0, :, step - 1, :2], atol=1e-4)
-    between = (predicted.states[0, 2, 0, 3, :2] + predicted.states[0, 2, 0, 4, :2]) / 2
-    np.testing.assert_allclose(seen[0.9][0] + centre, between, atol=1e-4)
-
-
-def test_headings_turn_the_short_way(tmp_path: Path) -> None:
-    states = np.array([[0.0, 0, np.pi - 0.1, 1], [1.0, 0, -np.pi + 0.1, 1]])
-    path, seen = pictures._until(states, np.array([True, True]), 0.5)
-    assert seen.all()
-    assert np.cos(path[-1, 2]) == pytest.approx(-1)
-
-
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
-def test_a_film_where_there_is_ffmpeg(tmp_path: Path) -> None:
-    scene = short()
-    path = animate(scene, forecast(scene), tmp_path / "scene.mp4")
-    assert path.read_bytes()[4:8] == b"ftyp"
-    assert 1000 < path.stat().st_size < 1_000_000
-
-
-def test_what_cannot_be_drawn_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_forecasts_several_scenes_and_absent_agents_are_refused(tmp_path: Path) -> None:
     scene = traffic()
     predicted = forecast(scene)
-    with pytest.raises(ConfigError, match=r"\.gif or"):
-        animate(scene, predicted, tmp_path / "scene.avi")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ConfigError, match=r"needs the program ffmpeg.*choose a \.gif"):
-        animate(scene, predicted, tmp_path / "scene.mp4")
-    with pytest.raises(ValueError, match="without a forecast"):
+    with pytest.raises(ValueError, match="without forecasts"):
         highway_comparison(scene, {}, tmp_path / "no.png")
     with pytest.raises(ValueError, match="one scene, not 2"):
         highway_scene(scene[[0, 0]], predicted[[0, 0]], tmp_path / "no.png")
     nobody = dataclasses.replace(scene, agent_mask=torch.zeros(1, 4, dtype=torch.bool))
-    with pytest.raises(ValueError, match="without an agent"):
+    with pytest.raises(ValueError, match="without an observed agent"):
         highway_scene(nobody, predicted, tmp_path / "no.png")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_film_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError("no space left")
-
-    monkeypatch.setattr(pictures, "_write_gif", full)
-    with pytest.raises(OSError, match="no space"):
-        animate(traffic(), forecast(traffic()), tmp_path / "scene.gif")
     assert list(tmp_path.iterdir()) == []
