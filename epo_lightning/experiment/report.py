@@ -18,8 +18,9 @@ from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import EvaluatedRun, Report, build_tables, collect, write_report
 from epo_lightning.report.render import code
+from epo_lightning.report.rows import Row
 from epo_lightning.report.runs import scored
-from epo_lightning.report.tables import Row, distinct
+from epo_lightning.report.tables import distinct
 from epo_lightning.report.write import is_timed, why_left_out
 from epo_lightning.run_folder import RunFolder
 

@@ -6,8 +6,10 @@ import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from epo_lightning.report.columns import MISSING
 from epo_lightning.report.render import Sheet
-from epo_lightning.report.tables import MISSING, Row, Table, distinct, trained_rows
+from epo_lightning.report.rows import Row
+from epo_lightning.report.tables import Table, distinct, trained_rows
 from epo_lightning.report.timings import Timing, duration, time
 from epo_lightning.run_folder import RunFolder
 

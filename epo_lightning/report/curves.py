@@ -17,8 +17,8 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, NullLoc
 from epo_lightning.identity import essence
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.paper import STEPS, is_papers
+from epo_lightning.report.rows import Row
 from epo_lightning.report.style import MODES, VEHICLES, style
-from epo_lightning.report.tables import Row
 from epo_lightning.run_folder import read_log
 
 METRIC = "val/minSADE"

@@ -9,6 +9,7 @@ import re
 import unicodedata
 from collections.abc import Sequence
 
+from epo_lightning.report.columns import MISSING, Column
 from epo_lightning.report.render import (
     Sheet,
     comparison_sheet,
@@ -17,8 +18,9 @@ from epo_lightning.report.render import (
     paper_text,
     with_ends,
 )
+from epo_lightning.report.rows import Row
 from epo_lightning.report.statistics import Comparisons
-from epo_lightning.report.tables import MISSING, Column, Row, Table
+from epo_lightning.report.tables import Table
 
 SPECIAL = {
     **{letter: rf"\{letter}" for letter in "&%$#_{}"},

@@ -8,8 +8,9 @@ from typing import Any
 
 from epo_lightning.identity import row_identity
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.rows import Row
 from epo_lightning.report.runs import data_name
-from epo_lightning.report.tables import Row, Table, distinct
+from epo_lightning.report.tables import Table, distinct
 from epo_lightning.report.timings import Timing
 from epo_lightning.run_folder import RunFolder
 

@@ -14,8 +14,9 @@ from typing import Any
 from epo_lightning.report.charts import Chart
 from epo_lightning.report.made import Made
 from epo_lightning.report.render import Sheet, difference_text, own_text, paper_text, signed, with_ends
+from epo_lightning.report.rows import Row
 from epo_lightning.report.style import svg
-from epo_lightning.report.tables import Row, Table, distinct
+from epo_lightning.report.tables import Table, distinct
 
 WIDEST, COLORS = 1500, 128
 """Largest width [pixels] and palette size of pictures: a page should be small enough to mail."""

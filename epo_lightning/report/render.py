@@ -17,9 +17,11 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from epo_lightning.report.columns import GAME, MISSING, OF_MODES, Column, number
+from epo_lightning.report.rows import Cell, Row
 from epo_lightning.report.selection import BestSetting
 from epo_lightning.report.statistics import Comparisons, Difference
-from epo_lightning.report.tables import GAME, MISSING, OF_MODES, Cell, Column, Row, Table, distinct, number
+from epo_lightning.report.tables import Table, distinct
 
 COMPARISON_LEGEND = (
     "Differences of the scores of two rows, paired by seed: the first row minus the second, so that negative is better for "

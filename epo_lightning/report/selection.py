@@ -9,8 +9,8 @@ from typing import Any
 
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import natural, word
+from epo_lightning.report.rows import Row, plain_rows, require_comparable
 from epo_lightning.report.runs import EvaluatedRun
-from epo_lightning.report.tables import Row, plain_rows, require_comparable
 
 SEARCHED = ("optimizer", "backbone", "forecaster")
 """Sections whose settings are searched for the best value; settings of other sections are varied for comparison."""

@@ -11,8 +11,10 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from epo_lightning.report.columns import Column
 from epo_lightning.report.paper import is_papers
-from epo_lightning.report.tables import Column, Row, Table
+from epo_lightning.report.rows import Row
+from epo_lightning.report.tables import Table
 
 CONFIDENCE = 0.95
 EQUAL = 1e-9

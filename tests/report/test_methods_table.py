@@ -12,12 +12,13 @@ from rich.console import Console
 
 from epo_lightning.report import Report, write_report
 from epo_lightning.report.charts import charts_of
+from epo_lightning.report.columns import Column, significant
 from epo_lightning.report.costs import cost_sheets
 from epo_lightning.report.latex import to_latex
 from epo_lightning.report.paper import is_papers
 from epo_lightning.report.render import legend, to_markdown
 from epo_lightning.report.runs import collect, find_runs
-from epo_lightning.report.tables import Column, Table, build_tables, significant
+from epo_lightning.report.tables import Table, build_tables
 from epo_lightning.report.timings import duration, read_timings
 from epo_lightning.run_folder import read_json, write_json
 

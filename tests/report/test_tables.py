@@ -18,8 +18,9 @@ from rich.console import Console
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, write_report
+from epo_lightning.report.rows import Cell, Row
 from epo_lightning.report.runs import collect, find_runs
-from epo_lightning.report.tables import Cell, Row, build_tables, distinct
+from epo_lightning.report.tables import build_tables, distinct
 from epo_lightning.run_folder import RunFolder, write_json
 
 from .run_folders import make_run, scores

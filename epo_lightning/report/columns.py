@@ -1,0 +1,79 @@
+"""Columns of the tables: their metrics, and how numbers are printed in them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+MISSING = "-"
+"""Text of a cell without a value."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table: its metric and its heading."""
+
+    metric: str
+    label: str
+
+    @property
+    def digits(self) -> int:
+        """Number of decimals: four for overlap rates, so that one overlap in 6000 scenes is visible, else three."""
+        return 4 if "overlap" in self.metric else 3
+
+    @property
+    def ranked(self) -> bool:
+        """Whether rows are ranked by it; energies and their gradients and gaps have different units in each row."""
+        return self.metric not in OWN_UNITS
+
+    def text(self, value: float) -> str:
+        """A value as tables print it: metrics of the game with three significant digits, others with fixed decimals."""
+        return significant(value) if self.metric in GAME else number(value, self.digits)
+
+    def long_text(self, value: float) -> str:
+        """A value with six digits."""
+        return f"{value:.6g}" if self.metric in GAME and not math.isnan(value) else number(value, 6)
+
+
+OWN_UNITS = ("energy_initial", "energy_solved", "energy_optimum", "gradient_norm", "nash_gap")
+GAME = (*OWN_UNITS, "nash_gap_relative")
+"""Metrics of the game that a forecaster solves; those of ``OWN_UNITS`` have the units of the row's own energy."""
+
+
+def number(value: float, digits: int) -> str:
+    """A number with fixed decimals; a dash for nan."""
+    return MISSING if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def significant(value: float) -> str:
+    """A number with three digits or more: ``1534``, ``15.3``, ``0.00153``, ``1.5e-05``; a dash for nan."""
+    if math.isnan(value):
+        return MISSING
+    rounded = float(f"{value:.3g}")
+    if rounded and not 1e-3 <= abs(rounded) < 1e5:
+        return f"{value:.1e}"
+    digits = 2 - math.floor(math.log10(abs(rounded))) if rounded else 0
+    return f"{value:.{max(digits, 0)}f}"
+
+
+MAIN = (
+    Column("minADE", "ADE"),
+    Column("minFDE", "FDE"),
+    Column("minSADE", "SADE"),
+    Column("minSFDE", "SFDE"),
+    Column("overlap_jfp", "OR (JFP)"),
+    Column("overlap_authors", "OR (authors)"),
+)
+
+EQUILIBRIUM = (
+    Column("energy_initial", "energy, initial"),
+    Column("energy_solved", "energy, solved"),
+    Column("energy_optimum", "energy, optimum"),
+    Column("gradient_norm", "gradient norm"),
+    Column("nash_gap", "Nash gap"),
+    Column("nash_gap_relative", "Nash gap, relative"),
+)
+
+OF_MODES = re.compile(r"minSADE_(\d+)")
+"""Names of the metrics minSADE among the k most likely joint modes."""
