@@ -1,6 +1,6 @@
 """Data classes of the project: the observed scene, the inferred game, its solution and the forecast.
 
-All shapes are written in one alphabet:
+The letters in shapes mean the same everywhere:
 
 ====  ==========================  ======  ================================================================
 B     scenes in a batch           P       pairs of agents i < j, P = N (N - 1) / 2
@@ -10,6 +10,7 @@ H     history steps               U = 2   control: acceleration [m/s^2], turn ra
 K     future steps                S       optimisation steps
 R     reference lines, residuals  Q       points of a reference line
 L     lane polylines              V       vectors of a lane polyline
+C     candidate strategies        D       width of the features z
 ====  ==========================  ======  ================================================================
 """
 
@@ -91,18 +92,18 @@ _FIELDS: Mapping[str, tuple[str, tuple[str | int, ...], str | None]] = {
     "subset": (_INTEGER, ("B",), None),
     "id": (_INTEGER, ("B",), None),
 }
-"""Kind of number, shape, and field that must be given as well, of every tensor of a :class:`Scene`."""
+"""For every tensor of a :class:`Scene`: kind of number, shape, and the field that it belongs to, which must be given too."""
 
 _LEAST = {"H": (1, "step; the last one is the current state, t0"), "K": (1, "step"), "Q": (2, "points of each line")}
-"""Smallest sizes of some dimensions, and what they count."""
+"""Smallest sizes of some dimensions, with the unit that error messages name."""
 
 
 @dataclass(frozen=True)
 class Scene(_Batch):
     """A batch of B observed scenes: agents' histories and sizes, the map and, in training, the agents' futures.
 
-    Positions are in one fixed frame for the whole scene. Masks are True where an entry is real; values behind a False
-    never influence a result. A mask that is left out means that every entry is real.
+    Positions are in one fixed frame for the whole scene. Masks are True where an entry is real and False for padding; the
+    values of padding never influence a result. A mask that is left out means that every entry is real.
 
     Attributes:
         history: states x, y [m], heading [rad], speed [m/s]; the last step is the current one, t0.
@@ -153,7 +154,7 @@ class Scene(_Batch):
     id: Int[Tensor, " B"] | None = None
 
     def __post_init__(self) -> None:
-        # Shapes and types only: values would have to be fetched from the accelerator. See `validate_values`.
+        # Only shapes and types are checked here; checking values would make the host wait for a GPU (`validate_values`).
         if not isinstance(self.dt, Real) or isinstance(self.dt, bool):
             raise TypeError(f"scene.dt is a {type(self.dt).__name__}; it takes a number of seconds")
         if not 0 < self.dt < math.inf:
@@ -174,7 +175,7 @@ class Scene(_Batch):
                 object.__setattr__(self, name, ones)
 
     def validate_values(self) -> None:
-        """Refuse values that no forecaster can use. Reads the tensors, so on an accelerator it waits for them.
+        """Refuse values that no forecaster can use. On a GPU, this check makes the host wait for the tensors.
 
         Raises:
             ValueError: a length or width that is not positive, or the index of a reference line that does not exist.
@@ -206,7 +207,7 @@ class Scene(_Batch):
 
     @property
     def finite(self) -> Bool[Tensor, " B"]:
-        """Scenes whose real entries are all finite; values behind a mask do not count."""
+        """Mask of the scenes whose real entries are all finite; padding is not checked."""
         result = torch.ones(len(self.history), dtype=torch.bool, device=self.history.device)
         references = None if self.references is None else self.references.flatten(3)
         speed = None if self.reference_speed is None else self.reference_speed[..., None]
@@ -229,7 +230,7 @@ class Scene(_Batch):
 
 
 def _check_tensor(name: str, value: Any, numbers: str, shape: tuple[str | int, ...], sizes: dict[str, int]) -> None:
-    """Compare one field of a scene with its declaration; ``sizes`` collects the sizes of the dimensions by letter.
+    """Compare one field of a scene with its declared type and shape; sizes of dimensions are added to ``sizes`` by letter.
 
     Raises:
         TypeError: not a tensor.
@@ -241,7 +242,7 @@ def _check_tensor(name: str, value: Any, numbers: str, shape: tuple[str | int, .
     given = "boolean" if value.dtype == torch.bool else "floating-point" if value.is_floating_point() else "integer"
     if given != numbers:
         hint = "; masks are torch.bool, True where an entry is real" if numbers == _MASK else ""
-        raise ValueError(f"scene.{name} is of type {value.dtype}, but takes {numbers} numbers{hint}")
+        raise ValueError(f"scene.{name} is of type {value.dtype}, expected {numbers} numbers{hint}")
     expected = [sizes.get(dim, dim) if isinstance(dim, str) else dim for dim in shape]
     fits = value.dim() == len(expected) and all(
         isinstance(want, str) or want == got for want, got in zip(expected, value.shape, strict=True)
@@ -265,13 +266,13 @@ class GameParameters(_Batch):
         own_weights: weight of each named feature of an agent; the energy squares it.
         pair_weights: weight of each named feature of a pair i < j, in the order of ``torch.triu_indices(N, N, 1)``.
         goals: goal position of each agent [m]; None for energies without a goal feature.
-        initial_controls: the strategies from which the solver starts, one for every mode; or, for solvers that choose, any
-            number C of candidate strategies.
+        initial_controls: the strategies from which the solver starts, one for every mode; or any number C of candidate
+            strategies, for solvers that choose among candidates.
         reference: index of the reference line that an agent follows, the one its goal lies on; None for energies without a
             lane feature.
         context: features z of the agents, for energies that are networks.
-        order: +1 or -1 for every pair i < j: the side on which they pass, or the agent that goes first; for energies that
-            are convex given the order.
+        order: +1 or -1 for every pair i < j: the side on which they pass, or the agent that goes first
+            (:mod:`~epo_lightning.game.pair_order`). None for energies without orders.
     """
 
     own_weights: Mapping[str, Float[Tensor, "B M N"]]
@@ -302,9 +303,9 @@ class Status(IntEnum):
     """Outcome of the minimisation of one scene and mode."""
 
     SOLVED = 0
-    """Every step was taken as the method defines it."""
+    """All steps were taken, with the configured damping and step size. It does not mean that the solver has converged."""
     DAMPED = 1
-    """A factorisation succeeded with more damping only, or steps were shortened."""
+    """A factorisation succeeded only with more damping, or steps were shortened."""
     STOPPED = 2
     """A step could not be taken and the last good iterate was kept; or an implicit gradient was requested where the Hessian
     is not positive definite."""
@@ -315,7 +316,7 @@ class Tables(_Batch):
     """Energies of C candidate strategies per agent, and the density p(k) = exp(-E(k)) / Z over joint choices k.
 
     Attributes:
-        states: states of the candidates; equal candidate numbers of different agents are unrelated.
+        states: states of the candidates; candidate k of one agent and candidate k of another one do not belong together.
         unary: E_i of every candidate.
         pair: E_ij of every two candidates: entry (k, l) is agent i's k-th with agent j's l-th; pairs in the order of
             ``torch.triu_indices``.
@@ -369,7 +370,8 @@ class Equilibrium(_Batch):
         gradient_norm: Euclidean norm of dE/du at the forecast; NaN where strategies are chosen among candidates.
         nash_gap: decrease of J_i when agent i alone changes to a local best response; zero for absent agents, NaN where
             ``optimum`` is NaN.
-        objective: J_i, the agent's own objective, at the forecast; zero for absent agents, NaN where it has no natural zero.
+        objective: J_i, the agent's own objective, at the forecast; zero for absent agents. NaN for energies that are not
+            sums of squares: their zero is arbitrary, so a gap relative to it means nothing.
     """
 
     initial: Float[Tensor, " B"]
@@ -384,8 +386,8 @@ class Equilibrium(_Batch):
 class JointForecast(_Batch):
     """M joint futures of all agents of a scene and their probabilities.
 
-    Losses read the logits, from which a gradient flows however small a probability is. A forecaster that gives none is
-    scored by its probabilities.
+    Losses read the logits, because their gradient does not vanish for very small probabilities. If a forecaster gives no
+    logits, losses take the logarithms of its probabilities.
 
     Attributes:
         states: futures; the agents of one mode belong together.
@@ -397,8 +399,8 @@ class JointForecast(_Batch):
         parameters: the inferred game.
         solution: the solver's result.
         goal_probabilities: each agent's probabilities of its goal candidates, for forecasters that choose among them.
-        order_logits: logit of every pair's order being +1, zero where it does not matter; for forecasters whose modes are
-            orders.
+        order_logits: logit of p(order of the pair = +1), zero for pairs whose order does not matter; for forecasters whose
+            modes are orders.
         own_energy: energy by feature and agent at the solution.
         pair_energy: energy by feature and pair at the solution.
         equilibrium: distance of the most likely mode from an equilibrium, where it was measured.

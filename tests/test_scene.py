@@ -64,7 +64,7 @@ def a_mask(*shape: int) -> torch.Tensor:
         ({"reference_speed": torch.ones(2)}, r"scene\.reference_speed has shape \[2\]; this scene takes \[2, 3\]"),
         ({"frame": torch.zeros(2, 2)}, r"scene\.frame has shape \[2, 2\]; this scene takes \[2, 3\]"),
         ({"subset": torch.zeros(3, dtype=torch.long)}, r"scene\.subset has shape \[3\]; this scene takes \[2\]"),
-        ({"id": torch.zeros(2)}, r"scene\.id is of type torch\.float32, but takes integer"),
+        ({"id": torch.zeros(2)}, r"scene\.id is of type torch\.float32, expected integer"),
         ({"agent_mask": torch.ones(2, 3)}, r"scene\.agent_mask is of type torch\.float32, .* masks are torch\.bool"),
         ({"history_mask": torch.ones(2, 3, 5)}, r"scene\.history_mask is of type torch\.float32"),
         ({"dt": 0.0}, r"scene\.dt must be positive and finite \[s\], not 0\.0"),

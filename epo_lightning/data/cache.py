@@ -1,4 +1,4 @@
-"""Data sets on disk: one folder per configuration, named by the hash of that configuration, complete or absent.
+"""Data sets on disk: one folder per configuration, named by the hash of that configuration and never incomplete.
 
 A data set is a folder ``<kind>-<hash12>/`` with one ``.safetensors`` file per split and a ``manifest.json`` that records the
 configuration and every file's size and SHA-256. The folder is assembled under a hidden name beside its final place and then
@@ -64,10 +64,10 @@ def versions() -> dict[str, str]:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock on a folder, so that only one process at a time makes it.
+    """Context with a lock on a folder, so that only one process at a time makes it.
 
-    Another process waits and says so; it must look again whether the folder exists now. The lock is a file beside the
-    folder, which the operating system releases however the process that holds it ends.
+    A second process prints that it waits, and waits; afterwards it must check again whether the folder exists. The lock is a
+    file beside the folder; the operating system releases it when the process ends, for whatever reason.
     """
     with writing(folder.parent):
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -150,14 +150,14 @@ def write(
         return folder
     work = folder.with_name(f".{folder.name}-unfinished")
     with writing(folder):
-        shutil.rmtree(work, ignore_errors=True)  # the rest of a process that was killed
+        shutil.rmtree(work, ignore_errors=True)  # files that a killed process left
         work.mkdir(parents=True)
         try:
             files = {}
             for split, tensors in splits.items():
                 path = work / f"{split}.safetensors"
                 path.touch()
-                mode = path.stat().st_mode  # as the umask has it; safetensors would make the file private
+                mode = path.stat().st_mode  # permissions by the umask; safetensors would make the file private
                 save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
                 path.chmod(mode)
                 files[path.name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
@@ -196,8 +196,8 @@ def manifest(folder: Path, command: str = "", config: Mapping[str, Any] | None =
     """The manifest of a data set.
 
     Args:
-        folder: of the data set.
-        command: makes the data set; for error messages.
+        folder: folder of the data set.
+        command: the command that makes the data set, for error messages.
         config: configuration that the data set must have been made from; None accepts any.
 
     Raises:

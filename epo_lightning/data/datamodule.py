@@ -23,18 +23,21 @@ from epo_lightning.task import Task
 
 
 class SceneDataset(Protocol):
-    """Records of a split; ``dataset[indices]`` with a LongTensor [B] is a Scene of B samples."""
+    """Interface of the scenes of a split; ``dataset[indices]`` with a LongTensor [B] is a batch of B scenes."""
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, indices: Tensor) -> Scene: ...
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw what differs from epoch to epoch."""
+        """Prepare the samples of an epoch, for data sets in which they differ between epochs."""
 
 
 class Subset:
-    """A share of a data set in its original order, drawn once: every seed and every row of a table sees the same scenes.
+    """A random share of the scenes of a data set, in their original order (``data.share``).
+
+    The draw does not depend on the run's seed, so that every run of a table sees the same scenes. (The named subsets of
+    ``Scene.subset``, for which metrics are reported, are something else.)
 
     Args:
         whole: the data set.
@@ -58,7 +61,7 @@ class Subset:
         return self.whole[self.chosen[indices]]
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw what differs from epoch to epoch."""
+        """Prepare the samples of an epoch of the whole data set."""
         self.whole.set_epoch(epoch)
 
 
@@ -66,15 +69,15 @@ class BatchSampler(DistributedSampler):
     """Index tensors of the batches of an epoch.
 
     Lightning calls ``set_epoch`` of a loader's sampler before each epoch, with the epoch that a checkpoint restored; the
-    order follows from the seed and that number. Under distributed training rank r of n takes every n-th index of every
-    batch from r on, so that all ranks together see the batch of one process. The base class DistributedSampler only keeps
-    Lightning from replacing this sampler by its own.
+    order follows from the seed and that number. In distributed training, rank r of n takes the indices r, r + n, r + 2n,
+    ... of every batch, so that all ranks together see the batch that one process would see. The only purpose of the base
+    class DistributedSampler is that Lightning does not replace this sampler by its own.
 
     Args:
         dataset: its ``set_epoch`` is called as well.
         batch_size: scenes per batch, of all ranks together.
         shuffle: whether the order is random; then an incomplete last batch is dropped.
-        seed: of the order.
+        seed: seed of the random order.
     """
 
     def __init__(self, dataset: SceneDataset, batch_size: int, shuffle: bool, seed: int) -> None:
@@ -122,7 +125,7 @@ def check_share(batch_size: int, world: int) -> None:
 
 
 def epoch_generator(seed: int, epoch: int) -> torch.Generator:
-    """Random generator of one epoch. The seed is mixed by numpy, because torch uses only its last 32 bits."""
+    """Random generator of one epoch. NumPy mixes seed and epoch into one number, because torch uses only 32 bits of it."""
     return torch.Generator().manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
 
 
@@ -149,7 +152,9 @@ class SceneDataModule(LightningDataModule):
     def __init__(self, batch_size: int, seed: int, share: float = 1.0) -> None:
         super().__init__()
         if not 0 < share <= 1:
-            raise ConfigError(f"data.share is {share}, expected a share of the scenes of every split, in (0, 1]")
+            raise ConfigError(
+                f"data.share is {share}, expected a number in (0, 1]: the share of the scenes that is used"
+            )
         if not isinstance(batch_size, int) or isinstance(batch_size, bool) or batch_size < 2:
             raise ConfigError(
                 f"batch_size is {batch_size!r}, but batch normalisation needs at least 2 scenes in a batch"

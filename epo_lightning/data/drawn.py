@@ -1,8 +1,8 @@
 """Random scenes in memory, for time measurements, smoke tests and checks without a data set.
 
-Only the tables are drawn; the classes of the real data, :class:`~epo_lightning.data.rpi.scenes.RPIDataset` and
-:class:`~epo_lightning.data.recorded.scenes.RecordedScenes`, make scenes of them. Shapes are therefore those of real scenes.
-Models cannot learn anything useful from them.
+Tables of records are drawn at random, and the classes of the real data
+(:class:`~epo_lightning.data.rpi.scenes.RPIDataset`, :class:`~epo_lightning.data.recorded.scenes.RecordedScenes`) make scenes
+of them, so all shapes are those of real scenes. A model cannot learn anything useful from them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ HEADWAY = 25.0
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of scenes: the sizes of a task, and the function that draws its tables.
+    """A kind of random scenes (RPI, highway, pedestrians): the sizes of its task, and the function that draws its tables.
 
     Attributes:
         agents: default number of agents.
@@ -71,7 +71,7 @@ def _curves(start: Tensor, heading: Tensor, speed: Tensor, turn: Tensor, time: T
 
 
 def _walkers(scenes: int, agents: int, kind: Kind, draw: torch.Generator, apart: float) -> Tensor:
-    """States [scenes, agents, H + K, 4] of agents that pass within about ``apart`` [m] of the same point."""
+    """States [scenes, agents, H + K, 4] of agents that all pass a common point at a distance of about ``apart`` [m]."""
     speed = _between(0.7, 1.5, scenes, agents, draw=draw)
     heading = _between(-torch.pi, torch.pi, scenes, agents, draw=draw)
     turn = _between(-0.1, 0.1, scenes, agents, draw=draw)
@@ -195,7 +195,7 @@ LIKE: Mapping[str, Kind] = {
     ),
     "pedestrians": Kind(4, 8, Task(12, 0.4, candidates=0, scale=5.0), _pedestrians),
 }
-"""Tasks whose scenes can be drawn."""
+"""Kinds of random scenes by the name in ``data.like``."""
 
 
 @register("data", "drawn")

@@ -11,7 +11,7 @@ class RecordingError(ConfigError):
     """Error for a recording that cannot be read: names the file, the row or element, what was expected and the remedy."""
 
     def __init__(self, path: Path | str, problem: str, row: int | None = None) -> None:
-        # An exception is pickled as its class and its arguments, and workers send theirs that way.
+        # Worker processes send exceptions pickled as class and arguments, so all arguments are passed to the base class.
         super().__init__(path, problem, row)
         self.path, self.problem, self.row = path, problem, row
 

@@ -27,14 +27,16 @@ def default_workers() -> int:
 
 
 class Report:
-    """Progress on standard error: a bar on a terminal, elsewhere a line whenever a unit of work is done.
+    """Progress of worker processes on standard error: a bar on a terminal, otherwise one line per finished unit of work.
+
+    A unit consists of one or more tasks: a main game of RPI is a unit, and each of its placements is a task.
 
     Args:
-        tasks: all that is still to do.
-        unit_of: from a task to the unit that it belongs to: the placements of a main game are tasks of their own.
-        unit: singular noun for the unit, such as ``game``.
+        tasks: the tasks that are not done yet.
+        unit_of: function from a task to its unit.
+        unit: singular noun for a unit, such as ``game``.
         doing, done: participles for the work, such as "solving" and "solved".
-        before: number of units that were finished earlier.
+        before: number of units that were finished by earlier commands.
         show: whether to report at all.
     """
 
@@ -99,13 +101,14 @@ def finished(
     """Tasks and their results ``function(*task)``, in the order in which they are finished.
 
     Args:
-        function: at module level, so that other processes find it.
-        tasks: its arguments.
-        workers: processes; None for one per core. A single one is this process.
-        report: counts every task once its result has been taken.
-        kept: for error messages: where finished work is kept.
+        function: the work; at module level, so that other processes can import it.
+        tasks: arguments of the function.
+        workers: number of processes; None for one per core. With 1, this process does the work.
+        report: progress report; a task is counted when its result has been consumed.
+        kept: sentence for error messages that names the folder of finished work.
         fresh: whether each task needs a process of its own.
-        first_here: whether this process does the first task before workers start: it compiles what they then find on disk.
+        first_here: whether this process does the first task before workers start, so that compiled functions are on disk
+            when they start.
 
     Raises:
         CacheError: a worker was killed, for instance for lack of memory.
@@ -140,7 +143,7 @@ def finished(
 
 
 def _watch_parent() -> None:
-    """Let a worker end with the process that started it, also when that was killed."""
+    """End this worker process when the process that started it ends, even if that one is killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
 

@@ -22,8 +22,9 @@ class Stretches:
         count: its number of steps.
         start: its first row.
         state: x, y [m], heading [rad], speed [m/s] of every row; headings are unwrapped.
-        ending: only if tracks are smoothed: every row's state and the J - 1 states before it, estimated without later
-            frames. The centred smoothing of ``state`` is better, but a forecaster must not see the future.
+        ending: for smoothed tracks, every row's state and the J - 1 states before it, estimated without later frames; None
+            for tracks that are not smoothed. ``state`` is smoothed with later frames too, which is more accurate, but the
+            inputs of a forecaster must not contain the future.
     """
 
     dt: float
@@ -112,7 +113,7 @@ def _states(values: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "*n 4"]:
 
 
 def _unwrap(heading: Float[np.ndarray, " n"], begin: Int[np.ndarray, " C"]) -> Float[np.ndarray, " n"]:
-    """Headings without jumps of a turn within a stretch."""
+    """Headings without jumps of 2 pi within a stretch."""
     turn = np.diff(heading, prepend=heading[:1])
     turns = np.round(turn / (2 * np.pi))
     turns[begin] = 0.0
@@ -156,10 +157,11 @@ def _ending(
     rate: float,
     dt: float,
 ) -> Float[np.ndarray, "Z J 4"]:
-    """States of every step and of the steps before it that the centred filter would smooth with later frames.
+    """States of every step, and of the J - 1 steps before it, estimated from frames up to the step only.
 
-    They come from the parabola that is fitted to the window that ends at the step. Where a stretch has no complete window
-    yet, they are the recorded states.
+    A parabola is fitted to the window that ends at the step and evaluated at the J steps. J - 1 is the number of earlier
+    steps that the centred filter would smooth with frames after the step. At the beginning of a stretch, before there is a
+    complete window, the recorded states are used.
 
     Args:
         raw: recorded positions, headings and velocities.

@@ -142,12 +142,14 @@ class LaneGraph:
                 a lane that does not exist.
         """
         if not len(self):
-            raise RecordingError(path, "there is no lane in it: is it a map of a road?")
+            raise RecordingError(path, "the map has no lanes: is it a map of a road?")
         for name in ("left", "right", "centre"):
             for lane, line in zip(self.ids, getattr(self, name), strict=True):
                 if not (np.abs(line) <= FARTHEST).all():
                     raise RecordingError(
-                        path, f"the {name} line of lane {lane} has coordinates that are no metres on a map"
+                        path,
+                        f"the {name} line of lane {lane} has coordinates that are not finite or beyond {FARTHEST:g} m: "
+                        "are they in metres?",
                     )
                 if len(line) < 2 or not np.ptp(line, axis=0).any():
                     raise RecordingError(
@@ -155,9 +157,9 @@ class LaneGraph:
                     )
         for neighbours in (self.left_of, self.right_of, self.adjacent_left, self.adjacent_right):
             if not ((neighbours >= -1) & (neighbours < len(self))).all():
-                raise RecordingError(path, "a lane lies beside one that does not exist")
+                raise RecordingError(path, "a lane names a neighbouring lane that does not exist")
         if not all(0 <= lane < len(self) for following in self.successors for lane in following):
-            raise RecordingError(path, "a lane leads into one that does not exist")
+            raise RecordingError(path, "a lane names a successor that does not exist")
         return self
 
     @cached_property
@@ -185,9 +187,10 @@ class LaneGraph:
         return shapely.STRtree(self.areas)
 
     def locate(self, position: Float[np.ndarray, "T 2"], heading: Float[np.ndarray, " T"]) -> Located:
-        """Lanes of agents: among the lanes that contain a position, the one with the best sum of distance and heading error.
+        """The lane of every position: of the lanes that contain it, that with the least offset and heading error.
 
-        The heading decides because the centreline of a crossing road may be nearer.
+        The heading error is included because the centreline of a crossing road may be nearer. Positions within ``BESIDE`` of
+        a lane are assigned to it if no lane contains them.
         """
         found = Located(np.full(len(position), -1), np.zeros(len(position)), np.full(len(position), np.inf))
         points = shapely.points(position)
@@ -208,7 +211,7 @@ class LaneGraph:
         row: Int[np.ndarray, " n"],
         lane: Int[np.ndarray, " n"],
     ) -> None:
-        """Write into ``found`` the best among the candidate lanes of some rows."""
+        """Write the best lane of each row into ``found``; ``row`` and ``lane`` are pairs of rows and candidate lanes."""
         along, offset = self.centrelines.project(lane, position[row])
         _, tangent = self.centrelines.at(lane, along)
         turned = np.cos(heading[row]) * tangent[:, 0] + np.sin(heading[row]) * tangent[:, 1]
@@ -240,7 +243,7 @@ def _reached(lane: int, following: Sequence[tuple[int, ...]]) -> set[int]:
 
 
 def lane_changes(agent: Int[np.ndarray, " T"], located: Located, lanes: LaneGraph) -> Bool[np.ndarray, " T"]:
-    """Mask [T] of the rows in which an agent is first seen on a lane beside its previous one (exiD: ``laneChange``).
+    """Mask [T] of the rows in which an agent is on a lane beside that of its previous row (exiD: ``laneChange``).
 
     Rows on no lane are ignored.
     """

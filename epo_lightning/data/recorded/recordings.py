@@ -1,4 +1,4 @@
-"""Recordings as data for training: scenes extracted once, kept in the cache, read by whole batches."""
+"""The data module ``recordings``: scenes are extracted from recordings once, kept in the cache and read in whole batches."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ class RecordedData(SceneDataModule):
     Args:
         dataset: name of the data in tables and in the cache.
         format: name of a registered recording format.
-        folder: of the recordings, or of a data set that was extracted from them. If it is absent, the data set that these
-            settings would give is looked for in the cache.
+        folder: folder of the recordings, or of a data set that was extracted from them. If it does not exist, the cache is
+            searched for a data set that was extracted with these settings.
         windows: selection of the windows that become scenes, fields of
             :class:`~epo_lightning.data.recorded.windows.WindowConfig`.
         map: whether to use lanes, and thus goal candidates.
@@ -74,7 +74,7 @@ class RecordedData(SceneDataModule):
         shape: agents' outline in the overlap rates, ``box`` or ``disc``.
         scale: length [m] that corresponds to 1 in the inputs of a network.
         root: folder of the cache; None for $EPO_CACHE or ``cache``.
-        seed: of the draws, and of the order of batches unless a run sets its own.
+        seed: seed of the random splits, and of the order of batches unless a run sets its own.
         batch_size: scenes per batch.
         share: share of the scenes of every split that is used, drawn once.
     """
@@ -175,23 +175,23 @@ class RecordedData(SceneDataModule):
         empty = [split for split in SPLITS if not found[split]]
         if empty:
             raise ConfigError(
-                f"{len(sources)} recording(s) in {len(groups)} group(s) leave none for {', '.join(empty)}: "
-                "three splits need recordings of their own"
+                f"{len(sources)} recording(s) in {len(groups)} group(s) are too few: no recording is left for "
+                f"{', '.join(empty)}; each of the three splits needs recordings of its own"
             )
         return found
 
     def identity(self, sources: Sequence[RecordingSource]) -> Any:
-        """Plain values that tell these recordings from others: names, sizes and checksums of all files."""
+        """Plain values that identify the recordings: names, groups, and names, sizes and checksums of all files."""
         return [[source.name, source.group, [_fingerprint(file) for file in source.files]] for source in sources]
 
     @cached_property
     def config(self) -> dict[str, Any]:
         """Configuration of the data set: all values that its files depend on.
 
-        Without the recordings it is that of the extracted data set in the cache that these settings would give.
+        If the recordings are absent, it is read from the data set in the cache that was extracted with these settings.
 
         Raises:
-            ConfigError: neither recordings nor an extracted data set, or several data sets that would do.
+            ConfigError: neither recordings nor an extracted data set exists, or several data sets fit the settings.
         """
         home = self.folder_of_recordings
         if cache.is_set(home):
@@ -232,13 +232,13 @@ class RecordedData(SceneDataModule):
         return {**self._settings(), "recordings": identity, "splits": splits}
 
     def _extracted(self) -> list[tuple[Path, dict[str, Any]]]:
-        """Data sets of the cache, and their configurations, that these settings would make of the same recordings."""
+        """Data sets in the cache that were extracted with these settings, and their configurations."""
         return [
             (folder, config) for folder, config in cache.configs(self.root, self.dataset_name) if self._gives(config)
         ]
 
     def _gives(self, config: Mapping[str, Any]) -> bool:
-        """Whether these settings make a data set of this configuration, given the recordings that it names."""
+        """Whether these settings, applied to the recordings that ``config`` names, give exactly ``config``."""
         try:
             sources = [RecordingSource(name, group, (), _absent) for name, group, _ in config["recordings"]]
             return self._config_of(sources, config["recordings"]) == config
@@ -321,8 +321,8 @@ class RecordedData(SceneDataModule):
         if not full:
             gone = ", ".join(f"{reason}: {count}" for reason, count in counts.items() if count) or "no window at all"
             raise ConfigError(
-                f"the split {split!r} of {self.dataset_name} has not a single scene ({gone}): relax data.windows, or give "
-                "it more recordings"
+                f"the split {split!r} of {self.dataset_name} has no scene ({gone}): relax data.windows, or add "
+                "recordings to the split"
             )
         whole = joined(full)
         index = np.array([number for number, found in enumerate(tables) if found is not None])
@@ -357,7 +357,7 @@ def _absent() -> Recording:
 
 
 def _fingerprint(file: Path) -> list[Any]:
-    """Name, size and checksum of a file. Of large files only evenly spaced pieces are read: recordings have gigabytes."""
+    """Name, size and checksum of a file. In large files only evenly spaced pieces are read, because they have gigabytes."""
     size, checksum = file.stat().st_size, 0
     with file.open("rb") as content:
         for place in range(0, size, max(PIECE, (size - PIECE) // PIECES)):

@@ -17,7 +17,7 @@ from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph, Located, Poly
 LINES = 3
 """Reference lines R per agent: left, own, right."""
 PER_LINE = 20
-"""Goal candidates per reference line: G = 60 in all."""
+"""Goal candidates per reference line: with three lines, G = 60 candidates per agent."""
 POINTS = 24
 """Points Q of a reference line."""
 BRAKING, ACCELERATING = 4.0, 3.0
@@ -81,8 +81,8 @@ class Routes:
         """Reference lines and goal candidates of agents.
 
         Args:
-            position, speed: of the agents [m, m/s].
-            located: their lanes; every agent is on one.
+            position, speed: positions [m] and speeds [m/s] of the agents.
+            located: lanes of the agents; every agent must be on a lane.
             time: horizon within which goals are reached [s].
         """
         speed = np.maximum(speed, 0.0)

@@ -22,7 +22,7 @@ class RecordedScenes:
         tables: the columns of an :class:`~epo_lightning.data.recorded.windows.SceneTables`.
         dt: time step [s].
         frame: ``fixed`` (axes of the recording) or ``aligned`` (x along the agents' mean heading).
-        names: of the recordings.
+        names: names of the recordings.
     """
 
     def __init__(self, tables: Mapping[str, Tensor], dt: float, frame: str, names: Sequence[str]) -> None:

@@ -78,7 +78,7 @@ class TrackTable:
             return int(np.flatnonzero(bad)[0])
 
         if not len(self.agent):
-            raise RecordingError(path, "there is no track in it")
+            raise RecordingError(path, "the recording has no tracks; at least one was expected")
         if not (np.isfinite(self.rate) and 1.0 <= self.rate <= 1000.0):
             raise RecordingError(path, f"a frame rate of {self.rate} Hz was expected to lie between 1 and 1000 Hz")
         by_agent = np.diff(self.agent)
@@ -88,7 +88,7 @@ class TrackTable:
             raise RecordingError(
                 path,
                 f"frame {self.frame[row]} of track {self.ids[self.agent[row]]} comes after its frame "
-                f"{self.frame[row - 1]}: time must go forward, and an id must belong to one agent",
+                f"{self.frame[row - 1]}: frames of a track must increase, and an id must belong to one agent",
             )
         for name, values, limit, unit in (
             ("position", self.position, FARTHEST, "m"),
@@ -119,9 +119,9 @@ class Recording:
     """The contents of one recording.
 
     Attributes:
-        name: unique within its data set.
-        group: recordings of one group may be kept in one split: a map, a scene, a layout.
-        tracks: of all agents.
+        name: name of the recording, unique within its data set.
+        group: name of a group of recordings, such as a map, a scene or a layout. Splits can keep a group together.
+        tracks: tracks of all agents.
         lanes: lane graph of the map; None without a map.
         dropped: numbers of items that the reader left out, by reason.
     """
@@ -139,9 +139,9 @@ class RecordingSource:
 
     Attributes:
         name, group: those of the :class:`Recording`.
-        files: its files; their contents identify a data set.
-        read: reads it, possibly in another process, so it is a function at module level or a partial of one. Raises
-            :class:`RecordingError`.
+        files: files of the recording; their contents identify a data set.
+        read: function that reads the recording, possibly in another process; it must therefore be a function at module level
+            or a partial of one. Raises :class:`RecordingError`.
     """
 
     name: str

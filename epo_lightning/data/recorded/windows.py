@@ -1,5 +1,6 @@
 """Extraction of scenes from recordings: the choice of agents and moments, and their data (Appendix C.2, "exiD").
 
+A window is a moment of a recording (t0) with a focal agent and its neighbours. Windows that pass all filters become scenes.
 Scenes share agents: a vehicle at one moment may be the centre of one scene and a neighbour in others. Its data are stored
 once, in a table of agents; a scene is a row of indices into that table. :class:`SceneTables` holds both, in coordinates
 relative to an origin of the recording.
@@ -49,7 +50,7 @@ class WindowConfig:
         complete: whether neighbours must be observed in the whole window, like the focal agent, or only at the current step.
         smoothing: length [s] of the smoothing filter; null for tracks that are smooth already.
         lanes: largest number of lane polylines L of a scene, the nearest ones.
-        speed_limit: for lanes without one [m/s].
+        speed_limit: reference speed [m/s] on lanes without a speed limit.
     """
 
     dt: float = 0.2
@@ -91,8 +92,7 @@ class WindowConfig:
             )
         if self.least_agents > self.agents:
             raise ConfigError(
-                f"data.windows.least_agents={self.least_agents} asks for more agents than data.windows.agents={self.agents} "
-                "lets in"
+                f"data.windows.least_agents={self.least_agents} must not be more than data.windows.agents={self.agents}"
             )
 
 
@@ -313,7 +313,7 @@ def _assemble(
     centre = (at * there).sum(1) / there.sum(1)
     heading = now[place, 2]
     ahead = np.stack([(f(heading) * there[..., 0]).sum(1) for f in (np.cos, np.sin)], 1)
-    # Opposite headings have no meaningful mean: the heading of the focal agent is used.
+    # If headings oppose each other, their mean has no meaning, and the heading of the focal agent is used.
     scattered = np.linalg.norm(ahead, axis=1) < AGREE * there[..., 0].sum(1)
     direction = np.where(scattered, heading[:, 0], np.arctan2(ahead[:, 1], ahead[:, 0]))
     candidates, references = np.empty((len(used), 0, 2)), np.empty((len(used), 0, 0, 2))

@@ -165,10 +165,10 @@ def test_routes_of_a_loop_go_on_where_the_agent_is():
 def test_graphs_that_cannot_be_maps_are_refused():
     lanes = road(curve(None))
     for change, message in (
-        ({"successors": [(99,)] * len(lanes)}, "leads into one that does not exist"),
-        ({"left_of": np.full(len(lanes), 99)}, "beside one that does not exist"),
+        ({"successors": [(99,)] * len(lanes)}, "names a successor that does not exist"),
+        ({"left_of": np.full(len(lanes), 99)}, "names a neighbouring lane that does not exist"),
         ({"centre": [line[:1] for line in lanes.centre]}, "has no length"),
-        ({"left": [line * np.nan for line in lanes.left]}, "no metres"),
+        ({"left": [line * np.nan for line in lanes.left]}, "are not finite or beyond"),
     ):
         with pytest.raises(RecordingError, match=message):
             dataclasses.replace(lanes, **change).check("map.osm")

@@ -134,7 +134,7 @@ def test_fingerprints_see_every_byte_of_small_files_and_large_changes_of_large_o
 def test_a_split_without_scenes_is_an_error_that_says_where_they_went(folder):
     for file in folder.glob("a-*.road"):
         file.write_text("empty")
-    with pytest.raises(ConfigError, match=r"'test' of roads has not a single scene .*too few agents around: \d+"):
+    with pytest.raises(ConfigError, match=r"'test' of roads has no scene .*too few agents around: \d+"):
         data(folder).generate(workers=1, progress=False)
 
 
@@ -163,7 +163,7 @@ def test_missing_data_and_misspelt_keys_say_what_to_do(folder, tmp_path):
         _ = RecordedData("roads", "roads", str(tmp_path / "nowhere"), WINDOWS).config
     with pytest.raises(ConfigError, match=r"which no recording has: .*known: a, b, c"):
         data(folder, test=["d"]).generate(progress=False)
-    with pytest.raises(ConfigError, match="leave none for train, val"):
+    with pytest.raises(ConfigError, match="no recording is left for train, val"):
         data(folder, test=["a", "b", "c"]).generate(progress=False)
     (tmp_path / "bare").mkdir()
     with pytest.raises(ConfigError, match="holds no recording in the format 'roads'"):

@@ -311,7 +311,7 @@ def test_joined_scenes_are_the_same_scenes():
         ("smoothing", 1e9, "smoothing must be 10 s or less"),
         ("history", 1, "data.windows.history must be 2 or more"),
         ("agents", 0, "data.windows.agents must be 1"),
-        ("least_agents", 5, "lets in"),
+        ("least_agents", 5, "must not be more than"),
         ("radius", -1.0, "positive, or null"),
         ("dt", 0.0, "data.windows.dt must be positive"),
     ],

@@ -125,7 +125,7 @@ def read_map(
             lanelets.append(lanelet)
     if not lanelets:
         reasons = ", ".join(f"{number} {reason}" for reason, number in left_out.items())
-        raise RecordingError(path, f"there is no lane in it ({reasons or 'no relation of type lanelet'})")
+        raise RecordingError(path, f"the map has no lanes ({reasons or 'no relation of type lanelet'})")
     if dropped is not None:
         dropped.update(left_out)
     return _graph(lanelets).check(path)

@@ -200,7 +200,7 @@ def scaled(factor, *names):
         (at(4, heading=1e9), r"row 6: heading is 1000000000.0; degrees"),
         (at(4, heading=float("nan")), r"row 6: heading is nan; degrees"),
         (at(4, frame=-1), r"row 6: frame -1 was expected in 0"),
-        (at(4, frame=2), r"frame 2 of track 10 comes after its frame 3: time must go forward"),
+        (at(4, frame=2), r"frame 2 of track 10 comes after its frame 3: frames of a track must increase"),
         (at(4, frame=3), r"frame 3 of track 10 comes after its frame 3"),
         (at(4, trackId=99), r"row 6: trackId 99 is not in 07_tracksMeta.csv"),
         (at(4, recordingId=8), r"row 6: recordingId is not 7 as in 07_recordingMeta.csv: .* mixed up"),
@@ -217,7 +217,7 @@ def scaled(factor, *names):
             lambda t: t.with_columns(
                 trackId=pl.when((pl.col("trackId") == 11) & (pl.col("frame") < 7)).then(10).otherwise("trackId")
             ),
-            "frame 5 of track 10 comes after its frame 11: time must go forward, and an id must belong to one agent",
+            "frame 5 of track 10 comes after its frame 11: frames of a track must increase",
         ),
         (lambda t: t.head(0), r"there are no rows in it"),
         (scaled(3.6, "xVelocity", "yVelocity"), r"positions move 0.278 times as fast as xVelocity"),

@@ -286,8 +286,11 @@ def changed(pattern, replacement, count=0):
     [
         (changed("</?osm", lambda m: m[0].replace("osm", "commonRoad")), "root element is <commonRoad>"),
         (changed("<node[^>]*>", ""), "there is no node in it"),
-        (changed("<relation.*</relation>", ""), r"there is no lane in it \(no relation of type lanelet\)"),
-        (changed("highway|emergency_lane", "walkway"), r"no lane in it \(6 lanelets that are not for vehicles\)"),
+        (changed("<relation.*</relation>", ""), r"the map has no lanes \(no relation of type lanelet\)"),
+        (
+            changed("highway|emergency_lane", "walkway"),
+            r"the map has no lanes \(6 lanelets that are not for vehicles\)",
+        ),
         (changed("role='left'", "role='right'"), r"6 lanelets without exactly one left and one right way"),
         (changed(r"<nd ref='\d+'/>", "<nd ref='999'/>"), "6 lanelets whose ways or nodes are missing"),
         (changed("<nd ref='2'/>", "<nd/>", 1), "a node of way 1 is missing; a whole number"),

@@ -86,7 +86,7 @@ def test_raster_of_six_frames(tmp_path):
         (ROWS.replace("9.0", "nan"), "row 7: x is 'nan'; a finite number was expected"),
         (ROWS.replace("31 5", "31.5 5"), "row 7: frame is '31.5'; a whole number"),
         (ROWS.replace("31 5", "31 1e12"), r"row 7: pedestrian is '1e12'; a whole number up to 1e\+09 was expected"),
-        (ROWS.replace("31 5", "21 7"), "frame 2 of track 7 comes after its frame 2: time must go forward"),
+        (ROWS.replace("31 5", "21 7"), "frame 2 of track 7 comes after its frame 2: frames of a track must increase"),
         (ROWS.replace("31 5", "32 5"), "frame 32 of pedestrian 5 is not annotated: annotated frames are 10 apart"),
         (ROWS.replace("9.0", "9e9"), r"position \[9000000000.0, 9000000000.0\] of track 5 .* another unit"),
         (ROWS.replace("-1.0", "-999"), "velocity"),
