@@ -25,8 +25,9 @@ from rich.table import Table
 from benchmarks.measure import positive
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
-from epo_lightning.experiment.config.settings import Settings, read
+from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.registry import ConfigError
+from epo_lightning.schema import read
 
 LOGGERS = ("csv", "tensorboard", "wandb", "mlflow")
 DATA = ("data=rpi", "data.games=10", "data.placements=1")

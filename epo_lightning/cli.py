@@ -293,7 +293,8 @@ def _config(arguments: Arguments) -> None:
         print(f"{verb}: the configuration is valid")
         return
     from epo_lightning.experiment import assembly, train
-    from epo_lightning.experiment.config.settings import Settings, read
+    from epo_lightning.experiment.config.settings import Settings
+    from epo_lightning.schema import read
 
     settings = read(Settings, config)
     data, model = assembly.check(settings)
@@ -341,7 +342,8 @@ def _multirun(arguments: Arguments) -> None:
     listed = compose.jobs("train", arguments.overrides, arguments.extra)
     if listed:
         from epo_lightning.experiment import assembly, train
-        from epo_lightning.experiment.config.settings import Settings, read
+        from epo_lightning.experiment.config.settings import Settings
+        from epo_lightning.schema import read
 
         for job in listed:
             settings = read(Settings, compose.compose("train", job, arguments.extra))

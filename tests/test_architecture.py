@@ -13,6 +13,7 @@ ROOT = Path(epo_lightning.__file__).parent
 FLOORS = {
     "scene": set(),
     "registry": set(),
+    "schema": {"registry"},
     "task": {"registry"},
     "identity": set(),
     "masking": set(),
@@ -26,7 +27,7 @@ FLOORS = {
     "metrics": {"scene", "registry"},
     "decoders": {"scene", "game"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
-    "data": {"scene", "registry", "task"},
+    "data": {"scene", "registry", "schema", "task"},
     "objectives": {"scene", "registry", "game", "solvers", "decoders", "losses"},
     "forecasters": {
         "scene",

@@ -24,12 +24,13 @@ from epo_lightning import registry
 from epo_lightning.data.datamodule import check_share
 from epo_lightning.experiment import debugging
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
-from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings, check_part
+from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings
 from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.forecasters import SUPPLIED, build_forecaster
 from epo_lightning.metrics.forecast import COLUMNS
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder
+from epo_lightning.schema import check_part
 from epo_lightning.task import Task
 
 

@@ -12,10 +12,11 @@ from lightning.pytorch import Trainer, seed_everything
 
 from epo_lightning import pretrained
 from epo_lightning.experiment import assembly, logs
-from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings, read
+from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
+from epo_lightning.schema import read
 
 TOLERANCE = 1e-5
 """Relative difference below which two scores are the same: machines and batch sizes change the last digits."""

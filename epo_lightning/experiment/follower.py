@@ -15,10 +15,11 @@ from lightning.pytorch import seed_everything
 from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
 
 from epo_lightning.experiment import assembly, callbacks
-from epo_lightning.experiment.config.settings import Settings, read
+from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.distributed import DDP, GRACE, HOST, PATIENCE, Place, here
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
+from epo_lightning.schema import read
 
 
 def followed(devices: int, run: RunFolder) -> bool:

@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import DashboardSettings, PredictSettings, Settings, read
+from epo_lightning.experiment.config.settings import DashboardSettings, PredictSettings, Settings
 from epo_lightning.experiment.csv_log import CSVLog
 from epo_lightning.experiment.dashboards.aside import Aside
 from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
@@ -28,6 +28,7 @@ from epo_lightning.experiment.pictures import choose, draw, forecast_of
 from epo_lightning.identity import SECTIONS, identity
 from epo_lightning.masking import mask
 from epo_lightning.run_folder import RunFolder, read_json, read_log
+from epo_lightning.schema import read
 
 
 def rows(run: RunFolder) -> list[Row]:

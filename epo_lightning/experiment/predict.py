@@ -10,12 +10,13 @@ from torch import Tensor
 
 from epo_lightning import pretrained
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import PredictSettings, Settings, read
+from epo_lightning.experiment.config.settings import PredictSettings, Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data
 from epo_lightning.experiment.pictures import choose, draw, forecast_of, spread
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_bytes, write_json
 from epo_lightning.scene import KINDS, JointForecast, Scene
+from epo_lightning.schema import read
 
 MEANING = {
     "states": "[B, M, N, K, 4] x, y [m], heading [rad], speed [m/s] of every joint mode",

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import ReportSettings, Settings, read
+from epo_lightning.experiment.config.settings import ReportSettings, Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data
 from epo_lightning.experiment.pictures import choose, eventful, forecast_of, is_traffic, pairs, spread
 from epo_lightning.experiment.sweeps.sweep import Sweep
@@ -23,6 +23,7 @@ from epo_lightning.report.runs import scored
 from epo_lightning.report.tables import distinct
 from epo_lightning.report.write import is_timed, why_left_out
 from epo_lightning.run_folder import RunFolder
+from epo_lightning.schema import read
 
 SCENES, GAMES = 4, 512
 """How many scenes are drawn, and over how many the distribution of learned weights is taken."""

@@ -13,11 +13,12 @@ from safetensors.torch import save
 
 from epo_lightning import pretrained
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
-from epo_lightning.experiment.config.settings import Settings, read
+from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_data
 from epo_lightning.experiment.pictures import choose
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_bytes, write_json
+from epo_lightning.schema import read
 
 SCENES = 16
 """Example scenes that ship with a run."""

@@ -19,13 +19,14 @@ from lightning.pytorch.callbacks import Timer
 
 from epo_lightning.experiment import assembly, callbacks, debugging, distributed, follower, gpus, logs
 from epo_lightning.experiment.config.compose import PACKAGE
-from epo_lightning.experiment.config.settings import EvaluateSettings, Measured, Settings, read
+from epo_lightning.experiment.config.settings import EvaluateSettings, Measured, Settings
 from epo_lightning.experiment.evaluate import score
 from epo_lightning.experiment.opening import refuse_changed
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import differences, identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
+from epo_lightning.schema import read
 
 NOT_IN_COMMAND = ("sweep=", "existing=", "runs=", "run_dir=", "resume=")
 """Overrides that do not change what is trained, and are left out of the recorded command."""

@@ -11,11 +11,10 @@ from epo_lightning.experiment.config.settings import (
     GenerateSettings,
     PredictSettings,
     ReportSettings,
-    check_part,
     measures,
-    read,
 )
 from epo_lightning.run_folder import RunFolder
+from epo_lightning.schema import check_part, read
 
 SCHEMAS: dict[str, type] = {
     "generate": GenerateSettings,

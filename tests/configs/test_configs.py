@@ -14,8 +14,9 @@ from hydra.types import RunMode
 from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose, hydra, jobs, options_of, tree
-from epo_lightning.experiment.config.settings import Settings, read
+from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import build_forecaster
+from epo_lightning.schema import read
 from epo_lightning.task import Task
 
 CONF = tree() / "conf"

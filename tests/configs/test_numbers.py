@@ -9,16 +9,10 @@ import pytest
 from epo_lightning.cli import parse
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
-from epo_lightning.experiment.config.settings import (
-    EvaluateSettings,
-    GenerateSettings,
-    PredictSettings,
-    Settings,
-    check_part,
-    read,
-)
+from epo_lightning.experiment.config.settings import EvaluateSettings, GenerateSettings, PredictSettings, Settings
 from epo_lightning.forecasters import SUPPLIED
 from epo_lightning.registry import ConfigError
+from epo_lightning.schema import check_part, read
 
 CONFIG = compose("train", ["experiment=rpi/v_lstm_epo", "logger=[csv,tensorboard]", "data=drawn", "data.like=rpi"])
 NAN, INF = float("nan"), float("inf")

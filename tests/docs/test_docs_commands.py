@@ -13,8 +13,9 @@ from docs.pages import PAGES, ROOT, commands, unknown
 from epo_lightning import cli
 from epo_lightning.experiment import assembly, verbs
 from epo_lightning.experiment.config import compose
-from epo_lightning.experiment.config.settings import Settings, read
+from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.sweeps import sweeping
+from epo_lightning.schema import read
 
 NOT_RUN = {
     "docker": "no container engine in the tests",

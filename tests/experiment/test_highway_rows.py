@@ -13,9 +13,10 @@ import pytest
 from experiment.conftest import Epo
 
 from epo_lightning.experiment.config.compose import compose, hydra, jobs, options_of, tree
-from epo_lightning.experiment.config.settings import Settings, read
+from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.config.sources import HIGHWAYS
 from epo_lightning.experiment.train import folder_for
+from epo_lightning.schema import read
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "exid_sim"
 DATA = (f"data.folder={FIXTURE}", "data.batch_size=4")

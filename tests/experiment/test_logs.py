@@ -22,12 +22,13 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from epo_lightning.experiment import logs
 from epo_lightning.experiment.callbacks import RandomStates
-from epo_lightning.experiment.config.settings import Settings, TensorBoardSettings, read
+from epo_lightning.experiment.config.settings import Settings, TensorBoardSettings
 from epo_lightning.experiment.dashboards import aside
 from epo_lightning.experiment.dashboards.aside import Aside
 from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
 from epo_lightning.experiment.dashboards.tensorboard import TensorBoard
 from epo_lightning.run_folder import RunFolder, discover
+from epo_lightning.schema import read
 
 ROW = "experiment=rpi/v_lstm_sc"
 STEP = "trainer/global_step"

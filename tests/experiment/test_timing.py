@@ -14,11 +14,12 @@ from experiment.conftest import TINY, Epo
 import epo_lightning
 from epo_lightning.experiment import assembly, verbs
 from epo_lightning.experiment.callbacks import RandomStates
-from epo_lightning.experiment.config.settings import Settings, measures, read
+from epo_lightning.experiment.config.settings import Settings, measures
 from epo_lightning.experiment.timing import SAMPLES, measure
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
+from epo_lightning.schema import read
 
 DRAWN = ("data=drawn", "data.scenes=32", "callbacks.progress=none")
 

@@ -28,6 +28,7 @@ from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, extract, joined
 from epo_lightning.data.workers import Report, finished
 from epo_lightning.registry import ConfigError, lookup, nearest, register
+from epo_lightning.schema import read
 from epo_lightning.task import Task
 
 VERSION = 2
@@ -35,23 +36,6 @@ VERSION = 2
 PIECE, PIECES = 1 << 14, 64
 """Size [bytes] and number of the pieces of a file that enter its checksum; files up to 1 MB are covered completely."""
 UNITS = ("recording", "group")
-
-
-def _window_config(windows: Mapping[str, Any]) -> WindowConfig:
-    """The window settings of a configuration, after a check of their names and types."""
-    known = {field.name: getattr(WindowConfig, field.name) for field in dataclasses.fields(WindowConfig)}
-    optional = {"radius": float, "smoothing": float}
-    for key, value in windows.items():
-        if key not in known:
-            raise ConfigError(f"unknown key data.windows.{key}: {nearest(str(key), known)}")
-        kind = optional.get(key, type(known[key]))
-        if value is None and key in optional:
-            continue
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (number if kind is float else type(value) is kind):
-            expected = {float: "a number", int: "a whole number", bool: "true or false"}[kind]
-            raise ConfigError(f"data.windows.{key} must be {expected}, not {value!r}")
-    return WindowConfig(**windows)
 
 
 @register("data", "recordings")
@@ -101,7 +85,7 @@ class RecordedData(SceneDataModule):
         super().__init__(batch_size, seed, share)
         self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
         self.list_sources = lookup("format", format)
-        self.windows = _window_config(windows)
+        self.windows = read(WindowConfig, windows, "data.windows")
         self.num_agents = self.windows.agents
         if self.windows.lane_change and not map:
             raise ConfigError("data.windows.lane_change asks for lanes, but data.map is false: set it to false as well")

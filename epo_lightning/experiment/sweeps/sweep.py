@@ -29,13 +29,14 @@ from typing import Any, Literal
 
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
-from epo_lightning.experiment.config.settings import Measured, Settings, measures, read
+from epo_lightning.experiment.config.settings import Measured, Settings, measures
 from epo_lightning.experiment.sweeps.orphans import end_with
 from epo_lightning.identity import identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.runs import data_name
 from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_json, write_text
+from epo_lightning.schema import read
 
 State = Literal["waiting", "running", "interrupted", "failed", "done"]
 BESIDE = (

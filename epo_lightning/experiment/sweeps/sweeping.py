@@ -13,13 +13,14 @@ from typing import Any
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config import compose
-from epo_lightning.experiment.config.settings import Settings, TrainerSettings, read
+from epo_lightning.experiment.config.settings import Settings, TrainerSettings
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
 from epo_lightning.experiment.sweeps.watch import news, status, summary
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import value_text, word
 from epo_lightning.run_folder import RunFolder, read_json
+from epo_lightning.schema import read
 
 ATTEMPTS = 3
 """How often a launcher may break down in a sweep."""

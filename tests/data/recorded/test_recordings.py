@@ -152,6 +152,8 @@ def test_missing_data_and_misspelt_keys_say_what_to_do(folder, tmp_path):
     for changes, message in (
         ({"windows": {"dt": 0.2, "horzion": 20}}, "did you mean 'horizon'"),
         ({"windows": {"agents": 2.5}}, "data.windows.agents must be a whole number"),
+        ({"windows": {"lane_change": 1}}, "data.windows.lane_change must be true or false, not 1"),
+        ({"windows": {"radius": "far"}}, "data.windows.radius must be a number or null, not 'far'"),
         ({"format": "raods"}, "did you mean 'roads'"),
         ({"frame": "moving"}, "unknown data.frame"),
         ({"map": False}, "lane_change asks for lanes"),

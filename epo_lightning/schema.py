@@ -1,0 +1,109 @@
+"""Values from YAML, checked against the type annotations of data classes and of the constructors of parts."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from epo_lightning.registry import ConfigError, check, lookup, nearest
+
+Section = typing.TypeVar("Section")
+
+
+def read(schema: type[Section], values: Mapping[str, Any], where: str = "") -> Section:
+    """An instance of the data class ``schema`` from a section of the configuration.
+
+    Raises:
+        ConfigError: an unknown key (with the nearest known one), a missing key or a value of another type.
+    """
+    hints = typing.get_type_hints(schema)
+    prefix = f"{where}." if where else ""
+    for key in values:
+        if key not in hints:
+            raise ConfigError(f"unknown key {prefix}{key}: {nearest(str(key), hints)}")
+    required = [f.name for f in dataclasses.fields(schema) if _required(f)]  # type: ignore[arg-type]
+    for key in required:
+        if key not in values:
+            raise ConfigError(f"missing key {prefix}{key}")
+    return schema(**{key: _read(hints[key], value, prefix + key) for key, value in values.items()})
+
+
+def _required(entry: dataclasses.Field[Any]) -> bool:
+    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
+
+
+def _read(hint: Any, value: Any, where: str) -> Any:
+    for option in typing.get_args(hint) or (hint,):
+        if dataclasses.is_dataclass(option) and isinstance(value, Mapping):
+            return read(typing.cast(type[Any], option), value, where)
+    if not fits(value, hint):
+        raise ConfigError(f"{where} must be {describe(hint)}, not {value!r}")
+    return value
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Whether a value read from YAML matches a type annotation. Types that YAML cannot express always match."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return any(fits(value, option) for option in arguments)
+    if origin is Literal:
+        return value in arguments and type(value) in {type(option) for option in arguments}
+    if hint in (None, type(None)):
+        return value is None
+    if hint is bool:
+        return isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and value == value  # not nan
+    if hint is str:
+        return isinstance(value, str)
+    kind = origin or hint
+    if isinstance(kind, type) and issubclass(kind, Mapping):
+        entry = arguments[1] if len(arguments) == 2 else Any
+        return isinstance(value, Mapping) and all(fits(item, entry) for item in value.values())
+    if isinstance(kind, type) and issubclass(kind, Sequence):
+        entry = arguments[0] if arguments else Any
+        return isinstance(value, Sequence) and not isinstance(value, str) and all(fits(item, entry) for item in value)
+    return True
+
+
+def describe(hint: Any) -> str:
+    """Description of a type for messages about YAML files, such as ``a whole number``."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(describe(option) for option in arguments)
+    if origin is Literal:
+        return "one of " + ", ".join(str(option) for option in arguments)
+    names = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"}
+    if hint in names:
+        return names[hint]
+    kind = origin or hint
+    if isinstance(kind, type) and issubclass(kind, Mapping):
+        return "a mapping"
+    if isinstance(kind, type) and issubclass(kind, Sequence):
+        return "a list" + (f" of {describe(arguments[0])}" if arguments else "")
+    return str(getattr(kind, "__name__", kind))
+
+
+def check_part(kind: str, values: Any, supplied: Sequence[str] = ()) -> None:
+    """Check the section of a part against its constructor: keys by :func:`registry.check`, types by its annotations.
+
+    Raises:
+        ConfigError: as :func:`registry.check`, or a value of another type.
+    """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{kind} must be a mapping with a name, not {values!r}")
+    check(kind, values, supplied)
+    part = lookup(kind, values["name"])
+    function = part.__init__ if isinstance(part, type) else part  # type: ignore[misc]
+    try:
+        hints = typing.get_type_hints(function)
+    except (NameError, TypeError, SyntaxError):  # annotations that exist for type checkers only, or spell tensor shapes
+        return
+    for key, value in values.items():
+        if key in hints and not fits(value, hints[key]):
+            raise ConfigError(f"{kind}.{key} must be {describe(hints[key])}, not {value!r}")
