@@ -27,12 +27,12 @@ class PolylineBackbone(Backbone):
 
     Attributes:
         history_width: size of the history encoder's features.
-        history_depth: number of its layers.
-        width: size of the features z that leave the global interaction graph.
+        history_depth: number of layers of the history encoder.
+        width: size of the features z, the backbone's output.
         lane_width, lane_depth: size and number of the lane encoder's layers.
-        dropout: dropout rate of the histories' features and of the attention's output in training.
-        scale: metres that an input of one stands for.
-        goal_input: whether a given goal is also an input of the network (``goal=all``), not of the energy alone.
+        dropout: dropout rate, in training, of the history features and of the attention's output.
+        scale: unit [m] of positions at the network's inputs.
+        goal_input: whether a given goal is also an input of the network (``goal=all``), and not only of the energy.
         map_input: whether the data has a map.
     """
 
@@ -49,7 +49,9 @@ class PolylineBackbone(Backbone):
     def __post_init__(self) -> None:
         super().__init__()
         if not self.scale > 0:
-            raise ValueError(f"scale must be positive, not {self.scale}: metres at a network input of one")
+            raise ValueError(
+                f"scale, the unit [m] of positions at the network's inputs, must be positive, not {self.scale}"
+            )
         history = self.history_encoder()
         lanes = LanePolylines(self.lane_width, self.lane_depth, self.scale) if self.map_input else None
         self.history = history

@@ -13,7 +13,7 @@ from epo_lightning.decoders.mlp import MLP
 from epo_lightning.scene import Scene
 
 NO_CANDIDATE = -1e9
-"""Logit of absent candidates: their softmax is exactly zero, and finite for agents that have no candidate at all."""
+"""Logit of absent candidates, whose probability is exactly zero. (-inf would give NaN for agents without candidates.)"""
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class Goals:
 
     Attributes:
         exist: agents that have a goal.
-        positions: goal positions [m], zero for agents without a goal; None where the energy asks for no goals.
-        reference: index of the reference line on which each goal lies; None where the scene names no lines.
+        positions: goal positions [m], zero for agents without a goal; None if the energy needs no goals.
+        reference: index of the reference line on which each goal lies; None for scenes without reference lines.
         logits: logits of the candidates, ``NO_CANDIDATE`` for absent ones; None where goals are not chosen.
         chosen: index of the candidate chosen in each mode; None where goals are not chosen.
     """
@@ -43,7 +43,7 @@ class Goals:
     def log_probability(self) -> Float[Tensor, "B _"]:
         """Log-probability [B, M] of every mode's joint choice of goals, without a gradient; [B, 1] zeros for given goals.
 
-        Goals are trained by the agents' final positions, not by the mode that came closest.
+        It has no gradient because goal logits are trained by the agents' observed final positions (L_goal) alone.
         """
         if self.logits is None or self.chosen is None:
             return torch.zeros(len(self.exist), 1, device=self.exist.device)
@@ -52,7 +52,7 @@ class Goals:
 
 
 def given_goals(scene: Scene) -> Float[Tensor, "B N 2"]:
-    """The single given goal of each agent, zero for agents without one (RPI: "the goal is given and not predicted").
+    """The single given goal of each agent, zero for agents without a goal. (In the paper's RPI experiments goals are given.)
 
     Raises:
         ValueError: the scene gives no goal, or several candidates per agent.
@@ -61,8 +61,8 @@ def given_goals(scene: Scene) -> Float[Tensor, "B N 2"]:
         raise ValueError("this forecaster reads given goals, but scene.goal_candidates [B, N, 1, 2] is None")
     if scene.goal_candidates.shape[2] != 1:
         raise ValueError(
-            f"this forecaster takes one given goal per agent, but scene.goal_candidates holds "
-            f"{scene.goal_candidates.shape[2]}: give it shape [B, N, 1, 2]"
+            f"this forecaster takes one given goal per agent, shape [B, N, 1, 2], but scene.goal_candidates has "
+            f"{scene.goal_candidates.shape[2]} per agent"
         )
     return scene.goal_candidates[:, :, 0].where(_exist(scene)[:, :, :1], 0.0)
 
@@ -71,7 +71,7 @@ class NoGoals(nn.Module):
     """Stand-in for a goal decoder where the energy asks for no goals."""
 
     def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Goals:
-        """No goals."""
+        """Goals without positions, for no agent."""
         return Goals(torch.zeros_like(scene.agent_mask))
 
 
@@ -104,7 +104,7 @@ class GoalDecoder(nn.Module):
 
     Args:
         width: size of the agent features.
-        scale: metres that an input of one stands for.
+        scale: unit [m] of positions at the network's inputs.
         modes: number M of games.
     """
 
@@ -161,7 +161,7 @@ def _exist(scene: Scene) -> Bool[Tensor, "B N G"]:
 
 
 def most_likely(logits: Float[Tensor, "B N G"], modes: int) -> Int[Tensor, "B M N"]:
-    """Indices of the M most likely candidates of every agent, in that order; an agent with fewer repeats them in turn."""
+    """Indices of the M most likely candidates of every agent, most likely first; if there are fewer, they are repeated."""
     order = logits.argsort(dim=-1, descending=True, stable=True)
     count = (logits > NO_CANDIDATE).sum(-1, keepdim=True).clamp_min(1)
     rank = torch.arange(modes, device=logits.device) % count

@@ -80,7 +80,7 @@ class MLP(nn.Module):
         width: size of the hidden features.
         layers: number of linear layers.
         norm: ``batch`` or ``layer`` normalisation of hidden features.
-        bias: whether the output layer has a bias, which has no effect on a softmax over rows.
+        bias: whether the output layer has a bias. (A softmax over rows cancels it.)
     """
 
     def __init__(
@@ -94,8 +94,8 @@ class MLP(nn.Module):
         self.norms = nn.ModuleList(normalisation(size) for size in sizes[1:])
         self.output = nn.Linear(sizes[-1], outputs, bias=bias)
         if norm == "batch":
-            # Batch normalisation removes a bias, whose gradient is then rounding error. Adam would turn it into steps of
-            # full length, which show in evaluation because the running means lag behind.
+            # Batch normalisation cancels these biases, so their gradients are rounding errors. Adam would make full-size
+            # steps of them, with an effect in evaluation, because the running means follow the biases with a delay.
             for linear in hidden:
                 linear.bias.requires_grad_(False)
 

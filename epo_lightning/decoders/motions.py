@@ -19,21 +19,21 @@ STRAIGHT, ARCS = 0.3, 0.2
 _BASES = (2, 3, 5)
 """Bases of Halton's sequence: coprime, so that no two coordinates agree and no clothoid is a circle."""
 _FIRST = 2
-"""Index of the first Halton number in use. Number 1 is 1/2 in base 2: an acceleration of zero, and a straight line with it
-would repeat the first candidate."""
+"""Index of the first Halton number in use. Number 1 is 1/2 in base 2, an acceleration of zero; a straight line with zero
+acceleration would repeat the first candidate."""
 
 
 class Motions(nn.Module):
     """C candidate strategies of every agent for the unicycle; nothing is learned.
 
-    The first keeps speed and heading. The others accelerate constantly, a in [-A, A], until the agent stands, and follow a
-    straight line, an arc of constant curvature kappa, or a clothoid, whose curvature changes linearly with the distance
-    covered. The turn rate is v kappa, so a standing agent does not turn. Curvatures are uniform in [-kappa_max, kappa_max],
-    or in the narrower range that keeps the lateral acceleration |kappa| v^2 <= A: without that bound, most curves at
-    motorway speed could not be driven.
+    The first candidate keeps speed and heading. The others have a constant acceleration a in [-A, A] (braking ends at a
+    standstill) and follow a straight line, an arc of constant curvature kappa, or a clothoid, whose curvature changes
+    linearly with the distance covered. The turn rate is v kappa, so a standing agent does not turn. Curvatures are
+    uniform in [-kappa_max, kappa_max], or in the narrower range that keeps the lateral acceleration |kappa| v^2 <= A:
+    without that bound, most curves could not be driven at motorway speed.
 
-    The original moves a bicycle model; one with steering angle delta is about this unicycle with kappa = tan(delta) /
-    wheelbase. The quasi-random sequence and the bound on lateral acceleration are departures from it.
+    Differences from the original: DSDNet uses a bicycle model, which with steering angle delta is about this unicycle with
+    kappa = tan(delta) / wheelbase; and it has neither the quasi-random sequence nor the bound on lateral acceleration.
 
     Args:
         horizon: number K of future steps.

@@ -33,14 +33,14 @@ class DecodedOrders(NamedTuple):
 class Orders(nn.Module):
     """phi_order: probability that the order of a pair is +1, from the features of both agents; one network for all pairs.
 
-    p(s_ij = +1) = sigmoid(l_ij), and pairs are independent of each other given the features. The logit is
-    l_ij = f(z_i, z_j) - f(z_j, z_i), which changes its sign when the two agents swap names, as needed for the agent that
-    goes first; or f(z_i, z_j) + f(z_j, z_i) for orders that are the same for both, as the side on which they pass.
+    p(s_ij = +1) = sigmoid(l_ij), and pairs are independent of each other given the features. If the order says which agent
+    goes first, it changes its sign when the two agents are swapped, so the logit is l_ij = f(z_i, z_j) - f(z_j, z_i). If it
+    says on which side they pass, it does not change, and the logit is l_ij = f(z_i, z_j) + f(z_j, z_i).
 
     Args:
         width: size of the agent features.
         modes: number M of joint modes.
-        symmetric: whether the order keeps its sign when the two agents swap names
+        symmetric: whether the order keeps its sign when the two agents are swapped
             (:attr:`~epo_lightning.game.pair_order.PairOrder.symmetric`).
     """
 
@@ -49,7 +49,7 @@ class Orders(nn.Module):
         if modes < 1:
             raise ValueError(f"modes must be 1 or more, not {modes}")
         self.modes, self.symmetric = modes, symmetric
-        self.mlp = MLP(2 * width, 64, 1, norm="layer", bias=symmetric)  # a difference takes a bias away
+        self.mlp = MLP(2 * width, 64, 1, norm="layer", bias=symmetric)  # the difference cancels a bias
 
     def forward(
         self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"], matter: Bool[Tensor, "B P"]
@@ -74,7 +74,7 @@ class Orders(nn.Module):
 
 
 def repeated(modes: Shaped[Tensor, "B M D"]) -> Bool[Tensor, "B M"]:
-    """Modes whose choices are those of an earlier mode: where there are fewer than M choices, they repeat in turn.
+    """Mask of the modes that repeat the choices of an earlier mode, which happens if there are fewer than M choices.
 
     Repeated modes get a probability of zero, so that no outcome is counted twice.
     """
@@ -86,9 +86,9 @@ def repeated(modes: Shaped[Tensor, "B M D"]) -> Bool[Tensor, "B M"]:
 def most_likely(logits: Float[Tensor, "B P"], matter: Bool[Tensor, "B P"], modes: int) -> Float[Tensor, "B M P"]:
     """The M most likely orders of independent pairs, most likely first; where there are fewer, they repeat in turn.
 
-    The most likely order has the sign of every logit, and each turned sign of a pair costs |l| of log-probability. The M
-    cheapest sets of turned signs are found pair by pair: the M cheapest sets of the first p pairs are M cheapest sets of the
-    first p - 1 pairs, with or without pair p. Pairs that do not matter keep +1.
+    The most likely order has the sign of every logit. Turning the sign of a pair lowers the log-probability by |l|. The M
+    sets of turned signs with the lowest total cost are found pair by pair: each of the M best sets of the first p pairs is
+    one of the M best sets of the first p - 1 pairs, with or without pair p. Pairs that do not matter keep +1.
     """
     batch, count = logits.shape
     cost = logits.new_full((batch, modes), torch.inf)

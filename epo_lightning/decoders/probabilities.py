@@ -13,14 +13,14 @@ class SceneProbabilities(nn.Module):
     """phi_prob: logits of the M joint futures from all agents' features and all futures (Section 4.4).
 
     The paper concatenates the features and trajectories of all agents and applies a linear layer. Here that layer has the
-    same block for every agent, so its result is a sum over agents: any number of agents, in any order, with any padding.
-    Futures enter as positions relative to the agent's current one, without a gradient.
+    same block for every agent, so its result is a sum over agents and works for any number and order of agents and any
+    padding. Inputs are future positions relative to the agent's current position, without a gradient.
 
     Args:
         width: size of the agent features.
         modes: number M of joint modes.
         horizon: number K of future steps.
-        scale: metres that an input of one stands for.
+        scale: unit [m] of positions at the network's inputs.
     """
 
     def __init__(self, width: int, modes: int, horizon: int, scale: float = 1.0) -> None:

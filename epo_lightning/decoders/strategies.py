@@ -1,4 +1,4 @@
-"""Initial strategies: the joint controls from which the game is solved, or which are the forecast itself (+SC)."""
+"""Initial strategies: joint controls at which the solver starts; for +SC, the controls of the forecast itself."""
 
 from __future__ import annotations
 
@@ -45,5 +45,5 @@ class ZeroStrategies(nn.Module):
         self.modes, self.horizon = modes, horizon
 
     def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B M N K 2"]:
-        """Zeros."""
+        """Controls of zero."""
         return z.new_zeros(len(z), self.modes, z.shape[1], self.horizon, 2)

@@ -24,9 +24,8 @@ class OwnWeights(nn.Module):
         width: size of the agent features.
         modes: number M of joint modes.
         features: names of the own features; without any there is no network.
-        start: weight at a network output of zero, one for all features or by name (others: 1). The output scales it, and
-            an output of one doubles it: some features are metres and some are hundredths of a radian, so their weights
-            differ in size.
+        start: weights at a network output of zero, one number for all features or numbers by name (others: 1). The weight is
+            start * (1 + output), because features have different units and magnitudes, and so have their weights.
     """
 
     start: Tensor
@@ -51,8 +50,8 @@ class PairWeights(nn.Module):
     """phi_pair: interaction weights of a pair from the features of both agents, one network for all pairs.
 
     For two agents this is the paper's decoder on the concatenation of all agent features. For more agents the paper
-    concatenates all N of them, which ties a model to one N; a decoder per pair does not. The first agent of a pair may be
-    a special one (RPI: the robot); where agents are exchangeable, ``symmetric`` weights are the mean over both orders.
+    concatenates all N features, so that a model works for one N only; a decoder per pair works for any N. The first agent of
+    a pair may have a special role (the robot of RPI); where agents are exchangeable, ``symmetric`` averages both orders.
 
     Args:
         width: size of the agent features.

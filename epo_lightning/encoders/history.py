@@ -15,16 +15,16 @@ VECTOR = 5
 
 
 def history_vectors(scene: Scene, scale: float = 1.0) -> tuple[Float[Tensor, "B N V 5"], Bool[Tensor, "B N V"]]:
-    """Every agent's history as V = H - 1 vectors, oldest first, and the mask of those observed at both ends.
+    """Every agent's history as V = H - 1 vectors, oldest first, and the mask of vectors whose both ends were observed.
 
     A vector holds the 2-D positions at which a step starts and ends, in units of ``scale`` metres, and the time [s] of its
-    end, as in VectorNet. An agent observed at t0 alone has one vector of length zero.
+    end, as in VectorNet. An agent observed only at t0 has one vector of length zero.
 
     Raises:
-        ValueError: a history of a single state, from which no motion can be read.
+        ValueError: a history of a single state, which contains no motion.
     """
     if scene.history.shape[2] < 2:
-        raise ValueError("scene.history holds H = 1 state per agent; reading a motion takes at least 2")
+        raise ValueError("scene.history has H = 1 state per agent; this network needs at least 2")
     seen = scene.history_mask & scene.agent_mask[..., None]
     position = torch.where(seen[..., None], scene.history[..., :2], 0.0) / scale
     batch, agents, steps = seen.shape
@@ -39,7 +39,7 @@ def history_vectors(scene: Scene, scale: float = 1.0) -> tuple[Float[Tensor, "B 
 class LSTMHistory(nn.Module):
     """LSTM over the vectors of an agent's history, oldest first (Appendix C.1, "Agent History Encoder").
 
-    Vectors of unobserved steps are removed and the others moved together, so that any padding gives the same feature.
+    Vectors of unobserved steps are skipped, so that padding does not change the feature.
 
     Args:
         width: size of the hidden state.
@@ -69,13 +69,13 @@ class LSTMHistory(nn.Module):
 class TransformerHistory(nn.Module):
     """Transformer over the vectors of an agent's history (Appendix C.1, after HiVT's temporal encoder).
 
-    Each vector carries a sinusoidal encoding of its age, and attention is masked to observed vectors, so that any padding
-    gives the same feature: that of the newest observed vector.
+    A sinusoidal encoding of its age is added to each vector, and attention is masked to observed vectors, so that padding
+    has no effect. The output is the feature of the newest observed vector.
 
     Args:
         width: size of the tokens and of the feature.
         depth: number of layers.
-        heads: number of attention heads; ``width`` must be a multiple of twice as many.
+        heads: number of attention heads; ``width`` must be a multiple of 2 * heads.
         scale: metres that an input of one stands for.
 
     Raises:
@@ -135,7 +135,7 @@ class _TransformerLayer(nn.Module):
 
 
 def _sinusoids(age: Tensor, width: int) -> Float[Tensor, "V {width}"]:
-    """Sines and cosines of an age in steps, of wavelengths from 2 pi to 20000 pi (Vaswani et al. 2017, Section 3.5)."""
+    """Sines and cosines of an age in steps, with wavelengths from 2 pi to 20000 pi (Vaswani et al. 2017, Section 3.5)."""
     rate = torch.exp(-math.log(1e4) * torch.arange(0, width, 2, device=age.device) / width)
     angle = age[:, None] * rate
     return torch.cat((angle.sin(), angle.cos()), -1)

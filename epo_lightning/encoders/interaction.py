@@ -28,7 +28,7 @@ class Attention(nn.Module):
     def forward(
         self, features: Float[Tensor, "B N D"], sources: Float[Tensor, "B S D"], mask: Bool[Tensor, "B S"]
     ) -> Float[Tensor, "B N D"]:
-        """Features after attention to the sources that exist by ``mask``; unchanged in scenes without any source."""
+        """Features after attention to the sources where ``mask`` is True; unchanged in scenes without any source."""
         scores = self.query(features) @ self.key(sources).mT * self.scale
         # A large negative number instead of -inf keeps the softmax finite in a scene without any source.
         gathered = scores.masked_fill(~mask[:, None, :], -1e9).softmax(-1) @ self.value(sources)

@@ -15,8 +15,8 @@ class LanePolylines(nn.Module):
     """PointNet-like lane encoder (Appendix C.1, "Lane Encoder"; VectorNet, Section 3.2).
 
     Every layer is a linear map, layer normalisation and ReLU of each vector; the maximum over the polyline's vectors is then
-    concatenated to each of them. The feature is the maximum of the last layer: VectorNet concatenates once more before its
-    last maximum, which only repeats the same numbers.
+    concatenated to each of them. The feature is the maximum over the last layer. (VectorNet concatenates once more before
+    the last maximum, which would only repeat each number.)
 
     Args:
         width: size of the layers and of the feature.
@@ -24,7 +24,7 @@ class LanePolylines(nn.Module):
         scale: metres that an input of one stands for.
 
     Raises:
-        ValueError: no layer.
+        ValueError: ``depth`` is less than 1.
     """
 
     def __init__(self, width: int = 64, depth: int = 3, scale: float = 1.0) -> None:

@@ -24,10 +24,10 @@ SUPPLIED: Mapping[str, tuple[str, ...]] = {
     "optimizer": (),
     "forecaster": ("task", "optimizer", "backbone", "dynamics", "energy", "solver", "backward", "objective"),
 }
-"""Constructor arguments by kind that :func:`build_forecaster` supplies and a configuration must not set; a part is given
-those of them that its constructor names. The order is that in which parts are built."""
+"""Constructor arguments, by kind of part, that :func:`build_forecaster` supplies and a configuration must not set. A
+constructor gets those that are in its signature. The kinds are in the order in which parts are built."""
 GOALS = ("energy", "all")
-"""Receivers of a given goal: the energy alone (the paper), or also the network of every learned forecaster."""
+"""Choices of who gets a given goal: ``energy``, the energy alone (the paper), or ``all``, the network's input as well."""
 
 
 def check_model(model: Mapping[str, Any]) -> None:
@@ -47,15 +47,15 @@ def check_model(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"unknown goal {model['goal']!r}: {nearest(str(model['goal']), GOALS)}")
     if model["goal"] == "all" and model.get("candidates", 1) > 1:
         raise ConfigError(
-            f"goal is 'all', but this data gives no goal that the network could be told, only {model['candidates']} "
-            "candidates for each agent: use goal=energy, with which the forecaster chooses among them"
+            f"goal is 'all', but this data gives no goal as an input of the network, only {model['candidates']} candidates "
+            "for each agent: use goal=energy, with which the forecaster chooses among the candidates"
         )
     for kind, supplied in SUPPLIED.items():
         check(kind, model[kind], supplied)
 
 
 def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
-    """Build a forecaster and the parts that its constructor names, in the order in which they depend on each other.
+    """Build a forecaster, and those parts that are arguments of its constructor.
 
     Args:
         model: the sections ``forecaster``, ``backbone``, ``dynamics``, ``energy``, ``solver``, ``backward``, ``objective``
@@ -69,7 +69,7 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
     task = Task.from_config(model)
     named = parameters("forecaster", model["forecaster"]["name"])
     parts: dict[str, Any] = {"task": task}
-    # Parts that the forecaster does not name are not built: their weights would be drawn from the same random numbers.
+    # Parts that the forecaster does not take are not built: drawing their initial weights would change those of the others.
     if "backbone" in named:
         parts["backbone"] = build(
             "backbone", model["backbone"], goal_input=model["goal"] == "all", map_input=task.map, scale=task.scale
@@ -97,7 +97,7 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
 
 
 def load(checkpoint: str | Path) -> Forecaster:
-    """A trained forecaster from a checkpoint alone, in evaluation mode: no configuration tree, no pickled code.
+    """Load a trained forecaster in evaluation mode. The checkpoint alone is needed, and no code in it is executed.
 
     Args:
         checkpoint: path of a ``.ckpt`` file, or the name of a forecaster that ships with the package: ``load("rpi")``.

@@ -23,12 +23,12 @@ class Forecaster(LightningModule):
     are logged. Validation and test metrics are those of :class:`~epo_lightning.metrics.ForecastMetrics`.
 
     Args:
-        task: what the data asks for.
-        optimizer: how parameters are trained.
+        task: sizes and units of the data's scenes.
+        optimizer: the optimiser and its learning-rate schedule.
     """
 
     configuration: dict[str, Any]
-    """The configuration this forecaster was built from; travels in every checkpoint."""
+    """The model's configuration, from which this forecaster was built; stored in every checkpoint."""
 
     def __init__(self, task: Task, optimizer: Adam) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ class Forecaster(LightningModule):
 
     @torch.no_grad()
     def predict(self, scene: Scene) -> JointForecast:
-        """The forecast in evaluation mode, with the energies that explain it.
+        """The forecast in evaluation mode, with the energy of every feature (:meth:`explain`).
 
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
         other scenes of the batch are the same as without it.
@@ -77,7 +77,7 @@ class Forecaster(LightningModule):
         return forecast
 
     def examine(self, scene: Scene, forecast: JointForecast) -> JointForecast:
-        """The forecast with measurements added that are made in tests but cost too much for every validation."""
+        """The forecast with further measurements, which are too slow for every validation and are made in tests only."""
         return forecast
 
     def training_step(self, scene: Scene, _: int) -> Tensor:

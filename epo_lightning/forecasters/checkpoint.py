@@ -1,4 +1,4 @@
-"""Checkpoints as files: read without running code from them, and refused where they are damaged."""
+"""Reading of checkpoint files, without executing code from them and with a check for damage."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         if damaged is not None:
             raise zipfile.BadZipFile(f"{damaged} differs from its checksum")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # zipfile, zlib, pickle and torch raise half a dozen kinds for damaged files
+    except Exception as error:  # for damaged files, zipfile, zlib, pickle and torch raise many types of exceptions
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(f"{path} is not a checkpoint that epo_lightning wrote, or is damaged ({reason})") from error
     parts = [content.get(key) for key in ("state_dict", "configuration")] if isinstance(content, dict) else [None]

@@ -1,4 +1,4 @@
-"""Combinations of energy, minimiser, derivative and objective that work together: the paper's Table 1, with its empty cells.
+"""Combinations of energy, minimiser, derivative and objective (the four parts of the paper's Table 1) that work together.
 
 Every part declares what it needs of the others and what it provides. A combination that cannot work is refused before
 anything runs, with the reason and the single changes that would make it work.
@@ -16,10 +16,10 @@ from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, STEPS, TABLES
 
 WORDS = {
     GRADIENT: "a gradient",
-    RESIDUALS: "residuals, of which it is half the sum of squares",
+    RESIDUALS: "residuals (it must be half the sum of their squares)",
     FEATURES: "named features whose structure the solver knows",
     PATH: "a path that can be differentiated",
-    STEPS: "steps of which it can take some and go on",
+    STEPS: "steps that can be interrupted and continued",
     STATIONARY: "strategies at which the gradient vanishes",
     SAMPLES: "samples",
     TABLES: "energies of candidates",
@@ -29,10 +29,10 @@ KINDS = ("energy", "solver", "backward", "objective")
 
 @dataclass(frozen=True)
 class Combination:
-    """One part of each kind, or their classes, which carry the same declarations.
+    """One part of each of the four kinds. Classes may stand for parts, because the declarations are class attributes.
 
     Attributes:
-        names: names of the parts, by kind.
+        names: registered names of the parts, by kind; for messages.
     """
 
     energy: Any

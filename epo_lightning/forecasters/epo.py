@@ -1,7 +1,7 @@
 """Energy-based potential games: the network infers a game, and the forecast minimises its energy (Sections 3, 4).
 
-The paper's own method (+EPO, Algorithm 1) is one choice of energy, minimiser, derivative and objective. The other methods of
-its Table 1, and the cells that the literature left empty, are other choices of the same four parts.
+The paper's own method (+EPO, Algorithm 1) is one choice of four parts: energy, minimiser, derivative and objective. The
+other methods of its Table 1, and combinations that have not been published, are other choices.
 """
 
 from __future__ import annotations
@@ -35,21 +35,25 @@ from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.task import Task
 
 INITIAL = ("decoded", "zero", "motions")
-"""Initial strategies, or candidates for solvers that choose: decoded by the network, controls of zero (the paper's ablation
-"no init"), or a mixture of motions of the unicycle."""
+"""Sources of the initial strategies, which are the candidates for solvers that choose among candidates: decoded by the
+network, controls of zero (the paper's ablation "no init"), or a mixture of motions of the unicycle."""
 
 EXAMINED = 512
-"""Scenes of a split, evenly spread, whose equilibrium is measured for energies without a fast layer or tables."""
+"""Number of evenly spread test scenes in which the Nash gap is measured, for energies where this is slow.
+
+It is slow for energies that are not made of named features, unless the solution has tables of candidates."""
 
 
 @register("forecaster", "epo")
 class EPO(Forecaster):
-    """Forecaster whose network infers weights, goals and initial strategies of a game, and whose solver plays it.
+    """Forecaster whose network infers a game (weights, goals, initial strategies), and whose solver minimises its energy.
 
-    Where the data has several goal candidates and the energy a goal or a lane, mode m of an agent heads for its m-th most
-    likely candidate, along the line on which that lies. A single candidate is a given goal, the same in all modes. A
-    minimiser that chooses among candidates plays one game, and its M best joint choices are the modes; others play one game
-    per mode.
+    Goals: if the data has several goal candidates and the energy a term for goals or lanes, an agent's goal in mode m is its
+    m-th most likely candidate, and it follows the reference line of that candidate. A single candidate is a given goal, the
+    same in all modes.
+
+    Modes: most minimisers solve one game per mode. A minimiser that chooses among candidate strategies solves one game, and
+    its M best joint choices are the modes.
 
     Args:
         backbone: the observation encoder phi_glob.
@@ -58,8 +62,9 @@ class EPO(Forecaster):
         backward: the derivative of the solution.
         objective: the training objective.
         modes: number M of joint modes.
-        own_start: own weights at a network output of zero, which scale the output as well: one number for all features, or
-            numbers by name while the others are 1. ``vel`` pulls speeds towards zero and has to start small on highways.
+        own_start: own weights before training (at a network output of zero); the output is scaled by the same numbers. One
+            number for all features, or numbers by feature name; features that are not named have 1. On highways ``vel``,
+            which pulls speeds towards zero, has to start small.
         pair_start: pair weight at a network output of zero.
         symmetric_pairs: whether pair weights are the same in both orders of two agents, so that forecasts do not depend on
             the order of agents.
@@ -109,13 +114,14 @@ class EPO(Forecaster):
             raise ConfigError(f"forecaster.control_scale must be positive and finite, not {control_scale}")
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
-        self.differentiate, self.objective = backward, objective  # Lightning calls something else `backward`
+        self.differentiate, self.objective = backward, objective  # `backward` is a method of LightningModule
+        # M games with one initial strategy each; for solvers that choose, one game with C candidates.
         games, starts = solver.games(modes), solver.starts(modes)
         width, scale, horizon = backbone.width, task.scale, task.horizon
         own, pair = energy.weighted
         start = _checked(own_start, own, energy.own)
         ranges = {} if motions is None and initial != "motions" else _ranges(motions)
-        # The order of construction is part of the result: every module draws its initial weights here.
+        # Do not change the order: every module draws its initial weights from the same sequence of random numbers.
         self.own_weights = OwnWeights(width, games, own, start)
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs)
         self.strategies: InitialStrategies | ZeroStrategies | Motions
@@ -197,8 +203,8 @@ class EPO(Forecaster):
     ) -> Tensor:
         """Unnormalised log-probabilities of the joint modes, [B, M].
 
-        Modes that are choices among candidates have the density exp(-E), modes that are orders the probability of their
-        orders and goals; for all others the network decodes it.
+        The logit of a choice among candidates is -E. The logit of a mode with orders is the log-probability of its orders
+        and goals. In all other cases the network decodes the logits.
         """
         if solution.assignment is not None:
             stopped = (solution.status == Status.STOPPED).any(1, keepdim=True)
@@ -211,11 +217,11 @@ class EPO(Forecaster):
         return self.probabilities(z, solution.states[..., :2], current[..., :2], scene.agent_mask)
 
     def _initial_states(self, scene: Scene, parameters: GameParameters) -> Tensor | None:
-        """The states of the initial strategies, [B, M, N, K, 4]; None where these are candidates, which are no modes."""
+        """The states of the initial strategies, [B, M, N, K, 4]; None for solvers that choose among candidates."""
         if TABLES in self.solver.provides:
             return None
         starts = parameters.initial_controls
-        # Initial strategies that are trained through the solution are not trained by their own states as well.
+        # Without a gradient if a gradient reaches the initial strategies through the solution (backward=unrolled).
         starts = starts.detach() if self.differentiate.teaches_start else starts
         return self.energy.dynamics.rollout(self.energy.initial(scene), starts, scene.dt)
 
@@ -240,7 +246,7 @@ class EPO(Forecaster):
         if report is None:
             return forecast
         if RESIDUALS not in self.energy.offers:
-            # An energy that may be negative has no natural zero, so a gap relative to the objective means nothing.
+            # The zero of such an energy is arbitrary, so a gap relative to the objective means nothing.
             report = dataclasses.replace(report, objective=torch.full_like(report.objective, torch.nan))
         whole = report.map(lambda t: t.new_full((scenes, *t.shape[1:]), torch.nan).index_copy(0, chosen, t))
         return dataclasses.replace(forecast, equilibrium=whole)
@@ -293,7 +299,7 @@ def _ranges(motions: Mapping[str, float] | None) -> dict[str, float]:
 def _checked(
     start: float | Mapping[str, float], features: Sequence[str], all_features: Sequence[str]
 ) -> float | Mapping[str, float]:
-    """Initial weights of own features. Names of features that only other energies have are accepted and unused.
+    """Check of ``own_start``. Names of features that this energy does not have are accepted and have no effect.
 
     Args:
         start: the configured value.

@@ -24,8 +24,8 @@ from epo_lightning.task import Task
 class Marginal(Forecaster):
     """Forecaster of trajectories per agent, trained by minADE and a classification loss (Section 5, "Baselines").
 
-    Joint futures are made afterwards: each agent's modes are ordered by probability, and joint mode m consists of every
-    agent's m-th.
+    Joint futures are combined afterwards: each agent's modes are ordered by probability, and joint mode m consists of the
+    m-th most likely mode of every agent.
 
     Args:
         backbone: the observation encoder.
@@ -55,7 +55,7 @@ class Marginal(Forecaster):
         positions, probabilities, logits = self.decoder(self.backbone(scene), current[..., :2])
         states = _with_motion(positions, current, scene.dt)
         states, probabilities, logits = marginal_to_joint(states, probabilities, logits)
-        # The product of probabilities, as a sum of logarithms: over many agents it is smaller than any float32 number.
+        # The product of probabilities, as a sum of logarithms: for many agents the product would underflow in float32.
         of_agents = log_probabilities(probabilities, logits, 1)
         joint = of_agents.where(scene.agent_mask[:, None], 0.0).sum(-1)
         return JointForecast(
