@@ -169,6 +169,23 @@ def test_moving_the_world_moves_the_frame_and_nothing_else(seed, turn):
         torch.testing.assert_close(getattr(moved, name), getattr(still, name), rtol=0, atol=5e-3)
 
 
+def test_an_aligned_scene_is_the_fixed_one_in_its_own_frame():
+    of = recording(curve(700.0, 0.4, (4000.0, -900.0)))
+    (fixed, _), (aligned, _) = scenes_of(of), scenes_of(of, frame="aligned")
+    angle = aligned.frame[:, 2]
+    assert angle.min() > 0.3
+    cosine, sine = angle.cos(), angle.sin()
+    rotation = torch.stack((torch.stack((cosine, -sine), -1), torch.stack((sine, cosine), -1)), -2)
+    for name in ("history", "future", "goal_candidates", "references", "lanes"):
+        here, there = (getattr(scene, name).double() for scene in (aligned, fixed))
+        for ends in (slice(0, 2), slice(2, 4)) if name == "lanes" else (slice(0, 2),):
+            turned = torch.einsum("bij,b...j->b...i", rotation, here[..., ends])
+            torch.testing.assert_close(turned, there[..., ends], rtol=0, atol=2e-3)
+        if name in ("history", "future"):
+            torch.testing.assert_close(here[..., 2] + angle[:, None, None], there[..., 2], rtol=0, atol=1e-5)
+            assert torch.equal(here[..., 3], there[..., 3])
+
+
 def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
     of = recording(vehicles=((1, 30.0, 0, 20.0, None), (2, 60.0, 1, 20.0, None)))
     away = of.tracks.agent == 1

@@ -1,0 +1,111 @@
+"""Training steps inside Lightning: the loss, gradient clipping, the schedule of the relaxation, scores of an epoch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning
+import pytest
+import torch
+from games import random_scene
+from suites import IMITATION, LOSS_WEIGHTS, model
+from torch.utils.data import DataLoader
+
+from epo_lightning import losses
+from epo_lightning.forecasters import Forecaster, build_forecaster
+from epo_lightning.metrics import ForecastMetrics
+from epo_lightning.scene import Scene
+
+BATCHES, EPOCHS = 2, 2
+RELAXED = {"relaxation": 0.5, "relaxation_steps": 3}
+BASELINE = {"modes": 2, "loss_weights": LOSS_WEIGHTS, **RELAXED}
+LEARNED = {
+    "marginal": {"forecaster": {"name": "marginal", **BASELINE}},
+    "scene_consistent": {"forecaster": {"name": "scene_consistent", **BASELINE}},
+    "epo": {"forecaster": {"name": "epo", "modes": 2}, "objective": {**IMITATION, **RELAXED}},
+}
+
+
+def build(name: str, **changes: Any) -> Forecaster:
+    torch.manual_seed(1)
+    return build_forecaster(model(**{**LEARNED[name], **changes}))
+
+
+def fit(forecaster: Forecaster, epochs: int = EPOCHS, **options: Any) -> list[Scene]:
+    """Train for some epochs of two batches each; returns the validation batches."""
+    training, validation = ([random_scene(4, 2) for _ in range(BATCHES)] for _ in range(2))
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        max_epochs=epochs,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        **options,
+    )
+    trainer.fit(forecaster, *(DataLoader(scenes, batch_size=None) for scenes in (training, validation)))
+    return validation
+
+
+class Recorder(lightning.Callback):
+    """The logged values after every step, the norm of the gradient, and the validation scores of every epoch."""
+
+    def __init__(self) -> None:
+        self.norms: list[float] = []
+        self.scores: list[dict[str, float]] = []
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, module: Forecaster, *_: Any) -> None:
+        gradients = [p.grad.flatten() for p in module.parameters() if p.grad is not None]
+        self.norms.append(float(torch.cat(gradients).norm()))
+
+    def on_validation_end(self, trainer: lightning.Trainer, module: Forecaster) -> None:
+        metrics = trainer.callback_metrics
+        self.scores.append({name: float(value) for name, value in metrics.items() if name.startswith("val/")})
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_the_logged_loss_is_the_weighted_sum_of_its_terms(name: str) -> None:
+    forecaster = build(name)
+    scene, logged = random_scene(4, 2), {}
+    forecaster.log_dict = lambda values, **_: logged.update(values)  # type: ignore[method-assign]
+    torch.manual_seed(0)
+    total = forecaster.training_step(scene, 0)
+    terms = {key.removeprefix("train/"): value for key, value in logged.items() if key != "train/loss"}
+    weights = LOSS_WEIGHTS if name != "epo" else IMITATION["weights"]
+    expected = sum(weights[key] * value for key, value in terms.items())
+    assert terms["probability"] > 0
+    torch.testing.assert_close(logged["train/loss"], expected)
+    torch.testing.assert_close(total.detach(), expected)
+
+
+def test_gradients_are_clipped_to_the_configured_norm() -> None:
+    free, clipped = Recorder(), Recorder()
+    torch.manual_seed(0)
+    fit(build("scene_consistent"), 1, callbacks=[free])
+    limit = 0.5 * min(free.norms)
+    assert limit > 0
+    torch.manual_seed(0)
+    fit(build("scene_consistent", optimizer={"name": "adam", "clip": limit}), 1, callbacks=[clipped])
+    assert clipped.norms == pytest.approx([limit] * BATCHES, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_the_relaxation_fades_with_optimisation_steps(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[int] = []
+    share = losses.Relaxation.at
+    monkeypatch.setattr(losses.Relaxation, "at", lambda self, step: (steps.append(step), share(self, step))[1])
+    fit(build(name), limit_val_batches=0)
+    assert steps == list(range(BATCHES * EPOCHS))
+
+
+def test_validation_scores_are_those_of_their_own_epoch() -> None:
+    forecaster, recorder = build("scene_consistent", optimizer={"name": "adam", "lr": 0.01}), Recorder()
+    validation = fit(forecaster, callbacks=[recorder])
+    metrics = ForecastMetrics(forecaster.task.subsets, forecaster.task.shape)
+    for scene in validation:
+        metrics.update(forecaster.predict(scene), scene)
+    expected = {f"val/{key}": float(value) for key, value in metrics.compute().items()}
+    first, last = recorder.scores
+    assert first["val/minSADE"] != pytest.approx(last["val/minSADE"], rel=1e-3)
+    assert last == pytest.approx(expected, rel=1e-5)
