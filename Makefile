@@ -18,8 +18,10 @@ RUNS ?= runs/first
 OUT ?= .
 BIN := $(VENV)/bin
 EPO := $(BIN)/epo
-# One stamp for what running needs, one for what testing needs as well (simulator, Ray, MLflow, browser, type checker).
+# One stamp for what running needs, one for what the site needs as well, and one for what testing needs as well (simulator,
+# Ray, MLflow, browser, type checker).
 INSTALLED := $(VENV)/.installed
+DOCUMENTABLE := $(VENV)/.documentable
 TESTABLE := $(VENV)/.testable
 
 .PHONY: run install test test-slow smoke asan lint docs checkpoint wheel clean
@@ -42,9 +44,13 @@ $(INSTALLED): $(SOURCES)
 	touch $@
 
 $(TESTABLE): $(SOURCES)
-	$(call virtual_environment,with everything that tests need: five minutes and the download)
-	$(BIN)/pip install -q -c constraints.txt -e '.[dev]'
-	touch $(INSTALLED) $@
+	$(call virtual_environment,with everything that tests need: a few minutes and the download)
+	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[dev,docs]'
+	touch $(INSTALLED) $(DOCUMENTABLE) $@
+
+$(DOCUMENTABLE): $(INSTALLED)
+	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[docs]'
+	touch $@
 
 # One thread per run and one run per core: small batches gain nothing from a second thread.
 run: $(INSTALLED)
@@ -83,8 +89,7 @@ lint: $(TESTABLE)
 	$(BIN)/mypy
 
 # -W: a reference that leads nowhere ends it.
-docs: $(INSTALLED)
-	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
+docs: $(DOCUMENTABLE)
 	$(BIN)/python -m sphinx -q -W --keep-going -j auto -b html docs build/docs
 
 checkpoint: $(INSTALLED)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -98,10 +100,32 @@ def test_backbones_and_forecasters_can_be_built_for_highways(backbone: str, fore
     assert any(name.startswith("goals") for name in learned) == forecaster.startswith("epo")
 
 
+def representatives(listed: list[list[str]]) -> list[list[str]]:
+    """Jobs of a sweep that together hold every pair of their words; of the seeds, every one once."""
+    chosen, seen = [], set()
+    for job in listed:
+        words = [word for word in job if not word.startswith("seed=")]
+        found = {*itertools.combinations(words, 2), *((word,) for word in job)}
+        if not found <= seen:
+            chosen.append(job)
+            seen |= found
+    return chosen
+
+
+def test_representatives_hold_every_pair() -> None:
+    grid = [[f"a={a}", f"b={b}", f"c={c}", f"seed={s}"] for a in "12" for b in "123" for c in "12" for s in "12"]
+    few = representatives(grid)
+    for one, other in itertools.combinations("abc", 2):
+        pairs = {(job["abc".index(one)], job["abc".index(other)]) for job in grid}
+        assert pairs == {(job["abc".index(one)], job["abc".index(other)]) for job in few}
+    assert {job[-1] for job in few} == {"seed=1", "seed=2"}
+    assert len(few) < len(grid) / 2
+
+
 @pytest.mark.parametrize("sweep", names(tree() / "sweeps"))
 def test_sweeps_list_their_runs(sweep: str) -> None:
     listed = jobs("train", [f"sweeps={sweep}"])
-    for job in listed or [[f"sweeps={sweep}"]]:
+    for job in representatives(listed) or [[f"sweeps={sweep}"]]:
         settings = read(Settings, compose("train", job))
         assert settings.measures
         assert "test" not in settings.measures or not sweep.startswith("grid")
@@ -225,3 +249,14 @@ def test_folders_beside_the_tree_are_no_groups() -> None:
         known = {folder.name for folder in CONF.iterdir() if folder.is_dir()} | {"sweeps", "hydra"}
         assert set(groups) <= known
         assert set(options_of(instance, "sweeps")) == set(names(tree() / "sweeps"))
+
+
+def test_a_file_of_the_tree_is_read_again_when_it_has_changed(tmp_path: Path) -> None:
+    file = tmp_path / "conf" / "experiment" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    for time, title in enumerate(("one", "two")):
+        file.write_text(f"# @package _global_\ndefaults: [rpi/v_lstm, _self_]\ntitle: {title}\n")
+        os.utime(file, (time, time))
+        for seed in (1, 2):
+            config = compose("train", ["experiment=mine", f"seed={seed}"], [str(tmp_path / "conf")])
+            assert (config["title"], config["seed"]) == (title, seed)

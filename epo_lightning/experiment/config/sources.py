@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+from pathlib import Path
+
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult
@@ -12,8 +15,26 @@ HIGHWAYS = ("exid", "us101", "highway_sim")
 """Data sets of highways, each of which has all rows of ``experiment/highway/`` under its own name."""
 EXPERIMENTS = "experiment"
 
+_PARSED: dict[tuple[str, str, str, int], bytes] = {}
+"""Parsed files, pickled, by provider, folder, name and time of the last change."""
 
-class TreeSource(FileConfigSource):
+
+class ParsedOnce(FileConfigSource):
+    """A folder whose files are parsed once per process: composing the runs of a sweep would parse them for every run."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        file = Path(self.path) / self._normalize_file_name(config_path)
+        if not file.is_file():
+            return super().load_config(config_path)  # raises
+        key = (self.provider, self.path, config_path, file.stat().st_mtime_ns)
+        if key not in _PARSED:
+            _PARSED[key] = pickle.dumps(super().load_config(config_path))
+        # Hydra changes what it is given, so that every composition gets a copy.
+        result: ConfigResult = pickle.loads(_PARSED[key])
+        return result
+
+
+class TreeSource(ParsedOnce):
     """A folder in which ``rpi/v_lstm`` is an option of ``experiment``, so that ``glob('rpi/*')`` finds it.
 
     ``experiment=us101/vibes`` is ``experiment=highway/vibes data=us101`` in one word: such a name has no file of its own.
@@ -75,7 +96,7 @@ def recorded_name(experiment: str, data: str) -> str:
     return f"{data}/{row}" if folder == "highway" and data in HIGHWAYS else experiment
 
 
-class SweepsSource(FileConfigSource):
+class SweepsSource(ParsedOnce):
     """The parent folder of ``sweeps/``, whose other contents Hydra does not see.
 
     Hydra takes every folder below an entry of its search path for a group. The parent of ``sweeps/`` is the root of a
