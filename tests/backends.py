@@ -150,7 +150,7 @@ class BackendSuite:
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     @pytest.mark.parametrize("agents", [1, 2, 4, 6])
-    def test_samples_do_not_depend_on_their_batch_by_a_single_bit(self, dtype, agents):
+    def test_samples_do_not_depend_on_their_batch_bit_for_bit(self, dtype, agents):
         scene = random_scene(19, agents, history=2, size=1.5, dtype=dtype)
         parameters = random_game(scene, modes=3, horizon=9)
         energy = FeatureEnergy(ALL, bounds=BOUNDS)
@@ -228,7 +228,7 @@ class BackendSuite:
         for name, gradient in gradients(leaves).items():
             assert gradient[others].isfinite().all(), name
 
-    def test_a_singular_sample_is_damped(self):
+    def test_a_singular_sample_is_reported_as_damped(self):
         scene = random_scene(4, 2, history=2, size=0.01)
         parameters = random_game(scene, own=("acc", "turnr"))
         for weight in parameters.own_weights.values():
@@ -238,7 +238,7 @@ class BackendSuite:
         assert torch.equal(solution.controls[1], parameters.initial_controls[1]), "nothing pulls anywhere"
         assert (solution.controls[0] - 0.49 * parameters.initial_controls[0]).abs().max() < 1e-5, "two steps of 0.3"
 
-    def test_lines_that_do_not_exist_pull_nobody(self):
+    def test_absent_reference_lines_have_no_effect(self):
         scene, energy = random_scene(3, 2, history=2, dtype=torch.float64), FeatureEnergy(["lane", "acc", "turnr"])
         parameters = random_game(scene)
         mask = torch.rand(3, 2, 2) < 0.5
@@ -269,7 +269,7 @@ class BackendSuite:
         solution.states.sum().backward()
         assert all(gradient.isfinite().all() for gradient in gradients(leaves).values())
 
-    def test_two_steps_of_time_and_no_steps_of_the_solver(self):
+    def test_two_time_steps_and_zero_solver_steps_are_solved(self):
         scene = random_scene(2, 2, history=2, dtype=torch.float64)
         energy = FeatureEnergy(ALL, bounds=BOUNDS)
         parameters = random_game(scene, horizon=2)
@@ -283,14 +283,14 @@ class BackendSuite:
         still.controls.sum().backward()
         assert (leaves.initial_controls.grad == 1).all()
 
-    def test_no_steps_do_not_hide_what_is_no_number(self):
+    def test_nan_samples_are_stopped_even_with_zero_steps(self):
         scene = random_scene(2, 2, history=2, size=0.01)
         parameters = random_game(scene)
         parameters.pair_weights["proximity"][1] = torch.nan
         solution = self.damped(FeatureEnergy(ALL, bounds=BOUNDS), scene, parameters, steps=0)
         assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2]
 
-    def test_stiff_rates_leave_single_precision_enough_digits(self):
+    def test_stiff_rates_are_accurate_in_single_precision(self):
         scene, own = random_scene(8, 2, history=2, size=1.0), ("goal", "acc", "turnr", "jerk")
         parameters = random_game(scene, 1, 40, own=own, spread=0.2)
         parameters.own_weights["jerk"].fill_(30.0)
@@ -299,7 +299,7 @@ class BackendSuite:
         torch.testing.assert_close(single.controls.double(), exact.controls, rtol=0, atol=5e-5)
         assert (single.status == Status.SOLVED).all()
 
-    def test_small_steps_do_not_drown_far_from_the_origin(self):
+    def test_small_steps_are_accurate_far_from_the_origin(self):
         scene, own = random_scene(4, 2, history=2, size=0.01), ("acc", "turnr")
         scene.history[..., :2] = 1e4
         scene.history[..., 3] = 0.3
@@ -310,7 +310,7 @@ class BackendSuite:
         # A unit in the last place of the coordinates themselves is 1 mm there.
         assert (single.states.double() - exact.states)[..., :2].abs().max() < 1.1e-3
 
-    def test_nothing_it_was_given_is_changed(self):
+    def test_inputs_are_not_modified(self):
         scene, energy = random_scene(3, 3, history=2, size=2.0), FeatureEnergy(ALL, bounds=BOUNDS)
         parameters = random_game(scene)
         before = parameters.map(torch.clone)
@@ -322,7 +322,7 @@ class BackendSuite:
         assert torch.equal(leaves.initial_controls, before.initial_controls)
         assert all(torch.equal(leaves.own_weights[name], weight) for name, weight in before.own_weights.items())
 
-    def test_broadcast_and_permuted_inputs(self):
+    def test_broadcast_and_permuted_inputs_give_the_same_solution(self):
         """Decoders hand over views: weights that were unbound, goals that were expanded over modes."""
         scene, energy = random_scene(3, 3, history=2, size=2.0), FeatureEnergy(ALL, bounds=BOUNDS)
         parameters = random_game(scene)

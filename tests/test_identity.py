@@ -30,7 +30,7 @@ def changed(key: str, value: Any) -> dict[str, Any]:
         *(("data.batch_size", 16), ("goal", "all"), ("objective.weights.goal", 7.0), ("callbacks.patience", 2)),
     ],
 )
-def test_what_decides_on_the_result_is_part_of_it(key: str, value: Any) -> None:
+def test_settings_that_affect_the_result_change_the_identity(key: str, value: Any) -> None:
     other = changed(key, value)
     assert identity(other, "d") != identity(CONFIG, "d")
     assert row_identity(other, "d") != row_identity(CONFIG, "d")
@@ -51,13 +51,13 @@ def test_what_decides_on_the_result_is_part_of_it(key: str, value: Any) -> None:
         *(("callbacks.progress", "bar"), ("budget", {"name": "other"}), ("experiment", "rpi/other")),
     ],
 )
-def test_names_places_and_machines_are_not(key: str, value: Any) -> None:
+def test_names_paths_and_hardware_do_not_change_the_identity(key: str, value: Any) -> None:
     other = changed(key, value)
     assert identity(other, "d") == identity(CONFIG, "d")
     assert differences(CONFIG, other) == []
 
 
-def test_a_number_is_the_same_however_it_is_written_and_one_batch_is_not_all_of_them() -> None:
+def test_equal_numbers_have_equal_identities_except_batch_limits() -> None:
     for key, one, other in (("optimizer.clip", 1, 1.0), ("solver.damping", 10, 10.0), ("forecaster.own_start", 1, 1.0)):
         assert identity(changed(key, one), "d") == identity(changed(key, other), "d")
         assert differences(changed(key, one), changed(key, other)) == []
@@ -73,12 +73,12 @@ def test_rows_are_runs_without_their_seed() -> None:
     assert row_identity(other, "d") == row_identity(CONFIG, "d")
 
 
-def test_data_counts_by_its_digest() -> None:
+def test_data_enters_the_identity_by_its_digest() -> None:
     assert identity(CONFIG, "one") != identity(CONFIG, "other")
     assert len(identity(CONFIG, "one")) == 16
 
 
-def test_the_order_of_keys_means_nothing() -> None:
+def test_the_order_of_keys_does_not_matter() -> None:
     shuffled = dict(reversed(CONFIG.items()))
     assert identity(shuffled, "d") == identity(CONFIG, "d")
     assert essence(shuffled) == essence(CONFIG)

@@ -39,7 +39,7 @@ def test_agents_without_a_future_do_not_count():
     assert (joint.item(), mode.item()) == (1.0, 0)
 
 
-def test_relaxation_adds_the_mean_over_modes_and_fades():
+def test_relaxation_adds_the_mean_over_modes_and_decays():
     relaxation = losses.Relaxation(share=0.5, steps=10)
     assert [relaxation.at(step) for step in (0, 5, 10, 99)] == [0.5, 0.25, 0.0, 0.0]
     joint, mode = losses.scene_imitation(DISTANCE, MASK, 0.5)  # modes are at 3 and 2

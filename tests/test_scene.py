@@ -73,7 +73,7 @@ def a_mask(*shape: int) -> torch.Tensor:
         ({"dt": float("inf")}, r"scene\.dt must be positive and finite \[s\], not inf"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_name(wrong, message):
+def test_tensors_of_wrong_shape_are_refused_by_name(wrong, message):
     Scene(torch.zeros(2, 3, 5, 4), 0.1, **FIELDS)
     with pytest.raises(ValueError, match=message):
         Scene(**{"history": torch.zeros(2, 3, 5, 4), "dt": 0.1, **FIELDS, **wrong})
@@ -89,7 +89,7 @@ def test_arrays_and_lists_are_refused_by_name(name):
         Scene(**fields, dt=torch.tensor(0.1))
 
 
-def test_masks_that_are_left_out_mean_that_everything_is_real():
+def test_masks_default_to_true():
     scene = Scene(torch.zeros(2, 3, 5, 4), 0.1, **FIELDS)
     shapes = {"history": (2, 3, 5), "agent": (2, 3), "future": (2, 3, 7), "goal": (2, 3, 6), "lane": (2, 5, 8)}
     for name, shape in {**shapes, "reference": (2, 3, 4)}.items():
@@ -100,7 +100,7 @@ def test_masks_that_are_left_out_mean_that_everything_is_real():
     assert bare.future_mask is bare.goal_mask is bare.lane_mask is bare.reference_mask is None
 
 
-def test_values_that_no_forecaster_can_use_are_refused_where_agents_exist():
+def test_invalid_values_of_present_agents_are_refused():
     scene = random_scene(3, 2)
     scene.validate_values()
     for bad in (0.0, -1.0):
@@ -121,7 +121,7 @@ def test_values_that_no_forecaster_can_use_are_refused_where_agents_exist():
     named.validate_values()
 
 
-def test_scenes_are_chosen_and_converted_as_a_whole():
+def test_indexing_and_conversion_apply_to_all_tensors_of_a_scene():
     scene = random_scene(4, 2)
     chosen = scene[[2, 0]].to(torch.float64)
     assert torch.equal(chosen.id, torch.tensor([2, 0]))
@@ -130,7 +130,7 @@ def test_scenes_are_chosen_and_converted_as_a_whole():
     assert scene[1].history.shape == (1, 2, 19, 4)
 
 
-def test_only_what_is_real_has_to_be_finite():
+def test_only_unmasked_values_must_be_finite():
     scene = random_scene(3, 2)
     scene.history[1, 0, 4] = torch.nan
     assert scene.finite.tolist() == [True, False, True]
@@ -144,7 +144,7 @@ def test_only_what_is_real_has_to_be_finite():
     assert scene.finite.all()
 
 
-def test_batches_within_a_batch_are_indexed_with_it():
+def test_nested_data_classes_are_indexed_with_the_batch():
     goals = torch.arange(3.0).view(3, 1, 1, 1).expand(3, 1, 1, 2)
     game = GameParameters({"goal": goals[..., 0]}, {}, torch.zeros(3, 1, 1, 2, 2), goals)
     forecast = JointForecast(torch.zeros(3, 1, 1, 2, 4), torch.ones(3, 1), parameters=game)

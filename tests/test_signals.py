@@ -12,7 +12,7 @@ from epo_lightning import cli
 
 @pytest.mark.parametrize("verb", ["generate", "train", "evaluate", "predict", "report", "sweep", "config"])
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_verb_that_is_stopped_says_so(
+def test_a_stopped_verb_prints_a_message(
     verb: str,
     number: signal.Signals,
     status: int,

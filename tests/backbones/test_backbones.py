@@ -46,14 +46,14 @@ def test_a_scene_without_a_map_is_refused_where_one_is_read(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_without_a_map_no_parameter_waits_for_lanes(name):
+def test_without_a_map_there_are_no_parameters_for_lanes(name):
     blind, reading = build("backbone", {"name": name}), build("backbone", {"name": name}, map_input=True)
     assert not [key for key in blind.state_dict() if "lane" in key]
     assert set(blind.state_dict()) < set(reading.state_dict())
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_larger_unit_and_a_larger_world_look_the_same(name):
+def test_features_depend_on_positions_relative_to_the_scale(name):
     features = []
     for scale in (1.0, 50.0):
         torch.manual_seed(1)
@@ -75,7 +75,7 @@ def test_a_larger_unit_and_a_larger_world_look_the_same(name):
         ({"name": "hivt_m", "history_depth": 0}, "history_depth must be 1 or more"),
     ],
 )
-def test_sizes_that_cannot_work_are_refused(changes, message):
+def test_invalid_sizes_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         build("backbone", {"name": "v_lstm", **changes}, map_input=True)
 

@@ -39,7 +39,7 @@ def test_epo_layer_compares_the_implementations(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_epo_layer_scales(tmp_path, capsys, monkeypatch):
+def test_epo_layer_reports_times_over_sizes(tmp_path, capsys, monkeypatch):
     axes = [(title, setting, axis, (2, 3)) for title, setting, axis, _ in scaling.AXES]
     monkeypatch.setattr(scaling, "AXES", axes)
     plot = tmp_path / "scaling.png"
@@ -50,7 +50,7 @@ def test_epo_layer_scales(tmp_path, capsys, monkeypatch):
     assert plot.stat().st_size > 1000
 
 
-def test_epo_layer_refuses_sizes_that_are_no_game(capsys):
+def test_epo_layer_refuses_invalid_sizes(capsys):
     assert refused(epo_layer.main, *SMALL, "--K", 1).startswith("K = 1: a game takes B, M, N and S of at least 1")
     refused(epo_layer.main, "--repeats", 0)
     assert "'0' is not a whole number, 1 or more" in capsys.readouterr().err
@@ -78,7 +78,7 @@ def test_dashboards_are_compared(capsys):
     assert "(+0.0%)" in shown
 
 
-def test_dashboards_say_which_data_are_missing(tmp_path):
+def test_dashboards_name_missing_data(tmp_path):
     assert "epo generate" in refused(dashboards.main, "--data", "data=rpi", f"data.root={tmp_path}")
 
 

@@ -38,7 +38,7 @@ def test_experiments_can_be_built(experiment: str) -> None:
 
 
 @pytest.mark.parametrize("data", sorted(folder.name for folder in (CONF / "experiment").iterdir()))
-def test_titles_are_told_apart(data: str) -> None:
+def test_titles_are_unique(data: str) -> None:
     rows = [name for name in names(CONF / "experiment") if name.startswith(f"{data}/")]
     configs = [compose("train", [f"experiment={name}"]) for name in rows]
     titles = [(config["title"], config["data"]["name"]) for config in configs]
@@ -82,7 +82,7 @@ def test_budgets_and_debugging_compose(budget: str, debug: list[str]) -> None:
 
 
 @pytest.mark.parametrize("data", names(CONF / "data"))
-def test_data_sets_can_be_described(data: str) -> None:
+def test_data_sets_can_be_built_from_their_configuration(data: str) -> None:
     built = assembly.build_data(compose("generate", [f"data={data}"])["data"])
     assert isinstance(built, SceneDataModule)
 
@@ -204,17 +204,17 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("words", MISTAKES)
-def test_mistakes_are_refused_in_one_message(words: str, refused: Callable[..., str]) -> None:  # noqa: F811
+def test_invalid_configurations_are_refused_in_one_message(words: str, refused: Callable[..., str]) -> None:  # noqa: F811
     verb, *rest = words.split()
     data = ["data=tiny"] if verb == "train" and "resume" not in words else []
     assert MISTAKES[words] in refused(verb, *data, *rest)
 
 
-def test_missing_data_is_said_before_a_folder_is_made(refused: Callable[..., str]) -> None:  # noqa: F811
+def test_missing_data_is_reported_before_a_folder_is_made(refused: Callable[..., str]) -> None:  # noqa: F811
     assert "epo generate" in refused("train", "experiment=rpi/v_lstm", "data.root=nowhere")
 
 
-def test_what_the_disk_refuses_is_one_message(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+def test_file_system_errors_give_one_message(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
     (tmp_path / "file").touch()
     assert epo("generate", "data=rpi_reduced", "data.root=file/cache", "progress=false") == 1
     message = capsys.readouterr().err.strip()
@@ -239,11 +239,11 @@ def test_help_and_configurations_are_printed(epo: Epo, capsys: pytest.CaptureFix
     assert not list(Path.cwd().iterdir())
 
 
-def test_folders_of_ones_own_come_first() -> None:
+def test_user_configuration_folders_take_precedence() -> None:
     assert compose("train", ["data=tiny"], [str(tiny.CONF)])["data"]["name"] == "tiny"
 
 
-def test_folders_beside_the_tree_are_no_groups() -> None:
+def test_other_folders_beside_the_tree_are_not_groups() -> None:
     with hydra() as instance:
         groups = instance.config_loader.list_groups("")
         known = {folder.name for folder in CONF.iterdir() if folder.is_dir()} | {"sweeps", "hydra"}

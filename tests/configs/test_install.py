@@ -34,7 +34,7 @@ def imported_at_once(tree: ast.AST) -> Iterator[str]:
             yield from imported_at_once(node)
 
 
-def test_modules_import_nothing_that_only_extras_bring() -> None:
+def test_modules_import_without_optional_dependencies() -> None:
     project = tomllib.loads(PROJECT.read_text())["project"]
     names = [re.split(r"[^\w.-]", text)[0] for text in project["dependencies"]]
     known = {MODULES.get(name, name) for name in names} | OF_DEPENDENCIES | sys.stdlib_module_names | {"epo_lightning"}

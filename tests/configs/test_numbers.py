@@ -61,12 +61,12 @@ def changed(key: str, value: Any) -> dict[str, Any]:
     return {**config, head: within(config[head], rest.split("."))}
 
 
-def test_the_configuration_itself_is_accepted() -> None:
+def test_the_default_configuration_is_accepted() -> None:
     assembly.check(read(Settings, CONFIG))
 
 
 @pytest.mark.parametrize(("key", "value"), CASES, ids=lambda case: str(case))
-def test_numbers_that_cannot_work_are_refused(key: str, value: Any) -> None:
+def test_invalid_numbers_are_refused(key: str, value: Any) -> None:
     with pytest.raises(ConfigError) as error:
         assembly.check(read(Settings, changed(key, value)))
     assert key.rpartition(".")[2] in str(error.value)
@@ -91,7 +91,7 @@ def test_no_number_of_a_part_may_be_nan(kind: str) -> None:
         *((PredictSettings, {"run": "run", key: -1}) for key in ("figures", "animate")),
     ],
 )
-def test_numbers_of_other_verbs(schema: type, values: dict[str, Any]) -> None:
+def test_invalid_numbers_of_other_verbs_are_refused(schema: type, values: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=f"{list(values)[-1]} must be"):
         read(schema, values)
 

@@ -27,7 +27,7 @@ def folder(tmp_path):
     return cache.write(tmp_path / "rpi-123", splits, {"seed": 1}, {"size": 3})
 
 
-def test_round_trip(folder):
+def test_a_written_set_is_read_back(folder):
     tensors = cache.load(folder, "train")
     assert torch.equal(tensors["a"], torch.arange(6.0).view(3, 2))
     assert torch.equal(tensors["b"], torch.arange(3))
@@ -38,7 +38,7 @@ def test_round_trip(folder):
     assert [path.name for path in folder.parent.iterdir()] == ["rpi-123"], "a temporary folder was left behind"
 
 
-def test_a_sound_set_is_never_written_again(folder):
+def test_a_complete_set_is_never_written_again(folder):
     before = (folder / "train.safetensors").stat().st_mtime_ns
     cache.write(folder, {"train": {"a": torch.zeros(1)}}, {"seed": 1}, {})
     assert (folder / "train.safetensors").stat().st_mtime_ns == before
@@ -50,7 +50,7 @@ def test_a_failing_write_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_missing(tmp_path):
+def test_a_missing_set_is_refused_with_the_command(tmp_path):
     with pytest.raises(cache.CacheError, match=r"^no RPI data at .*rpi-9; make it with `epo generate data=rpi`$"):
         cache.load(tmp_path / "rpi-9", "train", command=COMMAND)
     assert issubclass(cache.CacheError, ConfigError)
@@ -131,7 +131,7 @@ def test_numbers_that_are_not_finite_are_located(tmp_path):
         cache.load(folder, "val")
 
 
-def test_unknown_split(folder):
+def test_an_unknown_split_is_refused(folder):
     with pytest.raises(cache.CacheError, match="has no split 'valid'; it has test, train"):
         cache.load(folder, "valid")
 
@@ -173,7 +173,7 @@ def test_permissions_follow_the_umask(tmp_path, umask, folders, files):
         assert stat.S_IMODE(path.stat().st_mode) == files, path.name
 
 
-def test_the_rest_of_a_killed_process_is_removed(tmp_path):
+def test_leftovers_of_a_killed_process_are_removed(tmp_path):
     (tmp_path / ".rpi-1-unfinished").mkdir()
     (tmp_path / ".rpi-1-unfinished" / "train.safetensors").write_bytes(b"half")
     cache.verify(cache.write(tmp_path / "rpi-1", {"val": {"a": torch.zeros(1)}}, {}, {}))

@@ -43,7 +43,7 @@ def order(loader, epoch):
     return [batch.id.tolist() for batch in loader]
 
 
-def test_a_scene_is_what_the_vocabulary_says(data):
+def test_scenes_have_the_documented_fields(data):
     module = data()
     module.setup("fit")
     scene = next(iter(module.train_dataloader()))
@@ -60,7 +60,7 @@ def test_a_scene_is_what_the_vocabulary_says(data):
 
 
 @pytest.mark.parametrize("targets", ["executed", "sampled", "both"])
-def test_targets(targets):
+def test_targets_are_both_modes_the_executed_or_a_sampled_one(targets):
     rows = records(200)
     dataset = RPIDataset(rows, targets, seed=3)
     seen = dataset[torch.arange(len(dataset))]
@@ -109,7 +109,7 @@ def test_validation_keeps_everything_in_order_and_does_not_change(data):
     assert [batch.subset.tolist() for batch in loader] == before
 
 
-def test_the_test_split_is_not_touched_before_its_stage(data):
+def test_the_test_split_is_loaded_only_in_its_stage(data):
     module = data()
     (module.folder / "test.safetensors").unlink()
     module.setup("fit")
@@ -157,7 +157,7 @@ def fit(module, folder, epochs, checkpoint=None):
 
 @pytest.mark.filterwarnings("ignore:.*dirpath has changed.*")
 @pytest.mark.parametrize("targets", ["both", "sampled"])
-def test_a_resumed_run_sees_what_it_would_have_seen(data, tmp_path, targets):
+def test_a_resumed_run_gets_the_same_batches(data, tmp_path, targets):
     whole = fit(data(targets=targets), tmp_path / "a", 4)
     begun = fit(data(targets=targets), tmp_path / "b", 2)
     rest = fit(data(targets=targets), tmp_path / "c", 4, tmp_path / "b" / "epoch=1.ckpt")
@@ -206,7 +206,7 @@ def test_a_batch_that_ranks_cannot_share_evenly_is_refused(monkeypatch):
         ({"plcements": 3}, r"unknown key data\.plcements"),
     ],
 )
-def test_settings_that_cannot_work_are_refused(settings, message):
+def test_invalid_settings_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         build("data", {"name": "rpi", **settings})
 
@@ -242,6 +242,6 @@ def test_a_share_of_every_split_is_the_same_whatever_the_seed(tmp_path):
 
 
 @pytest.mark.parametrize("share", [0.0, -0.5, 1.5])
-def test_shares_that_cannot_be_are_refused(share):
+def test_invalid_shares_are_refused(share):
     with pytest.raises(ConfigError, match=r"data\.share"):
         RPIData(share=share)

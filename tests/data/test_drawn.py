@@ -54,7 +54,7 @@ def test_fields_shapes_and_types_are_the_real_ones(like, tmp_path):
 
 @pytest.mark.parametrize("like", REAL)
 @pytest.mark.parametrize("agents", [None, 1, 12])
-def test_scenes_make_sense(like, agents):
+def test_drawn_scenes_have_plausible_values(like, agents):
     scene = drawn(like, agents=agents, scenes=64)
     assert len(scene.history) == 64
     assert scene.history.shape[1] == (agents or DrawnData(like).kind.agents)
@@ -80,7 +80,7 @@ def test_vehicles_rarely_begin_within_each_other_and_some_change_lane():
     assert (scene.goal_candidates - last).norm(dim=-1).amin(-1).median() < 5.0
 
 
-def test_the_seed_decides():
+def test_scenes_depend_on_the_seed_and_the_split():
     one, again, other, later = (
         drawn("highway", split, seed=seed).history
         for split, seed in (("train", 3), ("train", 3), ("train", 4), ("test", 3))
@@ -101,7 +101,7 @@ def test_the_seed_decides():
         ({"scenes": 0}, "data.scenes must be 1 or more"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(options, message):
+def test_invalid_settings_are_refused(options, message):
     with pytest.raises(ConfigError, match=message):
         DrawnData(**options)
 

@@ -59,7 +59,7 @@ def test_the_documented_format_becomes_scenes(settings, tmp_path):
     assert scene.lanes is None
 
 
-def test_the_documented_format_refuses_what_cannot_be(settings, tmp_path):
+def test_the_documented_format_refuses_invalid_files(settings, tmp_path):
     for seed in range(3):
         walkers(seed).with_columns(vx=pl.col("vx") * 1000).write_csv(tmp_path / f"{seed}.csv")
     with pytest.raises(RecordingError, match=r"\.csv: velocity .* of track 7 .* is it in another unit"):

@@ -35,7 +35,7 @@ def contents(root: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(("words", "workers"), [(RPI, 1), (EXID, 2)])
-def test_killed_ten_times_it_leaves_nothing_or_everything(words, workers, tmp_path):
+def test_a_killed_generation_leaves_no_partial_set(words, workers, tmp_path):
     process = generate(words, tmp_path / "whole", workers=workers)
     began = time.monotonic()
     assert process.wait() == 0, process.communicate()[1]

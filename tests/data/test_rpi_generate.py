@@ -123,7 +123,7 @@ def test_splits_share_the_pool(data, monkeypatch):
     assert hard.generate(workers=1, progress=False) != data.folder
 
 
-def test_shapes_and_finite(records):
+def test_tables_have_documented_shapes_and_are_finite(records):
     for rows in records.values():
         count = len(rows["step"])
         assert rows["history"].shape == (count, 2, 19, 4)
@@ -151,7 +151,7 @@ def test_states_follow_from_controls_by_euler(records):
         assert np.abs(before + 0.1 * rate - states).max() < 1e-6
 
 
-def test_bellman_and_history(records):
+def test_executed_modes_satisfy_bellman_and_futures_become_history(records):
     """An executed mode is the rest of the one before, and what was a future becomes history."""
     rows = records["train"]
     pairs = 0

@@ -42,7 +42,7 @@ def test_lq_minimum_reports_a_problem_without_minimum():
 
 
 @pytest.mark.parametrize("owner", [[0, 0, 1, 1], [0, 1, 2, 1], [0, 0, 0, 0]])
-def test_lq_game_equals_coupled_riccati_and_nobody_can_deviate(owner):
+def test_lq_games_equal_coupled_riccati_equations_and_are_equilibria(owner):
     owner = np.array(owner)
     players = owner.max() + 1
     problem = dense.random_lq(np.random.default_rng(players), players=players)

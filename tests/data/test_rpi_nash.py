@@ -81,13 +81,13 @@ def check(modes):
     assert (np.abs(alternative) < 1e-5).mean() > 0.9
 
 
-def test_nobody_gains_by_deviating_in_200_sub_games():
+def test_no_agent_gains_by_deviating_in_200_sub_games():
     modes = sub_games(200)
     assert sum(mode.executed for mode in modes) >= 200
     check(modes)
 
 
-def test_a_strategy_that_is_no_equilibrium_is_found_out():
+def test_a_strategy_that_is_no_equilibrium_is_detected():
     mode = sub_games(1)[0]
     mode.controls = mode.controls + 0.02
     assert max(gains(mode, 0.0, np.random.default_rng(0))) > 1e-4

@@ -59,7 +59,7 @@ def test_padding_changes_neither_logits_nor_gradients(filling):
     torch.testing.assert_close([parameter.grad for parameter in learned], gradients, rtol=1e-3, atol=1e-5)
 
 
-def test_nobody_has_a_candidate():
+def test_a_scene_where_no_agent_has_a_candidate_is_decoded():
     decoder, scene = GoalDecoder(8).eval(), highway_scene(2, 3)
     scene.goal_mask[:] = False
     logits = decoder.logits(torch.randn(2, 3, 8), scene)
@@ -71,7 +71,7 @@ def test_nobody_has_a_candidate():
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(-3, 3)), min_size=1, max_size=7), st.integers(1, 9))
-def test_the_most_likely_come_first_and_then_again(logits, modes):
+def test_goals_are_sorted_by_probability_and_repeated(logits, modes):
     """Ties go to the earlier candidate; None is no candidate."""
     given_logits = torch.tensor([[[NO_CANDIDATE if logit is None else float(logit) for logit in logits]]])
     existing = [index for index, logit in enumerate(logits) if logit is not None]

@@ -36,14 +36,14 @@ def bends(states: torch.Tensor) -> torch.Tensor:
     return states[..., HEADING].diff(dim=-1) / way.norm(dim=-1)
 
 
-def test_the_first_goes_on_as_before():
+def test_the_first_motion_continues_the_present_one():
     current = moving()
     controls, states = rolled(Motions(10, 7, 2.0, 0.3), current)
     assert (controls[:, 0] == 0).all()
     torch.testing.assert_close(states[:, 0, :, -1, 2:], current[..., 2:])
 
 
-def test_the_mixture_is_the_papers():
+def test_motions_are_drawn_from_the_mixture_of_the_paper():
     current = moving(fastest=1.0) + torch.tensor([0.0, 0.0, 0.0, 20.0])  # too fast to stop
     _, states = rolled(Motions(12, 101, 2.0, 0.3), current)
     bend = bends(states)
@@ -72,7 +72,7 @@ def test_the_mixture_is_the_papers():
     st.integers(1, 25),
     st.sampled_from([torch.float32, torch.float64]),
 )
-def test_ranges_hold_and_nobody_drives_backwards(speed, acceleration, curvature, count, horizon, dtype):
+def test_motions_stay_within_their_ranges_and_never_reverse(speed, acceleration, curvature, count, horizon, dtype):
     current = torch.tensor([[[1.0, -2.0, 0.7, speed]]], dtype=dtype)
     controls, states = rolled(Motions(horizon, count, acceleration, curvature), current)
     assert controls.shape == (1, count, 1, horizon, 2)
@@ -84,7 +84,7 @@ def test_ranges_hold_and_nobody_drives_backwards(speed, acceleration, curvature,
     assert (turn * before.abs() <= acceleration + tolerance * (1.0 + curvature)).all(), "sideways"
 
 
-def test_who_stops_stays_and_who_stands_does_not_turn():
+def test_stopped_agents_stay_and_standing_agents_do_not_turn():
     slow = torch.tensor([[[0.0, 0.0, 0.3, 0.4], [5.0, 0.0, 1.0, 0.0]]], dtype=torch.float64)
     controls, states = rolled(Motions(20, 41, 1.0, 0.5), slow)
     speed = states[..., SPEED]
@@ -98,7 +98,7 @@ def test_who_stops_stays_and_who_stands_does_not_turn():
     assert (speed[:, :, 1, -1] > 0).any()
 
 
-def test_who_rolls_backwards_is_neither_stopped_at_once_nor_made_faster():
+def test_agents_rolling_backwards_are_slowed_within_the_range():
     current = torch.tensor([[[0.0, 0.0, 0.0, -0.2]]], dtype=torch.float64)
     controls, states = rolled(Motions(10, 21, 1.0, 0.5), current)
     assert (controls[..., 0].abs() <= 1.0).all()
@@ -106,7 +106,7 @@ def test_who_rolls_backwards_is_neither_stopped_at_once_nor_made_faster():
 
 
 @pytest.mark.parametrize("count", [2, 3, 6, 12, 100])
-def test_all_candidates_are_different_and_the_same_for_everybody(count):
+def test_candidates_are_distinct_and_equal_for_all_agents(count):
     motions = Motions(8, count, 2.0, 0.3)
     current = moving() + torch.tensor([0.0, 0.0, 0.0, 2.0])  # too fast to stand after a step, when all brake alike
     controls = motions.controls(current, DT)
@@ -121,7 +121,7 @@ def test_all_candidates_are_different_and_the_same_for_everybody(count):
 
 
 @pytest.mark.parametrize("wrong", [{"horizon": 0}, {"count": 0}, {"acceleration": 0.0}, {"curvature": math.inf}])
-def test_ranges_that_mean_nothing_are_refused(wrong):
+def test_invalid_ranges_are_refused(wrong):
     name = next(iter(wrong))
     with pytest.raises(ValueError, match=name):
         Motions(**{"horizon": 5, "count": 6, "acceleration": 1.0, "curvature": 0.1, **wrong})

@@ -18,7 +18,7 @@ from epo_lightning.scene import Scene
 
 @settings(max_examples=40, deadline=None)
 @given(count=st.integers(0, 7), modes=st.integers(1, 12), ties=st.booleans(), seed=st.integers(0, 1000))
-def test_the_most_likely_orders_are_those_of_all(count, modes, ties, seed):
+def test_the_most_likely_orders_equal_those_of_full_enumeration(count, modes, ties, seed):
     torch.manual_seed(seed)
     logits = torch.randn(3, count, dtype=torch.float64)
     logits = logits.round() if ties else logits
@@ -54,7 +54,7 @@ def decoder(symmetric: bool, modes: int = 3) -> Orders:
 
 
 @pytest.mark.parametrize("symmetric", [False, True])
-def test_names_of_agents_do_not_matter(symmetric):
+def test_orders_are_equivariant_to_the_order_of_agents(symmetric):
     orders, z, mask = decoder(symmetric), torch.randn(2, 4, 8, dtype=torch.float64), torch.ones(2, 4, dtype=torch.bool)
     names = [2, 0, 3, 1]
     _, scores, logits = orders(z, mask, all_pairs(mask))
@@ -68,7 +68,7 @@ def test_names_of_agents_do_not_matter(symmetric):
     torch.testing.assert_close(again, scores, rtol=0, atol=1e-12)
 
 
-def test_absent_agents_do_not_matter():
+def test_absent_agents_do_not_change_orders():
     orders, z = decoder(False), torch.randn(2, 3, 8, dtype=torch.float64)
     mask = torch.ones(2, 3, dtype=torch.bool)
     order, scores, logits = orders(z, mask, all_pairs(mask))
@@ -96,7 +96,7 @@ def test_log_probabilities_are_those_of_independent_pairs():
     assert (scores.diff(dim=-1) <= 0).all()
 
 
-def test_pairs_whose_order_does_not_matter_are_not_turned_scored_or_learned():
+def test_distant_pairs_are_not_varied_scored_or_learned():
     orders, z = decoder(False, modes=4), torch.randn(1, 3, 8, dtype=torch.float64, requires_grad=True)
     mask, matter = torch.ones(1, 3, dtype=torch.bool), torch.tensor([[True, False, False]])
     order, scores, logits = orders(z, mask, matter)
@@ -109,7 +109,7 @@ def test_pairs_whose_order_does_not_matter_are_not_turned_scored_or_learned():
     assert (z.grad[0, 2] == 0).all()
 
 
-def test_a_lone_agent_has_nobody_to_go_before():
+def test_a_single_agent_has_one_empty_order():
     mask = torch.ones(2, 1, dtype=torch.bool)
     order, scores, logits = Orders(8, 3)(torch.randn(2, 1, 8), mask, all_pairs(mask))
     assert order.shape == (2, 3, 0)
@@ -120,7 +120,7 @@ def test_a_lone_agent_has_nobody_to_go_before():
 
 @settings(max_examples=40, deadline=None)
 @given(modes=st.integers(1, 6), width=st.integers(0, 3), seed=st.integers(0, 1000))
-def test_repeats_are_what_was_there_before(modes, width, seed):
+def test_surplus_modes_repeat_earlier_orders(modes, width, seed):
     torch.manual_seed(seed)
     rows = torch.randint(2, (3, modes, width))
     for found, row in zip(repeated(rows).tolist(), rows.tolist(), strict=True):
@@ -140,7 +140,7 @@ def crossing(future: list[list[tuple[float, float]]], speeds=(1.0, 1.0), heading
     )
 
 
-def test_who_goes_first_is_who_is_ahead_in_the_end():
+def test_the_observed_order_is_that_of_the_last_positions():
     energy = ConvexEnergy(["acc", "lat_acc"], direction="along")
     # The second one overtakes: behind at first, and in the end too where only then both are seen.
     scene = crossing([[(1.0, 0.0), (2.0, 0.0), (3.0, 0.0)], [(0.5, 3.0), (1.9, 1.0), (6.0, 1.0)]])
@@ -156,7 +156,7 @@ def test_who_goes_first_is_who_is_ahead_in_the_end():
 
 
 @pytest.mark.parametrize("slip", [-0.2, 0.2])
-def test_overtaking_is_no_matter_of_who_is_ahead_while_side_by_side(slip):
+def test_the_order_of_overtaking_ignores_positions_side_by_side(slip):
     energy = ConvexEnergy(["acc", "lat_acc"], direction="along")
     scene = crossing([[(1.0, 0.0), (2.0, 0.0), (3.0, 0.0)], [(-3.0, 3.0), (2.0 + slip, 3.0), (8.0, 3.0)]])
     assert energy.pair_order.observed(scene)[0].tolist() == [[-1.0]]
@@ -176,7 +176,7 @@ def test_pairs_that_are_never_near_have_no_order():
         assert padded.tolist() == [[matters, False, False]]
 
 
-def test_on_which_side_they_pass():
+def test_the_observed_passing_side_is_recognised():
     energy = ConvexEnergy(["acc", "lat_acc"], direction="across")
     # Oncoming along x; the first keeps left of the second as it drives, which thus is on its right.
     scene = crossing([[(1.0, 0.5), (2.0, 0.5)], [(3.0, -0.5), (2.0, -0.5)]], headings=(0.0, torch.pi))

@@ -9,7 +9,7 @@ from epo_lightning.decoders.trajectories import Trajectories
 from epo_lightning.decoders.weights import OwnWeights, PairWeights
 
 
-def test_own_weights_start_where_they_are_told_to_by_name():
+def test_own_weights_start_at_their_configured_values():
     decoder = OwnWeights(8, 3, ["goal", "vel"], {"vel": 0.05}).eval()
     z, everyone = torch.randn(2, 4, 8), torch.ones(2, 4, dtype=torch.bool)
     plain = OwnWeights(8, 3, ["goal", "vel"]).eval()
@@ -31,7 +31,7 @@ def test_symmetric_pair_weights_ignore_the_order_of_agents(symmetric):
     assert torch.allclose(weights, swapped, atol=1e-6) == symmetric
 
 
-def test_trajectories_in_larger_units():
+def test_trajectories_are_decoded_in_units_of_the_scale():
     z, current = torch.randn(2, 3, 8), torch.zeros(2, 3, 2)
     metres, units = Trajectories(8, 2, 5), Trajectories(8, 2, 5, scale=50.0)
     units.load_state_dict(metres.state_dict())

@@ -32,7 +32,7 @@ SLOW = ("highway_sim.md-0", "solver.md-1")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in BLOCKS])
-def test_blocks_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_blocks_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT))  # for `benchmarks`, which runs from the root of the repository
     text = BLOCKS[name]
     for one, other in CHEAPER.items():

@@ -35,7 +35,7 @@ NOT_RUN = {
 }
 
 
-def test_the_readme_from_top_to_bottom(
+def test_all_commands_of_the_readme_run(
     epo: Callable[..., int],  # noqa: F811
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -21,7 +21,7 @@ CHEAPER = {
 """Words that make a command cheap; later words win."""
 
 
-def test_from_recordings_to_a_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tutorial_leads_from_recordings_to_a_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("EPO_CACHE", raising=False)
     monkeypatch.syspath_prepend(str(tmp_path))

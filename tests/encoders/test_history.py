@@ -49,7 +49,7 @@ def test_the_lstm_reads_observed_vectors_one_after_the_other(gappy):
             torch.testing.assert_close(features[b, i], hidden[-1, 0], rtol=0, atol=1e-6)
 
 
-def test_the_transformer_is_the_textbooks(gappy):
+def test_the_transformer_equals_a_textbook_implementation(gappy):
     """Every token of every layer, one attention at a time, on the observed vectors alone."""
     encoder = TransformerHistory(16, 3, heads=2)
     features = encoder(gappy)
@@ -80,7 +80,7 @@ def test_the_transformer_is_the_textbooks(gappy):
 
 @pytest.mark.parametrize("encoder", ENCODERS)
 @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
-def test_what_was_not_observed_is_of_no_consequence(encoder, filling, gappy):
+def test_unobserved_steps_do_not_change_features(encoder, filling, gappy):
     encode = encoder(16, 2)
     before = encode(gappy)
     gappy.history[~gappy.history_mask] = filling
@@ -95,7 +95,7 @@ def test_what_was_not_observed_is_of_no_consequence(encoder, filling, gappy):
 
 
 @pytest.mark.parametrize("encoder", ENCODERS)
-def test_who_was_seen_once_is_known_to_be_there(encoder, gappy):
+def test_features_depend_on_a_single_observation(encoder, gappy):
     encode = encoder(16, 2)
     before = encode(gappy)
     gappy.history[1, 2, -1, 0] += 1.0
@@ -104,7 +104,7 @@ def test_who_was_seen_once_is_known_to_be_there(encoder, gappy):
     assert torch.equal(after[0], before[0])
 
 
-def test_the_transformer_tells_old_from_new():
+def test_the_transformer_depends_on_the_order_of_steps():
     """The same two moves in the other order are another history."""
     scene = random_scene(1, 2, history=3)
     scene.history[0, 0, :, 0] = torch.tensor([0.0, 1.0, 0.0])

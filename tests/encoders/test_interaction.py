@@ -10,7 +10,7 @@ import torch
 from epo_lightning.encoders.interaction import Attention, TwoStageAttention
 
 
-def test_attention_is_a_weighted_mean_of_what_exists():
+def test_attention_is_a_weighted_mean_over_present_nodes():
     attention = Attention(8)
     features, sources = torch.randn(2, 3, 8), torch.randn(2, 4, 8)
     mask = torch.tensor([[True, True, False, True], [False, False, True, False]])
@@ -24,13 +24,13 @@ def test_attention_is_a_weighted_mean_of_what_exists():
 
 
 @pytest.mark.parametrize("sources", [0, 4])
-def test_without_anything_to_look_at_features_stay_as_they_are(sources):
+def test_features_without_neighbours_are_unchanged(sources):
     features = torch.randn(2, 3, 8)
     mask = torch.zeros(2, sources, dtype=torch.bool)
     assert torch.equal(Attention(8)(features, torch.randn(2, sources, 8), mask), features)
 
 
-def test_the_second_stage_passes_on_what_the_first_one_saw():
+def test_the_second_stage_propagates_information_of_the_first():
     """Moving a lane changes what an agent tells the others, not only what it knows itself."""
     stages = TwoStageAttention(8)
     agents, lanes = torch.randn(1, 3, 8), torch.randn(1, 4, 8)

@@ -9,7 +9,7 @@ from games import random_scene
 from epo_lightning.encoders.polyline import LanePolylines
 
 
-def test_it_is_vectornets():
+def test_the_encoder_equals_vectornet():
     encoder, scene = LanePolylines(16, 3, scale=2.0), random_scene(2, 1, lanes=5)
     features = encoder(scene.lanes, scene.lane_mask)
     assert features.shape == (2, 5, 16)
@@ -25,7 +25,7 @@ def test_it_is_vectornets():
 
 
 @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
-def test_absent_vectors_are_of_no_consequence(filling):
+def test_absent_vectors_do_not_change_features(filling):
     encoder, scene = LanePolylines(16, 3), random_scene(3, 1, lanes=6)
     scene.lane_mask[0, 2] = False
     scene.lane_mask[1, :, 0] = False

@@ -23,7 +23,7 @@ def checkpoint(path: Path, weight: float = 1.0) -> bytes:
     return path.read_bytes()
 
 
-def test_a_flipped_bit_is_noticed_wherever_weights_lie(tmp_path: Path) -> None:
+def test_a_flipped_bit_in_any_weight_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "some.ckpt"
     whole = checkpoint(path)
     assert read_checkpoint(path)["state_dict"]["w"].shape == (50, 20)
@@ -44,7 +44,7 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [torch.zeros(3), [1], {"state_dict": 1, "configuration": {}}, {"state_dict": {}}])
-def test_other_files_of_torch_are_refused(tmp_path: Path, content: object) -> None:
+def test_torch_files_that_are_no_checkpoints_are_refused(tmp_path: Path, content: object) -> None:
     torch.save(content, tmp_path / "some.ckpt")
     with pytest.raises(ConfigError, match="not a checkpoint that epo_lightning wrote"):
         read_checkpoint(tmp_path / "some.ckpt")

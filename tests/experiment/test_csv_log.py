@@ -102,7 +102,7 @@ def test_a_kill_while_a_column_is_added_loses_no_row(run: RunFolder) -> None:
     killed_everywhere(lambda: logs[0].log_metrics({"a": 3.0, "b": 1.0}, 3), kept, begin)
 
 
-def test_a_line_that_was_cut_off_is_no_row(run: RunFolder) -> None:
+def test_truncated_lines_are_ignored(run: RunFolder) -> None:
     write(run, 3)
     file = run.logs / "metrics.csv"
     file.write_bytes(file.read_bytes() + b"3,4.12")  # of 4.125
@@ -113,9 +113,7 @@ def test_a_line_that_was_cut_off_is_no_row(run: RunFolder) -> None:
     assert read_log(file)[-1]["train/loss"] == "4.125"
 
 
-def test_a_row_that_found_no_place_leaves_no_trace_and_is_written_later(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_row_that_failed_on_a_full_disk_is_written_later(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     import resource
 
     write(run, 4)

@@ -40,7 +40,7 @@ def logged(run: RunFolder, name: str) -> list[float]:
         return [float(row[name]) for row in csv.DictReader(file) if row.get(name)]
 
 
-def test_debugging_is_shown_and_kept_apart() -> None:
+def test_debugging_runs_have_their_own_folders() -> None:
     settings = [
         read(Settings, compose("train", ["experiment=rpi/v_lstm", *([f"debug='{way}'"] if way else [])]))
         for way in ("", *WAYS)
@@ -51,7 +51,7 @@ def test_debugging_is_shown_and_kept_apart() -> None:
         assert (each.callbacks.patience, each.callbacks.progress) == (None, "lines")
 
 
-def test_overfit_learns_a_few_scenes_by_heart(epo: Epo, tmp_path: Path) -> None:
+def test_overfit_reaches_a_small_loss_on_a_few_scenes(epo: Epo, tmp_path: Path) -> None:
     words = ("debug=overfit", "trainer.max_epochs=100", "trainer.validate_every=50")
     assert epo("train", "experiment=rpi/v_lstm_sc", *RPI, *words) == 0
     run = only_run(tmp_path)
@@ -90,12 +90,12 @@ def test_the_profile_is_a_table_and_a_trace(epo: Epo, tmp_path: Path, capsys: py
         assert str(folder / name) in said
 
 
-def test_a_training_too_short_for_a_profile_says_so(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_training_too_short_for_a_profile_prints_a_note(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     assert epo("train", "experiment=rpi/v_lstm", *RPI, "debug=profile", "trainer.max_steps=2") == 0
     assert "profile: none" in capsys.readouterr().out
 
 
-def test_the_first_bad_number_ends_a_run_in_one_message(epo: Epo, capsys: pytest.CaptureFixture[str], tmp_path) -> None:
+def test_the_first_nan_ends_a_run_with_one_message(epo: Epo, capsys: pytest.CaptureFixture[str], tmp_path) -> None:
     words = ("debug=nan", "budget=smoke", "optimizer.lr=1e30")
     assert epo("train", "experiment=rpi/v_lstm_sc", *RPI, *words) == 2
     message = capsys.readouterr().err.strip()
@@ -103,7 +103,7 @@ def test_the_first_bad_number_ends_a_run_in_one_message(epo: Epo, capsys: pytest
     assert only_run(tmp_path).record["status"] == "failed"
 
 
-def test_sound_training_is_let_through(epo: Epo) -> None:
+def test_finite_training_is_not_interrupted(epo: Epo) -> None:
     for row, like in (("exid/hivt_m_epo", "highway"), ("ucy/v_lstm_epo", "pedestrians")):
         words = (f"experiment={row}", "data=drawn", f"data.like={like}", "data.scenes=64", "budget=smoke", "debug=nan")
         assert epo("train", *words) == 0, row
@@ -132,7 +132,7 @@ def watched(change: Callable[[Forecaster, list[Scene]], None]) -> str:
     return str(error.value)
 
 
-def test_data_is_looked_at_first() -> None:
+def test_nan_in_the_data_is_reported_first() -> None:
     ids = []
 
     def poison(_: Forecaster, batches: list[Scene]) -> None:

@@ -160,7 +160,7 @@ def test_the_jobs_of_a_sweep_train_in_workers(epo: Epo) -> None:
 LONG = ("train", "experiment=rpi/v_lstm_sc", *QUIET, *RPI, DOUBLE, "optimizer.lr=5e-5")
 
 
-def test_a_run_on_one_device_goes_on_on_two(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_on_one_device_continues_on_two(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
     words = (*LONG, "trainer.max_epochs=4")
     assert epo(*words, "run_dir=whole") == 0
 
@@ -205,7 +205,7 @@ def test_the_leader_fails_when_a_follower_is_killed(epo: Epo) -> None:
     assert "killed by signal 9" in RunFolder(Path("run")).record["error"]
 
 
-def test_the_leader_says_what_a_follower_stumbled_over() -> None:
+def test_the_leader_reports_the_error_of_a_follower() -> None:
     processes = DDP(Place(world=2), task='{"run": "nowhere"').processes
     with pytest.raises(RuntimeError, match=r"process 1 of the run's 2 ended with exit status 1: .*JSONDecodeError"):
         processes.launch(processes.meet)
@@ -213,7 +213,7 @@ def test_the_leader_says_what_a_follower_stumbled_over() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_followers_end_with_the_leader_and_the_run_goes_on(epo: Epo, how: signal.Signals) -> None:
+def test_followers_end_with_the_leader_and_the_run_can_continue(epo: Epo, how: signal.Signals) -> None:
     assert epo(*LONG, "run_dir=whole", "trainer.max_epochs=12") == 0
     words = [*LONG, "run_dir=parts", TWO, "trainer.max_epochs=12"]
     leader = subprocess.Popen(
@@ -229,7 +229,7 @@ def test_followers_end_with_the_leader_and_the_run_goes_on(epo: Epo, how: signal
     same("whole", "parts", 1e-10)
 
 
-def test_what_learns_nothing_needs_one_process(epo: Epo) -> None:
+def test_forecasters_that_learn_nothing_use_one_process(epo: Epo) -> None:
     assert epo("train", "experiment=rpi/const_vel", *QUIET, *RPI, TWO, "run_dir=run") == 0
     assert RunFolder(Path("run")).finished
 

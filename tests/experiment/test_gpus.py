@@ -10,7 +10,7 @@ from epo_lightning.experiment.config.settings import TrainerSettings
 from epo_lightning.experiment.gpus import place, placed
 
 
-def test_empty_gpus_come_first_and_then_those_with_company(tmp_path: Path) -> None:
+def test_empty_gpus_are_taken_before_shared_ones(tmp_path: Path) -> None:
     with ExitStack() as stack:
         taken = [stack.enter_context(place(["a", "b"], 2, tmp_path)) for _ in range(4)]
     assert taken == [0, 1, 0, 1]
@@ -18,7 +18,7 @@ def test_empty_gpus_come_first_and_then_those_with_company(tmp_path: Path) -> No
         assert number == 0, "places are given back"
 
 
-def test_who_finds_no_place_waits_for_one(tmp_path: Path) -> None:
+def test_a_run_waits_for_a_free_gpu(tmp_path: Path) -> None:
     got = threading.Event()
 
     def wait() -> None:
@@ -33,7 +33,7 @@ def test_who_finds_no_place_waits_for_one(tmp_path: Path) -> None:
     waiting.join()
 
 
-def test_cpus_are_not_handed_out() -> None:
+def test_runs_on_cpu_take_no_gpu() -> None:
     settings = TrainerSettings(accelerator="cpu", devices=3)
     with placed(settings) as devices:
         assert devices == 3

@@ -59,25 +59,25 @@ def check(folder: Path, runs: str, *words: str) -> None:
 @pytest.mark.skipif(
     find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="the extra `local` is not installed"
 )
-def test_in_parallel_on_this_machine(sequential: Path) -> None:
+def test_a_sweep_runs_in_parallel_on_this_machine(sequential: Path) -> None:
     check(sequential, "local", "hydra/launcher=local", "hydra.launcher.n_jobs=2")
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("submitit") is None, reason="the extra `slurm` is not installed")
-def test_by_submitit_without_a_cluster(sequential: Path) -> None:
+def test_a_sweep_runs_through_submitit_without_a_cluster(sequential: Path) -> None:
     check(sequential, "submitit", "hydra/launcher=submitit_local")
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("sinfo") is None or "SLURM_CONF" not in os.environ, reason="no Slurm: set SLURM_CONF")
-def test_on_slurm(sequential: Path) -> None:
+def test_a_sweep_runs_on_slurm(sequential: Path) -> None:
     check(sequential, "slurm", "hydra/launcher=slurm", "hydra.launcher.timeout_min=30", "hydra.launcher.mem_gb=2")
 
 
 @pytest.mark.slow
 @pytest.mark.skipif("RAY_ADDRESS" not in os.environ, reason="no Ray cluster: set RAY_ADDRESS")
-def test_on_a_ray_cluster(sequential: Path) -> None:
+def test_a_sweep_runs_on_a_ray_cluster(sequential: Path) -> None:
     check(sequential, "ray", "hydra/launcher=ray_cluster")
 
 
@@ -85,7 +85,7 @@ def test_on_a_ray_cluster(sequential: Path) -> None:
 @pytest.mark.skipif(
     find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="the extra `local` is not installed"
 )
-def test_a_failure_elsewhere_is_seen_here(sequential: Path) -> None:
+def test_a_failure_in_a_worker_is_reported(sequential: Path) -> None:
     words = ("hydra/launcher=local", "hydra.launcher.n_jobs=2", "optimizer.lr=1e25", "seed=0")
     done = sweep(sequential, "failing", *words, rows="rpi/const_vel,rpi/v_lstm_sc")
     assert done.returncode == 1, done.stdout + done.stderr

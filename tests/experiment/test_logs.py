@@ -110,7 +110,7 @@ def hyperparameters(run: str) -> Any:
 # CSV
 
 
-def test_the_file_holds_every_row_at_once_and_a_full_disk_is_an_error(epo: Epo) -> None:
+def test_rows_are_written_at_once_and_a_full_disk_is_an_error(epo: Epo) -> None:
     assert epo("train", ROW, *TINY, "run_dir=run") == 0
     run = RunFolder.open("run")
     settings = read(Settings, run.config())
@@ -135,7 +135,7 @@ def test_only_the_first_of_several_processes_logs(epo: Epo, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("logger", ["logger=[tensorboard]", "logger=[csv,tensorboard]"])
-def test_tensorboard_shows_what_the_file_holds(epo: Epo, logger: str) -> None:
+def test_tensorboard_shows_the_values_of_the_csv_file(epo: Epo, logger: str) -> None:
     assert epo("train", ROW, *TINY, "run_dir=run", logger) == 0
     for name in ("val/minSADE", "train/loss"):
         points = [(event.step, event.value) for event in events("run").Scalars(name)]
@@ -196,7 +196,7 @@ def group_of(run: str) -> tuple[str, str]:
     raise AssertionError("no run in the file")
 
 
-def test_a_stopped_run_goes_on_in_the_same_run_of_wandb(epo: Epo, stopped: Callable[..., None]) -> None:
+def test_a_stopped_run_continues_in_the_same_wandb_run(epo: Epo, stopped: Callable[..., None]) -> None:
     stopped("run_dir=run", "logger=[wandb]")
     assert [folder["exit_code"] for folder in wandb_folders("run")] == [1]
     assert epo("train", "resume=run") == 0
@@ -205,7 +205,7 @@ def test_a_stopped_run_goes_on_in_the_same_run_of_wandb(epo: Epo, stopped: Calla
     assert wandb_history("run") == [(step, pytest.approx(value)) for step, value in in_file("run", "val/minSADE")]
 
 
-def test_pictures_and_the_checkpoint_can_be_sent_along(epo: Epo) -> None:
+def test_pictures_and_the_checkpoint_can_be_uploaded(epo: Epo) -> None:
     options = ("logger.wandb.pictures=2", "logger.wandb.artifacts=true")
     assert epo("train", ROW, *TINY, "run_dir=run", "logger=[wandb]", *options) == 0
     assert list(Path("run/logs/figures").glob("*.png"))
@@ -249,9 +249,7 @@ def test_mlflow_keeps_name_parameters_tags_and_scores_through_a_stop(epo: Epo, s
     assert run.data.metrics["test/minSADE"] == pytest.approx(measured)
 
 
-def test_a_missing_mlflow_is_said_before_anything_is_made(
-    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_mlflow_is_named_before_the_run(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mlflow", None)
     assert "pip install 'epo_lightning[mlflow]'" in refused("train", ROW, *TINY, "logger=[mlflow]")
 
@@ -333,7 +331,7 @@ def bad(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Bad]]:
 
 @pytest.mark.parametrize("how", ["raises", "hangs", "exits"])
 @pytest.mark.parametrize("where", ["open", "log", "close"])
-def test_a_bad_dashboard_stops_nothing(
+def test_a_failing_dashboard_does_not_stop_the_run(
     epo: Epo, bad: type[Bad], where: str, how: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(bad, "where", where)
@@ -396,7 +394,7 @@ def test_a_slow_dashboard_gets_every_row_in_order_and_costs_the_run_nothing(tmp_
     assert logger.off is None
 
 
-def test_what_a_dashboard_has_missed_is_told_again_by_an_evaluation(
+def test_an_evaluation_sends_missed_values_to_the_dashboard_again(
     epo: Epo, bad: type[Bad], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
@@ -408,7 +406,7 @@ def test_what_a_dashboard_has_missed_is_told_again_by_an_evaluation(
 
 
 @pytest.mark.skipif(not Path("/proc/mounts").is_file(), reason="mounts are made as on Linux")
-def test_a_full_disk_under_wandb_stops_nothing(
+def test_a_full_disk_under_wandb_does_not_stop_the_run(
     epo: Epo, stopped: Callable[..., None], capfd: pytest.CaptureFixture[str]
 ) -> None:
     stopped("run_dir=run", "logger=[csv]")

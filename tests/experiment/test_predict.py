@@ -95,7 +95,7 @@ def train(epo: Epo, data: str = "tiny_road") -> None:
     assert epo("train", "experiment=rpi/const_vel", *words, "run_dir=run") == 0
 
 
-def test_a_highway_run_is_drawn_scene_by_scene_and_says_where_its_scenes_come_from(epo: Epo) -> None:
+def test_highway_scenes_are_drawn_one_by_one_with_their_provenance(epo: Epo) -> None:
     from safetensors.torch import load_file
 
     train(epo)
@@ -119,7 +119,7 @@ def test_a_highway_run_is_drawn_scene_by_scene_and_says_where_its_scenes_come_fr
     assert index["kinds"] == list(KINDS)
 
 
-def test_discs_without_a_map_share_a_picture_as_before(epo: Epo) -> None:
+def test_pedestrian_scenes_share_one_picture(epo: Epo) -> None:
     train(epo, "tiny")
     assert epo("predict", "run=run", "out=out", "scenes=6", "figures=2") == 0
     index = json.loads(Path("out/index.json").read_text())
@@ -151,20 +151,20 @@ def test_scenes_of_any_other_loader_are_gathered() -> None:
 
 
 @pytest.mark.parametrize(("total", "count", "expected"), [(5, None, 5), (3, 9, 3), (9, 1, 1), (9, 4, 4)])
-def test_even_distances(total: int, count: int | None, expected: int) -> None:
+def test_scenes_are_chosen_at_even_distances(total: int, count: int | None, expected: int) -> None:
     chosen = even(total, count)
     assert len(chosen) == len(set(chosen.tolist())) == expected
     assert 0 <= chosen.min() <= chosen.max() < total
 
 
-def test_scenes_where_something_happens_are_preferred_and_spread() -> None:
+def test_scenes_with_events_are_preferred_and_spread() -> None:
     scenes = road_scenes(torch.arange(8))
     assert eventful(scenes, 2) == list(CHANGES)
     assert eventful(scenes, 99) == list(range(8))
     assert eventful(scenes, 1) == [3]
 
 
-def test_what_a_mask_hides_is_no_event() -> None:
+def test_masked_states_are_no_events() -> None:
     scenes = road_scenes(torch.arange(8))
     scenes.future_mask[3, 1] = False
     scenes.agent_mask[5, 0] = False
@@ -176,7 +176,7 @@ def test_what_a_mask_hides_is_no_event() -> None:
     assert eventful(scenes, 1) == [0]
 
 
-def test_events_of_the_past_where_the_future_is_not_known() -> None:
+def test_events_of_the_history_count_without_a_future() -> None:
     scenes = road_scenes(torch.arange(4))
     scenes.history[2, 0, :5, 1] += 2.0
     known = dataclasses.replace(scenes, future=None, future_mask=None)

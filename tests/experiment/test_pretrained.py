@@ -19,7 +19,7 @@ from epo_lightning.run_folder import RunFolder, read_json
 RPI = pretrained.HOME / "rpi"
 
 
-def test_it_loads_by_name_and_forecasts_what_it_was_not_trained_on(
+def test_the_packaged_model_loads_by_name_and_forecasts_unseen_scenes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -31,7 +31,7 @@ def test_it_loads_by_name_and_forecasts_what_it_was_not_trained_on(
     assert distances.mean((2, 3)).amin(1).mean() < 0.05
 
 
-def test_its_record_says_how_it_was_made() -> None:
+def test_the_packaged_record_gives_its_provenance() -> None:
     record, scores = RunFolder(RPI).record, read_json(RPI / "metrics.json")
     file = RPI / "checkpoints" / "best.ckpt"
     assert hashlib.sha256(file.read_bytes()).hexdigest() == record["sha256"]
@@ -61,7 +61,7 @@ def test_predict_takes_its_name_and_example_scenes(
     assert {path: path.stat().st_mtime_ns for path in RPI.rglob("*")} == before
 
 
-def test_a_folder_of_that_name_comes_first_and_other_names_are_refused(
+def test_a_run_folder_takes_precedence_and_unknown_names_are_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)

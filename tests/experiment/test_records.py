@@ -26,9 +26,7 @@ def umask(request: pytest.FixtureRequest) -> Iterator[int]:
     os.umask(before)
 
 
-def test_files_of_runs_sweeps_and_reports_have_the_permissions_that_the_umask_leaves(
-    epo: Epo, umask: int, tmp_path: Path
-) -> None:
+def test_permissions_of_files_follow_the_umask(epo: Epo, umask: int, tmp_path: Path) -> None:
     words = ("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/v_lstm_epo", "score=test")
     assert epo(*words, "logger=[tensorboard]") == 0
     assert epo("predict", "run=runs/rpi/v_lstm_epo/" + next(Path("runs/rpi/v_lstm_epo").iterdir()).name) == 0
@@ -119,7 +117,7 @@ def test_a_continued_run_gets_the_password_again(
     assert mlflow_hears == [ADDRESS] * 3
 
 
-def test_reports_mask_what_older_versions_wrote(tmp_path: Path, epo: Epo) -> None:
+def test_reports_mask_secrets_in_records_of_older_versions(tmp_path: Path, epo: Epo) -> None:
     run = make_run(tmp_path / "runs" / "a", "V-LSTM", "marginal", scores(0.3))
     text = run.record_file.read_text()
     run.record_file.write_text(text.replace("epo train", f"epo train logger.mlflow.uri={ADDRESS}"))
@@ -205,9 +203,7 @@ def test_a_read_only_folder_is_named_in_one_line(epo: Epo, capsys: pytest.Captur
         assert "/sys/here" in one_line(capsys)
 
 
-def test_a_disk_that_is_full_while_a_report_is_written_keeps_the_report_of_before(
-    epo: Epo, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_keeps_the_previous_report(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.3))
     assert epo("report", "runs=runs") == 0
     before = content("report")
@@ -219,9 +215,7 @@ def test_a_disk_that_is_full_while_a_report_is_written_keeps_the_report_of_befor
     assert content("report") == before
 
 
-def test_a_full_disk_fails_the_runs_of_a_sweep_that_find_no_place_and_no_other(
-    epo: Epo, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_fails_only_the_runs_without_space(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test")
     assert epo(*words, "experiment=rpi/const_vel") == 0
     before = content("runs/rpi")

@@ -117,9 +117,7 @@ def test_a_run_that_is_terminated_while_it_is_measured_ends(
     assert run.metrics_file().exists()
 
 
-def test_a_run_that_is_terminated_outside_of_lightnings_loops_ends_at_once(
-    epo: Epo, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_terminated_outside_lightning_loops_ends_at_once(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
     original = training._best_score
 
     def terminate(*arguments: object) -> float:
@@ -176,9 +174,7 @@ def files_of_at_most(count: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_full_disk_is_said_to_be_full_and_the_run_goes_on_when_it_is_not(
-    epo: Epo, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_is_named_and_the_run_can_continue_later(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     assert epo(*WORSENING, "run_dir=whole") == 0
     capsys.readouterr()
     with files_of_at_most(200_000):

@@ -65,7 +65,7 @@ def test_the_same_seed_gives_the_same_metrics_and_another_does_not(epo: Epo) -> 
     assert set(json.loads(one)) == {"split", "data_digest", "checkpoint", "metrics"}
 
 
-def test_constant_velocity_is_kept_and_scored_like_any_other(epo: Epo) -> None:
+def test_constant_velocity_has_a_run_folder_and_scores(epo: Epo) -> None:
     assert epo("train", "experiment=rpi/const_vel", *TINY, "run_dir=run") == 0
     assert epo("evaluate", "run=run") == 0
     assert RunFolder(Path("run")).record["parameters"] == 0
@@ -79,7 +79,7 @@ def test_validation_scores_go_to_their_own_file(epo: Epo) -> None:
     assert not Path("run/metrics.json").exists()
 
 
-def test_a_stopped_run_goes_on_bit_for_bit(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stopped_run_continues_bit_for_bit(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("train", ROW, *TINY, "trainer.max_epochs=4", "callbacks.patience=3")
     assert epo(*words, "run_dir=whole") == 0
 
@@ -106,7 +106,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(epo: Epo, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.slow
-def test_a_killed_process_goes_on_to_the_same_metrics(tmp_path: Path) -> None:
+def test_a_killed_run_continues_to_the_same_metrics(tmp_path: Path) -> None:
     program = [sys.executable, str(Path(tiny.__file__).resolve())]
     root = Path(__file__).parents[2]
     environment = {**os.environ, "PYTHONPATH": str(root)}
@@ -189,6 +189,6 @@ def test_files_are_replaced_as_a_whole(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_missing_checkpoints_are_said_to_be_missing(tmp_path: Path) -> None:
+def test_missing_checkpoints_are_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no checkpoint at"):
         read_checkpoint(tmp_path / "no.ckpt")

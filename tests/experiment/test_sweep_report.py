@@ -75,7 +75,7 @@ def test_a_sweep_reports_its_runs_and_the_states_of_the_others(runs: Path) -> No
     assert "`epo sweep rpi_main`" in written
 
 
-def test_scores_on_another_split_belong_to_another_report(runs: Path) -> None:
+def test_scores_on_another_split_are_left_out(runs: Path) -> None:
     for split in ("test", "val"):
         finish(make_run(runs / "a", "V-LSTM", "marginal", scores(0.3), split=split))
     finish(make_run(runs / "b", "V-LSTM", "marginal", scores(0.3), seed=1, split="test"))
@@ -84,7 +84,7 @@ def test_scores_on_another_split_belong_to_another_report(runs: Path) -> None:
     assert [folder for folder, _ in subject.left_out] == ["runs/b"]
 
 
-def test_a_sweep_that_measures_time(runs: Path) -> None:
+def test_a_sweep_that_measures_time_is_reported(runs: Path) -> None:
     finish(timed(runs, 2, 1, 4, 0.001))
     finish(timed(runs, 4, 1, 4, 0.002))
     begin(runs, "runtime", {"N2-S1-M4": None, "N4-S1-M4": None}, score="time")
@@ -95,7 +95,7 @@ def test_a_sweep_that_measures_time(runs: Path) -> None:
     assert "Budget:" not in (out / "results.md").read_text()  # a time does not depend on it
 
 
-def test_a_sweep_that_measures_scores_and_time(runs: Path) -> None:
+def test_a_sweep_that_measures_scores_and_time_is_reported(runs: Path) -> None:
     for run in of_methods(runs):
         finish(run)
     not_asked_for = {"data_digest": "abc", "split": "val", "metrics": scores(0.9)}
@@ -121,7 +121,7 @@ def test_a_sweep_that_measures_scores_and_time(runs: Path) -> None:
     ]
 
 
-def test_what_cannot_be_reported_is_said(runs: Path) -> None:
+def test_sweeps_that_cannot_be_reported_are_refused(runs: Path) -> None:
     make_run(runs / "a", "V-LSTM", "marginal", None)
     begin(runs, "rpi_main", {"a": None})
     with pytest.raises(ConfigError, match=r"none of the 1 runs of .* is evaluated: .*epo evaluate runs=runs "):

@@ -36,7 +36,7 @@ def untrained(epo: Epo, tmp_path: Path) -> RunFolder:
     return timed(epo, tmp_path, "experiment=exid/v_lstm_epo", "budget=untrained")
 
 
-def test_what_is_written(epo: Epo, tmp_path: Path) -> None:
+def test_the_record_has_sizes_machine_and_times(epo: Epo, tmp_path: Path) -> None:
     words = ("data.agents=3", "forecaster.modes=4", "solver.steps=1", "budget=untrained", "score=time")
     run = timed(epo, tmp_path, "experiment=exid/v_lstm_epo", *words)
     found = read_json(run.metrics_file("time"))
@@ -49,19 +49,19 @@ def test_what_is_written(epo: Epo, tmp_path: Path) -> None:
     assert seconds["p10"] < seconds["mean"]
 
 
-def test_a_trained_run_and_one_without_a_solver(epo: Epo, tmp_path: Path) -> None:
+def test_trained_runs_and_runs_without_a_solver_are_timed(epo: Epo, tmp_path: Path) -> None:
     run = timed(epo, tmp_path, "experiment=rpi/v_lstm_sc", "data.like=rpi", "budget=smoke", "score=time")
     found = read_json(run.metrics_file("time"))
     assert run.record["steps"] > 0
     assert (found["agents"], found["steps"], found["modes"]) == (2, None, 2)
 
 
-def test_steps_are_those_that_are_taken_when_forecasting(epo: Epo, tmp_path: Path) -> None:
+def test_recorded_steps_are_those_of_a_forecast(epo: Epo, tmp_path: Path) -> None:
     words = ("experiment=exid/v_lstm_epo", "budget=untrained", "solver.steps=1", "solver.test_steps=3", "score=time")
     assert read_json(timed(epo, tmp_path, *words).metrics_file("time"))["steps"] == 3
 
 
-def test_it_is_the_time_of_one_forecast_without_gradients(epo: Epo, tmp_path: Path) -> None:
+def test_the_time_is_that_of_one_forecast_without_gradients(epo: Epo, tmp_path: Path) -> None:
     run = timed(epo, tmp_path, "experiment=exid/const_vel", "budget=untrained")
 
     class Slow(torch.nn.Module):
@@ -83,7 +83,7 @@ def test_it_is_the_time_of_one_forecast_without_gradients(epo: Epo, tmp_path: Pa
     assert measure(run, settings)["seconds"]["median"] < 0.005
 
 
-def test_an_untrained_run_is_a_whole_one(untrained: RunFolder, epo: Epo) -> None:
+def test_an_untrained_run_has_a_complete_run_folder(untrained: RunFolder, epo: Epo) -> None:
     record = untrained.record
     assert (record["status"], record["steps"], record["budget"]) == ("finished", 0, "untrained")
     settings = read(Settings, untrained.config())
@@ -96,7 +96,7 @@ def test_an_untrained_run_is_a_whole_one(untrained: RunFolder, epo: Epo) -> None
     assert read_json(untrained.metrics_file("test"))["metrics"]["minSADE"] > 0
 
 
-def test_scores_and_the_time_of_one_run(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_run_has_scores_and_a_time(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("experiment=rpi/v_lstm_epo", "data.like=rpi", "budget=smoke", "score=[time,test]")
     run = timed(epo, tmp_path, *words)
     assert "next: epo report runs=" in capsys.readouterr().out
@@ -132,23 +132,23 @@ def test_a_run_that_lacks_what_it_was_asked_for_is_not_ready_for_a_report(
         *((("time", "test"), ("test", "time")), (["test", "time", "test"], ("test", "time"))),
     ],
 )
-def test_what_is_measured_is_said_in_one_way(score: Any, found: tuple[str, ...]) -> None:
+def test_measurements_have_one_canonical_order(score: Any, found: tuple[str, ...]) -> None:
     assert measures(score) == found
 
 
 @pytest.mark.parametrize("score", ["[test,tiem]", "speed", "[[test]]", "1"])
-def test_what_cannot_be_measured_is_refused(refused: Callable[..., str], score: str) -> None:
+def test_unknown_measurements_are_refused(refused: Callable[..., str], score: str) -> None:
     message = refused("train", "experiment=rpi/v_lstm", *DRAWN, f"score={score}")
     assert "score must be one of test, val, time or a list of one of test, val, time or null" in message
 
 
-def test_a_run_is_the_same_whatever_is_measured(untrained: RunFolder) -> None:
+def test_measurements_do_not_change_the_identity_of_a_run(untrained: RunFolder) -> None:
     config = untrained.config()
     names = {identity({**config, "score": score}, "digest") for score in (None, "test", ["test", "time"])}
     assert len(names) == 1
 
 
-def test_the_time_of_a_training_that_was_stopped_counts(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_time_includes_stopped_parts(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
     original, epochs = RandomStates.on_train_epoch_start, []
 
     def slow_then_stop(self: RandomStates, *words: Any) -> None:
@@ -171,7 +171,7 @@ def test_the_time_of_a_training_that_was_stopped_counts(epo: Epo, monkeypatch: p
     assert run.record["seconds"] > before
 
 
-def test_a_lost_checkpoint_is_said(untrained: RunFolder) -> None:
+def test_a_missing_checkpoint_is_named(untrained: RunFolder) -> None:
     untrained.checkpoint("best").unlink()
     with pytest.raises(ConfigError, match=r"no checkpoint .*best\.ckpt"):
         measure(untrained, read(Settings, untrained.config()))

@@ -39,7 +39,7 @@ def earlier(rows: list[Any]) -> list[bool]:
 
 
 @pytest.mark.parametrize("agents", [1, 2, 4])
-def test_modes_of_orders_and_goals_are_as_likely_as_both(agents):
+def test_probabilities_of_modes_are_products_of_orders_and_goals(agents):
     scene = highway_scene(6, agents)
     scene.agent_mask[0, 0] = agents == 1  # somebody is absent, and somebody else has no candidate
     scene.goal_mask[1, 0] = False
@@ -71,7 +71,7 @@ def test_modes_of_orders_and_goals_are_as_likely_as_both(agents):
     assert repeats or agents > 1
 
 
-def test_probabilities_of_modes_do_not_teach_goals():
+def test_probabilities_of_modes_have_no_gradient_to_goals():
     forecaster = tgl(3)
     forecaster(highway_scene(4)).probabilities.square().sum().backward()
     assert any(p.grad is not None and (p.grad != 0).any() for p in forecaster.orders.parameters())
@@ -101,7 +101,7 @@ def scored(scene: Scene, forecast: JointForecast) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("objective", ["conditional", "imitation"])
-def test_joint_choices_that_begin_anew_have_no_probability(objective):
+def test_repeated_joint_choices_have_zero_probability(objective):
     scene = random_scene(4, 2, history=5, horizon=8)
     scene.agent_mask[0, 1] = False
     forecaster = candidates(2, 7, objective).train()
@@ -153,7 +153,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("name", "wrong", "message"), REFUSED)
-def test_what_cannot_work_is_refused(name, wrong, message):
+def test_invalid_combinations_are_refused(name, wrong, message):
     parts = row(name, 2)
     parts["forecaster"] |= wrong
     with pytest.raises(ConfigError, match=message):

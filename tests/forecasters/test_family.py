@@ -145,7 +145,7 @@ class DSDNet(_Row):
     row = "dsdnet"
     learned = ("density", "marginal")
 
-    def test_motions_are_not_learned(self):
+    def test_sampled_motions_are_not_trained(self):
         """``regression`` tells how well they cover what happened."""
         forecaster, scene = self.forecaster().train(), self.lesson()
         terms = forecaster.losses(scene, forecaster(scene))

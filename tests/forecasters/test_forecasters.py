@@ -21,7 +21,7 @@ class TestConstantVelocity(ForecasterSuite):
     config = {"name": "constant_velocity"}
     modes = 1
 
-    def test_agents_go_straight_on(self):
+    def test_constant_velocity_continues_straight(self):
         scene = Scene(torch.tensor([[[[1.0, 2.0, math.pi / 2, 3.0]]]]), 0.1)
         states = self.forecaster().predict(scene).states[0, 0, 0]
         torch.testing.assert_close(states[:, 0], torch.ones(40))
@@ -36,7 +36,7 @@ class TestMarginal(ForecasterSuite):
         assert (forecast.agent_probabilities[:, 0] >= forecast.agent_probabilities[:, 1]).all()
         assert (forecast.probabilities[:, 0] >= forecast.probabilities[:, 1]).all()
 
-    def test_heading_and_speed_are_those_of_the_way(self):
+    def test_heading_and_speed_follow_from_positions(self):
         scene = random_scene(2, 2)
         states = self.forecaster().predict(scene).states
         step = states[..., 1:, :2] - states[..., :-1, :2]
@@ -66,7 +66,7 @@ class TestEPO(ForecasterSuite):
         total = sum(term.sum(-1) for term in (*forecast.own_energy.values(), *forecast.pair_energy.values()))
         torch.testing.assert_close(total, forecast.solution.energy)
 
-    def test_weights_start_where_they_are_told_to(self):
+    def test_weights_start_at_their_configured_values(self):
         forecaster = self.forecaster()
         for decoder in (forecaster.own_weights, forecaster.pair_weights, forecaster.strategies):
             torch.nn.init.zeros_(decoder.mlp.output.weight)
@@ -81,7 +81,7 @@ class TestEPO(ForecasterSuite):
         with pytest.raises(ValueError, match=r"scene\.goal_candidates \[B, N, 1, 2\] is None"):
             self.forecaster().predict(scene)
 
-    def test_a_given_goal_behind_its_mask_does_not_count(self):
+    def test_masked_goals_are_ignored(self):
         """Neither its value nor the origin attracts the agent."""
         forecaster, scene = self.forecaster(), random_scene(2, 2)
         scene.goal_mask[0, 1] = False
@@ -118,12 +118,12 @@ EPO = TestEPO.config
         ({"speed": 1}, "unknown key 'speed'"),
     ],
 )
-def test_configurations_that_cannot_work_are_refused(changes, message):
+def test_invalid_configurations_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         build_forecaster(model(**{"forecaster": EPO, **changes}))
 
 
-def test_loading_what_is_not_a_checkpoint(tmp_path):
+def test_files_that_are_no_checkpoints_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="no checkpoint at"):
         epo_lightning.load(tmp_path / "missing.ckpt")
     (tmp_path / "text.ckpt").write_text("not a checkpoint")
@@ -134,7 +134,7 @@ def test_loading_what_is_not_a_checkpoint(tmp_path):
         epo_lightning.load(tmp_path / "other.ckpt")
 
 
-def test_loading_a_checkpoint_of_another_architecture(tmp_path):
+def test_checkpoints_of_another_architecture_are_refused(tmp_path):
     forecaster = build_forecaster(model(EPO))
     configuration = model(EPO, backbone={"name": "v_lstm", "width": 64})
     torch.save({"configuration": configuration, "state_dict": forecaster.state_dict()}, tmp_path / "wide.ckpt")
@@ -142,7 +142,7 @@ def test_loading_a_checkpoint_of_another_architecture(tmp_path):
         epo_lightning.load(tmp_path / "wide.ckpt")
 
 
-def test_what_is_dear_to_examine_is_examined_in_some_scenes(monkeypatch):
+def test_expensive_diagnostics_are_computed_for_a_share_of_scenes(monkeypatch):
     monkeypatch.setattr("epo_lightning.forecasters.epo.EXAMINED", 3)
     solver = {"name": "gradient_descent", "steps": 2, "step_size": 1e-3}
     forecaster = build_forecaster(model(EPO, energy={"name": "neural"}, solver=solver, horizon=5)).eval()
@@ -154,7 +154,7 @@ def test_what_is_dear_to_examine_is_examined_in_some_scenes(monkeypatch):
     torch.testing.assert_close(report.energy[2], alone.energy[0])
 
 
-def test_what_cannot_be_predicted_is_refused(monkeypatch):
+def test_invalid_scenes_are_refused(monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users run it
     forecaster = build_forecaster(model({"name": "constant_velocity"}))
     with pytest.raises(TypeError, match=r"predict takes an epo_lightning\.scene\.Scene, not a ndarray"):

@@ -52,7 +52,7 @@ def test_mode_m_heads_for_the_mth_most_likely_candidate_along_its_line():
                 assert forecast.parameters.reference[b, m, i] == scene.goal_reference[b, i, chosen]
 
 
-def test_the_goal_loss_is_part_of_training_and_teaches_the_goal_decoder_alone_of_all_decoders():
+def test_the_goal_loss_trains_only_the_goal_decoder():
     epo, scene = forecaster().train(), highway_scene(8)
     terms = epo.losses(scene, epo(scene))
     assert {name: weight for name, (weight, _) in terms.items()} == {**LOSS_WEIGHTS, "goal": 0.1}
@@ -61,7 +61,7 @@ def test_the_goal_loss_is_part_of_training_and_teaches_the_goal_decoder_alone_of
     assert taught == {"backbone", "goals"}
 
 
-def test_who_has_no_candidate_heads_nowhere():
+def test_agents_without_candidates_have_zero_goal_weights():
     epo, scene = forecaster(), highway_scene(2)
     scene.goal_mask[0, 1] = False
     forecast = epo.predict(scene)
@@ -119,7 +119,7 @@ def test_constant_velocity_keeps_heading_and_speed_on_a_map():
     assert (forecast.states[..., 2] == 0.3).all()
 
 
-def test_an_agent_without_a_future_teaches_nothing():
+def test_agents_without_a_future_have_no_gradient():
     """Whatever stands behind a False of the future's mask leaves losses and gradients as they are."""
     for config in (EPO, TestSceneConsistent.config, TestMarginal.config):
         gradients = []
@@ -147,7 +147,7 @@ def test_an_agent_without_a_future_teaches_nothing():
         ({"objective": {"name": "imitation", "weights": LOSS_WEIGHTS}}, "weights must name"),
     ],
 )
-def test_configurations_that_cannot_work_are_refused(changes, message):
+def test_invalid_configurations_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         build_forecaster(highway_model(**{"forecaster": EPO, **changes}))
 
@@ -168,7 +168,7 @@ def test_scenes_that_lack_what_is_needed_are_refused(gone, message):
         forecaster().predict(scene)
 
 
-def test_models_from_before_there_were_maps_still_build():
+def test_configurations_from_before_maps_still_build():
     """The keys that old checkpoints lack."""
     old = model({"name": "epo", "modes": 2, "own_start": 1.0})
     assert not {"candidates", "map"} & set(old)

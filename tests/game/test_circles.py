@@ -143,7 +143,7 @@ def test_cars_in_adjacent_lanes_do_not_overlap_and_cars_in_a_row_do():
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), turn=st.floats(-7.0, 7.0), x=st.floats(-50.0, 50.0), y=st.floats(-50.0, 50.0))
-def test_symmetric_and_unmoved_by_a_common_motion(seed, turn, x, y):
+def test_residuals_are_symmetric_and_invariant_to_rigid_motion(seed, turn, x, y):
     torch.manual_seed(seed)
     (first, second), sizes = pair_of_states(30)
     depth = row_overlap(first, second, *sizes)
@@ -345,7 +345,7 @@ def mine():
     PAIR_FEATURES.pop("mine", None)
 
 
-def test_a_function_of_ones_own_gets_sizes_too(mine):
+def test_user_defined_functions_receive_sizes(mine):
     pair_feature(mine, needs="size")(lambda *both: row_overlap(*both))
     scene, parameters = traffic(agents=3, apart=1.0)
     twin = dataclasses.replace(parameters, pair_weights={mine: parameters.pair_weights["circles"]})
@@ -360,7 +360,7 @@ def test_a_function_of_ones_own_gets_sizes_too(mine):
             pair_feature("other", source, needs=needs)
 
 
-def test_the_configured_energy():
+def test_the_configured_energy_can_be_built():
     config = compose("train", ["experiment=rpi/v_lstm_epo", "energy=exid_circles"])["energy"]
     plain = compose("train", ["experiment=rpi/v_lstm_epo", "energy=exid"])["energy"]
     assert config == {**plain, "pair": ["circles"]}

@@ -87,7 +87,7 @@ def test_collisions_are_the_overlaps_of_the_metric(shape):
         assert (found == counted).float().mean() > 0.9
 
 
-def test_who_only_touches_does_not_collide():
+def test_touching_agents_do_not_collide():
     for shape in ("disc", "box"):
         energy, scene, game = drawn(shape, agents=2, scenes=1, modes=1)
         scene.history[:], scene.size[:] = 0.0, 2.0
@@ -98,7 +98,7 @@ def test_who_only_touches_does_not_collide():
             assert energy.terms(scene, game, controls)["collision"].item() == expected
 
 
-def test_the_network_sees_waypoints():
+def test_the_network_reads_only_waypoints():
     """Straight motion at constant speed: positions, no turn, and the distance travelled."""
     energy, scene, game = drawn("disc", agents=1, scenes=1, modes=1)
     assert energy.waypoints == [0, 1, 2, 3]

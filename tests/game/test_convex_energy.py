@@ -123,7 +123,7 @@ def test_energies_are_convex_whatever_the_order(direction, agents, share, scale,
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_names_of_agents_and_the_frame_do_not_matter(direction):
+def test_the_energy_is_invariant_to_agents_order_and_frame(direction):
     scene, game = convex_game()
     energy = convex_energy(direction=direction)
     value = energy(scene, game, game.initial_controls)
@@ -150,7 +150,7 @@ def test_names_of_agents_and_the_frame_do_not_matter(direction):
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_absent_agents_do_not_matter(direction):
+def test_absent_agents_do_not_change_the_energy(direction):
     scene, game = convex_game()
     energy = convex_energy(direction=direction)
     value, slope = gradient(energy, scene, game, game.initial_controls)
@@ -219,7 +219,7 @@ def still(states) -> Scene:
     return Scene(history=history, dt=0.1, size=torch.ones(1, len(states), 2, dtype=torch.float64))
 
 
-def test_directions_where_the_first_choice_vanishes():
+def test_directions_have_a_fallback_where_the_first_choice_vanishes():
     along, across = (convex_energy(["acc", "lat_acc"], direction) for direction in DIRECTIONS)
 
     def direction(energy, *states):
@@ -237,7 +237,7 @@ def test_directions_where_the_first_choice_vanishes():
     assert direction(across, (0, 2, 1.0, 0), (0, 0, 2.0, 0)) == pytest.approx([-1, 0])
 
 
-def test_an_order_says_nothing_about_agents_that_are_far_apart():
+def test_orders_of_distant_agents_have_no_effect():
     scene, game = convex_game()
     energy = convex_energy(within=1e-6)
     assert (energy.terms(scene, game, game.initial_controls)["order"] == 0).all()
@@ -264,7 +264,7 @@ def test_the_weight_of_accelerations_is_not_decoded():
     assert torch.equal(same, energy(scene, game, game.initial_controls))
 
 
-def test_what_an_energy_needs():
+def test_the_energy_declares_its_needs():
     assert convex_energy().needs == {"goals", "reference_speed", "size", "order"}
     assert convex_energy().heading == {"goal", "lateral"}
     alone = convex_energy(["acc", "lat_acc"], pair=())
@@ -300,12 +300,12 @@ def test_configurations_can_be_built(name):
         ({"dynamics": Unicycle()}, "dynamics=double_integrator, not with Unicycle"),
     ],
 )
-def test_mistakes_in_configurations(settings, message):
+def test_invalid_settings_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         ConvexEnergy(**{"own": ["acc", "lat_acc"], "dynamics": DoubleIntegrator(), **settings})
 
 
-def test_mistakes_in_tensors():
+def test_invalid_tensors_are_refused():
     scene, game = convex_game()
     energy = convex_energy()
 

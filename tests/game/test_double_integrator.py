@@ -50,7 +50,7 @@ def test_positions_are_affine_in_the_controls():
     assert (blend[..., 3] - parts[..., 3]).abs().max() > 1e-3  # speeds are not
 
 
-def test_shape_and_heading_of_who_goes_straight():
+def test_straight_motion_has_constant_heading():
     initial = torch.tensor([1.0, 2.0, 3.0, 0.5])
     states = ROLL(initial, torch.zeros(4, 2), 0.1)
     assert states.shape == (4, 4)
@@ -58,7 +58,7 @@ def test_shape_and_heading_of_who_goes_straight():
     assert (states[:, 3] == 0.5).all()
 
 
-def test_gradients_of_a_standing_agent_are_numbers():
+def test_gradients_of_a_standing_agent_are_finite():
     controls = torch.zeros(5, 2, dtype=torch.float64, requires_grad=True)
     states = ROLL(torch.tensor([0.0, 0.0, 0.7, 0.0], dtype=torch.float64), controls, 0.1)
     assert (states[:, 2] == 0.7).all()

@@ -140,7 +140,7 @@ def test_normal_equations_equal_automatic_differentiation(agents, modes, horizon
     torch.testing.assert_close(changes, expected, rtol=0, atol=1e-11 * scale)
 
 
-def test_absent_agents_change_nothing_whatever_they_hold():
+def test_absent_agents_do_not_change_the_energy():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, own=ALL)
     energy = FeatureEnergy(ALL, bounds=BOUNDS)
@@ -179,7 +179,7 @@ def test_the_nearest_point_slides_along_its_segment():
     torch.testing.assert_close(jacobian, slides[..., :, None] * slides[..., None, :], rtol=0, atol=1e-15)
 
 
-def test_who_follows_a_line_that_does_not_exist_is_not_drawn_to_it():
+def test_absent_reference_lines_have_no_effect():
     scene = random_scene(2, 2, history=2)
     parameters = random_game(scene)
     scene.reference_mask[:] = False
@@ -275,7 +275,7 @@ def test_bad_declarations_are_refused(registry):
         pair_feature("ours", Source.SPEED)
 
 
-def test_the_potential_is_each_agents_own_cost_up_to_what_the_agent_cannot_change():
+def test_the_energy_is_an_exact_potential_of_the_agents_costs():
     """The defining property of a potential game: dE/du_i is the gradient of agent i's own terms and its pairs."""
     scene = random_scene(1, 3, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene)

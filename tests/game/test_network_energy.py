@@ -48,7 +48,7 @@ def one_game(game, candidates):
 @each
 @pytest.mark.parametrize("features", [{}, FEATURES], ids=["alone", "with features"])
 @pytest.mark.parametrize("agents", [1, 3])
-def test_tables_are_those_of_the_default(kind, features, agents):
+def test_tables_equal_those_of_the_default_implementation(kind, features, agents):
     energy = KINDS[kind](**features).double()
     scene, game = crowd(agents=agents, own=features.get("own", ()))
     first, candidates = one_game(game, 4)
@@ -89,7 +89,7 @@ def test_large_tables_are_made_in_parts(kind, monkeypatch):
 
 
 @each
-def test_absent_agents_change_nothing_whatever_they_hold(kind):
+def test_absent_agents_do_not_change_the_energy(kind):
     energy = KINDS[kind](**FEATURES).double()
     scene, game = crowd(own=FEATURES["own"])
     nothing = torch.full((2, 2, WIDTH), torch.nan, dtype=torch.float64)
@@ -123,7 +123,7 @@ def test_another_order_of_agents_reorders_the_terms(kind):
 
 
 @each
-def test_the_frame_of_the_scene_does_not_matter(kind):
+def test_the_energy_is_invariant_to_the_frame(kind):
     energy = KINDS[kind]().double()
     scene, game = crowd()
     angle = torch.tensor(0.7, dtype=torch.float64)
@@ -162,7 +162,7 @@ def test_features_are_added_to_the_networks(kind):
     assert plain.heading == set()
 
 
-def test_the_potential_is_each_agents_own_cost_up_to_what_the_agent_cannot_change():
+def test_the_energy_is_an_exact_potential_of_the_agents_costs():
     scene, game = crowd(own=FEATURES["own"])
     energy = KINDS["neural"](**FEATURES).double()
     controls = game.initial_controls.clone().requires_grad_()
@@ -175,7 +175,7 @@ def test_the_potential_is_each_agents_own_cost_up_to_what_the_agent_cannot_chang
 
 
 @each
-def test_a_feature_of_ones_own_works_in_every_energy(kind):
+def test_a_registered_feature_works_in_every_energy(kind):
     try:
 
         @own_feature("lateral")
@@ -211,7 +211,7 @@ def test_a_feature_must_not_be_called_like_a_term():
 
 
 @each
-def test_tensors_that_do_not_fit_are_named(kind):
+def test_tensors_of_wrong_shape_are_named(kind):
     scene, game = crowd(own=["acc"])
     energy = KINDS[kind](own=["acc"]).double()
     controls = game.initial_controls

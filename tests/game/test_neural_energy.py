@@ -105,7 +105,7 @@ def test_gradients_and_hessians_equal_finite_differences():
     assert torch.autograd.gradgradcheck(value, inputs)
 
 
-def test_every_control_matters():
+def test_the_energy_depends_on_every_control():
     """The last position does not depend on the last controls (explicit Euler), but heading and speed do."""
     energy, scene, game = drawn()
     controls = game.initial_controls.clone().requires_grad_()
@@ -113,7 +113,7 @@ def test_every_control_matters():
     assert (gradient != 0).all()
 
 
-def test_everything_is_learned():
+def test_all_parameters_have_gradients():
     energy, scene, game = drawn()
     energy(scene, game, game.initial_controls).sum().backward()
     for name, parameter in energy.named_parameters():

@@ -49,7 +49,7 @@ SYMMETRIC = {
 
 
 @pytest.mark.parametrize("name", ASYMMETRIC)
-def test_what_depends_on_the_order_is_refused(name):
+def test_features_that_depend_on_the_order_are_refused(name):
     pair_feature(name)(ASYMMETRIC[name])
     with pytest.raises(ConfigError, match=f"pair feature '{name}' is not symmetric.*no potential game.*a_i > 0"):
         FeatureEnergy(["acc"], [name])
@@ -58,7 +58,7 @@ def test_what_depends_on_the_order_is_refused(name):
 
 
 @pytest.mark.parametrize("name", SYMMETRIC)
-def test_what_does_not_is_not(name):
+def test_symmetric_features_are_accepted(name):
     pair_feature(name)(SYMMETRIC[name])
     assert FeatureEnergy(["acc"], [name]).pair == [name]
 

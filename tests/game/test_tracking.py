@@ -81,7 +81,7 @@ def test_noise_does_not_become_wild_controls():
     assert (found - controls).square().mean().sqrt() < 0.25
 
 
-def test_linear_motion_is_found_from_nothing_in_one_step():
+def test_linear_motion_is_tracked_in_one_step_from_zero_controls():
     time = torch.linspace(0.0, 3.0, 40, dtype=torch.float64)
     scene = random_scene(3, 2, horizon=40, dtype=torch.float64)
     controls = torch.stack((time.sin(), (2.0 * time).cos()), -1).expand(3, 2, -1, -1)
@@ -103,7 +103,7 @@ def test_a_double_integrator_follows_a_unicycle():
     assert (found.abs() < 5.0).all()
 
 
-def test_the_solution_minimises_what_it_says():
+def test_the_solution_minimises_the_documented_cost():
     # Independently: a linear least-squares problem in double precision, solved by QR.
     scene, _ = driven(1, 1, horizon=12, dynamics=Unicycle("heun"))
     scene = dataclasses.replace(scene, future=scene.future + 0.02 * torch.randn_like(scene.future))
@@ -120,7 +120,7 @@ def test_the_solution_minimises_what_it_says():
         assert_close(found[0, 0, :, channel], expected, rtol=0, atol=1e-4)
 
 
-def test_what_was_not_observed_has_no_weight():
+def test_unobserved_steps_have_no_weight():
     scene, controls = driven(2, 3, horizon=10)
     mask = torch.ones(2, 3, 10, dtype=torch.bool)
     mask[0, 1, 6:] = False  # left
@@ -140,7 +140,7 @@ def test_what_was_not_observed_has_no_weight():
     assert ((reached - scene.future)[1, 2, mask[1, 2], :2].norm(dim=-1) < 0.05).all()
 
 
-def test_who_stands_still_does_not_turn():
+def test_standing_agents_do_not_turn():
     scene = random_scene(2, 1, horizon=10, dtype=torch.float64)
     history = scene.history.clone()
     history[..., 3] = 0.0
@@ -155,7 +155,7 @@ def test_who_stands_still_does_not_turn():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_padding_and_the_rest_of_the_batch_do_not_matter(dtype):
+def test_tracking_does_not_depend_on_padding_or_batch(dtype):
     scene, _ = driven(dynamics=Unicycle("heun"), dtype=dtype)
     found, error = observed_controls(EULER, scene)
     assert found.dtype == error.dtype == dtype

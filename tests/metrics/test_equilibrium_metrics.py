@@ -38,7 +38,7 @@ def scores(equilibrium: Equilibrium | None, parts=(slice(0, 4),), subsets=("even
     return {name: value.item() for name, value in metrics.compute().items()}
 
 
-def test_means_over_all_scenes_and_none_over_subsets() -> None:
+def test_equilibrium_scores_are_means_over_all_scenes_without_subsets() -> None:
     report = found()
     result = scores(report)
     assert [name for name in result if name in EQUILIBRIUM_METRICS] == list(EQUILIBRIUM_METRICS)
@@ -60,7 +60,7 @@ def test_means_over_all_scenes_and_none_over_subsets() -> None:
     assert result["nash_gap_relative"] == pytest.approx(sum(shares) / 4)
 
 
-def test_batches_add_up() -> None:
+def test_scores_do_not_depend_on_the_batch_size() -> None:
     report = found()
     assert scores(report, (slice(0, 1), slice(1, 4))) == pytest.approx(scores(report))
 
@@ -69,7 +69,7 @@ def test_forecasts_without_a_report_have_no_such_scores() -> None:
     assert not set(EQUILIBRIUM_METRICS) & set(scores(None))
 
 
-def test_scenes_without_a_finite_value_are_left_out_and_show_elsewhere() -> None:
+def test_values_that_are_not_finite_are_left_out_of_the_mean() -> None:
     report = found()
     optimum, gap = report.optimum.clone(), report.nash_gap.clone()
     optimum[1], gap[2, 0], gap[3, 1] = torch.inf, torch.nan, torch.inf
@@ -79,7 +79,7 @@ def test_scenes_without_a_finite_value_are_left_out_and_show_elsewhere() -> None
     assert result["energy_solved"] == pytest.approx(report.energy.mean().item())
 
 
-def test_gaps_are_compared_with_positive_objectives_alone() -> None:
+def test_relative_gaps_need_a_positive_objective() -> None:
     report = found()
     objective = report.objective.clone()
     objective[0, 0], objective[1], objective[2:] = -3.0, 0.0, -1.0

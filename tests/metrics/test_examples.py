@@ -12,7 +12,7 @@ MODULES = {"forecast": 1, "functional.displacement": 1, "functional.marginal": 1
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_examples_print_what_they_say(name: str) -> None:
+def test_docstring_examples_give_the_printed_output(name: str) -> None:
     module = import_module(f"epo_lightning.metrics.{name}")
     tests = [test for test in doctest.DocTestFinder(exclude_empty=True).find(module) if test.examples]
     assert len(tests) >= MODULES[name]

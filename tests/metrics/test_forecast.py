@@ -66,7 +66,7 @@ def test_scores_equal_the_reference_for_all_scenes_and_every_subset(shape: str) 
     assert scores["executed/minSADE"] != pytest.approx(scores["alternative/minSADE"], abs=1e-3)
 
 
-def test_batches_do_not_matter() -> None:
+def test_scores_do_not_depend_on_the_batch_size() -> None:
     case, subset = big_case()
     whole = filled(case, subset, [slice(0, 23)])
     assert filled(case, subset, [slice(b, b + 1) for b in range(23)]) == pytest.approx(whole, abs=1e-12)
@@ -80,7 +80,7 @@ def test_subsets_need_names_and_numbers() -> None:
     assert not any(name.startswith(SUBSETS) for name in beyond)
 
 
-def test_initial_scores_only_where_there_are_initial_strategies() -> None:
+def test_initial_scores_exist_only_with_initial_strategies() -> None:
     case, _ = big_case()
     metrics = ForecastMetrics()
     metrics.update(case.forecast(), case.scene())
@@ -88,13 +88,13 @@ def test_initial_scores_only_where_there_are_initial_strategies() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*was called before the ``update``.*")
-def test_nothing_seen_is_nan() -> None:
+def test_scores_without_scenes_are_nan() -> None:
     scores = ForecastMetrics(subsets=SUBSETS).compute()
     assert tuple(scores) == METRICS
     assert all(math.isnan(value) for value in scores.values())
 
 
-def test_reset_forgets() -> None:
+def test_reset_clears_the_state() -> None:
     case, subset = big_case()
     metrics = ForecastMetrics(subsets=SUBSETS)
     metrics.update(case.forecast(), case.scene(subset))
@@ -104,7 +104,7 @@ def test_reset_forgets() -> None:
     assert metrics.compute() == first
 
 
-def test_broken_forecast_is_loud() -> None:
+def test_a_nan_forecast_has_infinite_scores() -> None:
     case = make_case(2, scenes=4)
     states = case.states.clone()
     states[:] = torch.nan

@@ -85,7 +85,7 @@ def partly_observed() -> Scene:
     return dataclasses.replace(scene, agent_mask=present, future_mask=observed, future=future)
 
 
-def test_losses_are_those_counted_by_hand():
+def test_losses_equal_hand_computed_values():
     scene = partly_observed()
     unary, pair, states = drawn(scene)
     unary[0, 1] = NAN
@@ -131,7 +131,7 @@ def test_derivatives_by_finite_differences(density):
     assert torch.autograd.gradcheck(total, given, fast_mode=True)
 
 
-def test_the_joint_density_teaches_by_comparing_with_expectation():
+def test_the_gradient_is_the_difference_from_the_expectation():
     """d(-log p(k*))/d unary = [k*_i = k] - p(k_i)."""
     scene = scene_of()
     unary, pair, states = drawn(scene)
@@ -168,7 +168,7 @@ def test_candidates_that_the_energy_forbids_are_no_targets(density):
 
 @pytest.mark.parametrize("density", ["joint", "marginal"])
 @pytest.mark.parametrize("broken", ["closest do not go together", "no number"])
-def test_impossible_scenes_cost_something_finite_and_teach_nothing(density, broken):
+def test_impossible_scenes_have_a_finite_loss_and_no_gradient(density, broken):
     scene = scene_of()
     unary, pair, states = drawn(scene)
     if broken == "no number":
@@ -191,7 +191,7 @@ def test_impossible_scenes_cost_something_finite_and_teach_nothing(density, brok
     assert (unary.grad[1:] != 0).all()
 
 
-def test_no_probability_is_above_one_whichever_solver_gave_the_tables():
+def test_probabilities_are_at_most_one_for_every_solver():
     """Hard pair energies, for which Bethe's log Z is below the true one, and agents of whom nothing was observed."""
     scene = partly_observed()
     unary, pair, states = drawn(scene)
@@ -210,7 +210,7 @@ def test_no_probability_is_above_one_whichever_solver_gave_the_tables():
     assert below, "no table was hard enough"
 
 
-def test_goals_are_taught_where_they_are_decoded():
+def test_decoded_goals_are_trained():
     scene = scene_of()
     scene = dataclasses.replace(scene, goal_candidates=torch.randn(SCENES, AGENTS, 3, 2).double(), goal_mask=None)
     logits = torch.zeros(SCENES, AGENTS, 3, dtype=torch.float64, requires_grad=True)
@@ -224,12 +224,12 @@ def test_goals_are_taught_where_they_are_decoded():
 
 
 @pytest.mark.parametrize("wrong", ["much", None, True, -0.1, INF, NAN])
-def test_weights_that_are_none_are_named(wrong):
+def test_unknown_weights_are_named(wrong):
     with pytest.raises(ConfigError, match=r"objective\.weights\.marginal must be a number, 0 or more, not"):
         Conditional({**WEIGHTS, "marginal": wrong})
 
 
-def test_unlikely_closest_candidates_are_still_learned_from():
+def test_unlikely_closest_candidates_have_a_gradient():
     scene = scene_of()
     unary, pair, states = drawn(scene)
     for number, agent in itertools.product(range(SCENES), range(AGENTS)):
@@ -241,7 +241,7 @@ def test_unlikely_closest_candidates_are_still_learned_from():
     assert (unary.grad.amax(-1) > 0.1 / SCENES).all()
 
 
-def test_candidates_that_are_learned_are_drawn_to_what_was_observed():
+def test_learned_candidates_are_trained_towards_the_observation():
     scene = scene_of()
     unary, pair, states = drawn(scene)
     states.requires_grad_()
@@ -252,7 +252,7 @@ def test_candidates_that_are_learned_are_drawn_to_what_was_observed():
         assert torch.equal(moved[number, :, agent], hot)
 
 
-def test_what_is_missing_is_said():
+def test_missing_inputs_are_named():
     scene = scene_of()
     objective = Conditional(WEIGHTS)
     with pytest.raises(ValueError, match="a density over candidates needs"):
@@ -266,7 +266,7 @@ def test_what_is_missing_is_said():
         Conditional({"density": 1.0})
 
 
-def test_its_page_is_its_schema():
+def test_the_configuration_file_states_the_defaults():
     page = yaml.safe_load((Path(__file__).parents[2] / "conf" / "objective" / "conditional.yaml").read_text())
     assert isinstance(registry.build("objective", page), Conditional)
     assert set(page) == {"name", "weights", "density"}

@@ -49,7 +49,7 @@ def setting(energy=GAME, own=ALL, scenes=3, modes=3, agents=2):
     return scene, leaves_of(random_game(scene, modes, 7, own=own))
 
 
-def test_with_exact_samples_it_is_the_gradient_of_the_exact_likelihood():
+def test_with_exact_samples_the_gradient_is_that_of_the_likelihood():
     # Precision w^2: -log p = w^2 u^2 / 2 - log w + ..., per control. Samples +-1 / w have exactly the right second moment.
     scene, parameters = setting(QUADRATIC, ("acc", "turnr"), modes=1)
     weights = torch.stack([parameters.own_weights[name] for name in ("acc", "turnr")], -1)[..., None, :]
@@ -67,7 +67,7 @@ def test_with_exact_samples_it_is_the_gradient_of_the_exact_likelihood():
         assert_close(weight.grad, leaf.grad)
 
 
-def test_with_langevin_samples_it_is_that_within_their_error():
+def test_with_langevin_samples_the_gradient_is_within_sampling_error():
     scene = random_scene(4000, 1, horizon=2, dtype=torch.float64)
     controls = torch.randn(4000, 1, 2, 2, dtype=torch.float64)
     scene = demonstrate(scene, controls)
@@ -118,7 +118,7 @@ def test_the_value_is_the_difference_of_energies_of_the_mode_that_came_closest()
     assert torch.equal(parameters.own_weights["vel"].grad.abs().sum(-1) > 0, taught)
 
 
-def test_nothing_is_learned_through_samples():
+def test_samples_have_no_gradient():
     scene, parameters = setting()
     forecast = forecast_of(GAME, scene, parameters, GradientDescent(2, 1e-3))
     assert forecast.solution.controls.requires_grad
@@ -128,7 +128,7 @@ def test_nothing_is_learned_through_samples():
     assert parameters.own_weights["vel"].grad.abs().sum() > 0
 
 
-def test_initial_strategies_learn_where_chains_end():
+def test_initial_strategies_are_trained_towards_the_ends_of_chains():
     scene, parameters = setting(agents=1)
     scene = pad(scene)
     parameters = leaves_of(widen(parameters))
@@ -173,7 +173,7 @@ def test_goals_are_learned_where_they_are_decoded():
     assert_close(value, torch.nn.functional.cross_entropy(logits.flatten(0, 1), closest.flatten()))
 
 
-def test_what_was_not_observed_is_taken_from_the_sample():
+def test_unobserved_controls_are_taken_from_the_sample():
     scene, parameters = setting(QUADRATIC, ("acc", "turnr"), modes=1)
     mask = torch.ones(3, 2, 7, dtype=torch.bool)
     mask[0] = False  # a scene of which nothing was observed
@@ -190,7 +190,7 @@ def test_what_was_not_observed_is_taken_from_the_sample():
     assert (parameters.own_weights["acc"].grad[0] == 0).all()
 
 
-def test_a_scene_of_which_nothing_was_observed_teaches_nothing():
+def test_a_scene_without_observations_has_no_gradient():
     scene, parameters = setting()
     mask = torch.ones(3, 2, 7, dtype=torch.bool)
     mask[1] = False
@@ -226,7 +226,7 @@ def test_a_scene_of_which_nothing_was_observed_teaches_nothing():
         assert_close(terms[name][1], share * value, msg=name)
 
 
-def test_padding_does_not_matter():
+def test_padding_does_not_change_the_loss():
     scene, parameters = setting()
     narrow = Contrastive(WEIGHTS)(scene, forecast_of(GAME, scene, parameters), GAME)
     padded = leaves_of(widen(parameters.map(torch.Tensor.detach)))
@@ -241,7 +241,7 @@ def test_padding_does_not_matter():
         assert (padded.own_weights[name].grad[:, :, 2:] == 0).all()
 
 
-def test_games_are_chosen_with_all_that_belongs_to_them():
+def test_game_parameters_are_indexed_together():
     scene, parameters = setting()
     parameters = dataclasses.replace(parameters, context=torch.randn(3, 2, 5, dtype=torch.float64))
     scenes, modes = torch.tensor([2, 0, 2]), torch.tensor([1, 2, 0])
@@ -268,7 +268,7 @@ def test_a_scene_without_a_future_is_refused():
         Contrastive(WEIGHTS)(dataclasses.replace(scene, future=None, future_mask=None), forecast, GAME)
 
 
-def test_the_configuration_fits():
+def test_the_configuration_file_states_the_defaults():
     given = yaml.safe_load(CONF.read_text())
     assert given.pop("name") == "contrastive"
     assert tuple(Contrastive(**given).weights) == Contrastive.terms

@@ -106,7 +106,7 @@ def test_the_best_weight_is_the_precision_of_the_data():
         assert (weights.grad * sign > 0).all() if sign else (weights.grad.abs() < 1e-9).all()
 
 
-def test_responsibilities_come_by_themselves():
+def test_gradients_are_weighted_by_responsibilities():
     scene, parameters, controls = setting()
     logits = torch.randn(3, 3, dtype=torch.float64, requires_grad=True)
     Laplace(WEIGHTS, damping=0.0)(scene, forecast_of(QUADRATIC, scene, parameters, logits), QUADRATIC)["density"][
@@ -185,7 +185,7 @@ def test_any_game_gives_its_gradient_and_gauss_newton_matrix(energy):
         assert_close(one, other)
 
 
-def test_agents_that_touch_tell_of_each_other_while_controls_are_missing():
+def test_coupled_agents_inform_each_others_missing_controls():
     scene, parameters, controls = setting(ALL, agents=3)
     mask = torch.ones(3, 3, HORIZON, dtype=torch.bool)
     mask[0, 1, 2:] = False
@@ -240,7 +240,7 @@ def test_energies_of_other_kinds_have_the_same_likelihood():
     assert_close(log_densities(Other(GAME), padded, wide, shown, 0.1)[0], known)
 
 
-def test_how_far_agents_get_says_nothing_about_their_lane():
+def test_longitudinal_progress_has_no_gradient_to_lateral_weights():
     # A straight line ahead, and an agent on it: acceleration costs nothing that the lane would see.
     energy = FeatureEnergy(own=["lane", "acc", "turnr"], pair=[])
     scene, parameters, controls = setting(tuple(energy.own), modes=1, agents=1)
@@ -260,7 +260,7 @@ def test_how_far_agents_get_says_nothing_about_their_lane():
     assert_close(value[:, 0], along.sum((1, 2)), rtol=1e-5, atol=1e-5)
 
 
-def test_padding_and_the_rest_of_the_batch_do_not_matter():
+def test_the_loss_does_not_depend_on_padding_or_batch():
     scene, parameters, controls = setting(ALL)
     objective = Laplace(WEIGHTS)
     narrow = objective(scene, forecast_of(GAME, scene, parameters), GAME)
@@ -326,14 +326,14 @@ def test_initial_strategies_imitate():
     assert (parameters.initial_controls.grad.flatten(2).norm(dim=-1) > 0).sum() == 3
 
 
-def test_nothing_is_learned_through_the_solution():
+def test_the_solution_has_no_gradient():
     scene, parameters, _ = setting()
     Laplace(WEIGHTS)(scene, forecast_of(QUADRATIC, scene, parameters), QUADRATIC)["density"][1].backward()
     assert parameters.initial_controls.grad is None
 
 
 @pytest.mark.parametrize("damping", [-1.0, float("inf"), float("nan")])
-def test_a_damping_that_cannot_be_is_refused(damping):
+def test_an_invalid_damping_is_refused(damping):
     with pytest.raises(ValueError, match="damping"):
         Laplace(WEIGHTS, damping)
 

@@ -56,7 +56,9 @@ def test_an_animation_shows_its_forecast_from_t0_on(tmp_path: Path) -> None:
     assert apart == [False] * 5 + [True] * 12
 
 
-def test_in_every_frame_vehicles_are_where_they_are_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_frame_has_vehicles_at_their_interpolated_positions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = short()
     predicted = forecast(scene)
     seen: dict[float, tuple[np.ndarray, list[np.ndarray]]] = {}
@@ -105,7 +107,7 @@ def test_a_scene_without_future_map_and_sizes_is_animated(tmp_path: Path) -> Non
     assert len(list(frames(animate(Scene(short().history, DT), predicted, tmp_path / "scene.gif")))) == 17
 
 
-def test_headings_turn_the_short_way(tmp_path: Path) -> None:
+def test_headings_are_interpolated_along_the_shorter_arc(tmp_path: Path) -> None:
     states = np.array([[0.0, 0, np.pi - 0.1, 1], [1.0, 0, -np.pi + 0.1, 1]])
     path, seen = animation._until(states, np.array([True, True]), 0.5)
     assert seen.all()
@@ -113,7 +115,7 @@ def test_headings_turn_the_short_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
-def test_a_film_where_there_is_ffmpeg(tmp_path: Path) -> None:
+def test_an_mp4_is_written_with_ffmpeg(tmp_path: Path) -> None:
     scene = short()
     path = animate(scene, forecast(scene), tmp_path / "scene.mp4")
     assert path.read_bytes()[4:8] == b"ftyp"
@@ -131,7 +133,7 @@ def test_other_endings_and_a_missing_ffmpeg_are_refused(tmp_path: Path, monkeypa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_film_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_animation_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError("no space left")
 

@@ -58,7 +58,7 @@ def test_training_steps_are_whole_numbers() -> None:
     assert all(label.lstrip("\N{MINUS SIGN}").isdigit() for label in labels)
 
 
-def test_a_row_without_a_sound_log_is_left_out_with_a_note(tmp_path: Path) -> None:
+def test_a_row_with_a_damaged_log_is_left_out_with_a_note(tmp_path: Path) -> None:
     for name in ("whole", "missing", "empty", "nan", "other"):
         run = make_run(tmp_path / name, name, "marginal", scores(0.3))
         if name == "nan":
@@ -76,7 +76,7 @@ def test_a_row_without_a_sound_log_is_left_out_with_a_note(tmp_path: Path) -> No
         draw_learning([])
 
 
-def test_the_half_of_a_line_is_no_value_and_a_repeated_step_counts_once(tmp_path: Path) -> None:
+def test_truncated_lines_are_ignored_and_repeated_steps_count_once(tmp_path: Path) -> None:
     file = tmp_path / "metrics.csv"
     file.write_text("epoch,step,val/minSADE\n0,99,0.5\n1,199,0.4\n1,199,0.3\n2,x9,0.2\n2,299,0.2")
     assert validation_log(file, "val/minSADE") == {100: 0.5, 200: 0.3}
@@ -84,7 +84,7 @@ def test_the_half_of_a_line_is_no_value_and_a_repeated_step_counts_once(tmp_path
         validation_log(file, "val/minFDE")
 
 
-def test_the_s_curve_joins_rows_that_differ_in_steps_alone(tmp_path: Path) -> None:
+def test_the_s_curve_joins_rows_that_differ_only_in_steps(tmp_path: Path) -> None:
     over_steps(tmp_path / "steps")
     shutil.rmtree(tmp_path / "steps" / "S8-s1")  # not done yet
     (curve,) = steps_curves(distinct(build_tables(collect(tmp_path))))
@@ -102,7 +102,7 @@ def test_the_s_curve_joins_rows_that_differ_in_steps_alone(tmp_path: Path) -> No
     assert drawn["row3-line"] == [(steps, values["initial/minSADE"]) for steps, values in STEPS.items()]
 
 
-def test_rows_that_differ_in_more_than_steps_are_no_curve(tmp_path: Path) -> None:
+def test_rows_that_differ_in_more_than_steps_are_not_joined(tmp_path: Path) -> None:
     for steps, width in ((1, 32), (2, 64)):
         settings = {"solver.steps": steps, "backbone.width": width}
         make_run(tmp_path / str(steps), "V-LSTM + EPO", "epo", scores(0.1), settings=settings)
@@ -134,7 +134,7 @@ def test_the_heat_map_shows_every_timing_and_the_papers(tmp_path: Path) -> None:
     assert "keep-4-None-paper" not in by_id
 
 
-def test_timings_are_a_table_as_well(tmp_path: Path) -> None:
+def test_timings_are_listed_in_a_table(tmp_path: Path) -> None:
     timed(tmp_path, 12, 8, 4, 0.0076)
     timed(tmp_path, 4, 2, 1, 0.003)
     timed(tmp_path, 4, None, 1, 0.0009)
@@ -148,7 +148,7 @@ def test_timings_are_a_table_as_well(tmp_path: Path) -> None:
     assert timing_sheet("here", read_timings(find_runs(tmp_path / "N4-S2-M1"))[0]).header[0] == "N"  # one method
 
 
-def test_runtime_over_modes(tmp_path: Path) -> None:
+def test_runtime_over_modes_shows_ours_and_the_papers(tmp_path: Path) -> None:
     over_runtime(tmp_path)
     timings, _ = read_timings(find_runs(tmp_path))
     key, seconds = over_modes(timings)
@@ -170,14 +170,14 @@ def test_seeds_of_a_timing_are_averaged_and_machines_kept_apart(tmp_path: Path) 
 @pytest.mark.parametrize(
     "changes", [{"seconds": {"mean": -1}}, {"samples": None}, {"seconds": None}, {"threads": "many"}]
 )
-def test_a_damaged_timing_is_a_note(tmp_path: Path, changes: dict[str, object]) -> None:
+def test_a_damaged_timing_gives_a_note(tmp_path: Path, changes: dict[str, object]) -> None:
     run = timed(tmp_path, 2, 1, 4, 0.001, **changes)
     timings, (note,) = read_timings([run])
     assert timings == []
     assert note.startswith(f"{run.path}/runtime.json is not what `score=time` writes")
 
 
-def test_seconds_as_people_say_them() -> None:
+def test_times_have_two_digits_and_a_unit() -> None:
     values = (12.3, 1.04, 0.9996, 0.17, 0.0099, 0.00123, 0.000046, 2e-7)
     assert [time(value) for value in values] == [
         *("12 s", "1.0 s", "1.0 s", "170 ms", "9.9 ms", "1.2 ms", "46 µs", "0.2 µs"),
@@ -205,7 +205,7 @@ def test_charts_come_with_legends_and_numbers(tmp_path: Path) -> None:
     assert made["N2-S1-M4"].runs[0].command == "epo train experiment=None seed=0"
 
 
-def test_a_drawing_for_the_page_has_ids_of_its_own_and_no_style_sheet() -> None:
+def test_svg_drawings_have_unique_ids_and_no_style_sheet() -> None:
     curve = Curve("a", (1, 2), (0.5, 0.4), (0.4, 0.3), (0.6, 0.5), 2)
     drawing, again = (svg(draw_learning([curve], legend=False), "name") for _ in range(2))
     assert drawing == again

@@ -52,7 +52,7 @@ def pixels(path: Path) -> np.ndarray:
     return imread(path)[..., :3]
 
 
-def test_joint_predictions_grow_with_scenes_and_forecasters(tmp_path: Path) -> None:
+def test_the_figure_grows_with_scenes_and_forecasters(tmp_path: Path) -> None:
     one, many = scenes(1), scenes(2)
     small = joint_predictions(one, {"SC": forecast(one)}, tmp_path / "deep" / "one.png")
     large = joint_predictions(many, {"SC": forecast(many), "EPO": forecast(many)}, tmp_path / "many.png")
@@ -69,7 +69,7 @@ def test_joint_predictions_show_forecasts_and_alternatives(tmp_path: Path) -> No
     assert pixels(other).shape != pixels(near).shape or not np.array_equal(pixels(other), pixels(near))
 
 
-def test_what_stands_behind_a_mask_is_not_drawn(tmp_path: Path) -> None:
+def test_masked_values_are_not_drawn(tmp_path: Path) -> None:
     scene = scenes(1)
     pictures = []
     for garbage in (torch.nan, 1e9):
@@ -82,14 +82,14 @@ def test_what_stands_behind_a_mask_is_not_drawn(tmp_path: Path) -> None:
     assert np.array_equal(*pictures)
 
 
-def test_same_figure_same_bytes_and_the_readers_settings_stay(tmp_path: Path) -> None:
+def test_equal_figures_have_equal_bytes_and_matplotlib_settings_stay(tmp_path: Path) -> None:
     scene, size = scenes(1), mpl.rcParams["font.size"]
     first, second = (joint_predictions(scene, {"a": forecast(scene)}, tmp_path / name) for name in ("a.png", "b.png"))
     assert first.read_bytes() == second.read_bytes()
     assert mpl.rcParams["font.size"] == size
 
 
-def test_weights_of_one_and_of_several_forecasters(tmp_path: Path) -> None:
+def test_weights_of_one_and_several_forecasters_are_drawn(tmp_path: Path) -> None:
     plain = forecast(scenes())
     learned = dataclasses.replace(plain, parameters=game())
     one = learned_weights(learned, tmp_path / "one.png")
@@ -119,7 +119,7 @@ def test_numbers_below_narrow_weights_do_not_overlap(
         assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
 
 
-def test_what_cannot_be_drawn_is_said(tmp_path: Path) -> None:
+def test_invalid_inputs_are_refused(tmp_path: Path) -> None:
     scene = scenes()
     with pytest.raises(ValueError, match=r"\['SC'\] has inferred a game"):
         learned_weights({"SC": forecast(scene)}, tmp_path / "no.png")

@@ -30,12 +30,12 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
-def test_a_title_that_looks_like_mathematics_is_drawn_as_it_is(out: Path) -> None:
+def test_dollar_signs_in_titles_are_drawn_literally(out: Path) -> None:
     assert (out / "figures" / "learning_curves.png").stat().st_size > 10_000
     assert r"$\frac{$" in (out / "index.html").read_text()
 
 
-def test_no_html_gets_into_markdown(out: Path) -> None:
+def test_html_is_escaped_in_markdown(out: Path) -> None:
     written = (out / "results.md").read_text()
     outside = "".join(part for part in written.splitlines(keepends=True) if not part.startswith("- `"))
     assert "<img" not in outside
@@ -44,7 +44,7 @@ def test_no_html_gets_into_markdown(out: Path) -> None:
     assert "``epo train title='-x' x='`<b>`'``" in written, "a backtick in a command does not end the code"
 
 
-def test_no_cell_of_a_spreadsheet_is_a_formula_and_numbers_are_numbers(out: Path) -> None:
+def test_csv_cells_are_never_formulas_and_numbers_stay_numbers(out: Path) -> None:
     with (out / "results.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["method"].lstrip("'") for row in rows} == set(TITLES)
@@ -55,7 +55,7 @@ def test_no_cell_of_a_spreadsheet_is_a_formula_and_numbers_are_numbers(out: Path
     assert means == {-0.2, 0.0}
 
 
-def test_code_in_markdown() -> None:
+def test_markdown_code_with_backticks_has_longer_delimiters() -> None:
     assert [code(text) for text in ("a", "`", "a``b")] == ["`a`", "`` ` ``", "```a``b```"]
 
 

@@ -27,7 +27,7 @@ def changed(section: str, **values: Any) -> dict[str, Any]:
 
 
 @given(plain | st.lists(plain, max_size=3))
-def test_words_are_read_as_the_value_that_they_stand_for(value: Any) -> None:
+def test_override_words_are_read_back_as_their_values(value: Any) -> None:
     (argument,) = shlex.split(word("optimizer.lr", value))
     override = OverridesParser.create().parse_override(argument)
     assert override.key_or_group == "optimizer.lr"
@@ -40,7 +40,7 @@ def test_words_are_read_as_the_value_that_they_stand_for(value: Any) -> None:
     assert type(read) is type(value)
 
 
-def test_what_varies_by_hand() -> None:
+def test_varying_settings_equal_those_found_by_hand() -> None:
     four, wide = changed("solver", steps=4), changed("backbone", width=64)
     assert varying([CONFIG, four, wide]) == [
         {"backbone.width": 128, "solver.steps": 2},
@@ -51,7 +51,7 @@ def test_what_varies_by_hand() -> None:
     assert varying([CONFIG, {**CONFIG, "seed": 2, "title": "x"}]) == [{}, {}]
 
 
-def test_keys_are_as_short_as_they_can_be() -> None:
+def test_keys_are_shortened_while_unambiguous() -> None:
     keys = ["solver.steps", "solver.name", "data.windows.history"]
     assert short_keys(keys, CONFIG) == {
         "solver.steps": "steps",
@@ -60,7 +60,7 @@ def test_keys_are_as_short_as_they_can_be() -> None:
     }
 
 
-def test_labels_by_hand() -> None:
+def test_labels_equal_those_written_by_hand() -> None:
     settings = [{"solver.steps": steps, "solver.name": name} for steps, name in ((2, "lm"), (4, "x" * 40))]
     assert labels("V", settings, CONFIG, ["aaaa", "bbbb"]) == [
         "V, steps=2, solver.name=lm",
@@ -77,7 +77,7 @@ def test_labels_round_numbers_unless_that_makes_them_equal() -> None:
     assert of(0.0003453, 0.0003454) == ["V, rate=0.0003453, steps=1234", "V, rate=0.0003454, steps=1234"]
 
 
-def test_rows_that_settings_do_not_name_are_named_by_their_identity() -> None:
+def test_rows_with_too_long_labels_are_named_by_their_identity() -> None:
     rows = ["0123456789abcdef", "fedcba9876543210"]
     many = [{f"solver.k{number}": number + row for number in range(5)} for row in range(2)]
     assert labels("V", many, CONFIG, rows) == ["V, row 01234567", "V, row fedcba98"]

@@ -67,7 +67,7 @@ def test_all_tables_compile_and_fit_the_page(tmp_path: Path) -> None:
 
 
 @needs_latex
-def test_titles_may_hold_anything(tmp_path: Path) -> None:
+def test_tables_with_any_characters_in_titles_compile(tmp_path: Path) -> None:
     for index, title in enumerate(NASTY):
         make_run(tmp_path / "runs" / str(index), title, "marginal", scores(0.1 * index))
     (table,) = build_tables(collect(tmp_path / "runs"))
@@ -75,14 +75,14 @@ def test_titles_may_hold_anything(tmp_path: Path) -> None:
     compiled(tmp_path, to_latex(table), sheet_to_latex(sheet))
 
 
-def test_special_characters_by_hand() -> None:
+def test_special_characters_are_escaped() -> None:
     assert latex_text("a_b & 5% #1") == r"a\_b \& 5\% \#1"
     assert latex_text("\\{$") == r"\textbackslash{}\{\$"
     assert latex_text("0.1 ± 0.2\nµé") == r"0.1 $\pm$ 0.2 {[}U+00B5{]}é"
     assert slug("rpi, test split: +EPO") == "tab:rpi-test-split-epo"
 
 
-def test_ranks_paper_and_rules_by_hand(tmp_path: Path) -> None:
+def test_ranks_paper_values_and_rules_equal_hand_written_latex(tmp_path: Path) -> None:
     lines = to_latex(two_groups(tmp_path)[0]).splitlines()
     sc = next(line for line in lines if line.startswith("V-LSTM + SC &"))
     cells = [cell.strip() for cell in sc.removesuffix(r"\\").split("&")]
@@ -100,7 +100,7 @@ def test_ranks_paper_and_rules_by_hand(tmp_path: Path) -> None:
     assert r"VIBES, 100 \% & 1" in "\n".join(lines)
 
 
-def test_comments_say_what_is_behind_the_numbers(tmp_path: Path) -> None:
+def test_comments_give_the_provenance_of_the_numbers(tmp_path: Path) -> None:
     tables = two_groups(tmp_path)
     (comparisons,) = build_comparisons(tables)
     for text in (to_latex(tables[0]), comparisons_to_latex(comparisons)):

@@ -52,7 +52,7 @@ def test_only_the_papers_own_row_has_the_papers_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", PARTS)
-def test_any_other_part_makes_it_another_method(kind: str) -> None:
+def test_any_other_part_makes_another_method(kind: str) -> None:
     ours = dict(zip(PARTS, METHODS[1].parts, strict=True))
     config = {part: {"name": name} for part, name in ours.items()}
     assert is_papers("epo", config)
@@ -62,7 +62,7 @@ def test_any_other_part_makes_it_another_method(kind: str) -> None:
     assert is_papers("marginal", {**config, kind: {"name": "another"}})
 
 
-def test_another_method_is_not_compared_as_epo(tmp_path: Path) -> None:
+def test_other_methods_are_not_compared_as_epo(tmp_path: Path) -> None:
     of_methods(tmp_path)
     for seed in range(2):
         make_run(tmp_path / f"sc{seed}", "V-LSTM + SC", "scene_consistent", scores(0.1), seed=seed)
@@ -71,7 +71,7 @@ def test_another_method_is_not_compared_as_epo(tmp_path: Path) -> None:
     assert {(line["method"], line["other"]) for line in found} == {("EPO", "V-LSTM + SC")}
 
 
-def test_the_game_of_every_method(tmp_path: Path) -> None:
+def test_equilibrium_scores_of_every_method_have_a_table(tmp_path: Path) -> None:
     table = tables_of(tmp_path)["rpi, test split: equilibrium"]
     assert [column.metric for column in table.columns] == [
         *("energy_initial", "energy_solved", "energy_optimum", "gradient_norm", "nash_gap", "nash_gap_relative"),
@@ -91,7 +91,7 @@ def test_the_game_of_every_method(tmp_path: Path) -> None:
     assert lines(markdown, "EPO")[0][-1] == "<u>0.125 ± 0</u>"
 
 
-def test_columns_that_no_row_has_and_rows_without_a_game_are_left_out(tmp_path: Path) -> None:
+def test_empty_columns_and_rows_without_a_game_are_left_out(tmp_path: Path) -> None:
     of_methods(tmp_path)
     make_run(tmp_path / "m", "V-LSTM", "marginal", scores(0.1))
     whole = {table.title: table for table in build_tables(collect(tmp_path))}
@@ -102,7 +102,7 @@ def test_columns_that_no_row_has_and_rows_without_a_game_are_left_out(tmp_path: 
     assert list({table.title for table in build_tables(collect(tmp_path / "m"))}) == ["rpi, test split"]
 
 
-def test_a_gap_that_one_seed_lacks_is_a_dash(tmp_path: Path) -> None:
+def test_a_gap_missing_for_one_seed_is_shown_as_a_dash(tmp_path: Path) -> None:
     runs = of_methods(tmp_path)
     content = read_json(runs[3].metrics_file())
     del content["metrics"]["nash_gap_relative"]
@@ -112,7 +112,7 @@ def test_a_gap_that_one_seed_lacks_is_a_dash(tmp_path: Path) -> None:
     assert found[-2:] == ["0.250 ± 0", "-"]
 
 
-def test_the_k_most_likely_modes(tmp_path: Path) -> None:
+def test_accuracy_of_the_k_most_likely_modes_has_a_table(tmp_path: Path) -> None:
     table = tables_of(tmp_path)["rpi, test split: accuracy of the k most likely modes"]
     assert [column.label for column in table.columns] == ["SADE, k=1", "SADE, k=2", "SADE, k=3"]
     markdown = to_markdown(table)
@@ -120,7 +120,7 @@ def test_the_k_most_likely_modes(tmp_path: Path) -> None:
     assert lines(markdown, "EPO")[0][2:] == ["**0.040 ± 0.000**", "**0.030 ± 0.000**", "-"]
 
 
-def test_more_than_nine_modes_stand_in_their_order_and_one_is_no_table(tmp_path: Path) -> None:
+def test_ten_modes_are_in_numeric_order_and_a_single_mode_has_no_table(tmp_path: Path) -> None:
     many = {f"minSADE_{k}": 1.0 / k for k in range(1, 12)}
     make_run(tmp_path / "many", "V-LSTM", "marginal", scores(0.1) | many)
     make_run(tmp_path / "cv", "Constant velocity", "constant_velocity", scores(0.5) | {"minSADE_1": 0.5})
@@ -130,7 +130,7 @@ def test_more_than_nine_modes_stand_in_their_order_and_one_is_no_table(tmp_path:
     assert len(build_tables(collect(tmp_path / "cv"))) == 1
 
 
-def test_missing_cells_in_every_format(tmp_path: Path) -> None:
+def test_missing_cells_are_dashes_in_every_format(tmp_path: Path) -> None:
     tables = tables_of(tmp_path / "runs")
     table = tables["rpi, test split: accuracy of the k most likely modes"]
     row = next(line for line in to_latex(table).splitlines() if line.startswith("EPO &"))
@@ -153,7 +153,7 @@ def test_missing_cells_in_every_format(tmp_path: Path) -> None:
     assert {line["method"] for line in found if line["metric"] == "gradient_norm"} == {"EPO", "Laplace"}
 
 
-def test_legends_speak_of_games_and_modes_where_there_are_any(tmp_path: Path) -> None:
+def test_legends_explain_games_and_modes_only_if_present(tmp_path: Path) -> None:
     tables = tables_of(tmp_path)
     main, modes, equilibrium = (legend([table]) for table in tables.values())
     assert "Nash gap is the most that an agent could gain by changing its strategy alone" in equilibrium
@@ -171,12 +171,12 @@ def test_legends_speak_of_games_and_modes_where_there_are_any(tmp_path: Path) ->
         *((0.0009999, "0.00100"), (math.inf, "inf")),
     ],
 )
-def test_numbers_of_any_size(value: float, text: str) -> None:
+def test_numbers_have_three_significant_digits(value: float, text: str) -> None:
     assert significant(value) == text
     assert Column("nash_gap", "").text(value) == text
 
 
-def test_costs_by_hand(tmp_path: Path) -> None:
+def test_costs_equal_hand_computed_values(tmp_path: Path) -> None:
     runs = of_methods(tmp_path)
     tables = build_tables(collect(runs))
     (sheet,) = cost_sheets(tables, read_timings(runs)[0])
@@ -188,7 +188,7 @@ def test_costs_by_hand(tmp_path: Path) -> None:
     assert "median time of one joint forecast, on A CPU (cpu, 1 thread)." in sheet.note
 
 
-def test_costs_of_rows_that_learn_nothing_were_not_timed_or_elsewhere(tmp_path: Path) -> None:
+def test_costs_of_untrained_and_untimed_rows_are_dashes(tmp_path: Path) -> None:
     runs = of_methods(tmp_path)
     runs[-1].metrics_file("time").unlink()  # one seed of Laplace is left
     time_it(runs[0], 0.5, "A slow CPU")
@@ -201,7 +201,7 @@ def test_costs_of_rows_that_learn_nothing_were_not_timed_or_elsewhere(tmp_path: 
     assert "(1) on A slow CPU (cpu, 1 thread); (2) on A CPU (cpu, 1 thread)." in sheet.note
 
 
-def test_no_costs_without_a_time(tmp_path: Path) -> None:
+def test_without_times_there_is_no_cost_table(tmp_path: Path) -> None:
     run = make_run(tmp_path, "V-LSTM", "marginal", scores(0.3))
     tables = build_tables(collect([run]))
     assert cost_sheets(tables, []) == []
@@ -211,7 +211,7 @@ def test_no_costs_without_a_time(tmp_path: Path) -> None:
     assert "Forecast" not in sheet.note
 
 
-def test_a_row_on_two_splits_cost_once_and_data_sets_are_sheets_apart(tmp_path: Path) -> None:
+def test_costs_count_a_row_once_and_have_one_table_per_data_set(tmp_path: Path) -> None:
     for data, title in (("rpi", "V-LSTM"), ("exid", "V-LSTM"), ("exid", "V-LSTM")):
         for split in ("test", "val"):
             run = make_run(tmp_path / data, title, "marginal", scores(0.3), data=data, split=split)
@@ -220,7 +220,7 @@ def test_a_row_on_two_splits_cost_once_and_data_sets_are_sheets_apart(tmp_path: 
     assert [(sheet.title, len(sheet.lines)) for sheet in sheets] == [("Cost: exid", 1), ("Cost: rpi", 1)]
 
 
-def test_costs_in_every_format(tmp_path: Path) -> None:
+def test_costs_are_written_in_every_format(tmp_path: Path) -> None:
     of_methods(tmp_path / "runs")
     console = Console(file=io.StringIO(), width=80)
     markdown = write_report(Report.of_folder(tmp_path / "runs"), tmp_path / "out", console=console)
@@ -252,7 +252,7 @@ def test_runs_of_several_methods_that_were_only_timed_are_named(tmp_path: Path) 
     ]
 
 
-def test_a_figure_of_the_runtime_is_of_one_method(tmp_path: Path) -> None:
+def test_runtime_figures_show_one_method_each(tmp_path: Path) -> None:
     for agents in (2, 4):
         timed(tmp_path / "ours", agents, 2, 4, 0.001 * agents)
     other = timed(tmp_path / "other", 4, 8, 4, 0.5)
@@ -264,7 +264,7 @@ def test_a_figure_of_the_runtime_is_of_one_method(tmp_path: Path) -> None:
     assert [line[:4] for line in chart.numbers] == [("2", "2", "4", "2.0 ms"), ("4", "2", "4", "4.0 ms")]
 
 
-def test_durations_as_people_say_them() -> None:
+def test_durations_have_a_suitable_unit() -> None:
     assert [duration(value) for value in (0.4, 75, 119.4, 720, 11400)] == [
         "0 s",
         "75 s",

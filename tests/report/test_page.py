@@ -138,7 +138,7 @@ def test_the_best_is_bold_and_the_second_underlined(opened: Any) -> None:
     assert "underline" in second.evaluate("it => getComputedStyle(it).textDecorationLine")
 
 
-def test_what_stands_behind_a_number(opened: Any, page_file: Path) -> None:
+def test_a_click_on_a_number_shows_its_provenance(opened: Any, page_file: Path) -> None:
     table = opened.locator("table.scores").first
     cell = table.locator("tbody tr", has_text="V-LSTM + EPO").locator("button.cell").nth(2)
     detail = opened.locator("#detail")
@@ -162,7 +162,7 @@ def test_what_stands_behind_a_number(opened: Any, page_file: Path) -> None:
     assert cell.evaluate("it => it === document.activeElement")
 
 
-def test_rows_of_a_chart_come_and_go_with_the_legend(opened: Any) -> None:
+def test_clicks_on_the_legend_toggle_rows_of_a_chart(opened: Any) -> None:
     opened.locator("#tab-learning-curves").click()
     chart = opened.locator("#learning-curves figure")
     line, band, other = (
@@ -190,7 +190,7 @@ def test_how_it_was_made_names_every_run_and_what_was_left_out(opened: Any) -> N
     assert "newest of 2024-05-03" in opened.locator("header").inner_text()
 
 
-def test_a_phone_sees_all_of_it(browser: Any, page_file: Path) -> None:
+def test_the_page_fits_the_screen_of_a_phone(browser: Any, page_file: Path) -> None:
     page = browser.new_page(viewport={"width": 390, "height": 800}, has_touch=True, is_mobile=True)
     page.goto(page_file.as_uri())
     for tab in page.locator('[role="tab"]').all():
@@ -208,7 +208,7 @@ def test_a_phone_sees_all_of_it(browser: Any, page_file: Path) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_stands_out_in_both_schemes(browser: Any, page_file: Path, scheme: str) -> None:
+def test_text_has_enough_contrast_in_both_colour_schemes(browser: Any, page_file: Path, scheme: str) -> None:
     page = browser.new_page(color_scheme=scheme)
     page.goto(page_file.as_uri())
 
@@ -229,7 +229,7 @@ def test_text_stands_out_in_both_schemes(browser: Any, page_file: Path, scheme: 
     page.close()
 
 
-def test_without_scripts_and_on_paper_every_section_is_there(browser: Any, page_file: Path) -> None:
+def test_all_sections_are_shown_without_scripts_and_in_print(browser: Any, page_file: Path) -> None:
     context = browser.new_context(java_script_enabled=False)
     page = context.new_page()
     page.goto(page_file.as_uri())
@@ -244,7 +244,7 @@ def test_without_scripts_and_on_paper_every_section_is_there(browser: Any, page_
     page.close()
 
 
-def test_the_file_needs_nothing_else(page_file: Path) -> None:
+def test_the_page_loads_no_other_file(page_file: Path) -> None:
     text = page_file.read_text()
     linked = re.findall(r'(?:src|href)="([^"]*)"', text)
     assert linked
@@ -264,7 +264,7 @@ def test_sections_without_content_are_left_out(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "figures").exists()
 
 
-def test_pictures_are_made_small_and_stay_the_same_picture(tmp_path: Path) -> None:
+def test_pictures_are_reduced_and_remain_similar(tmp_path: Path) -> None:
     gradient = np.zeros((300, 3000, 3), np.uint8)
     gradient[..., 0] = np.linspace(0, 255, 3000)
     Image.fromarray(gradient).save(tmp_path / "wide.png")

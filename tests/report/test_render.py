@@ -44,7 +44,7 @@ def printed(table: Sheet, width: int = 80) -> str:
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
-def test_comparison_by_hand_in_every_format(tmp_path: Path) -> None:
+def test_a_comparison_is_rendered_in_every_format(tmp_path: Path) -> None:
     pairs(tmp_path)
     (comparisons,) = build_comparisons(build_tables(collect(tmp_path)))
     sheet = comparison_sheet(comparisons)
@@ -86,7 +86,7 @@ def test_the_terminal_shows_a_comparison_in_80_columns(tmp_path: Path) -> None:
         assert expected in words
 
 
-def test_best_settings_say_how_to_train_with_them(tmp_path: Path) -> None:
+def test_best_settings_are_shown_with_their_overrides(tmp_path: Path) -> None:
     for lr, value in ((0.1, 0.4), (0.01, 0.3)):
         make_run(
             tmp_path / str(lr), "V-LSTM", "marginal", scores(value), split="val", experiment="rpi/v_lstm",
@@ -99,7 +99,7 @@ def test_best_settings_say_how_to_train_with_them(tmp_path: Path) -> None:
     assert settings_sheet([]).lines == ()
 
 
-def test_csv_has_what_is_behind_every_number(tmp_path: Path) -> None:
+def test_csv_has_the_provenance_of_every_number(tmp_path: Path) -> None:
     pairs(tmp_path)
     records = list(csv.DictReader(io.StringIO(to_csv(build_tables(collect(tmp_path))))))
     assert len(records) == 2 * 6
@@ -113,13 +113,13 @@ def test_csv_has_what_is_behind_every_number(tmp_path: Path) -> None:
     assert (single["paper"], single["difference"]) == ("", "")
 
 
-def test_markdown_titles_are_no_markup(tmp_path: Path) -> None:
+def test_markdown_titles_are_escaped(tmp_path: Path) -> None:
     make_run(tmp_path, "a|b *c* <u> `d` [e]", "epo", scores(0.1))
     row = to_markdown(build_tables(collect(tmp_path))[0]).splitlines()[4]
     assert row.startswith(r"| a\|b \*c\* &lt;u> \`d\` \[e\] | 1 |")
 
 
-def test_titles_are_no_markup_of_the_terminal(tmp_path: Path) -> None:
+def test_titles_are_escaped_for_the_terminal(tmp_path: Path) -> None:
     make_run(tmp_path, "[red]x[/] [/nothing]", "epo", scores(0.1))
     (table,) = build_tables(collect(tmp_path))
     console = Console(file=io.StringIO(), width=160)

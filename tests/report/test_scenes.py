@@ -92,7 +92,7 @@ def test_vehicles_stand_to_scale_where_they_are(tmp_path: Path, drawn: list[Figu
     assert across[0] == pytest.approx(up[1])
 
 
-def test_the_picture_does_not_depend_on_how_the_recording_lies(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_the_picture_does_not_depend_on_the_frame_of_the_recording(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
     predicted = forecast(scene)
     angle, shift = 2.4, (512.0, -77.0)
@@ -114,7 +114,7 @@ def test_the_picture_does_not_depend_on_how_the_recording_lies(tmp_path: Path, d
             np.testing.assert_allclose(first.get_xydata(), second.get_xydata(), atol=1e-3)
 
 
-def test_oncoming_traffic_is_on_the_same_road(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_oncoming_traffic_does_not_turn_the_picture(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
     scene.history[0, 1, :, 2] = torch.pi
     highway_scene(scene, forecast(scene), tmp_path / "scene.png")
@@ -122,7 +122,7 @@ def test_oncoming_traffic_is_on_the_same_road(tmp_path: Path, drawn: list[Figure
     np.testing.assert_allclose(np.ptp(corners, axis=0), SIZES[2], rtol=1e-5)
 
 
-def test_lanes_of_the_piece_that_is_shown(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_only_lanes_within_the_picture_are_drawn(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
     highway_scene(scene, forecast(scene), tmp_path / "scene.png")
     (axes, *_) = drawn[0].axes
@@ -137,7 +137,7 @@ def test_lanes_of_the_piece_that_is_shown(tmp_path: Path, drawn: list[Figure]) -
     assert not [patch for patch in drawn[1].axes[0].patches if isinstance(patch, PathPatch)]
 
 
-def test_other_modes_give_other_pixels_and_the_same_ones_the_same_bytes(tmp_path: Path) -> None:
+def test_equal_forecasts_give_equal_bytes_and_others_do_not(tmp_path: Path) -> None:
     scene, size = traffic(), mpl.rcParams["font.size"]
     predicted = forecast(scene)
     first, second = (highway_scene(scene, predicted, tmp_path / name) for name in ("a.png", "b.png"))
@@ -193,7 +193,7 @@ def test_unobserved_steps_are_gaps(tmp_path: Path, drawn: list[Figure]) -> None:
     np.testing.assert_allclose(ends, last - centre, atol=1e-4)
 
 
-def test_a_forecast_that_is_not_finite_is_said_to_be(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_a_forecast_that_is_not_finite_is_noted_in_its_panel(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
     predicted = forecast(scene)
     predicted.states[0, 2, 1, 3] = torch.nan
@@ -209,7 +209,7 @@ def test_a_forecast_that_is_not_finite_is_said_to_be(tmp_path: Path, drawn: list
     assert all(np.isfinite(axes.get_xlim() + axes.get_ylim()).all() for axes in drawn[1].axes)
 
 
-def test_a_forecast_that_flies_off_does_not_take_the_picture_with_it(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_a_diverging_forecast_does_not_enlarge_the_picture(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
     predicted = forecast(scene)
     predicted.states[0, 0, 1] *= 1e7
@@ -220,7 +220,7 @@ def test_a_forecast_that_flies_off_does_not_take_the_picture_with_it(tmp_path: P
     assert max(pixels(path).shape) < 3000
 
 
-def test_a_scene_of_which_little_is_known(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_a_scene_without_future_map_and_sizes_is_drawn(tmp_path: Path, drawn: list[Figure]) -> None:
     bare = Scene(traffic().history, DT)
     predicted = JointForecast(forecast(traffic(), modes=1).states, torch.ones(1, 1))
     pixels(highway_scene(bare, predicted, tmp_path / "scene.png"))
@@ -250,7 +250,7 @@ def test_pedestrians_are_discs_in_their_own_frame(tmp_path: Path, drawn: list[Fi
         np.testing.assert_allclose(np.linalg.norm(ring - here, axis=1), 0.25, rtol=1e-5)
 
 
-def test_many_agents_and_modes_still_fit(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_many_agents_and_modes_fit_into_the_picture(tmp_path: Path, drawn: list[Figure]) -> None:
     many = 32
     places = torch.linspace(-300, 300, many)
     track = states(places, torch.full((many,), 25.0), LANE * (torch.arange(many) % 3 - 1))
@@ -268,7 +268,7 @@ def test_many_agents_and_modes_still_fit(tmp_path: Path, drawn: list[Figure]) ->
     assert max(pixels(path).shape) < 3000
 
 
-def test_forecasters_side_by_side(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_a_comparison_has_a_panel_for_each_forecaster(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
     row = forecast(scene)
     constant = JointForecast(row.states[:, :1], torch.ones(1, 1))

@@ -39,7 +39,7 @@ def best(folder: Path) -> list[BestSetting]:
     return best_settings(collect(folder))
 
 
-def test_the_lowest_mean_over_seeds_wins_by_hand(tmp_path: Path) -> None:
+def test_the_lowest_mean_over_seeds_wins(tmp_path: Path) -> None:
     # Means 0.25, 0.20, 0.21: the best single seed (0.10) is not that of the best mean.
     search(tmp_path, {(0.001, 64): [0.10, 0.40], (0.0005, 64): [0.19, 0.21], (0.0005, 128): [0.20, 0.22]})
     search(tmp_path, {(0.001, 64): [0.5, 0.5], (0.001, 128): [0.3, 0.3]}, title="V-LSTM + SC")
@@ -61,7 +61,7 @@ def test_the_test_split_never_chooses(tmp_path: Path) -> None:
         best(tmp_path)
 
 
-def test_test_scores_beside_are_not_looked_at(tmp_path: Path) -> None:
+def test_test_scores_are_ignored(tmp_path: Path) -> None:
     search(tmp_path, {(0.001, 64): [0.1], (0.0005, 64): [0.9]}, split="test")
     search(tmp_path, {(0.001, 64): [0.4], (0.0005, 64): [0.3]})
     (found,) = best(tmp_path)
@@ -103,7 +103,7 @@ def test_experiments_without_a_choice_are_left_out(tmp_path: Path) -> None:
     assert best(tmp_path) == []
 
 
-def test_words_without_an_experiment_name_the_parts(tmp_path: Path) -> None:
+def test_overrides_without_an_experiment_name_the_parts(tmp_path: Path) -> None:
     for number, lr in enumerate((0.1, 0.2)):
         settings = {"solver.steps": 2 + number, "optimizer.lr": lr}
         make_run(tmp_path / str(lr), "own", "epo", scores(number), split="val", settings=settings)
@@ -112,7 +112,7 @@ def test_words_without_an_experiment_name_the_parts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["solver.steps", "forecaster.modes"])
-def test_what_is_varied_to_see_its_effect_is_not_chosen(tmp_path: Path, key: str) -> None:
+def test_settings_varied_for_comparison_are_not_selected(tmp_path: Path, key: str) -> None:
     for value in (1, 2):
         make_run(tmp_path / str(value), "own", "epo", scores(value), split="val", settings={key: value})
     assert best(tmp_path) == []

@@ -20,7 +20,7 @@ from .run_folders import make_run, scores
 numbers = st.integers(0, 10**8).map(lambda number: number / 1e6)  # SciPy's variance of tiny numbers is zero
 
 
-def test_three_pairs_by_hand() -> None:
+def test_three_pairs_equal_hand_computed_values() -> None:
     # Differences -1, -2, -3: mean -2, sample variance (1 + 0 + 1) / 2 = 1, standard error 1 / sqrt(3) = 0.57735.
     # t = -2 / 0.57735 = -3.4641 with 2 degrees of freedom. The distribution function of t with 2 degrees is
     # 1/2 + t / (2 sqrt(2 + t^2)), so p = 1 - 3.4641 / sqrt(2 + 12) = 1 - 0.92582 = 0.07418.
@@ -32,7 +32,7 @@ def test_three_pairs_by_hand() -> None:
     assert (found.low, found.high) == (pytest.approx(-4.48414, abs=1e-5), pytest.approx(0.48414, abs=1e-5))
 
 
-def test_two_pairs_by_hand() -> None:
+def test_two_pairs_equal_hand_computed_values() -> None:
     # Differences 1 and 3: mean 2, sample deviation sqrt(2), standard error 1, t = 2 with 1 degree of freedom, a Cauchy
     # variable: p = 1 - (2 / pi) atan(2), quantile tan(0.475 pi).
     found = compare([2.0, 4.0], [1.0, 1.0])
@@ -41,7 +41,7 @@ def test_two_pairs_by_hand() -> None:
 
 
 @given(st.lists(st.tuples(numbers, numbers), min_size=2, max_size=8))
-def test_as_scipy(pairs: list[tuple[float, float]]) -> None:
+def test_p_values_and_intervals_equal_those_of_scipy(pairs: list[tuple[float, float]]) -> None:
     one, other = (np.array(values) for values in zip(*pairs, strict=True))
     found = compare(list(one), list(other))
     assert found.n == len(pairs)
@@ -57,7 +57,7 @@ def test_as_scipy(pairs: list[tuple[float, float]]) -> None:
 
 
 @given(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=6))
-def test_the_other_way_round_only_signs_change(pairs: list[tuple[float, float]]) -> None:
+def test_swapping_the_rows_changes_only_signs(pairs: list[tuple[float, float]]) -> None:
     one, other = zip(*pairs, strict=True)
     there, back = compare(one, other), compare(other, one)
     assert there.mean is not None
@@ -77,13 +77,11 @@ def test_the_other_way_round_only_signs_change(pairs: list[tuple[float, float]])
         ([1.0, math.inf], [1.0, math.inf], Difference(2, reason="a score is not a finite number")),
     ],
 )
-def test_where_no_test_is_possible_the_reason_is_said(
-    one: list[float], other: list[float], expected: Difference
-) -> None:
+def test_a_missing_test_has_a_reason(one: list[float], other: list[float], expected: Difference) -> None:
     assert compare(one, other) == expected
 
 
-def test_differences_that_vary_by_rounding_do_not_vary() -> None:
+def test_differences_equal_up_to_rounding_count_as_equal() -> None:
     one, other = [0.3, 0.2, 0.7], [0.2, 0.1, 0.6]  # 0.1 each, but for the last bits
     assert len({a - b for a, b in zip(one, other, strict=True)}) > 1
     assert compare(one, other).reason == "equal for every seed"

@@ -39,7 +39,7 @@ def paper_table(folder: Path) -> None:
     make_run(folder / "epo" / "s1", "V-LSTM + EPO", "epo", scores(0.06), seed=1)
 
 
-def test_mean_deviation_and_order_by_hand(tmp_path: Path) -> None:
+def test_mean_deviation_and_order_equal_hand_computed_values(tmp_path: Path) -> None:
     paper_table(tmp_path)
     rows = rows_of(tmp_path)
     assert list(rows) == ["V-LSTM", "V-LSTM + SC", "V-LSTM + EPO", "Constant velocity"]
@@ -61,7 +61,7 @@ def test_rows_that_the_paper_does_not_have_follow_in_the_order_of_the_runs(tmp_p
     assert [row.name for row in table.rows] == ["Later", "V-LSTM + EPO", "Mine", "VIBES", "HiVT", "Zeta", "Alpha"]
 
 
-def test_what_learns_nothing_has_no_deviation_where_its_runs_agree(tmp_path: Path) -> None:
+def test_methods_that_learn_nothing_have_no_deviation_if_runs_agree(tmp_path: Path) -> None:
     for seed in range(3):
         make_run(tmp_path / f"cv{seed}", "Constant velocity", "constant_velocity", scores(0.5, 0.1 * seed), seed=seed)
         make_run(tmp_path / f"m{seed}", "V-LSTM", "marginal", scores(0.5), seed=seed)
@@ -84,14 +84,14 @@ def test_best_and_second_of_the_group_and_the_papers_values(tmp_path: Path) -> N
     assert rows["Constant velocity"].cells["minSADE"] == Cell(0.5, None, None, None)
 
 
-def test_what_prints_the_same_ranks_the_same(tmp_path: Path) -> None:
+def test_equal_printed_values_have_equal_ranks(tmp_path: Path) -> None:
     for name, value in (("a", 0.10001), ("b", 0.10002), ("c", 0.2), ("d", math.nan)):
         make_run(tmp_path / name, name, "epo", scores(value))
     ranks = {name: row.cells["minADE"].rank for name, row in rows_of(tmp_path).items()}
     assert ranks == {"a": 1, "b": 1, "c": 2, "d": None}
 
 
-def test_rows_that_know_more_are_ranked_apart_and_have_no_paper_value(tmp_path: Path) -> None:
+def test_rows_with_given_goals_are_ranked_separately_without_paper_values(tmp_path: Path) -> None:
     paper_table(tmp_path)
     make_run(tmp_path / "g1", "V-LSTM + SC, goal known", "scene_consistent", scores(0.03), goal="all")
     make_run(tmp_path / "g2", "V-LSTM + EPO, goal known", "epo", scores(0.02), goal="all")
@@ -143,7 +143,7 @@ def test_splits_are_tables_apart(tmp_path: Path) -> None:
         ({"settings": {"callbacks.patience": 5}}, r"callbacks\.patience \(5: V-LSTM \+ EPO; null: V-LSTM\)"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(tmp_path: Path, differing: dict[str, Any], message: str) -> None:
+def test_runs_that_are_not_comparable_are_refused(tmp_path: Path, differing: dict[str, Any], message: str) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3))
     make_run(tmp_path / "b", "V-LSTM + EPO", "epo", scores(0.1), **differing)
     with pytest.raises(ConfigError, match=message) as refused:
@@ -152,7 +152,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, differing: dict[str,
     assert str(tmp_path / "b") in str(refused.value)
 
 
-def test_what_tables_compare_may_differ(tmp_path: Path) -> None:
+def test_parts_that_tables_compare_may_differ(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3), settings={"optimizer.lr": 0.01})
     differing = {"solver.steps": 8, "backbone.width": 64, "trainer.threads": 4, "data.root": "/elsewhere"}
     run = make_run(tmp_path / "b", "VIBES + EPO", "epo", scores(0.1), backbone="vibes", goal="all", settings=differing)
@@ -183,14 +183,14 @@ def test_constant_velocity_has_no_budget_but_the_same_test_data(tmp_path: Path) 
         rows_of(tmp_path)
 
 
-def test_a_run_counts_once(tmp_path: Path) -> None:
+def test_the_same_run_twice_is_refused(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3), seed=4)
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     with pytest.raises(ConfigError, match=r"'V-LSTM' has seed 4 twice, .*a and .*b are the same run"):
         build_tables(collect(tmp_path))
 
 
-def test_rows_of_one_title_are_told_apart_by_what_differs(tmp_path: Path) -> None:
+def test_rows_of_one_title_are_distinguished_by_their_settings(tmp_path: Path) -> None:
     for steps in (1, 12, 2):
         for seed in (0, 1):
             options: dict[str, Any] = {"seed": seed, "settings": {"solver.steps": steps}}
@@ -227,7 +227,7 @@ def test_the_figure_over_steps_has_the_papers_validation_values(tmp_path: Path) 
     assert (five["minSADE"].paper, five["minSADE"].difference) == (None, None)
 
 
-def test_runs_of_one_row_have_the_same_scores(tmp_path: Path) -> None:
+def test_runs_of_one_row_must_have_the_same_metrics(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3) | {"minXYZ": 1.0})
     make_run(tmp_path / "b", "V-LSTM", "marginal", scores(0.3), seed=1)
     with pytest.raises(ConfigError, match=r"a was scored by minXYZ and .*b was not: epo evaluate run=.*b split=test"):
@@ -236,7 +236,7 @@ def test_runs_of_one_row_have_the_same_scores(tmp_path: Path) -> None:
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.floats(0, 1e3), min_size=1, max_size=5))
-def test_means_and_deviations_as_numpy(tmp_path: Path, values: list[float]) -> None:
+def test_means_and_deviations_equal_those_of_numpy(tmp_path: Path, values: list[float]) -> None:
     folder = tmp_path / "runs"
     shutil.rmtree(folder, ignore_errors=True)
     for seed, value in enumerate(values):
@@ -264,7 +264,7 @@ def test_every_number_has_its_command_commit_data_and_identity(tmp_path: Path) -
     assert found.row == row_identity(run.config(), "t")
 
 
-def test_a_run_stands_in_the_table_of_each_split_that_it_was_scored_on(tmp_path: Path) -> None:
+def test_a_run_is_in_the_table_of_every_split_with_scores(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3))
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.2), split="val")
     make_run(tmp_path / "b", "V-LSTM + SC", "scene_consistent", scores(0.1), split="val")
@@ -276,7 +276,7 @@ def test_a_run_stands_in_the_table_of_each_split_that_it_was_scored_on(tmp_path:
     assert len(distinct([*tables, *tables])) == 3
 
 
-def test_a_report_may_be_on_chosen_runs(tmp_path: Path) -> None:
+def test_a_report_may_contain_chosen_runs_only(tmp_path: Path) -> None:
     runs = [make_run(tmp_path / name, name, "epo", scores(0.1)) for name in ("a", "b", "c")]
     waiting = RunFolder(tmp_path / "waiting")
     begun = make_run(tmp_path / "begun", "begun", "epo", None)
@@ -291,7 +291,7 @@ def test_a_report_may_be_on_chosen_runs(tmp_path: Path) -> None:
         collect([waiting, begun])
 
 
-def test_collect_says_what_is_missing_and_what_to_run(tmp_path: Path) -> None:
+def test_collect_names_missing_scores_and_the_command_for_them(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no folder .*nowhere.*epo train"):
         collect(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match=r"no run in or below .*epo train"):
@@ -339,7 +339,7 @@ def test_damaged_files_are_named(tmp_path: Path, file: str, content: str | bytes
         assert re.search(message, str(refused.value), re.DOTALL)
 
 
-def test_a_run_that_was_killed_before_it_began_is_no_damage(tmp_path: Path) -> None:
+def test_a_run_killed_before_its_start_is_not_reported_as_damaged(tmp_path: Path) -> None:
     make_run(tmp_path / "b", "V-LSTM + SC", "scene_consistent", scores(0.3))
     (make_run(tmp_path / "a", "V-LSTM", "marginal", None).path / "run.json").unlink()
     assert [run.path.name for run in collect(tmp_path)] == ["b"]

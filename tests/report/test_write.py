@@ -35,7 +35,7 @@ def report(runs: Path, out: Path, **options: object) -> tuple[str, str]:
     return markdown, console.file.getvalue()  # type: ignore[attr-defined]
 
 
-def test_markdown_by_hand(tmp_path: Path) -> None:
+def test_markdown_equals_a_hand_written_table(tmp_path: Path) -> None:
     three_rows(tmp_path / "runs")
     markdown, _ = report(tmp_path / "runs", tmp_path / "out", preface="A reduced budget.")
     assert (tmp_path / "out" / "results.md").read_text() == markdown
@@ -99,7 +99,7 @@ def test_figures_are_linked_from_the_report(tmp_path: Path) -> None:
     assert "![joint](figures/joint.png)" in markdown
 
 
-def test_the_legend_and_captions_speak_of_what_is_there(tmp_path: Path) -> None:
+def test_the_legend_and_captions_explain_only_shown_content(tmp_path: Path) -> None:
     three_rows(tmp_path / "ours")
     make_run(tmp_path / "other" / "m", "V-LSTM", "marginal", scores(0.3), data="highway_sim")
     whole = report(tmp_path / "ours", tmp_path / "out")[0], (tmp_path / "out" / "results.tex").read_text()
@@ -136,7 +136,7 @@ def test_the_terminal_ends_with_what_is_left_out(tmp_path: Path) -> None:
         assert printed.splitlines()[-1] == f"{words} (see How this was made in results.md)"
 
 
-def test_latex_and_comparisons_lie_beside(tmp_path: Path) -> None:
+def test_latex_and_comparisons_are_written_to_files(tmp_path: Path) -> None:
     rows_with_seeds(tmp_path / "runs")
     report(tmp_path / "runs", tmp_path / "out")
     latex = (tmp_path / "out" / "results.tex").read_text()
@@ -145,7 +145,7 @@ def test_latex_and_comparisons_lie_beside(tmp_path: Path) -> None:
     assert {(line["method"], line["other"], line["n"]) for line in compared} == {("V-LSTM + EPO", "V-LSTM + SC", "3")}
 
 
-def test_a_search_ends_in_its_best_setting_or_says_why_not(tmp_path: Path) -> None:
+def test_a_search_shows_its_best_setting_or_the_reason_for_none(tmp_path: Path) -> None:
     for lr, value in ((0.001, 0.05), (0.0003, 0.04)):
         for seed in range(2):
             options: dict[str, Any] = {"seed": seed, "split": "val", "settings": {"optimizer.lr": lr}}
@@ -158,12 +158,12 @@ def test_a_search_ends_in_its_best_setting_or_says_why_not(tmp_path: Path) -> No
     assert "No setting was chosen: no setting of 'V-LSTM + EPO' has finite scores" in markdown
 
 
-def test_an_s_curve_is_no_search(tmp_path: Path) -> None:
+def test_a_sweep_over_steps_has_no_best_setting(tmp_path: Path) -> None:
     over_steps(tmp_path / "runs")
     assert "Best settings" not in report(tmp_path / "runs", tmp_path / "out")[0]
 
 
-def test_runs_that_were_only_timed_are_a_report(tmp_path: Path) -> None:
+def test_runs_with_times_alone_can_be_reported(tmp_path: Path) -> None:
     over_runtime(tmp_path / "runs")
     markdown, _ = report(tmp_path / "runs", tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["figures", "index.html", "results.md"]
@@ -172,7 +172,7 @@ def test_runs_that_were_only_timed_are_a_report(tmp_path: Path) -> None:
     assert f"- `{folder}`: `epo train experiment=None seed=0`" in markdown
 
 
-def test_runs_that_are_left_out_and_changed_code_are_said(tmp_path: Path) -> None:
+def test_left_out_runs_and_changed_code_are_reported(tmp_path: Path) -> None:
     three_rows(tmp_path / "runs")
     assert "Left out" not in report(tmp_path / "runs", tmp_path / "out")[0]
     late = make_run(tmp_path / "runs" / "late", "Late", "epo", None)
@@ -187,7 +187,7 @@ def test_runs_that_are_left_out_and_changed_code_are_said(tmp_path: Path) -> Non
     assert "| V-LSTM | rpi, test split | reduced | 0 | 0123456789+ | abc | 1234 | 1 |" in markdown
 
 
-def test_nothing_is_overwritten_by_a_report_that_fails(tmp_path: Path) -> None:
+def test_a_failed_report_overwrites_nothing(tmp_path: Path) -> None:
     three_rows(tmp_path / "runs")
     before, _ = report(tmp_path / "runs", tmp_path / "out")
     make_run(tmp_path / "runs" / "odd", "Odd", "epo", scores(0.1), budget="paper")
@@ -199,7 +199,7 @@ def test_nothing_is_overwritten_by_a_report_that_fails(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
-def test_a_full_disk_leaves_no_half_of_a_file(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_no_partial_file(tmp_path: Path) -> None:
     rows_with_seeds(tmp_path / "runs")
     report(tmp_path / "runs", tmp_path / "before")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -56,7 +56,7 @@ class BackboneSuite:
         padded = backbone(pad(scene, agents=3, steps=4, filling=filling, lanes=2, vectors=3))
         torch.testing.assert_close(padded[:, :2], backbone(scene), rtol=0, atol=1e-5)
 
-    def test_padding_leaves_gradients_as_they_are(self, backbone):
+    def test_padding_does_not_change_gradients(self, backbone):
         scene = random_scene(3, 2, lanes=5)
         gradients = []
         for given in (scene, pad(scene, agents=3, steps=4, lanes=2, vectors=3)):
@@ -71,7 +71,7 @@ class BackboneSuite:
         for index in range(4):
             torch.testing.assert_close(backbone(scene[index])[0], together[index], rtol=0, atol=1e-5)
 
-    def test_a_scene_without_any_lane(self, backbone):
+    def test_a_scene_without_lanes_has_finite_features(self, backbone):
         scene = random_scene(3, 2, lanes=5)
         scene.lane_mask[1] = False
         scene.lanes[1] = torch.nan
@@ -81,7 +81,7 @@ class BackboneSuite:
         assert all(p.grad.isfinite().all() for p in backbone.parameters())
         torch.testing.assert_close(z[1], backbone(scene[1])[0], rtol=0, atol=1e-5)
 
-    def test_the_order_of_agents_lanes_and_vectors(self, backbone):
+    def test_features_are_equivariant_to_agents_and_invariant_to_lanes_and_vectors(self, backbone):
         scene = random_scene(3, 4, lanes=5)
         z = backbone(scene)
         torch.testing.assert_close(backbone(reordered(scene, [2, 0, 3, 1])), z[:, [2, 0, 3, 1]], rtol=0, atol=1e-5)

@@ -31,11 +31,11 @@ class DynamicsSuite:
         """States x_0 [B, 1, N, 4] and controls [B, M, N, K, 2]."""
         return torch.randn(2, 1, 3, 4, dtype=torch.float64), torch.randn(2, 2, 3, 5, 2, dtype=torch.float64)
 
-    def test_shape(self, dynamics):
+    def test_rollouts_have_the_declared_shape(self, dynamics):
         initial, controls = self.motion()
         assert dynamics.rollout(initial, controls, DT).shape == (2, 2, 3, 5, 4)
 
-    def test_a_control_changes_later_states_alone(self, dynamics):
+    def test_a_control_changes_only_later_states(self, dynamics):
         initial, controls = self.motion()
         before = dynamics.rollout(initial, controls, DT)
         controls[..., 3, :] += 1.0
@@ -43,7 +43,7 @@ class DynamicsSuite:
         assert torch.equal(after[..., :3, :], before[..., :3, :])
         assert (after[..., 3:, :] != before[..., 3:, :]).any(-1).all()
 
-    def test_agents_modes_and_scenes_do_not_matter_to_each_other(self, dynamics):
+    def test_agents_modes_and_scenes_are_independent(self, dynamics):
         initial, controls = self.motion()
         states = dynamics.rollout(initial, controls, DT)
         for scene, mode, agent in torch.cartesian_prod(*map(torch.arange, controls.shape[:3])).tolist():

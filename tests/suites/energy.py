@@ -48,7 +48,7 @@ class EnergySuite:
         assert total.isfinite().all()
         torch.testing.assert_close(total, sum(term.sum(-1) for term in terms.values()))
 
-    def test_what_is_not_needed_may_be_missing(self, energy):
+    def test_optional_inputs_may_be_missing(self, energy):
         scene, game = game_of(energy)
         without = {"references": None, "reference_mask": None} if "reference" not in energy.needs else {}
         without |= {} if "reference_speed" in energy.needs else {"reference_speed": None}
@@ -58,7 +58,7 @@ class EnergySuite:
         expected = energy(scene, game, game.initial_controls)
         assert torch.equal(energy(bare, game, game.initial_controls), expected)
 
-    def test_what_is_needed_and_missing_is_named(self, energy):
+    def test_a_missing_required_input_is_named(self, energy):
         scene, game = game_of(energy)
         for name in energy.needs:
             lacking, holder = (game, "game") if name in ("goals", "reference", "context", "order") else (scene, "scene")
@@ -66,7 +66,7 @@ class EnergySuite:
             with pytest.raises(ValueError, match=name):
                 energy(*((scene, lacking) if holder == "game" else (lacking, game)), game.initial_controls)
 
-    def test_it_is_the_potential_of_a_game(self, energy):
+    def test_the_energy_is_the_potential_of_a_game(self, energy):
         """A change of one agent's strategy changes the energy by as much as that agent's objective (Theorem 1)."""
         scene, game = game_of(energy)
         controls = game.initial_controls
@@ -77,7 +77,7 @@ class EnergySuite:
             change = energy.objectives(scene, game, other)[:, :, agent] - objective[:, :, agent]
             torch.testing.assert_close(energy(scene, game, other) - before, change, rtol=1e-9, atol=1e-9)
 
-    def test_samples_and_modes_do_not_matter_to_each_other(self, energy):
+    def test_samples_and_modes_are_independent(self, energy):
         scene, game = game_of(energy)
         together = energy(scene, game, game.initial_controls)
         for index in range(3):
@@ -88,7 +88,7 @@ class EnergySuite:
         torch.testing.assert_close(flipped, together, rtol=1e-12, atol=1e-12)
 
     @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
-    def test_padding_does_not_matter(self, energy, filling):
+    def test_padding_does_not_change_the_energy(self, energy, filling):
         scene, game = game_of(energy)
         wide_scene, wide = padded(scene, game, filling)
         controls, wide_controls = (g.initial_controls.clone().requires_grad_() for g in (game, wide))
@@ -100,7 +100,7 @@ class EnergySuite:
             torch.testing.assert_close(gradient[:, :, :3], expected, rtol=1e-10, atol=1e-10)
             assert (gradient[:, :, 3:] == 0).all()
 
-    def test_a_poisoned_sample_stays_alone(self, energy):
+    def test_a_poisoned_sample_leaves_the_others_unchanged(self, energy):
         scene, game = game_of(energy)
         controls = game.initial_controls.clone().requires_grad_()
         healthy, spoiled = energy(scene, game, controls), energy(poisoned(scene), game, controls)
@@ -110,7 +110,7 @@ class EnergySuite:
             (gradient,) = torch.autograd.grad(spoiled.sum(), controls)
             assert torch.equal(gradient[[0, 2]], expected[[0, 2]])
 
-    def test_the_order_of_agents_does_not_matter(self, energy):
+    def test_the_energy_is_equivariant_to_the_order_of_agents(self, energy):
         scene, game = game_of(energy)
         other_scene, other = in_order(energy, scene, game, [2, 0, 1])
         expected = energy(scene, game, game.initial_controls)
@@ -160,7 +160,7 @@ class FeatureSuite(EnergySuite):
         own, pair = ([self.own] if self.own else []), ([self.pair] if self.pair else [])
         return build_energy({"name": "features", "own": own, "pair": pair, "bounds": self.bounds})
 
-    def test_the_weight_enters_squared(self, energy):
+    def test_terms_are_quadratic_in_their_weights(self, energy):
         scene, game = game_of(energy)
         value = energy(scene, game, game.initial_controls)
         assert (value > 0).any(), "the feature is active in some of the random games"
@@ -171,7 +171,7 @@ class FeatureSuite(EnergySuite):
         heavy = dataclasses.replace(game, **doubled)
         torch.testing.assert_close(energy(scene, heavy, game.initial_controls), 4.0 * value)
 
-    def test_the_solver_knows_its_gradient(self, energy):
+    def test_the_gradient_of_the_solver_equals_autograd(self, energy):
         """A step with a damping far above the curvature goes against the gradient, by 1 / damping of it."""
         scene, game = game_of(energy)
         controls = game.initial_controls.clone().requires_grad_()

@@ -193,7 +193,7 @@ class HighwaySuite(ForecasterSuite):
     def padded(self, scene: Scene, **details: Any) -> Scene:
         return pad(scene, agents=2, **details, lanes=2, vectors=3, candidates=4)
 
-    def test_the_order_of_agents(self):
+    def test_forecasts_are_equivariant_to_the_order_of_agents(self):
         forecaster, scene, order = self.forecaster(), self.scene(3), [2, 0, 3, 1]
         forecast, other = forecaster.predict(scene), forecaster.predict(reordered(scene, order))
         self.assert_same(other.states, forecast.states[:, :, order])

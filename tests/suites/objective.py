@@ -70,7 +70,7 @@ class ObjectiveSuite:
         """The terms that count; others are for the log alone, and need not be means over scenes."""
         return {name: value for name, (weight, value) in terms.items() if weight > 0}
 
-    def test_declarations_and_names(self, objective, energy):
+    def test_terms_have_the_declared_names(self, objective, energy):
         assert objective.needs <= {PATH, STEPS, STATIONARY, SAMPLES, TABLES}
         assert objective.of_energy <= {GRADIENT, RESIDUALS, FEATURES}
         assert set(objective.weights) == set(objective.terms)
@@ -95,21 +95,21 @@ class ObjectiveSuite:
             torch.testing.assert_close(value, torch.stack([terms[name] for terms in alone]).mean(), msg=name)
 
     @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
-    def test_padding_does_not_matter(self, objective, energy, filling):
+    def test_padding_does_not_change_the_loss(self, objective, energy, filling):
         scene, game = self.game(energy)
         expected = self.weighted(self.terms(objective, energy, scene, game))
         wide = self.weighted(self.terms(objective, energy, *padded(scene, game, filling)))
         for name, value in expected.items():
             torch.testing.assert_close(wide[name], value, msg=name)
 
-    def test_the_order_of_agents_does_not_matter(self, objective, energy):
+    def test_the_loss_is_invariant_to_the_order_of_agents(self, objective, energy):
         scene, game = self.game(energy)
         expected = self.weighted(self.terms(objective, energy, scene, game))
         other = self.weighted(self.terms(objective, energy, *in_order(energy, scene, game, [2, 0, 1])))
         for name, value in expected.items():
             torch.testing.assert_close(other[name], value, rtol=1e-6, atol=1e-8, msg=name)
 
-    def test_what_was_not_observed_does_not_matter(self, objective, energy):
+    def test_unobserved_steps_do_not_change_the_loss(self, objective, energy):
         """Neither its values nor, where nothing of a scene was observed, its gradient."""
         scene, game = self.game(energy)
         scene.future_mask[1] = False

@@ -62,14 +62,14 @@ class SolverSuite:
             torch.testing.assert_close(given, expected, rtol=self.tolerance, atol=self.tolerance, msg=name)
         assert torch.equal(one.status, other.status)
 
-    def test_declarations(self):
+    def test_declared_properties_have_their_types(self):
         minimiser = build("solver", self.config)
         assert minimiser.needs <= {GRADIENT, RESIDUALS, FEATURES}
         assert minimiser.provides <= {PATH, STEPS, STATIONARY, SAMPLES, TABLES}
         assert minimiser.provides
         assert (STEPS in minimiser.provides) == isinstance(minimiser, Stepwise)
 
-    def test_a_solution_is_consistent_and_lower_than_its_start(self, energy):
+    def test_a_solution_is_consistent_and_has_less_energy_than_its_start(self, energy):
         scene, game = self.game(energy)
         solution = self.minimiser()(energy, scene, game)
         assert solution.controls.shape == (3, MODES, 3, HORIZON, 2)
@@ -86,7 +86,7 @@ class SolverSuite:
             torch.testing.assert_close(solution.initial_energy, energy(scene, game, game.initial_controls))
             assert (solution.energy < solution.initial_energy).all()
 
-    def test_the_gradient_vanishes_where_it_converges(self, energy):
+    def test_the_gradient_vanishes_at_converged_solutions(self, energy):
         if STATIONARY not in self.provides:
             pytest.skip("this minimiser does not lead to minima")
         scene, game = self.game(energy)
@@ -100,14 +100,14 @@ class SolverSuite:
         torch.testing.assert_close(solution.gradient_norm, norm(solution.controls), rtol=1e-4, atol=1e-6)
         assert (norm(solution.controls) < self.remaining * norm(game.initial_controls)).all()
 
-    def test_samples_do_not_matter_to_each_other(self, energy):
+    def test_samples_are_independent(self, energy):
         scene, game = self.game(energy)
         together = self.minimiser()(energy, scene, game)
         for index in range(3):
             self.assert_same(self.minimiser()(energy, scene[index], game[index]), together[index])
 
     @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
-    def test_padding_does_not_matter(self, energy, filling):
+    def test_padding_does_not_change_solutions(self, energy, filling):
         scene, game = self.game(energy)
         alone, wide = self.minimiser()(energy, scene, game), self.minimiser()(energy, *padded(scene, game, filling))
         torch.testing.assert_close(wide.controls[:, :, :3], alone.controls, rtol=self.tolerance, atol=self.tolerance)
@@ -115,13 +115,13 @@ class SolverSuite:
         assert wide.controls.isfinite().all()
         assert torch.equal(wide.status, alone.status)
 
-    def test_a_poisoned_sample_stays_alone(self, energy):
+    def test_a_poisoned_sample_leaves_the_others_unchanged(self, energy):
         scene, game = self.game(energy)
         healthy, spoiled = self.minimiser()(energy, scene, game), self.minimiser()(energy, poisoned(scene), game)
         assert torch.equal(spoiled.controls[[0, 2]], healthy.controls[[0, 2]])
         assert torch.equal(spoiled.status[[0, 2]], healthy.status[[0, 2]])
 
-    def test_the_order_of_agents_does_not_matter(self, energy):
+    def test_solutions_are_equivariant_to_the_order_of_agents(self, energy):
         scene, game = self.game(energy)
         order = [2, 0, 1]
         expected = self.minimiser()(energy, scene, game)

@@ -74,7 +74,7 @@ def test_states_are_interpolated_on_a_common_clock(seed, times):
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=20)
-def test_smoothing_is_the_filter_of_savitzky_and_golay(seed):
+def test_smoothing_equals_a_savitzky_golay_filter(seed):
     tracks = walk(seed, 10.0, [40, 61, 83, 12])
     clock, dropped = stretches(tracks, 0.1, 1.0, shortest=1)  # windows of eleven rows; every row is a step
     kept = [rows for rows in pieces(tracks) if len(rows) >= 11]
@@ -94,7 +94,7 @@ def test_a_clock_faster_than_the_recording_is_refused():
         stretches(traffic(curve(None), FOUR), 0.02, None, 1)
 
 
-def test_a_recording_without_traffic_gives_nothing():
+def test_a_recording_without_traffic_has_no_tracks():
     tracks = traffic(curve(None), FOUR)
     empty = {f.name: getattr(tracks, f.name)[:0] for f in dataclasses.fields(tracks) if f.name != "rate"}
     clock, _ = stretches(TrackTable(rate=10.0, **empty), 0.2, 1.0, 1)

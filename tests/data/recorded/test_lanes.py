@@ -54,7 +54,7 @@ def test_agents_are_found_on_their_lanes_wherever_the_road_lies(radius, turn, se
     np.testing.assert_allclose(found.offset, offset, atol=0.1)  # chords of the arc
 
 
-def test_who_heads_against_a_lane_or_is_beside_the_road_is_on_none():
+def test_agents_heading_against_a_lane_or_beside_the_road_are_on_no_lane():
     lanes = road(curve(None))
     position = np.array([[50.0, 0.0], [50.0, -2.5], [50.0, -3.5], [50.0, 0.0]])
     assert lanes.locate(position, np.array([np.pi, 0.0, 0.0, 0.3])).lane.tolist() == [-1, 0, -1, 0]
@@ -111,7 +111,7 @@ def crossing(angle: float):
 
 
 @pytest.mark.parametrize("degrees", [20, 45, 70])
-def test_who_drives_over_or_under_a_road_is_not_on_it(degrees):
+def test_agents_on_bridges_are_not_on_the_road_below(degrees):
     lanes = crossing(np.radians(degrees))
     along = np.linspace(-20, 20, 81)
     position = np.stack([along, np.full(81, 0.5)], 1)  # half a metre left of the middle, right along the lane
@@ -127,7 +127,7 @@ def test_changes_are_seen_on_lanelets_of_any_length(length):
     assert np.flatnonzero(lane_changes(np.zeros(50, int), found, lanes)).tolist() == [25]
 
 
-def test_routes_of_a_loop_go_on_where_the_agent_is():
+def test_routes_on_a_loop_start_at_the_agent():
     """A lane that leads into a ring and over its own beginning."""
     angles = np.linspace(-np.pi / 2, np.pi, 60)
     ring = np.stack([60 + 40 * np.cos(angles), 40 + 40 * np.sin(angles)], 1)
@@ -162,7 +162,7 @@ def test_routes_of_a_loop_go_on_where_the_agent_is():
     assert (own[..., 0] > x[:, None]).all()
 
 
-def test_graphs_that_cannot_be_maps_are_refused():
+def test_invalid_lane_graphs_are_refused():
     lanes = road(curve(None))
     for change, message in (
         ({"successors": [(99,)] * len(lanes)}, "names a successor that does not exist"),

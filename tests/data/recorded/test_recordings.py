@@ -89,7 +89,7 @@ def test_splits_are_drawn_by_group_where_none_is_named(folder):
     assert len(other) > 1
 
 
-def test_what_was_extracted_before_an_error_is_not_extracted_again(folder, tmp_path):
+def test_extraction_continues_after_an_error(folder, tmp_path):
     one = data(folder).generate(workers=1, progress=False)
     again = data(folder, root=str(tmp_path / "again"))
     (folder / "stop").touch()
@@ -105,7 +105,7 @@ def test_what_was_extracted_before_an_error_is_not_extracted_again(folder, tmp_p
         assert (one / f"{part}.safetensors").read_bytes() == (two / f"{part}.safetensors").read_bytes()
 
 
-def test_the_set_depends_on_what_is_in_the_files(folder):
+def test_the_digest_depends_on_the_contents_of_the_files(folder):
     before = data(folder).digest
     assert data(folder).digest == before
     assert data(folder, frame="fixed").digest != before
@@ -114,7 +114,7 @@ def test_the_set_depends_on_what_is_in_the_files(folder):
     assert data(folder).digest != before
 
 
-def test_fingerprints_see_every_byte_of_small_files_and_large_changes_of_large_ones(tmp_path):
+def test_fingerprints_cover_small_files_and_samples_of_large_ones(tmp_path):
     file = tmp_path / "tracks.csv"
     for size in (1, 1000, 900_000):
         content = bytearray(np.random.default_rng(0).bytes(size))
@@ -131,7 +131,7 @@ def test_fingerprints_see_every_byte_of_small_files_and_large_changes_of_large_o
     assert _fingerprint(file) != before
 
 
-def test_a_split_without_scenes_is_an_error_that_says_where_they_went(folder):
+def test_a_split_without_scenes_is_an_error_with_the_reasons(folder):
     for file in folder.glob("a-*.road"):
         file.write_text("empty")
     with pytest.raises(ConfigError, match=r"'test' of roads has no scene .*too few agents around: \d+"):
@@ -148,7 +148,7 @@ def test_recordings_without_scenes_keep_their_place(folder):
     assert (test[torch.arange(len(test))].frame[:, :2].abs() > 0).all()
 
 
-def test_missing_data_and_misspelt_keys_say_what_to_do(folder, tmp_path):
+def test_missing_data_and_misspelt_keys_name_the_remedy(folder, tmp_path):
     for changes, message in (
         ({"windows": {"dt": 0.2, "horzion": 20}}, "did you mean 'horizon'"),
         ({"windows": {"agents": 2.5}}, "data.windows.agents must be a whole number"),
@@ -174,7 +174,7 @@ def test_missing_data_and_misspelt_keys_say_what_to_do(folder, tmp_path):
         data(folder).setup("fit")
 
 
-def test_of_several_at_once_one_makes_the_set_and_the_others_wait(folder):
+def test_one_of_several_processes_extracts_and_the_others_wait(folder):
     READ.clear()
     with ThreadPoolExecutor(3) as pool:
         made = list(pool.map(lambda _: data(folder).generate(workers=1, progress=False), range(3)))
@@ -198,7 +198,7 @@ def test_training_needs_the_extracted_data_set_but_not_the_recordings(folder):
         data(folder, root=str(folder.parent / "elsewhere")).setup("fit")
 
 
-def test_of_several_extracted_data_sets_one_is_chosen_by_its_folder(folder):
+def test_one_of_several_extracted_data_sets_is_chosen_by_its_folder(folder):
     one = data(folder)
     one.generate(workers=1, progress=False)
     (folder / "a-0.road").unlink()

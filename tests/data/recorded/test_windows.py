@@ -91,7 +91,7 @@ def obvious(of, config: WindowConfig) -> set[tuple[int, frozenset[int]]]:
     ),
 )
 @settings(max_examples=25, deadline=None)
-def test_windows_are_those_that_a_loop_finds(seed, config):
+def test_windows_equal_those_of_a_plain_loop(seed, config):
     of = recording(vehicles=crowd(seed))
     scenes, counts = extract(of, config)
     expected = obvious(of, config)
@@ -110,7 +110,7 @@ def test_windows_are_those_that_a_loop_finds(seed, config):
     assert counts["windows"] == counts["scenes"] + dropped
 
 
-def test_a_scene_holds_what_the_recording_says():
+def test_a_scene_equals_the_states_of_the_recording():
     of = recording(curve(700.0, 0.4, (4000.0, -900.0)))
     scene, data = scenes_of(of)
     tracks = of.tracks
@@ -208,7 +208,7 @@ def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
         torch.testing.assert_close(scene.current[:, 0, 2], torch.zeros(len(scene.history)), rtol=0, atol=1e-5)
 
 
-def test_tracks_may_begin_and_end_when_they_like():
+def test_tracks_may_begin_and_end_at_any_time():
     of = recording(seconds=20.0, vehicles=[*FOUR, (12, 90.0, 2, 24.0, None)])
     lives = np.array([500, 500, 400, 350, 150])[of.tracks.agent]  # the last one leaves long before the others
     kept = of.tracks.frame <= lives
@@ -276,7 +276,7 @@ def test_a_vehicle_on_no_lane_is_counted_and_left_out():
 @pytest.mark.parametrize("smoothing", [None, 1.0])
 @given(st.integers(0, 10_000))
 @settings(max_examples=10, deadline=None)
-def test_what_a_network_sees_does_not_know_the_future(smoothing, seed):
+def test_inputs_do_not_depend_on_the_future(smoothing, seed):
     config = WindowConfig(radius=None, lane_change=False, smoothing=smoothing)
     of, frame = recording(vehicles=crowd(seed, 6)), 100
     random = np.random.default_rng(seed)
@@ -333,6 +333,6 @@ def test_joined_scenes_are_the_same_scenes():
         ("dt", 0.0, "data.windows.dt must be positive"),
     ],
 )
-def test_recipes_that_cannot_work_are_refused(key, value, message):
+def test_invalid_window_settings_are_refused(key, value, message):
     with pytest.raises(ConfigError, match=message):
         WindowConfig(**{key: value})

@@ -45,7 +45,7 @@ def test_a_configuration_is_plain_and_names_everything_that_matters():
         ({"minutes": float("nan")}, "minutes is nan"),
     ],
 )
-def test_what_cannot_be_simulated_is_refused(wrong: dict[str, Any], message: str):
+def test_invalid_simulation_settings_are_refused(wrong: dict[str, Any], message: str):
     with pytest.raises(ConfigError, match=message):
         config(**wrong)
 
@@ -81,7 +81,7 @@ def test_it_waits_for_another_process_that_makes_the_folder(tmp_path: Path, caps
         assert making.result() == folder
 
 
-def test_a_folder_that_is_something_else_is_left_alone(tmp_path: Path):
+def test_other_folders_are_not_overwritten(tmp_path: Path):
     folder = finished(tmp_path / "there", SMALL)
     with pytest.raises(cache.CacheError, match="another configuration"):
         make_recordings(folder, config(seed=4))
@@ -93,14 +93,14 @@ def test_a_folder_that_is_something_else_is_left_alone(tmp_path: Path):
         make_recordings(folder, SMALL)
 
 
-def test_too_many_accidents_are_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_recordings_with_many_implausible_vehicles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
     monkeypatch.setattr(generate, "MOST_DROPPED", -1.0)
     with pytest.raises(ConfigError, match=r"recording 0 on layout diverge: 0 of \d+ vehicles move implausibly"):
         generate.record(tmp_path, "", 0, LAYOUTS[2], 3, 2.0)
 
 
-def test_traffic_in_which_nobody_changes_lane_is_no_recording(tmp_path: Path):
+def test_recordings_without_lane_changes_are_refused(tmp_path: Path):
     pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
     with pytest.raises(ConfigError, match=r"no vehicle changes lane in 0\.04 s: use more minutes"):
         generate.record(tmp_path, "", 0, LAYOUTS[2], 3, 0.04)
@@ -113,7 +113,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_set_is_whole(made: Path):
+def test_a_generated_set_has_all_files(made: Path):
     manifest = generate.verify(made, SMALL)
     files = contents(made)
     assert set(manifest["files"]) == set(files) - {cache.MANIFEST}
@@ -128,7 +128,7 @@ def test_a_set_is_whole(made: Path):
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(made: Path, tmp_path: Path):
+def test_a_killed_generation_continues_to_the_same_bytes(made: Path, tmp_path: Path):
     """One worker, killed after the first recording: the second run keeps it, and equals the run of two workers."""
     folder = tmp_path / "set"
     program = (

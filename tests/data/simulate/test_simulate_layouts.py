@@ -21,7 +21,7 @@ def test_layouts_are_at_least_seven_and_addressed_by_their_place():
     assert len({layout.name for layout in LAYOUTS}) == len(LAYOUTS)
 
 
-def test_layouts_differ_in_what_they_are_for():
+def test_layouts_differ_in_geometry_and_purpose():
     ons = [sum(np.isfinite(strip.join) for strip in layout.lanes) for layout in LAYOUTS]
     offs = [sum(np.isfinite(strip.leave) for strip in layout.lanes) for layout in LAYOUTS]
     assert {(1, 0), (0, 1), (1, 1), (2, 0)} <= set(zip(ons, offs, strict=True))

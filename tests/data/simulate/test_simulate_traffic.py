@@ -200,7 +200,7 @@ def test_the_same_seed_gives_the_same_bytes(folder: Path, tmp_path: Path):
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
 
 
-def test_vehicles_that_swerve_as_none_can_are_left_out():
+def test_vehicles_with_impossible_lateral_motion_are_left_out():
     """A vehicle that is moved 1.5 m sideways from one step to the next, in otherwise steady traffic."""
     step = np.tile(np.arange(-25, 250), 2)
     aside = np.where((step > 100) & (np.arange(550) >= 275), 1.5, 0.0)
@@ -226,7 +226,7 @@ def test_the_filter_keeps_cubics_and_their_derivatives():
     np.testing.assert_allclose(second[:, 0], -4 + 3 * inside, atol=1e-5)
 
 
-def test_without_the_simulator_there_is_a_remedy(monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_simulator_is_named_with_the_remedy(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "libsumo", None)
     with pytest.raises(ConfigError, match=r"pip install 'epo_lightning\[sim\]'"):
         simulator()

@@ -72,7 +72,7 @@ def test_a_sweep_trains_and_scores_every_run_once(epo: Epo, capsys: pytest.Captu
     assert {path for path, mark in marks(sweep).items() if mark != before[path]} == {str(first.path), str(second.path)}
 
 
-def test_a_failed_run_is_said_and_does_not_stop_the_others(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_run_is_reported_and_does_not_stop_the_others(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     words = (*SWEEP, "optimizer.lr=1e25")
     assert epo(*words) == 1
     sweep = the_sweep()
@@ -94,7 +94,7 @@ def test_a_sweep_stops_at_a_failure_if_asked_to(epo: Epo, capsys: pytest.Capture
     assert "2 done, 1 failed, 5 waiting" in capsys.readouterr().out
 
 
-def test_two_starts_of_a_sweep_do_not_meet(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_second_start_of_a_running_sweep_is_refused(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     assert epo("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm") == 0
     with the_sweep().lock():
         assert epo("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm") == 2
@@ -115,7 +115,7 @@ def test_two_processes_do_not_train_the_same_run(epo: Epo, refused: Callable[...
     assert run.state == "interrupted"
 
 
-def test_what_was_killed_before_it_had_begun_begins_again(epo: Epo) -> None:
+def test_a_run_killed_before_its_start_is_started_again(epo: Epo) -> None:
     words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm")
     assert epo(*words) == 0
     (job,) = the_sweep().jobs
@@ -139,14 +139,14 @@ def test_one_damaged_run_does_not_hide_the_others(epo: Epo, capsys: pytest.Captu
 
 
 @pytest.mark.parametrize("place", ["a,b", "x(1)", "it's", "über", "a=b", "[z]", "{k}", "#5", "~t", 'q"q', "s p", "a:b"])
-def test_folders_may_be_called_anything(epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
+def test_folders_may_have_any_name(epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
     (tmp_path / place).mkdir()
     monkeypatch.chdir(tmp_path / place)
     assert epo("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/const_vel") == 0
     assert list((tmp_path / place).glob("runs/rpi/const_vel/*/run.json"))
 
 
-def test_times_on_other_threads_are_other_times(epo: Epo) -> None:
+def test_times_with_other_thread_counts_are_measured_again(epo: Epo) -> None:
     words = ("sweep", "rpi_main", "data=drawn", "budget=untrained", "seed=0", "experiment=rpi/v_lstm", "score=time")
     for threads in (1, 2):
         assert epo(*words, f"trainer.threads={threads}") == 0
@@ -155,7 +155,7 @@ def test_times_on_other_threads_are_other_times(epo: Epo) -> None:
     assert json.loads((job.run.path / "runtime-cpu-1.json").read_text())["threads"] == 1, "nothing is lost"
 
 
-def test_a_run_is_done_when_all_is_measured(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_done_when_all_measurements_exist(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("sweep", "rpi_main", "data=drawn", "data.scenes=32", "budget=untrained", "seed=0", "experiment=rpi/v_lstm")
     assert epo(*words, "score=test") == 0
     (job,) = the_sweep().jobs
@@ -185,7 +185,7 @@ def test_records_of_older_versions_are_read(tmp_path: Path) -> None:
     assert [job.measures for job in sweep.jobs] == [("test",), (), ("time",)]
 
 
-def test_runs_of_one_title_and_seed_are_told_apart(tmp_path: Path) -> None:
+def test_runs_of_one_title_and_seed_have_distinct_names(tmp_path: Path) -> None:
     places = ("rpi/a/paper-s0", "rpi/b/paper-s0", "rpi/c/short-s0")
     jobs = [Job((), RunFolder(tmp_path / place), "0", "EPO", 0, ()) for place in places]
     names = names_of([*jobs, Job((), RunFolder(tmp_path / "d"), "0", "EPO", 1, ())])
@@ -210,7 +210,7 @@ def test_damaged_runs_are_named_before_anything_runs(epo: Epo, refused: Callable
     assert "data" in refused(*words)
 
 
-def test_mistakes_in_sweeps_are_refused(refused: Callable[..., str]) -> None:
+def test_invalid_sweeps_are_refused(refused: Callable[..., str]) -> None:
     assert "'rpi_main'" in refused("sweep", "rpi_mian")
     assert "rpi_main" in refused("sweep", "seed=1")
     assert "'seed'" in refused("sweep", "rpi_main", "sede=1")
@@ -248,7 +248,7 @@ def test_the_latest_sweep_of_a_name_is_found(tmp_path: Path) -> None:
         Sweep.find("rpi_mai", [], tmp_path)
 
 
-def test_runs_on_two_data_sets_are_told_apart_by_their_names() -> None:
+def test_runs_on_two_data_sets_are_named_by_their_data() -> None:
     def job(title: str, data: str, folder: str) -> Job:
         return Job((), RunFolder(Path(folder)), folder, title, 0, ("test",), data)
 
@@ -267,7 +267,7 @@ def test_a_sweep_over_two_data_sets_records_their_names(tmp_path: Path) -> None:
     assert names == ["JFP (drawn (rpi)), seed 0", "JFP (drawn (highway)), seed 0"]
 
 
-def test_labels_say_what_is_run_and_not_where() -> None:
+def test_labels_depend_on_the_settings_and_not_on_the_machine() -> None:
     assert label("steps", []) == label("steps", ["logger=[wandb]", "hydra/launcher=local", "runs=x"]) == "steps"
     assert label("steps", ["hydra.sweeper.params.seed=7"]) != "steps"
     assert label("steps", ["hydra.sweeper.n_trials=7", "hydra.launcher.n_jobs=2"]) == "steps"
@@ -275,7 +275,7 @@ def test_labels_say_what_is_run_and_not_where() -> None:
     assert label("steps", ["a=1", "b=2"]) == label("steps", ["b=2", "a=1"])
 
 
-def test_run_folders_are_named_by_what_they_mean() -> None:
+def test_run_folders_are_named_by_their_settings() -> None:
     def variant(*words: str) -> str:
         return compose("train", ["experiment=rpi/v_lstm_epo", *words])["variant"]
 
@@ -295,7 +295,7 @@ def test_globs_find_experiments_in_folders() -> None:
 @pytest.mark.skipif(
     find_spec("hydra_plugins.hydra_optuna_sweeper") is None, reason="the extra `search` is not installed"
 )
-def test_a_search_goes_on_where_it_was(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_search_continues_after_a_stop(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("sweep", "rpi_search", *TINY, "hydra.sweeper.sampler.n_startup_trials=1")
     assert epo(*words, "hydra.sweeper.n_trials=2") == 0
     sweep = the_sweep()
@@ -316,7 +316,7 @@ def test_a_search_goes_on_where_it_was(epo: Epo, capsys: pytest.CaptureFixture[s
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", [(), ("hydra/launcher=local", "hydra.launcher.n_jobs=2")])
 @pytest.mark.parametrize(("how", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
-def test_a_stopped_sweep_says_so_and_leaves_nobody_behind(
+def test_a_stopped_sweep_prints_a_note_and_leaves_no_process(
     tmp_path: Path, launcher: tuple[str, ...], how: signal.Signals, status: int
 ) -> None:
     environment = {**os.environ, "PYTHONPATH": str(SRC)}

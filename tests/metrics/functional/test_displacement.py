@@ -24,7 +24,7 @@ def two_agents(mask: torch.Tensor | None = None) -> dict[str, float]:
     return {name: metric(states, future, mask).item() for name, metric in METRICS.items()}
 
 
-def test_by_hand() -> None:
+def test_displacement_metrics_equal_hand_computed_values() -> None:
     # Mode 0: agents average 2 and 10, end at 3 and 10. Mode 1: average 4 and 4, end at 4 and 6.
     assert two_agents() == {"minADE": 3.0, "minSADE": 4.0, "minFDE": 4.5, "minSFDE": 5.0}
 
@@ -35,7 +35,7 @@ def test_unobserved_steps_do_not_count() -> None:
     assert two_agents(mask) == {"minADE": 2.5, "minSADE": 4.0, "minFDE": 6.0, "minSFDE": 6.0}
 
 
-def test_each_metric_takes_its_own_mode() -> None:
+def test_each_metric_chooses_its_own_best_mode() -> None:
     states = torch.zeros(1, 2, 1, 2, 2)
     states[0, 0, 0, :, 0] = torch.tensor([0.0, 3.0])
     states[0, 1, 0, :, 0] = torch.tensor([9.0, 1.0])
@@ -76,7 +76,7 @@ def test_equals_loops(case: Case) -> None:
 
 
 @pytest.mark.parametrize("name", METRICS)
-def test_nothing_observed_is_nan_and_a_broken_forecast_is_not(name: str) -> None:
+def test_scores_are_nan_without_observations_and_inf_for_broken_forecasts(name: str) -> None:
     future, mask = torch.zeros(2, 1, 2, 2), torch.tensor([[[False, False]], [[True, True]]])
     values = METRICS[name](torch.full((2, 3, 1, 2, 2), torch.nan), future, mask)
     assert values[0].isnan()

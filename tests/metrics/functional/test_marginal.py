@@ -11,7 +11,7 @@ from .. import reference
 from ..cases import Case, cases
 
 
-def test_by_hand() -> None:
+def test_marginal_metrics_equal_hand_computed_values() -> None:
     states = torch.arange(6.0).view(1, 3, 2, 1, 1)  # modes of agent 0: 0, 2, 4; of agent 1: 1, 3, 5
     probabilities = torch.tensor([[[0.2, 0.5], [0.3, 0.1], [0.5, 0.4]]])
     joint, ordered = marginal_to_joint(states, probabilities)
@@ -35,7 +35,7 @@ def test_equals_loops_and_leaves_marginal_metrics_alone(case: Case) -> None:
     torch.testing.assert_close(after, before, equal_nan=True)
 
 
-def test_joint_metrics_see_the_order() -> None:
+def test_joint_metrics_depend_on_the_order_of_modes() -> None:
     # Each agent has one mode that is right; put together they are right only if both are equally ranked.
     states = torch.zeros(1, 2, 2, 1, 2)
     states[0, 0, 1], states[0, 1, 0] = 1.0, 1.0

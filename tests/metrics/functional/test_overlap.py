@@ -35,7 +35,7 @@ def test_radius_is_half_of_the_size_and_touching_is_no_overlap(shape: str, dista
 
 
 @pytest.mark.parametrize(("shape", "expected"), [("disc", 0.0), ("box", 1.0)])
-def test_corners_belong_to_boxes_only(shape: str, expected: float) -> None:
+def test_corners_overlap_for_boxes_but_not_for_discs(shape: str, expected: float) -> None:
     assert rate([[0, 0, 0], [0.45, 0.45, 0]], shape) == expected
 
 
@@ -55,7 +55,7 @@ def test_long_box_that_only_its_own_side_separates() -> None:
     assert overlapping_pairs(states, sizes, everyone, "box").all()
 
 
-def test_definitions_by_hand() -> None:
+def test_both_overlap_rates_equal_hand_computed_values() -> None:
     # Three agents in a row: two of the three pairs overlap.
     row = [[0.0, 0, 0], [0.4, 0, 0], [0.8, 0, 0]]
     assert rate(row, definition="jfp") == 1.0
@@ -82,7 +82,7 @@ def test_equals_polygons(case: Case, shape: str, definition: str) -> None:
 
 
 @pytest.mark.parametrize("shape", ["disc", "box"])
-def test_random_cases_hold_both_answers(shape: str) -> None:
+def test_random_cases_contain_overlapping_and_separate_agents(shape: str) -> None:
     case = make_case(0, scenes=200, steps=2)
     mean = overlap_rate(case.states, case.probabilities, case.size, case.agent_mask, shape=shape).nanmean()
     assert 0.2 < mean < 0.8
@@ -110,7 +110,7 @@ def test_scene_is_the_same_alone_in_a_batch_and_padded(shape: str) -> None:
 
 
 @pytest.mark.parametrize("shape", ["disc", "box"])
-def test_broken_forecast_is_not_consistent(shape: str) -> None:
+def test_a_nan_forecast_has_an_infinite_overlap_rate(shape: str) -> None:
     states = torch.zeros(2, 1, 2, 1, 4)
     states[:, :, 1, :, 0] = 5.0
     states[1, 0, 1, 0, 0] = torch.nan
@@ -120,7 +120,7 @@ def test_broken_forecast_is_not_consistent(shape: str) -> None:
     assert values.tolist() == [0.0, math.inf]
 
 
-def test_unknown_words_are_named() -> None:
+def test_unknown_options_are_named() -> None:
     with pytest.raises(ConfigError, match=r"unknown shape 'disk'.*did you mean 'disc'"):
         rate([[0, 0, 0]], shape="disk")
     with pytest.raises(ConfigError, match=r"unknown definition 'author'.*did you mean 'authors'"):

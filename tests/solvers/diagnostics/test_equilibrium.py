@@ -158,7 +158,7 @@ def test_gaps_of_a_linear_quadratic_game_are_those_of_the_closed_form(kind):
 
 @KINDS
 @pytest.mark.parametrize("agents", [1, 3])
-def test_gaps_are_what_another_minimiser_finds(kind, agents):
+def test_gaps_equal_those_of_another_minimiser(kind, agents):
     scene = random_scene(2, agents, history=2, size=1.0, dtype=torch.float64)
     parameters = random_game(scene, 1, STEPS, own=OWN)
     energy = FeatureEnergy(OWN, ["proximity"])
@@ -186,7 +186,7 @@ def test_gaps_are_what_another_minimiser_finds(kind, agents):
         torch.testing.assert_close(found.energy - found.optimum, found.nash_gap[:, 0], rtol=1e-8, atol=0)
 
 
-def test_at_solved_games_nobody_gains_anything():
+def test_gaps_vanish_at_solved_games():
     scene = random_scene(24, 3, history=2, size=1.0, dtype=torch.float64)
     parameters = random_game(scene, 1, STEPS, spread=0.1)
     energy = FeatureEnergy(("goal", "vel", "acc", "turnr", "jerk"))
@@ -210,7 +210,7 @@ def test_optima_are_never_above_the_forecast_and_gaps_never_negative(kind):
     assert (found.nash_gap <= found.objective).all()
 
 
-def test_the_most_likely_mode_is_looked_at():
+def test_the_most_likely_mode_is_examined():
     scene = random_scene(4, 2, history=2, size=1.5, dtype=torch.float64)
     parameters = random_game(scene, 3, STEPS)
     energy = FeatureEnergy(ALL, bounds=BOUNDS)
@@ -226,7 +226,7 @@ def test_the_most_likely_mode_is_looked_at():
     torch.testing.assert_close(found.nash_gap, alone.nash_gap, rtol=0, atol=0)
 
 
-def test_one_game_for_all_modes_is_that_of_each():
+def test_a_game_shared_by_all_modes_equals_one_per_mode():
     scene = random_scene(4, 2, history=2, size=1.5, dtype=torch.float64)
     parameters = random_game(scene, 1, STEPS)
     energy = FeatureEnergy(ALL, bounds=BOUNDS)
@@ -241,7 +241,7 @@ FIELDS = ("initial", "energy", "optimum", "gradient_norm", "nash_gap", "objectiv
 
 @KINDS
 @pytest.mark.parametrize("filling", [float("nan"), 1e6])
-def test_neither_padding_nor_the_batch_matters(kind, filling):
+def test_reports_do_not_depend_on_padding_or_batch(kind, filling):
     scene = random_scene(7, 3, history=2, size=1.5, dtype=torch.float64)
     parameters = random_game(scene, 1, 4, own=OWN)
     energy = kind(FeatureEnergy(OWN))
@@ -263,7 +263,7 @@ def test_neither_padding_nor_the_batch_matters(kind, filling):
 
 
 @KINDS
-def test_a_broken_scene_has_no_finite_report_and_leaves_the_others(kind):
+def test_a_nan_scene_has_no_finite_report_and_leaves_the_others_unchanged(kind):
     scene = random_scene(3, 2, history=2, size=1.5, dtype=torch.float64)
     parameters = random_game(scene, 1, STEPS, own=OWN)
     energy = kind(FeatureEnergy(OWN))
@@ -276,7 +276,7 @@ def test_a_broken_scene_has_no_finite_report_and_leaves_the_others(kind):
         torch.testing.assert_close(getattr(broken, name)[[0, 2]], getattr(sound, name)[[0, 2]], msg=name)
 
 
-def test_nothing_is_reported_without_a_game_a_solution_or_a_way_to_look():
+def test_there_is_no_report_without_a_game_or_a_solution():
     scene = random_scene(2, 2, history=2)
     parameters = random_game(scene, 1, STEPS, own=OWN)
     energy = FeatureEnergy(OWN)
@@ -287,7 +287,7 @@ def test_nothing_is_reported_without_a_game_a_solution_or_a_way_to_look():
     assert equilibrium(Valued(energy), scene, forecast) is None
 
 
-def test_scenes_without_anybody_are_at_rest():
+def test_scenes_without_agents_have_zero_gaps():
     scene = random_scene(2, 2, history=2, dtype=torch.float64)
     scene = dataclasses.replace(scene, agent_mask=torch.tensor([[False, False], [True, True]]))
     parameters = random_game(scene, 1, STEPS, own=OWN)
@@ -298,7 +298,7 @@ def test_scenes_without_anybody_are_at_rest():
         assert (found.nash_gap[1] > 0).all()
 
 
-def test_features_that_only_pytorch_knows_are_reported_too():
+def test_features_unknown_to_the_kernel_are_supported():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, 1, 4, own=OWN)
     parameters = dataclasses.replace(parameters, pair_weights={"circles": parameters.pair_weights["proximity"]})
@@ -388,7 +388,7 @@ def test_at_the_lowest_joint_choice_there_is_no_gap_and_other_modes_lead_there()
         assert (found.nash_gap.max() > 0) == (likely == 0)
 
 
-def test_choices_that_cost_infinitely_much_have_gaps_that_say_so():
+def test_infinitely_expensive_choices_have_infinite_gaps():
     scene, tables, assignment = finite_game(1, 2, 3, 1)
     assignment = torch.zeros_like(assignment)
     energy, parameters = FeatureEnergy(OWN), random_game(scene, 1, 4, own=OWN)
@@ -433,7 +433,7 @@ def reduced(energy, scene, parameters, steps, step_size, damping, held):
 
 @pytest.mark.parametrize("solve", SOLVERS, ids=["compiled", "structured", "whole"][-len(SOLVERS) :])
 @pytest.mark.parametrize(("agents", "size"), [(1, 1.0), (2, 2.0), (4, 1.5), (5, 3.0)])
-def test_held_agents_stay_and_the_others_solve_the_reduced_system(solve, agents, size):
+def test_held_agents_keep_their_controls_while_the_others_are_solved(solve, agents, size):
     scene = random_scene(3, agents, history=2, size=size, dtype=torch.float64)
     parameters = random_game(scene, 2, 6)
     energy = FeatureEnergy(ALL, bounds=BOUNDS)
@@ -460,7 +460,7 @@ def test_held_agents_stay_and_the_others_solve_the_reduced_system(solve, agents,
 
 @pytest.mark.parametrize("solve", SOLVERS, ids=["compiled", "structured", "whole"][-len(SOLVERS) :])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_equal_dampings_of_all_agents_are_that_of_the_sample_to_the_bit(solve, dtype):
+def test_equal_dampings_of_all_agents_equal_one_damping_bit_for_bit(solve, dtype):
     scene = random_scene(5, 3, history=2, size=1.5, dtype=dtype)
     parameters = random_game(scene, 2, 7)
     energy = FeatureEnergy(ALL, bounds=BOUNDS)
@@ -474,7 +474,7 @@ def test_equal_dampings_of_all_agents_are_that_of_the_sample_to_the_bit(solve, d
 # Many functions at once.
 
 
-def test_rosenbrocks_valleys_are_followed_to_their_ends():
+def test_rosenbrock_functions_are_minimised():
     starts = torch.tensor([[-1.2, 1.0, -1.0], [2.0, -3.0, 0.5], [1.0, 1.0, 1.0], [torch.nan, 0.0, 0.0]]).double()
     height = torch.tensor([100.0, 10.0, 100.0, 1.0]).double()
 
@@ -496,7 +496,7 @@ def test_rosenbrocks_valleys_are_followed_to_their_ends():
     assert quasi_newton.minimise(evaluate, starts[:0]).after.shape == (0,)
 
 
-def test_who_falls_without_end_is_given_up_and_who_creeps_is_not():
+def test_unbounded_descent_is_given_up_and_slow_convergence_is_not():
     # Down a slope for ever, towards a bound that is never reached, along a parabola, and a quartic with a flat ground.
     def evaluate(index, point):
         with torch.enable_grad():

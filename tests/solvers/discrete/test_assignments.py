@@ -154,7 +154,7 @@ def test_derivatives_by_finite_differences(find):
 
 
 @pytest.mark.parametrize("find", [assignments.enumerate_, assignments.sum_product])
-def test_what_is_impossible_has_a_gradient_of_zero(find):
+def test_impossible_assignments_have_a_gradient_of_zero(find):
     unary, pair, everyone = drawn(2, 3, 3)
     unary[0, 0, 1] = INF
     pair[0, 1, :, 2] = INF  # nothing of agent 0 goes with agent 2's last candidate
@@ -170,7 +170,7 @@ def test_what_is_impossible_has_a_gradient_of_zero(find):
 
 
 @pytest.mark.parametrize("find", [assignments.enumerate_, assignments.sum_product])
-def test_scenes_without_any_possibility_say_so(find):
+def test_scenes_without_a_possible_assignment_are_marked(find):
     unary, pair, everyone = drawn(2, 3, 2)
     pair[0, 0] = INF
     unary.requires_grad_()
@@ -182,7 +182,7 @@ def test_scenes_without_any_possibility_say_so(find):
 
 
 @pytest.mark.parametrize("find", [assignments.enumerate_, assignments.sum_product])
-def test_absent_agents_take_their_first_candidate_whatever_they_hold(find):
+def test_absent_agents_take_their_first_candidate(find):
     unary, pair, everyone = drawn(2, 2, 3)
     wide, wide_pair = (
         torch.full((2, 4, 3), NAN, dtype=torch.float64),
@@ -212,7 +212,7 @@ def test_absent_agents_take_their_first_candidate_whatever_they_hold(find):
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 4), st.integers(1, 4), st.integers(1, 12))
-def test_the_best_are_those_of_a_sorted_list(seed, agents, count, modes):
+def test_the_best_assignments_equal_those_of_a_sorted_list(seed, agents, count, modes):
     torch.manual_seed(seed)
     unary, pair, everyone = drawn(2, agents, count)
     unary, pair = forbid(unary, pair)
@@ -226,7 +226,7 @@ def test_the_best_are_those_of_a_sorted_list(seed, agents, count, modes):
             assert tuple(chosen[scene, mode].tolist()) == choice
 
 
-def test_modes_apart_are_found_as_a_plain_loop_finds_them():
+def test_distinct_modes_equal_those_of_a_plain_loop():
     scenes, agents, count, modes, apart = 4, 3, 3, 7, 1.3
     unary, pair, everyone = drawn(scenes, agents, count)
     everyone[0, 1] = False
@@ -290,7 +290,7 @@ def test_large_problems_are_searched_and_summed():
 
 
 @pytest.mark.parametrize("agents", [3, 8])
-def test_scenes_do_not_matter_to_each_other(agents):
+def test_scenes_are_independent(agents):
     unary, pair, everyone = drawn(4, agents, 4)
     everyone[1, 2] = False
     results = [*assignments.partition(unary, pair, everyone), *assignments.best(unary, pair, everyone, 3)]

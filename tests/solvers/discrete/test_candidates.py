@@ -100,7 +100,7 @@ def test_modes_are_the_best_joint_strategies(kind):
         torch.testing.assert_close(tables.log_partition, (-energies).logsumexp(1))
 
 
-def test_the_initial_energy_is_that_of_who_ignores_all_others():
+def test_the_initial_energy_is_that_of_agents_choosing_independently():
     scene, game = played(count=4)
     solution = Enumeration(candidates=4, modes=2)(ENERGY, scene, game)
     own = dataclasses.replace(game, pair_weights={"proximity": 0.0 * game.pair_weights["proximity"]})
@@ -109,7 +109,7 @@ def test_the_initial_energy_is_that_of_who_ignores_all_others():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_energies_states_and_densities_learn(kind):
+def test_gradients_of_energies_states_and_densities_equal_differences(kind):
     """Finite differences along one direction of everything that the network decodes."""
     scene, game = played(scenes=1)
     solver, leaves = kind(candidates=3, modes=2), leaves_of(game)
@@ -142,7 +142,7 @@ def test_energies_states_and_densities_learn(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_scenes_and_absent_agents_do_not_matter(kind):
+def test_other_scenes_and_absent_agents_do_not_change_solutions(kind):
     scene, game = played(scenes=3)
     scene = dataclasses.replace(scene, agent_mask=scene.agent_mask.clone())
     scene.agent_mask[1, 0] = False
@@ -190,7 +190,7 @@ def test_scenes_without_an_answer_stop_and_leave_the_others_alone(kind, broken):
     assert unary.grad.isfinite().all()
 
 
-def test_agents_that_can_do_nothing_are_named():
+def test_agents_without_a_valid_candidate_are_named():
     scene, game = played()
     unary = torch.zeros(2, 3, 3, dtype=torch.float64)
     unary[1, 2] = INF
@@ -198,7 +198,7 @@ def test_agents_that_can_do_nothing_are_named():
         Enumeration(candidates=3)(Given(unary, torch.zeros(2, 3, 3, 3, dtype=torch.float64)), scene, game)
 
 
-def test_messages_take_over_where_there_is_too_much_to_enumerate_and_say_so_once():
+def test_message_passing_replaces_too_large_enumerations_with_one_warning():
     scene, game = played(1, 5, 6)
     candidates._warn_once.cache_clear()
     with pytest.warns(UserWarning, match="more than 4096"):
@@ -243,7 +243,7 @@ def test_a_scene_in_another_precision_and_one_without_agents():
         assert no_scene.controls.shape == (0, 1, 3, 5, 2)
 
 
-def test_what_they_ask_the_network_for():
+def test_solvers_declare_numbers_of_candidates_games_and_modes():
     for kind in KINDS:
         solver = kind(candidates=5)
         assert (solver.starts(3), solver.games(3), solver.for_modes(3).modes, solver.modes) == (5, 1, 3, 1)
@@ -251,7 +251,7 @@ def test_what_they_ask_the_network_for():
 
 
 @pytest.mark.parametrize("name", ["enumeration", "sum_product"])
-def test_their_pages_are_their_schema(name):
+def test_configuration_files_state_the_defaults(name):
     page = Path(__file__).parents[3] / "conf" / "solver" / f"{name}.yaml"
     solver = registry.build("solver", yaml.safe_load(page.read_text()))
     assert set(yaml.safe_load(page.read_text())) - {"name"} == {field.name for field in dataclasses.fields(solver)} - {
@@ -270,6 +270,6 @@ def test_their_pages_are_their_schema(name):
         (SumProduct, {"damping": 1.0}),
     ],
 )
-def test_settings_that_cannot_work_are_refused(kind, wrong):
+def test_invalid_settings_are_refused(kind, wrong):
     with pytest.raises(ConfigError, match=f"solver.{next(iter(wrong))}"):
         kind(**wrong)

@@ -113,14 +113,14 @@ def test_a_reference_line_that_does_not_exist_stops_that_sample():
         (FeatureEnergy(["acc"]), 2, torch.float16, "not torch.float16"),
     ],
 )
-def test_what_it_cannot_solve_it_says(energy, agents, dtype, reason):
+def test_unsupported_games_are_refused_with_the_reason(energy, agents, dtype, reason):
     scene = random_scene(1, agents, history=2)
     parameters = random_game(scene, own=("acc",))
     assert compiled.obstacle(energy, scene, parameters) is None or dtype == torch.float32
     assert reason in compiled.obstacle(energy, scene, parameters.to(dtype))
 
 
-def test_sixty_four_agents():
+def test_sixty_four_agents_are_solved():
     scene, energy = (
         random_scene(1, 64, history=2, size=0.7, dtype=torch.float64),
         FeatureEnergy(["acc", "turnr", "goal"]),
@@ -132,7 +132,7 @@ def test_sixty_four_agents():
     assert (energy.terms(scene, parameters, parameters.initial_controls)["proximity"] > 0).sum() > 64
 
 
-def test_the_layer_takes_it_where_it_can_and_says_once_where_it_cannot(monkeypatch):
+def test_the_layer_uses_the_kernel_or_warns_once(monkeypatch):
     scene, energy = random_scene(2, 2, history=2), FeatureEnergy(ALL, bounds=BOUNDS)
     parameters = random_game(scene)
     by_default = LevenbergMarquardt()(energy, scene, parameters).controls
@@ -156,7 +156,7 @@ def test_the_layer_takes_it_where_it_can_and_says_once_where_it_cannot(monkeypat
         interface.library()
 
 
-def test_other_sources_are_noticed(tmp_path, monkeypatch):
+def test_a_kernel_built_from_other_sources_is_noticed(tmp_path, monkeypatch):
     monkeypatch.setattr(build, "fingerprint", lambda: 1)
     with pytest.raises(OSError, match="built from other sources"):
         build.load()
@@ -165,7 +165,7 @@ def test_other_sources_are_noticed(tmp_path, monkeypatch):
         build.load(tmp_path / "empty.so")
 
 
-def test_a_machine_without_a_compiler_is_told_so(tmp_path):
+def test_a_missing_compiler_is_named(tmp_path):
     """What the installation prints, and goes on."""
     for path in build.HERE.iterdir():
         if path.suffix in (".py", ".hpp", ".cpp"):

@@ -223,7 +223,7 @@ def test_gauss_newton_hessians_give_another_implicit_gradient():
     assert 0.9 < cosine < 1.0 - 1e-9
 
 
-def test_what_is_no_minimum_has_no_implicit_gradient():
+def test_points_that_are_no_minimum_have_zero_implicit_gradients():
     scene = random_scene(2, 2, history=2, dtype=torch.float64)
     parameters = random_game(scene, 1, 4, ("goal",))
     parameters.own_weights["goal"][1] = 0.0
@@ -259,7 +259,7 @@ def test_truncated_gradients_are_those_of_the_last_steps(adaptive):
     torch.testing.assert_close(leaves.goals.grad, again.goals.grad, rtol=0, atol=0)
 
 
-def test_detached_solutions_teach_nothing():
+def test_detached_solutions_have_no_gradient():
     scene = random_scene(2, 2, history=2)
     energy, leaves = FeatureEnergy(ALL, bounds=BOUNDS), leaves_of(random_game(scene))
     solution = Detached()(LevenbergMarquardt(), energy, scene, leaves)
@@ -267,7 +267,7 @@ def test_detached_solutions_teach_nothing():
     assert not solution.states.requires_grad
 
 
-def test_adaptive_steps_never_raise_an_energy_and_every_sample_decides_for_itself():
+def test_adaptive_steps_never_raise_the_energy_of_any_sample():
     scene = random_scene(6, 3, history=2, size=2.0, dtype=torch.float64)
     scene = dataclasses.replace(scene, dt=0.5)  # long ways, on which a linearised heading is far from the truth
     parameters = random_game(scene, horizon=10, spread=1.0)
@@ -313,7 +313,7 @@ def test_another_number_of_steps_outside_training():
 @pytest.mark.parametrize("backend", ["compiled", "pytorch"])
 @pytest.mark.parametrize("backward", [Unrolled(), Truncated(), Implicit(), Detached()])
 @pytest.mark.parametrize(("scenes", "modes", "agents"), [(0, 2, 2), (2, 0, 2), (2, 2, 0)])
-def test_no_game_at_all_has_an_empty_solution(backend, backward, scenes, modes, agents):
+def test_empty_games_have_empty_solutions(backend, backward, scenes, modes, agents):
     scene = random_scene(scenes, agents, history=2)
     energy, game = FeatureEnergy(ALL, bounds=BOUNDS), random_game(scene, modes)
     solution = backward(LevenbergMarquardt(backend=backend), energy, scene, game)
@@ -322,7 +322,7 @@ def test_no_game_at_all_has_an_empty_solution(backend, backward, scenes, modes, 
 
 
 @pytest.mark.parametrize("backend", ["compiled", "pytorch"])
-def test_scenes_follow_the_precision_of_their_game(backend):
+def test_scenes_are_converted_to_the_precision_of_the_game(backend):
     scene = random_scene(2, 2, history=2, dtype=torch.float64)
     parameters = random_game(scene).to(torch.float32)
     solve, energy = LevenbergMarquardt(backend=backend), FeatureEnergy(ALL, bounds=BOUNDS)

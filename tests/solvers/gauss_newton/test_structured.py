@@ -180,7 +180,7 @@ class HostMustNotWait(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(("integrator", "pair"), [("euler", "proximity"), ("heun", "proximity"), ("euler", "circles")])
-def test_the_unsplit_path_never_asks_the_device_for_a_number(integrator, pair):
+def test_the_unsplit_path_needs_no_synchronisation_with_the_device(integrator, pair):
     scene = random_scene(3, 3, history=2, size=2.0)
     parameters = random_game(scene)
     weights = {pair: parameters.pair_weights["proximity"]}
@@ -193,7 +193,7 @@ def test_the_unsplit_path_never_asks_the_device_for_a_number(integrator, pair):
         solve(energy, scene, parameters, split=True)
 
 
-def test_without_splitting_a_sample_without_a_factor_stops_alone():
+def test_a_sample_without_a_factorisation_stops_alone():
     scene = random_scene(3, 2, history=2)
     parameters = random_game(scene)
     energy = FeatureEnergy(["goal", "acc", "turnr"])
@@ -235,7 +235,7 @@ def twins():
 
 @pytest.mark.parametrize("split", [True, False])
 @pytest.mark.parametrize("stride", [1, 3])
-def test_undeclared_features_solve_to_what_declared_ones_do(twins, split, stride):
+def test_undeclared_features_have_the_solutions_of_declared_ones(twins, split, stride):
     scene = random_scene(2, 3, history=2, size=1.0, dtype=torch.float64)
     parameters = random_game(scene, 2, 6)
     parameters = dataclasses.replace(parameters, goals=torch.zeros_like(parameters.goals))

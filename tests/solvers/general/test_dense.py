@@ -209,7 +209,7 @@ def test_implicit_gradients_equal_central_differences_of_the_argmin(case, by):
     assert (error < 1e-6) == (case == "convex")
 
 
-def test_networks_learn_through_the_minimum():
+def test_implicit_gradients_reach_networks():
     scene, game = learned_game()
     energy = Learned()
     cotangent = torch.randn_like(game.initial_controls)
@@ -268,7 +268,7 @@ def test_a_common_scale_of_all_weights_has_no_gradient():
     assert (along.abs() > 1e-4 * length).all()
 
 
-def test_what_is_no_minimum_has_no_gradient():
+def test_points_that_are_no_minimum_have_zero_gradients():
     scene, game = feature_game(scenes=3)
     game = dataclasses.replace(game, initial_controls=NEWTON(FEATURES, scene, game).controls)
     controls = game.initial_controls.clone()
@@ -297,7 +297,7 @@ def test_what_is_no_minimum_has_no_gradient():
         assert (slope[expected == Status.SOLVED] != 0).any()
 
 
-def test_a_scene_of_no_numbers_leaves_networks_alone():
+def test_a_nan_scene_gives_networks_no_gradient():
     scene, game = learned_game()
     energy = Learned()
 
@@ -339,7 +339,7 @@ def test_padding_and_batches_do_not_change_gradients():
 
 
 @pytest.mark.parametrize("kind", ["features", "convex", "gauss_newton"])
-def test_solutions_that_are_no_minima_are_told_of_once(kind, monkeypatch):
+def test_unconverged_solutions_are_warned_of_once(kind, monkeypatch):
     energy, (scene, game) = (convex_energy(), convex_game()) if kind == "convex" else (FEATURES, feature_game())
     teach = Implicit("gauss_newton" if kind == "gauss_newton" else "exact")
     monkeypatch.setattr(descent, "_warned", False)
@@ -359,7 +359,7 @@ def test_solutions_that_are_no_minima_are_told_of_once(kind, monkeypatch):
 @pytest.mark.parametrize(
     ("shares", "told"), [((2e-3, 2e-3, 5e-4), "67 %"), ((2e-3, 5e-4, 5e-4), None), ((0.0, 0.0, 0.0), None)]
 )
-def test_only_most_of_a_batch_makes_a_warning(shares, told, monkeypatch):
+def test_a_warning_needs_most_of_a_batch_to_be_unconverged(shares, told, monkeypatch):
     monkeypatch.setattr(descent, "_warned", False)
     left = torch.tensor(shares, dtype=torch.float64)[:, None]
     slope, value = (2.0 * left).sqrt()[..., None], torch.ones_like(left)  # with a Hessian of 1

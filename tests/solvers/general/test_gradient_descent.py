@@ -121,7 +121,7 @@ def test_truncation_changes_what_is_learned_and_not_what_is_found(taught):
 
 
 @torch.no_grad()
-def test_who_goes_on_remembers_how_far_to_go():
+def test_continued_descent_keeps_its_step_size():
     scene, parameters = game(scenes=4)
     solve = GradientDescent(9, 0.5, [1.0, 0.3])
     first, memory = solve.run(GAME, scene, parameters, 6)
@@ -133,7 +133,7 @@ def test_who_goes_on_remembers_how_far_to_go():
 
 @torch.no_grad()
 @pytest.mark.parametrize("first", range(8))
-def test_status_is_that_of_all_steps(first):
+def test_the_status_covers_all_steps(first):
     # One control with curvature 1, nine times too long: halved thrice before anything is taken, or at the end.
     scene, parameters = quadratic(scenes=1, modes=1, agents=1)
     for name in QUADRATIC.own:
@@ -146,7 +146,7 @@ def test_status_is_that_of_all_steps(first):
 
 
 @torch.no_grad()
-def test_many_steps_go_towards_a_minimum():
+def test_many_steps_approach_a_minimum():
     scene, parameters = game()
     solution = GradientDescent(60, 5e-4)(GAME, scene, parameters)
     assert (solution.energy < solution.initial_energy).all()
@@ -165,7 +165,7 @@ def test_no_steps_return_the_start():
 
 @pytest.mark.parametrize("weight", [float("nan"), 1e100])
 @pytest.mark.parametrize("solve", [GradientDescent(4, 0.02), Langevin(4, 0.1)])
-def test_a_sample_that_cannot_go_on_keeps_its_last_good_iterate(solve, weight):
+def test_a_stopped_sample_keeps_its_last_finite_iterate(solve, weight):
     scene, parameters = game()
     bad = broken(parameters, (1, 0), weight)
     torch.manual_seed(3)
@@ -181,7 +181,7 @@ def test_a_sample_that_cannot_go_on_keeps_its_last_good_iterate(solve, weight):
 
 
 @pytest.mark.parametrize("weight", [float("nan"), 1e100])
-def test_a_sample_that_cannot_go_on_spoils_no_gradient(weight):
+def test_a_stopped_sample_leaves_gradients_finite(weight):
     scene, parameters = game()
     solve = GradientDescent(4, 0.02)
     leaves, bad = leaves_of(parameters), leaves_of(broken(parameters, (1, 0), weight))
@@ -197,7 +197,7 @@ def test_a_sample_that_cannot_go_on_spoils_no_gradient(weight):
     assert_close(start.grad[1, 0], 2.0 * start.detach()[1, 0])
 
 
-def test_padding_and_the_rest_of_the_batch_do_not_matter():
+def test_solutions_do_not_depend_on_padding_or_batch():
     scene, parameters = game()
     solve = GradientDescent(5, 0.02)
     leaves = leaves_of(parameters)
@@ -217,14 +217,14 @@ def test_padding_and_the_rest_of_the_batch_do_not_matter():
     assert_close(alone.controls[0], solution.controls[1])
 
 
-def test_a_scene_in_another_precision():
+def test_solutions_have_the_precision_of_the_game():
     scene, parameters = game()
     solution = GradientDescent(3)(GAME, scene.to(torch.float32), parameters)
     assert solution.controls.dtype == torch.float64
 
 
 @pytest.mark.parametrize("shape", [(0, 2, 2), (2, 0, 2), (2, 2, 0)])
-def test_nothing_to_solve(shape):
+def test_empty_games_have_empty_solutions(shape):
     scenes, modes, agents = shape
     scene = random_scene(scenes, agents)
     solution = GradientDescent(2)(GAME, scene, random_game(scene, modes))
@@ -245,7 +245,7 @@ def test_nothing_to_solve(shape):
         (Langevin, {"scale": [1.0, -1.0]}, "solver.scale"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(part, settings, key):
+def test_invalid_settings_are_refused(part, settings, key):
     with pytest.raises(ConfigError, match=key):
         part(**settings)
 

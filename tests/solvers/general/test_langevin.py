@@ -37,7 +37,7 @@ def within_error(samples, mean, covariance):
     assert ((samples.T.cov() - covariance).abs() < 5.0 * error).all()
 
 
-def test_every_step_has_the_law_of_a_linear_recursion():
+def test_samples_have_the_mean_and_covariance_of_the_linear_recursion():
     # Jerk couples neighbouring accelerations, and speeds those of all steps: the covariance is full.
     own = ("acc", "turnr", "jerk", "vel")
     energy, scene, one, many = chains(own, {"acc": 1.0, "turnr": 3.0, "jerk": 0.05, "vel": 2.0})
@@ -56,7 +56,7 @@ def test_every_step_has_the_law_of_a_linear_recursion():
     within_error(found, minimum + mean, covariance)
 
 
-def test_long_chains_sample_the_density_as_wide_as_their_steps_make_it():
+def test_long_chains_sample_the_density_widened_by_the_step_size():
     weights = {"acc": 1.0, "turnr": 2.0}
     energy, scene, _, many = chains(("acc", "turnr"), weights, horizon=2)
     delta = 0.8
@@ -74,7 +74,7 @@ def test_short_steps_sample_the_density_whatever_the_scale():
     assert ((found.var(0) / exact - 1.0).abs() < 0.06).all()  # 1 % of it from the steps
 
 
-def test_noise_is_that_of_the_generator_and_no_derivative_leads_through_it():
+def test_noise_comes_from_the_generator_and_has_no_derivative():
     scene = random_scene(dtype=torch.float64)
     parameters = leaves_of(random_game(scene))
     first, second = (Langevin(3)(GAME, scene, parameters) for _ in range(2))
@@ -95,7 +95,7 @@ def test_forecasts_are_made_without_noise():
     assert torch.equal(quiet(GAME, scene, parameters).controls, quiet(GAME, scene, parameters).controls)
 
 
-def test_absent_agents_stand_still_whatever_they_hold():
+def test_absent_agents_keep_zero_controls():
     scene = random_scene(dtype=torch.float64)
     parameters = random_game(scene)
     solution = Langevin(5)(GAME, pad(scene), widen(parameters))
@@ -105,7 +105,7 @@ def test_absent_agents_stand_still_whatever_they_hold():
     assert (solution.status != Status.STOPPED).all()
 
 
-def test_a_chain_that_stopped_does_not_go_on():
+def test_a_stopped_chain_stays_stopped():
     scene = random_scene(2, dtype=torch.float64)
     parameters = random_game(scene)
     start = parameters.initial_controls.clone()

@@ -140,7 +140,7 @@ def test_the_papers_energy_has_the_minimum_that_levenberg_marquardt_finds(minimi
     assert solution.gradient_norm.max() < 1e-7
 
 
-def test_newton_leaves_where_the_hessian_is_indefinite():
+def test_newton_leaves_regions_with_an_indefinite_hessian():
     """Where agents overlap, hinges make the Hessian indefinite, and undamped steps would raise the energy."""
     scene, game = feature_game(size=3.0)
     scene = dataclasses.replace(scene, dt=0.4)
@@ -154,7 +154,7 @@ def test_newton_leaves_where_the_hessian_is_indefinite():
 
 
 @pytest.mark.parametrize("direction", ["along", "across"])
-def test_hinges_are_left_behind_from_anywhere(direction):
+def test_newton_converges_across_hinges_from_any_start(direction):
     """Whole Newton steps between the pieces of a quadratic may go up, or in a circle; here they are shortened."""
     scene, game = convex_game(scenes=8, agents=4, modes=2, horizon=10)
     scene = dataclasses.replace(scene, dt=0.4)
@@ -186,7 +186,7 @@ class Counted(ConvexEnergy):
         return super().hessian(scene, parameters, controls)
 
 
-def test_hessians_are_of_scenes_that_have_not_converged():
+def test_hessians_are_computed_only_for_unconverged_scenes():
     scene, game = convex_game(scenes=4)
     energy = Counted(convex_energy().own)
     minimum = Newton(50, 1e-9)(energy, scene[:3], game[:3])
@@ -201,7 +201,7 @@ def test_hessians_are_of_scenes_that_have_not_converged():
 
 @pytest.mark.parametrize("minimise", [Newton(), LBFGS()], ids=["newton", "lbfgs"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_defaults_come_close(minimise, dtype):
+def test_default_settings_converge(minimise, dtype):
     scene, game = convex_game(scenes=2, agents=3, dtype=torch.float64)
     exact = PRECISE[0](convex_energy(), scene, game)
     solution = minimise(convex_energy(), scene, game.to(dtype))  # the scene follows
@@ -223,7 +223,7 @@ def test_energies_never_rise_with_more_steps(minimise):
 
 
 @both
-def test_samples_go_their_own_way(minimise):
+def test_samples_are_independent(minimise):
     """A sample has the same result alone and in any batch."""
     scene, game = convex_game(scenes=3, agents=2, modes=2)
     easy = PRECISE[0](convex_energy(), scene[0], game[0]).controls
@@ -238,7 +238,7 @@ def test_samples_go_their_own_way(minimise):
 
 
 @both
-def test_absent_agents_do_not_matter(minimise):
+def test_absent_agents_do_not_change_solutions(minimise):
     scene, game = convex_game(scenes=2, agents=2)
     minimise = dataclasses.replace(minimise, tolerance=1e-6)
     expected = minimise(convex_energy(), scene, game)
@@ -250,7 +250,7 @@ def test_absent_agents_do_not_matter(minimise):
 
 
 @both
-def test_a_sample_of_no_numbers_is_stopped_where_it_is_and_disturbs_nobody(minimise):
+def test_a_nan_sample_stops_at_its_start_and_leaves_the_others_unchanged(minimise):
     scene, game = convex_game(scenes=2, modes=2, agents=2)
     expected = minimise(convex_energy(), scene, game)
     weight = game.own_weights["lateral"].clone()
@@ -281,7 +281,7 @@ def test_solutions_are_constants(minimise):
 
 
 @both
-def test_nothing_to_solve(minimise):
+def test_empty_games_have_empty_solutions(minimise):
     scene, game = convex_game(scenes=2, agents=1)
     lone = minimise(convex_energy(), scene, game)
     assert (lone.energy < lone.initial_energy).all()
@@ -292,7 +292,7 @@ def test_nothing_to_solve(minimise):
         minimise(convex_energy(), scene, game.to(torch.float16))
 
 
-def test_a_weight_of_zero_leaves_the_floor():
+def test_a_weight_of_zero_keeps_the_smallest_curvature():
     scene, game = convex_game(scenes=1, agents=2)
     none = {name: torch.zeros_like(weight) for name, weight in game.own_weights.items()}
     game = dataclasses.replace(game, own_weights=none, pair_weights={"order": torch.zeros_like(game.order)})
@@ -316,14 +316,14 @@ def test_a_weight_of_zero_leaves_the_floor():
         (LBFGS, {"history": 0}, "solver.history"),
     ],
 )
-def test_mistakes_in_configurations(kind, changes, message, monkeypatch):
+def test_invalid_settings_are_refused(kind, changes, message, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checks would come first
     with pytest.raises(ConfigError, match=message):
         kind(**changes)
 
 
 @pytest.mark.parametrize(("name", "kind"), [("newton", Newton), ("lbfgs", LBFGS)])
-def test_configurations_are_the_defaults(name, kind):
+def test_configuration_files_state_the_defaults(name, kind):
     config = yaml.safe_load((tree() / "conf" / "solver" / f"{name}.yaml").read_text())
     assert config.pop("name") == name
     assert kind(**config) == kind()

@@ -87,12 +87,12 @@ def read(folder: Path, content: str | bytes):
     return recording
 
 
-def test_is_a_format():
+def test_commonroad_is_a_registered_format():
     assert lookup("format", "commonroad") is commonroad
 
 
 @pytest.mark.parametrize("version", ["2018b", "2020a"])
-def test_tracks(tmp_path, version):
+def test_tracks_equal_the_states_of_the_scenario(tmp_path, version):
     other = obstacle(
         9, [state(3, point(0, 5), np.pi / 2, 2.0), state(5, point(0, 6), np.pi / 2, -2.0)], kind="bus", version=version
     )
@@ -116,11 +116,11 @@ def test_tracks(tmp_path, version):
     ("name", "kind"),
     [("taxi", "car"), ("truck", "truck"), ("bicycle", "bicycle"), ("train", "other"), ("unknown", "other")],
 )
-def test_kinds(tmp_path, name, kind):
+def test_kinds_of_agents_are_mapped(tmp_path, name, kind):
     assert KINDS[read(tmp_path, scenario(drive(7, [10.0, 11.0], kind=name))).tracks.kind[0]] == kind
 
 
-def test_intervals_and_areas(tmp_path):
+def test_intervals_and_areas_are_read_as_their_centres(tmp_path):
     areas = [
         "<circle><radius>3</radius><center><x>1</x><y>2</y></center></circle>",
         "<rectangle><length>4</length><width>2</width><orientation>0.7</orientation>"
@@ -154,7 +154,7 @@ def test_positions_are_those_of_the_centre(tmp_path, shape, size, centre):
     np.testing.assert_allclose(tracks.position, [centre] * 2)
 
 
-def test_lanes(tmp_path):
+def test_lanes_equal_the_lanelets_of_the_scenario(tmp_path):
     signs = (
         '<trafficSign id="70"><trafficSignElement><trafficSignID>R2-1</trafficSignID><additionalValue>29.0</additionalValue>'
         "</trafficSignElement></trafficSign>"
@@ -214,7 +214,7 @@ def test_lanes(tmp_path):
         ("dashed_solid", False, True),
     ],
 )
-def test_markings(tmp_path, marking, from_right, from_left):
+def test_markings_decide_on_lane_changes(tmp_path, marking, from_right, from_left):
     content = scenario(
         lanelet(1, 4.0, right=marking, rest=beside("Right", 2)), lanelet(2, left=marking, rest=beside("Left", 1))
     )
@@ -224,7 +224,7 @@ def test_markings(tmp_path, marking, from_right, from_left):
     assert lanes.right_of[0] == (1 if from_left else -1)
 
 
-def test_what_is_left_out_is_counted(tmp_path):
+def test_left_out_content_is_counted(tmp_path):
     static = f'<staticObstacle id="30"><type>parkedVehicle</type><shape>{RECTANGLE}</shape></staticObstacle>'
     standing = state(0, point(0, 0))
     silent = re.sub("<velocity>.*?</velocity>", "", drive(34, [10.0, 11.0]))
@@ -250,14 +250,14 @@ def test_what_is_left_out_is_counted(tmp_path):
     }
 
 
-def test_static_obstacles_of_2018b(tmp_path):
+def test_static_obstacles_of_2018b_are_counted_and_left_out(tmp_path):
     static = '<obstacle id="30"><role>static</role></obstacle>'
     recording = read(tmp_path, scenario(static, drive(7, [1.0, 2.0], version="2018b"), version="2018b"))
     assert recording.dropped == {"static obstacles": 1}
     assert recording.lanes is None
 
 
-def test_planning_problem_without_traffic(tmp_path):
+def test_a_planning_problem_without_traffic_has_no_tracks(tmp_path):
     recording = read(tmp_path, scenario(ROAD))
     assert recording.dropped == {"recordings without traffic": 1}
     assert len(recording.lanes) == 2
@@ -292,7 +292,7 @@ def test_scenes_that_overlap_are_grouped(tmp_path):
     assert all(source.read().group == source.group for source in sources)
 
 
-def test_bad_folders(tmp_path):
+def test_invalid_folders_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="there is no CommonRoad scenario"):
         commonroad(tmp_path)
     for folder in ("a", "b"):
@@ -375,13 +375,13 @@ BOMB = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY e "ha"><!ENTITY f "&e;&e;">]>
         ),
     ],
 )
-def test_bad_files(tmp_path, content, message):
+def test_invalid_files_are_refused(tmp_path, content, message):
     with pytest.raises(RecordingError, match=f"USA_A-1_1_T-1.xml: .*{message}"):
         read(tmp_path, content)
 
 
 @shared
-def test_us101():
+def test_us101_scenarios_are_read():
     sources = commonroad(SHARED)
     recordings = [source.read() for source in sources]
     assert len(recordings) == 22
@@ -407,7 +407,7 @@ def test_us101():
 
 
 @shared
-def test_as_the_formats_own_library():
+def test_tracks_and_lanes_equal_those_of_the_commonroad_library():
     file_reader = pytest.importorskip("commonroad.common.file_reader", reason="commonroad-io is not installed")
     for source in commonroad(SHARED):
         (path,) = source.files

@@ -21,7 +21,7 @@ def read(folder):
 
 @pytest.mark.parametrize("version", ["2.0", "2.1"])
 @pytest.mark.parametrize("inner", [False, True])
-def test_round_trip(tmp_path, version, inner):
+def test_written_tracks_are_read_back(tmp_path, version, inner):
     tracks = drive()
     write(tmp_path, tracks, version=version)
     (source,) = lookup("format", "exid")(tmp_path / "data" if inner else tmp_path)
@@ -44,7 +44,7 @@ def test_round_trip(tmp_path, version, inner):
     np.testing.assert_array_equal(recording.lanes.speed_limit, np.full(6, 27.78))
 
 
-def test_files_right_in_the_folder(tmp_path):
+def test_files_may_lie_directly_in_the_folder(tmp_path):
     write(tmp_path)
     for file in (tmp_path / "data").iterdir():
         file.rename(tmp_path / file.name)
@@ -52,7 +52,7 @@ def test_files_right_in_the_folder(tmp_path):
     assert len(read(tmp_path).tracks) == 36
 
 
-def test_all_columns(tmp_path):
+def test_all_columns_are_read(tmp_path):
     tracks = drive()
     write(tmp_path, tracks.select(reversed(tracks.columns)))
     table = reader.read_tracks(tmp_path / "data" / "07_tracks.csv")
@@ -99,7 +99,7 @@ def test_rows_may_be_sorted_by_frame(tmp_path):
         np.testing.assert_array_equal(getattr(ours, name), getattr(sorted_, name))
 
 
-def test_quotes_and_other_line_ends(tmp_path):
+def test_quotes_and_other_line_ends_are_read(tmp_path):
     write(tmp_path)
     for file in (tmp_path / "data").iterdir():
         head, *rows = file.read_text().splitlines()
@@ -124,7 +124,7 @@ def test_heading_is_unwrapped_per_track(tmp_path):
     np.testing.assert_allclose(table.heading[first], np.deg2rad(around["heading"].to_numpy())[first])
 
 
-def test_what_is_counted(tmp_path):
+def test_left_out_content_is_counted(tmp_path):
     tracks = drive()
     meta = meta_of(tracks, ("motorcycle", "Zeppelin", "car"))
     meta = meta.with_columns(
@@ -229,7 +229,7 @@ def scaled(factor, *names):
         ),
     ],
 )
-def test_wrong_tracks(tmp_path, change, message):
+def test_invalid_tracks_are_refused(tmp_path, change, message):
     tracks = drive()
     write(tmp_path, change(tracks), meta_of(tracks))
     with pytest.raises(RecordingError, match=message):
@@ -256,7 +256,7 @@ def test_wrong_tracks(tmp_path, change, message):
         ({"xUtmOrigin": SETTING["xUtmOrigin"] + 3000.0}, r"location2.osm: 100% of the positions"),
     ],
 )
-def test_wrong_settings(tmp_path, setting, message):
+def test_invalid_settings_are_refused(tmp_path, setting, message):
     write(tmp_path, setting=SETTING | setting)
     with pytest.raises(RecordingError, match=message):
         read(tmp_path)
@@ -273,14 +273,14 @@ def test_wrong_settings(tmp_path, setting, message):
         (lambda m: m.with_columns(recordingId=pl.lit(6)), r"07_tracksMeta.csv, row 2: recordingId is not 7"),
     ],
 )
-def test_wrong_meta(tmp_path, change, message):
+def test_invalid_metadata_is_refused(tmp_path, change, message):
     write(tmp_path, meta=change(meta_of(drive())))
     with pytest.raises(RecordingError, match=message):
         read(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["07_tracks.csv", "07_tracksMeta.csv", "07_recordingMeta.csv"])
-def test_files_that_are_missing_empty_or_cut_off(tmp_path, name):
+def test_missing_empty_and_truncated_files_are_refused(tmp_path, name):
     write(tmp_path)
     file = tmp_path / "data" / name
     whole = file.read_bytes()
@@ -302,7 +302,7 @@ def test_files_that_are_missing_empty_or_cut_off(tmp_path, name):
         exid(tmp_path)
 
 
-def test_folders_without_recordings_or_with_two_maps(tmp_path):
+def test_folders_without_recordings_or_with_two_maps_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="there is no such folder"):
         exid(tmp_path / "nowhere")
     with pytest.raises(RecordingError, match=r"there is no recording in it: files called NN_tracks.csv"):

@@ -153,7 +153,7 @@ def accounted(recording: Recording, root: Element) -> None:
     assert lanes + dropped["lanes without length"] == len(root.findall("lanelet"))
 
 
-def test_scenarios(tmp_path: Path):
+def test_damaged_scenarios_give_only_recording_errors(tmp_path: Path):
     path = tmp_path / "scene.xml"
     path.write_text(SCENARIO)
     original = commonroad(tmp_path)[0].read()
@@ -236,7 +236,7 @@ def break_cells(draw: np.random.Generator, text: str) -> str:
     return "\n".join(" ".join(row) for row in rows)
 
 
-def test_pedestrians(tmp_path: Path):
+def test_damaged_pedestrian_files_give_only_recording_errors(tmp_path: Path):
     (tmp_path / "square").mkdir()
     path = tmp_path / "square/obsmat.txt"
     text = pedestrians()

@@ -191,7 +191,7 @@ CSV = [
 HARMLESS = {shuffle_columns}
 
 
-def test_tracks_and_metadata(tmp_path):
+def test_damaged_tracks_and_metadata_give_only_recording_errors(tmp_path):
     random = np.random.default_rng(0)
     folder = write(tmp_path / "exid", drive(frames=8), setting=SETTING | {"duration": 1.0})
     (source,) = exid(folder)
@@ -323,7 +323,7 @@ XML = [
 ]
 
 
-def test_maps(tmp_path):
+def test_damaged_maps_give_only_recording_errors(tmp_path):
     random = np.random.default_rng(1)
     text = str(road())
     path = tmp_path / "map.osm"

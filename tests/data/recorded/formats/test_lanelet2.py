@@ -77,7 +77,7 @@ def compare(path, origin):
     return ours
 
 
-def test_fzi_map():
+def test_the_fzi_map_is_read():
     path = shared(FZI)
     lanes = compare(path, FZI_ORIGIN)
     assert len(lanes) == 328
@@ -86,7 +86,7 @@ def test_fzi_map():
     assert (lanes.adjacent_left >= 0).sum() > 100
 
 
-def test_every_centreline_of_the_fzi_map():
+def test_centrelines_of_the_fzi_map_equal_those_of_lanelet2():
     """Also of footways, whose boundaries are less orderly."""
     library = Library(shared(FZI), FZI_ORIGIN)
     assert len(library.lanelets) == 371
@@ -123,7 +123,7 @@ MARKINGS = [
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_random_roads(tmp_path, seed):
+def test_centrelines_of_random_roads_equal_those_of_lanelet2(tmp_path, seed):
     """Four lanes side by side and four in a row, of points strewn about, ways stored either way round and all markings."""
     random = np.random.default_rng(seed)
     osm = Osm()
@@ -162,7 +162,7 @@ def test_random_roads(tmp_path, seed):
 
 
 @pytest.mark.parametrize("marking", MARKINGS, ids=lambda marking: "-".join(marking.values()))
-def test_markings(tmp_path, marking):
+def test_markings_decide_on_lane_changes(tmp_path, marking):
     """Whether one may change across each marking, to either side, however its way is stored."""
     for number, backwards in enumerate((False, True)):
         osm = road()
@@ -174,7 +174,7 @@ def test_markings(tmp_path, marking):
         assert (lanes.adjacent_right[0], lanes.adjacent_left[1]) == (1, 0)
 
 
-def test_closed_begin_and_repeated_nodes(tmp_path):
+def test_closed_starts_and_repeated_nodes_are_read(tmp_path):
     """A lane that opens from a point, as beside an on-ramp; and nodes that a way names twice in a row."""
     osm = Osm()
     tip, *lower = (osm.node(x, 0.0) for x in (0.0, 20.0, 40.0, 60.0))
@@ -191,7 +191,7 @@ def test_closed_begin_and_repeated_nodes(tmp_path):
 
 
 @pytest.mark.parametrize(("noise", "share"), [(0.5, 1.0), (3.0, 0.95), (10.0, 0.95)])
-def test_wild_boundaries(noise, share):
+def test_centrelines_of_irregular_boundaries_equal_those_of_lanelet2(noise, share):
     """Also where boundaries cross, come back and fold over, the centreline is the library's. A few of the worst hang on how
     the library rounds: whether the first point of the centreline lies on the line between the bounds' first points."""
     library = pytest.importorskip("lanelet2", reason="there is no lanelet2 wheel for this Python").core
@@ -211,7 +211,7 @@ def test_wild_boundaries(noise, share):
     assert np.mean(same) >= share
 
 
-def test_colliding_and_negative_ids(tmp_path):
+def test_colliding_and_negative_ids_are_read(tmp_path):
     """Nodes, ways and relations count from one each; JOSM gives new elements negative ids."""
     (tmp_path / "a.osm").write_text(str(road()))
     (tmp_path / "b.osm").write_text(str(unique(road())))
@@ -235,7 +235,7 @@ def test_colliding_and_negative_ids(tmp_path):
     assert np.isnan(a.speed_limit).all()
 
 
-def test_a_ring_leads_into_itself(tmp_path):
+def test_lanes_of_a_ring_succeed_each_other(tmp_path):
     osm = Osm()
     angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     ways = []
@@ -248,7 +248,7 @@ def test_a_ring_leads_into_itself(tmp_path):
     assert compare(tmp_path / "map.osm", ORIGIN).successors == [(1,), (0,)]
 
 
-def test_participants_and_drawn_centrelines(tmp_path):
+def test_participants_and_drawn_centrelines_are_respected(tmp_path):
     osm = road()
     osm.lanelets[0][3]["participant:bicycle"] = "yes"
     osm.lanelets[1][3]["participant:vehicle"] = "yes"
@@ -260,7 +260,7 @@ def test_participants_and_drawn_centrelines(tmp_path):
     assert lanes.ids.tolist() == [2002, 2003, 2004, 2005, 2006]
 
 
-def test_another_zone_and_hemisphere(tmp_path):
+def test_other_zones_and_hemispheres_are_projected(tmp_path):
     """The zone is that of the map, unless it is given."""
     from pyproj import Transformer
 
@@ -305,7 +305,7 @@ def changed(pattern, replacement, count=0):
         (lambda text: text[: len(text) // 2], "not well-formed XML"),
     ],
 )
-def test_wrong_maps(tmp_path, change, message):
+def test_invalid_maps_are_refused(tmp_path, change, message):
     text = str(road())
     assert change(text) != text
     (tmp_path / "map.osm").write_text(change(text))
@@ -327,7 +327,7 @@ def test_wrong_maps(tmp_path, change, message):
         (changed("(<relation id='1' .*?)highway", r"\1crosswalk", 1), "that are not for vehicles"),
     ],
 )
-def test_what_is_left_out_is_counted(tmp_path, change, reason):
+def test_left_out_content_is_counted(tmp_path, change, reason):
     (tmp_path / "map.osm").write_text(change(str(road())))
     dropped = Counter()
     lanes = read_map(tmp_path / "map.osm", ORIGIN, dropped=dropped)

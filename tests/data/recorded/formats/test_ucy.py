@@ -39,11 +39,11 @@ def read(folder: Path, content: str | bytes = ROWS):
     return source.read()
 
 
-def test_is_a_format():
+def test_ucy_is_a_registered_format():
     assert lookup("format", "ucy") is ucy
 
 
-def test_columns(tmp_path):
+def test_columns_are_read_as_tracks(tmp_path):
     recording = read(tmp_path)
     tracks = recording.tracks
     assert (recording.name, recording.group, recording.lanes) == ("square", "square", None)
@@ -61,14 +61,14 @@ def test_columns(tmp_path):
     np.testing.assert_allclose(tracks.heading, [0.0, -np.pi / 2, 0.0, walked, walked, walked])
 
 
-def test_order_of_rows_says_nothing(tmp_path):
+def test_the_order_of_rows_does_not_matter(tmp_path):
     expected = read(tmp_path).tracks
     shuffled = read(tmp_path, "\r\n".join(sorted(ROWS.splitlines(), reverse=True))).tracks
     for name, value in vars(expected).items():
         np.testing.assert_array_equal(getattr(shuffled, name), value)
 
 
-def test_raster_of_six_frames(tmp_path):
+def test_frames_six_apart_give_the_annotation_rate(tmp_path):
     tracks = read(tmp_path, "6 1 0 0 0 1 0 0\n12 1 1 0 0 1 0 0\n24 1 3 0 0 1 0 0\n30 1 4 0 0 1 0 0").tracks
     assert tracks.rate == pytest.approx(25 / 6)
     assert tracks.frame.tolist() == [0, 1, 3, 4]
@@ -94,13 +94,13 @@ def test_raster_of_six_frames(tmp_path):
         ("0 1 0 0 0 0 0 0\n100 1 0 0 0 0 0 0", "a frame rate of 0.25 Hz"),
     ],
 )
-def test_bad_files(tmp_path, content, message):
+def test_invalid_files_are_refused(tmp_path, content, message):
     with warnings.catch_warnings(), pytest.raises(RecordingError, match=f"obsmat.txt.*{message}"):
         warnings.simplefilter("error")
         read(tmp_path, content)
 
 
-def test_bad_folders(tmp_path):
+def test_invalid_folders_are_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"there is no obsmat.txt in this folder"):
         ucy(tmp_path)
     write(tmp_path / "a", ROWS)
@@ -110,7 +110,7 @@ def test_bad_folders(tmp_path):
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason=f"no recordings of UCY in {SHARED}")
-def test_recordings():
+def test_the_real_recordings_are_read():
     recordings = {source.name: source.read() for source in ucy(SHARED)}
     counts = {name: (len(each.tracks), len(each.tracks.ids)) for name, each in recordings.items()}
     assert counts == {"zara01": (5024, 148), "zara02": (9537, 204)}

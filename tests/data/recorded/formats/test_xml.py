@@ -16,7 +16,7 @@ BOMB = (
 )
 
 
-def test_parses(tmp_path):
+def test_valid_files_are_parsed(tmp_path):
     (tmp_path / "a.xml").write_text('<a><b k="1.5"> 2 </b></a>')
     root = xml.parse(tmp_path / "a.xml")
     (element,) = root
@@ -42,7 +42,7 @@ def test_parses(tmp_path):
         ('<?xml version="1.0" encoding="utf-8"?><a>\xe4</a>'.encode("latin-1"), "not well-formed"),
     ],
 )
-def test_refuses(tmp_path, content, message):
+def test_invalid_and_dangerous_files_are_refused(tmp_path, content, message):
     (tmp_path / "a.xml").write_bytes(content)
     started = time.perf_counter()
     with pytest.raises(RecordingError, match=message):
@@ -50,21 +50,21 @@ def test_refuses(tmp_path, content, message):
     assert time.perf_counter() - started < 1.0
 
 
-def test_missing_file_or_folder(tmp_path):
+def test_a_missing_file_or_a_folder_is_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"b.xml: there is no such file$"):
         xml.parse(tmp_path / "b.xml")
     with pytest.raises(RecordingError, match="cannot be read: Is a directory"):
         xml.parse(tmp_path)
 
 
-def test_deep_nesting_is_survived(tmp_path):
+def test_deep_nesting_is_parsed(tmp_path):
     depth = 100_000
     (tmp_path / "a.xml").write_text("<a>" * depth + "</a>" * depth)
     assert sum(1 for _ in xml.parse(tmp_path / "a.xml").iter("a")) == depth
 
 
 @pytest.mark.parametrize("text", [None, "", "x", "nan", "inf", "1e999", "1_0", "9" * 5000])
-def test_no_number(text):
+def test_text_that_is_no_number_is_refused(text):
     with pytest.raises(RecordingError, match=r"^a.xml: lat of node 3 is .*; a finite number was expected there$"):
         xml.number(text, "lat of node 3", "a.xml")
     with pytest.raises(RecordingError, match=r"^a.xml: lat of node 3 is .*; a whole number was expected there$"):
