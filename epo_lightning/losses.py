@@ -1,7 +1,7 @@
 """Terms of training objectives (Appendix C.4). Every loss is a mean over scenes.
 
-Cross entropies take log-probabilities (:attr:`~epo_lightning.scene.JointForecast.log_probabilities`): the gradient by the
-logits is softmax - one-hot then, also where the probability itself is smaller than any number of its precision.
+Cross entropies take log-probabilities (:attr:`~epo_lightning.scene.JointForecast.log_probabilities`), so that their gradient
+by the logits is softmax - one-hot even if the probability underflows.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Relaxation:
-    """Share of the imitation loss that is the mean over modes instead of the closest mode; it fades to zero.
+    """Schedule of a loss that trains all modes a little at first: (1 - share) * closest mode + share * mean over modes.
 
-    The paper's loss trains only the closest mode. A mode that starts far from the data in some scenes gets no gradient there
-    and stays unused. A small share early in training draws every mode towards the data.
+    The paper's loss trains only the mode that is closest to the data. A mode that starts far from the data gets no gradient
+    and stays unused. With a small share of the mean early in training, every mode is drawn towards the data.
 
     Attributes:
         share: share of the mean at the first step; 0 is the paper's loss.
@@ -51,7 +51,7 @@ def distances(
     The distance of every step is raised to ``power``; TGL uses 1.05.
 
     Raises:
-        ValueError: futures and observation that have other numbers of scenes, agents or steps.
+        ValueError: forecast and observation differ in the number of scenes, agents or steps.
     """
     batch, _, agents, steps, _ = positions.shape
     if future.shape[:3] != (batch, agents, steps) or mask.shape != future.shape[:3]:
@@ -124,7 +124,7 @@ def marginal_probability(
 
 
 def _cross_entropy(log_probability: Tensor) -> Tensor:
-    """-log p. An impossible mode (a repeated one) costs as much as the smallest number, without a gradient."""
+    """-log p. A mode with p = 0 (a repeated one) costs -log of the smallest positive number, without a gradient."""
     least = math.log(torch.finfo(log_probability.dtype).tiny)
     return -torch.where(log_probability == -torch.inf, least, log_probability)
 
@@ -142,6 +142,6 @@ def marginal_density(
 
 
 def surprise(log_density: Tensor) -> Tensor:
-    """-log p. An impossible or unknown (NaN) outcome costs as much as the smallest number, without a gradient."""
+    """-log p. If log p is infinite or NaN, -log of the smallest positive number, without a gradient."""
     least = torch.finfo(log_density.dtype).tiny
     return -torch.where(log_density.isfinite(), log_density, math.log(least))

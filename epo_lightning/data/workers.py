@@ -18,7 +18,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from epo_lightning.data.cache import CacheError
 
-Task = tuple[Any, ...]
+Arguments = tuple[Any, ...]
+"""A task of the workers: the arguments of one call of their function."""
 
 
 def default_workers() -> int:
@@ -42,8 +43,8 @@ class Report:
 
     def __init__(
         self,
-        tasks: Sequence[Task],
-        unit_of: Callable[[Task], Any],
+        tasks: Sequence[Arguments],
+        unit_of: Callable[[Arguments], Any],
         unit: str,
         doing: str,
         done: str,
@@ -68,7 +69,7 @@ class Report:
         self.row = self.bar.add_task("", total=self.total, completed=before)
         self.begin = self.first = time.monotonic()
 
-    def advance(self, task: Task) -> None:
+    def advance(self, task: Arguments) -> None:
         """Count a finished task."""
         unit, now = self.unit_of(task), time.monotonic()
         self.left[unit] -= 1
@@ -91,13 +92,13 @@ class Report:
 
 def finished(
     function: Callable[..., Any],
-    tasks: Sequence[Task],
+    tasks: Sequence[Arguments],
     workers: int | None,
     report: Report,
     kept: str,
     fresh: bool = False,
     first_here: bool = False,
-) -> Iterator[tuple[Task, Any]]:
+) -> Iterator[tuple[Arguments, Any]]:
     """Tasks and their results ``function(*task)``, in the order in which they are finished.
 
     Args:

@@ -51,13 +51,16 @@ class Combination:
         """The reason why the combination cannot work; None where it can."""
         energy, solver, backward, objective = (f"{kind}={self.names[kind]}" for kind in KINDS)
         for part, needed in (
-            (solver, self.solver.needs),
-            (backward, self.backward.of_energy),
-            (objective, self.objective.of_energy),
+            (solver, self.solver.needs_from_energy),
+            (backward, self.backward.needs_from_energy),
+            (objective, self.objective.needs_from_energy),
         ):
             if lacking := needed - self.energy.offers:
                 return f"{part} needs an energy with {_and(lacking)}, which {energy} does not offer"
-        for part, needed in ((backward, self.backward.needs), (objective, self.objective.needs)):
+        for part, needed in (
+            (backward, self.backward.needs_from_solver),
+            (objective, self.objective.needs_from_solver),
+        ):
             if needed and not needed & self.solver.provides:
                 return f"{part} needs {_or(needed)}, and {solver} provides {_or(self.solver.provides)}"
         if self.objective.through_solution and not self.backward.teaches:

@@ -182,7 +182,7 @@ class EPO(Forecaster):
             raise ValueError("the energy follows reference lines, but scene.goal_reference [B, N, G] is None")
         own_weights = self.own_weights(z, scene.agent_mask)
         # Agents without a goal have the position (0, 0) for it: zero goal weights keep it from attracting them.
-        for name in self.energy.heading & own_weights.keys():
+        for name in self.energy.goal_terms & own_weights.keys():
             own_weights[name] = own_weights[name].where(goals.exist[:, None], 0.0)
         return GameParameters(
             own_weights=own_weights,

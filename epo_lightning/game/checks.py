@@ -10,7 +10,7 @@ from epo_lightning.registry import ConfigError
 
 
 def is_number(value: Any) -> bool:
-    """Whether a configured value is a number; bool and text are none."""
+    """Whether a configured value is a number; True and False do not count as numbers."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 

@@ -70,7 +70,7 @@ def row_extent(size: Float[Tensor, "*agents 2"]) -> Float[Tensor, "*agents"]:
 def places(size: Float[Tensor, "*agents 2"]) -> Float[Tensor, "*agents 5"]:
     """The centres of an agent's circles along its axis [m], the central ones first.
 
-    Agents with fewer than five circles have some of them twice, which changes no maximum.
+    For agents with fewer than five circles some circles are repeated; the largest overlap stays the same.
     """
     length, width = size.unbind(-1)
     end = (length - width) / 2

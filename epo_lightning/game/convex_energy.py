@@ -134,14 +134,14 @@ class ConvexEnergy(Energy):
         E = 1/2 sum_i |w_i c(u_i)|^2 + 1/2 sum_{i<j} w_ij^2 sum_t a_t max(0, d_ij - s_ij n_ij . (p_i - p_j))^2
 
     Own terms: ``goal``, the offset of the last position from the goal [m]; ``lateral``, the offset from the goal across the
-    heading at t0 at every step [m]; ``velref``, the speed along minus the reference speed [m/s]; ``lat_vel``, the velocity
-    across [m/s];
-    ``acc`` and ``lat_acc``, the accelerations along and across [m/s^2]; ``jerk`` and ``lat_jerk``, their rates [m/s^3].
+    heading at t0 at every step [m]; ``velref``, the velocity along this heading minus the reference speed [m/s];
+    ``lat_vel``, the velocity across it [m/s]; ``acc`` and ``lat_acc``, the accelerations along and across it [m/s^2];
+    ``jerk`` and ``lat_jerk``, their rates [m/s^3].
 
-    The pair term ``order`` keeps a distance d_ij, half the sum of both lengths and a gap, on one side: s_ij = +1 where agent
-    i is to be ahead of agent j in the direction n_ij, -1 where behind (:class:`~epo_lightning.game.pair_order.PairOrder`
-    defines n_ij). Only those steps count (a_t) at which both, at constant velocity, would be near each other: an order says
-    nothing about agents that are far apart.
+    The pair term ``order`` keeps a distance d_ij, half the sum of both lengths plus a gap, on one side: with s_ij = +1 agent
+    i should be ahead of agent j in the direction n_ij, with -1 behind (:class:`~epo_lightning.game.pair_order.PairOrder`
+    defines n_ij). a_t is 1 for the steps at which both agents would be near each other at constant velocity, and 0 for the
+    others, because the order of agents that are far apart does not matter.
 
     Attributes:
         own: names as above. ``acc`` (weight 1, not decoded) and ``lat_acc`` are mandatory: they make the energy strictly
@@ -191,7 +191,7 @@ class ConvexEnergy(Energy):
         return of_agents | ({"size", "order"} if self.pair else set())
 
     @property
-    def heading(self) -> set[str]:
+    def goal_terms(self) -> set[str]:
         """Names of the terms of goals."""
         return {name for name in self.own if _OWN[name][1] == "goals"}
 
@@ -222,14 +222,15 @@ class ConvexEnergy(Energy):
     ) -> Float[Tensor, "B M n n"]:
         """d2E/du2 in closed form, n = 2 N K, in the order of ``controls.flatten(2)``; zero for absent agents.
 
-        Residuals are linear in the controls, so their second derivatives are constants of the scene, times squared weights:
-        by the controls of one direction of one agent for own terms, and for a pair, over the steps with an active hinge,
+        Residuals are linear in the controls, so the Hessian equals J^T J and depends on the controls only through the set of
+        active hinges. An own term contributes a constant block for one agent and one direction (along or across), times its
+        squared weight. A pair contributes to the blocks of both agents a and b
 
             w_ij^2 sum_t g_a g_b P_t^T P_t,
 
-        with g, n_ij in the frames of both agents with opposite signs, and P_t, the derivative of a position at t by the
-        controls. This equals J^T J. Differentiable with respect to weights; the jumps where hinges turn active have no
-        derivative.
+        a sum over the steps with an active hinge, where g is n_ij in the agent's frame (negative for agent j), and P_t the
+        derivative of a position at step t by the controls of one direction. Differentiable with respect to weights; where a
+        hinge becomes active, the Hessian jumps, which has no derivative.
 
         Raises:
             ValueError: shapes or names of scene, parameters and controls that do not fit together.

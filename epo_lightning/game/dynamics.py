@@ -34,7 +34,7 @@ def _turn_left(vector: Float[Tensor, "... 2"]) -> Float[Tensor, "... 2"]:
 
 @runtime_checkable
 class Dynamics(Protocol):
-    """The interface of dynamics: the map from controls to states, for every agent on its own."""
+    """The interface of dynamics: the map from controls to states, for every agent independently of the others."""
 
     def rollout(
         self, initial: Float[Tensor, "*#batch 4"], controls: Float[Tensor, "*batch K 2"], dt: float

@@ -1,10 +1,10 @@
-"""The interface of energies: sums of terms of single agents and of pairs, and thereby potentials of games (Eq. 7).
+"""The interface of energies. An energy is a sum of terms of agents and of pairs, and so the potential of a game (Eq. 7).
 
     E(u; o) = sum_i E_i(u_i; o) + sum_{i<j} E_ij(u_i, u_j; o)
 
 Agent i's own objective is J_i = E_i + sum_j E_ij. Pair terms are symmetric, so dE/du_i = dJ_i/du_i: no agent can improve
-its objective by changing its strategy alone if and only if no such change lowers the energy (Theorem 1). The methods of this
-family (the paper's Table 1) need nothing of an energy but its terms.
+its objective by changing its strategy alone if and only if no such change lowers the energy (Theorem 1). All methods of the
+paper's Table 1 use an energy through these terms only.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from epo_lightning.registry import ConfigError, nearest, parts
 from epo_lightning.scene import GameParameters, Scene
 
 GRADIENT, RESIDUALS, FEATURES = "gradient", "residuals", "features"
-"""Optional properties of an energy: a gradient by the controls; residuals, of which it is half the sum of squares; named
-features, whose structure a solver knows."""
+"""Optional properties of an energy: a useful gradient with respect to the controls; residuals, the energy being half the sum
+of their squares; named features, whose Jacobians have a structure that the fast solver uses."""
 
 _TABLE_ENTRIES = 2_000_000
-"""Number of steps of candidate pairs that are evaluated together, which bounds the memory."""
+"""Largest number of (pair of candidates, step) entries that are evaluated together, which bounds the memory."""
 
 
 def check_names(kind: str, names: Any, known: Collection[str], what: str) -> None:
-    """Check a list of names of terms: all are known, and none stands there twice.
+    """Check a list of names of terms: all are known, and no name is repeated.
 
     Raises:
         ConfigError: an unknown name (the message suggests the nearest known one), a repeated name, or no list.
@@ -54,8 +54,8 @@ class Energy(ABC):
     """The interface of all energies. Subclasses define the terms; this class adds them up.
 
     Attributes:
-        offers: some of :data:`GRADIENT`, :data:`RESIDUALS` and :data:`FEATURES`.
-        own, pair: names of the terms of agents and of pairs.
+        offers: the properties that the energy has, of :data:`GRADIENT`, :data:`RESIDUALS` and :data:`FEATURES`.
+        own, pair: names of the terms of agents (own terms) and of pairs (pair terms).
         dynamics: the map from controls to states.
     """
 
@@ -75,13 +75,13 @@ class Energy(ABC):
         return set()
 
     @property
-    def heading(self) -> set[str]:
-        """Names of the own terms that pull an agent to its goal or its line."""
+    def goal_terms(self) -> set[str]:
+        """Names of the own terms that attract an agent to its goal or its reference line."""
         return set()
 
     @property
     def pair_order(self) -> PairOrder | None:
-        """The order of pairs that the energy takes as given in ``parameters.order``; None for energies without orders."""
+        """The meaning of the orders in ``parameters.order``; None for energies without orders."""
         return None
 
     @abstractmethod
@@ -92,7 +92,11 @@ class Energy(ABC):
         states: Float[Tensor, "B C N K 4"],
         controls: Float[Tensor, "B C N K 2"],
     ) -> dict[str, Float[Tensor, "B C N"]]:
-        """E_i by name, zero for absent agents. The parameters hold C games, or one game for all C candidates."""
+        """Values of the own terms E_i by name, zero for absent agents.
+
+        ``states`` and ``controls`` hold C strategies of every agent. ``parameters`` hold C games, one for each of them, or
+        one game for all of them.
+        """
 
     @abstractmethod
     def pair_terms(
@@ -102,7 +106,10 @@ class Energy(ABC):
         first: Float[Tensor, "B C P K 4"],
         second: Float[Tensor, "B C P K 4"],
     ) -> dict[str, Float[Tensor, "B C P"]]:
-        """E_ij by name for the states of both agents of every pair, zero where one is absent. Symmetric in the agents."""
+        """Values of the pair terms E_ij by name, from the states of both agents of every pair; zero if one is absent.
+
+        A pair term must be symmetric: swapping the two agents does not change it.
+        """
 
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
         """Check that scene, parameters and controls fit together.
@@ -132,7 +139,7 @@ class Energy(ABC):
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]
     ) -> Float[Tensor, "B M"]:
         """The energy E(u) of every joint strategy."""
-        # Added one by one: a sum over stacked terms would round differently in batches of other sizes.
+        # Terms are added one by one, because a sum over stacked terms would round differently in batches of other sizes.
         first, *others = (term.sum(-1) for term in self.terms(scene, parameters, controls).values())
         return sum(others, first)
 
@@ -150,12 +157,15 @@ class Energy(ABC):
     def tables(
         self, scene: Scene, parameters: GameParameters, candidates: Float[Tensor, "B C N K 2"]
     ) -> tuple[Float[Tensor, "B N C"], Float[Tensor, "B P C C"]]:
-        """Tables of E_i for C candidate strategies of every agent, and of E_ij for all pairs (k-th of i, l-th of j).
+        """Tables of E_i for C candidate strategies of every agent, and of E_ij for every two candidates of a pair.
 
         Args:
             scene: the scene.
             parameters: one game, M = 1.
-            candidates: controls; candidates of different agents are combined in all ways.
+            candidates: controls of the candidates.
+
+        Returns:
+            E_i [B, N, C], and E_ij [B, P, C, C], whose entry (k, l) belongs to agent i's k-th and agent j's l-th candidate.
         """
         self.validate(scene, parameters, candidates)
         controls = torch.where(scene.agent_mask[:, None, :, None, None], candidates, 0.0)

@@ -1,8 +1,8 @@
 """Derivatives of named features: signals, their Jacobian along directions, and elementwise first and second derivatives.
 
 A declared feature is c(z(u)) with a signal z whose Jacobian is known in closed form (:func:`signal_and_change`) and an
-elementwise function c (:func:`own_derivatives`, :func:`pair_derivatives`). An undeclared one is any differentiable function
-of the trajectory, which forward-mode automatic differentiation takes (:func:`undeclared_change`).
+elementwise function c (:func:`own_derivatives`, :func:`pair_derivatives`). An undeclared feature is any differentiable
+function of the trajectory and is differentiated by forward-mode automatic differentiation (:func:`undeclared_change`).
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class Derivatives(NamedTuple):
 
 
 def differentiate(function: Callable[..., Tensor], value: Tensor, *others: Tensor, second: bool = False) -> Derivatives:
-    """An elementwise function with its first and, on demand, second derivative by its first argument.
+    """Value and first derivative of an elementwise function by its first argument; with ``second``, the second one as well.
 
-    The derivatives are differentiable themselves.
+    The derivatives can be differentiated again by autograd.
     """
 
     def first(argument: Tensor) -> Tensor:
@@ -111,12 +111,14 @@ class Surroundings:
 def linear_signal(
     feature: OwnFeature, controls: Tensor, speed: Float[Tensor, "*batch K"], dt: float, channels: int = -1
 ) -> Float[Tensor, "*batch R"]:
-    """A control, its rate or the speed; the same for changes of controls and speed, because the signal is linear in them.
+    """The signal of a feature with the source CONTROL, RATE or SPEED.
+
+    These signals are linear in controls and speeds, so the function also maps changes of them to the change of the signal.
 
     Args:
-        feature: one with the source CONTROL, RATE or SPEED.
+        feature: the feature.
         controls: accelerations and turn rates.
-        speed: speeds at the nodes 1 .. K.
+        speed: speeds v_1 .. v_K after every step.
         dt: time step [s].
         channels: the dimension of ``controls`` that holds accelerations and turn rates.
     """
@@ -133,7 +135,7 @@ def add_linear_force(
     node: Float[Tensor, "*batch 2 K"],
     dt: float,
 ) -> None:
-    """Add a force on a linear signal to the forces on the controls, or to those on the nodes (speed, heading), in place.
+    """Backpropagate a gradient by a linear signal (``force``) to the controls, or to speed and heading (``node``), in place.
 
     This is the adjoint of :func:`linear_signal`.
     """
@@ -165,9 +167,10 @@ def signal_and_change(
         feature: the feature, with any source but TRAJECTORY.
         states, controls: the trajectories.
         moved, directions: the changes of states and controls.
-        around: what the signal refers to.
-        slide: whether the nearest point of a line slides along as an agent moves, which is the exact derivative. Otherwise
-            it is held (Gauss-Newton): a line pulls as stiffly along as across, steps are shorter and solutions the same.
+        around: the other inputs of the signal.
+        slide: for lines, whether the derivative takes into account that the nearest point of the line moves along with the
+            agent (the exact derivative). Otherwise the point is held fixed, as the solver does: the line then also resists
+            motion along it, so steps are shorter, but the solution is the same.
     """
     match feature.source:
         case Source.CONTROL | Source.RATE | Source.SPEED:
@@ -198,7 +201,7 @@ def signal_and_change(
 def nearest_point(
     position: Float[Tensor, "*batch K 2"], line: Float[Tensor, "*#batch Q 2"]
 ) -> tuple[Float[Tensor, "*batch K 2"], Float[Tensor, "*batch K 2"]]:
-    """The nearest point of a polyline, and the unit tangent of its segment, zero where the point is the end of a segment.
+    """The nearest point of a polyline, and the unit tangent of its segment; zero if the point is an end of a segment.
 
     Differentiable with respect to the position; the choice of the segment is held constant (the first one on a tie).
     """
@@ -268,9 +271,9 @@ def undeclared_change(
     """Value of a function, and its change along D directions (their first dimension), by forward-mode differentiation.
 
     Args:
-        function: takes two tensors that vary and ``others`` that do not.
-        at: the two tensors.
-        directions: D changes of both.
+        function: function of two tensors that vary and of ``others``, which are constant.
+        at: values of the two tensors.
+        directions: D directions of both tensors.
         others: further arguments, held constant.
     """
     value = function(*at, *others)

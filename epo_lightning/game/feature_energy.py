@@ -38,8 +38,8 @@ class FeatureEnergy(Energy):
     no effect. Because the pair terms are symmetric, a minimiser of E is an open-loop Nash equilibrium in which agent i
     minimises its own terms plus the pair terms it takes part in (Theorem 1).
 
-    A pair with a weight of exactly zero is no edge of the game: it costs nothing to solve, and because weights enter squared
-    its weight has no gradient either. Weights of zero thus tell a game which pairs do not interact.
+    A pair with a weight of exactly zero does not interact: solvers skip it, and because weights enter squared, its weight
+    has no gradient. Set weights to zero to define which pairs of a game do not interact.
 
     Example::
 
@@ -50,9 +50,10 @@ class FeatureEnergy(Energy):
     Attributes:
         own: names of :data:`~epo_lightning.game.features.OWN_FEATURES`, which includes custom features
             (:func:`~epo_lightning.game.features.own_feature`).
-        pair: names of :data:`~epo_lightning.game.features.PAIR_FEATURES`. Discs have half an agent's length as radius; for
-            rows of circles see :mod:`~epo_lightning.game.circles`.
-        bounds: lowest and highest value of a signal, for features whose name ends in ``b``: ``{"vel": (-0.05, 2.0)}``.
+        pair: names of :data:`~epo_lightning.game.features.PAIR_FEATURES`. For ``proximity`` an agent is a disc whose radius
+            is half its length; for ``circles`` see :mod:`~epo_lightning.game.circles`.
+        bounds: lowest and highest value of a signal (speed ``vel``, acceleration ``acc``, ...), for features whose name ends
+            in ``b``: ``{"vel": (-0.05, 2.0)}``.
         dynamics: a :class:`~epo_lightning.game.dynamics.Unicycle`.
         pair_stride: steps between evaluations of pair features: they are evaluated at k = stride, 2 stride, ...
     """
@@ -72,8 +73,8 @@ class FeatureEnergy(Energy):
             raise ConfigError("an energy needs at least one feature")
         if not isinstance(self.dynamics, Unicycle):
             raise ConfigError(
-                "named features are those of a unicycle: they go with dynamics=unicycle, not with "
-                f"{type(self.dynamics).__name__}; energy=convex goes with dynamics=double_integrator"
+                "named features are defined for dynamics=unicycle, not for "
+                f"{type(self.dynamics).__name__}; energy=convex works with dynamics=double_integrator"
             )
         check_whole("energy.pair_stride", self.pair_stride)
         for name, pair in self.pair_features.items():
@@ -99,7 +100,7 @@ class FeatureEnergy(Energy):
         return {feature.needs for feature in self.own_features.values() if feature.needs}
 
     @property
-    def heading(self) -> set[str]:
+    def goal_terms(self) -> set[str]:
         """Names of the features of goals and of lines."""
         return {name for name, feature in self.own_features.items() if feature.needs in ("goals", "reference")}
 
@@ -147,9 +148,9 @@ class FeatureEnergy(Energy):
         controls: Float[Tensor, "B M N K 2"],
         directions: Float[Tensor, "D B M N K 2"],
     ) -> tuple[Float[Tensor, "B M R"], Float[Tensor, "D B M R"]]:
-        """All residuals r in one row, and their change J v along D directions v of the controls.
+        """The vector r of all residuals, and its directional derivatives J v along D directions v of the controls.
 
-        Both are differentiable with respect to controls and parameters; active hinges are held constant.
+        Both are differentiable with respect to controls and parameters; the set of active hinges is held constant.
         """
         _, residuals, changes = zip(*self._features(scene, parameters, controls, directions), strict=True)
         return torch.cat([r.flatten(2) for r in residuals], -1), torch.cat([c.flatten(3) for c in changes], -1)
@@ -311,10 +312,10 @@ class FeatureEnergy(Energy):
             raise ValueError(f"pair features take the agents' {what} from scene.size [B, N, 2], which is None")
 
     def finite(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
-        """The games whose inputs are finite, checked where NaN or infinity would not reach the solution.
+        """Mask of the games whose inputs are finite.
 
-        The weight of a pair that never touches, the position of an agent that no feature refers to, and all points of a
-        reference line but the nearest have no effect on the solution.
+        Only inputs are checked whose NaN or infinity might not show in the solution: weights of pairs that never touch,
+        positions of agents that no feature refers to, and points of reference lines other than the nearest.
         """
         present = scene.agent_mask
         finite = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)
@@ -331,7 +332,7 @@ class FeatureEnergy(Energy):
             of_modes = of_modes & torch.where(present[:, None, :, None, None], line, 0.0).isfinite().flatten(2).all(2)
         return of_modes
 
-    # Inputs of the residuals, for the solvers too. Absent agents are zeroed here and nowhere else.
+    # The methods below return the inputs of the residuals; solvers use them as well. They set absent agents to zero.
 
     def surroundings(self, scene: Scene, parameters: GameParameters) -> Surroundings:
         """The inputs of own features besides the trajectory."""
@@ -409,7 +410,7 @@ def _check_bounds(bounds: Any) -> None:
 
 
 def _refuse_asymmetry(name: str, feature: PairFeature) -> None:
-    """Check that a pair feature costs both agents the same; otherwise the game has no potential.
+    """Refuse a pair feature that costs the two agents of a pair different amounts: the game would have no potential.
 
     Raises:
         ConfigError: a feature that depends on the order of the agents, or a function that fails on trial inputs.
@@ -429,8 +430,8 @@ def _refuse_asymmetry(name: str, feature: PairFeature) -> None:
     if costs is not None:
         raise ConfigError(
             f"pair feature {name!r} is not symmetric: for two trial agents 1/2 |r|^2 is {costs[0]:.4g}, and {costs[1]:.4g} "
-            "when they are swapped. Such a game is no potential game: no energy of this form has its equilibria as minima. "
-            "Make the feature symmetric, for instance by returning the residuals of both orders. If agents only weigh it "
-            "differently, a_i E_ij with a_i > 0, keep E_ij symmetric: dividing the own terms of every agent by its a_i has "
-            "the same effect, and decoded own weights can learn it"
+            "when they are swapped, so the game has no potential, and minimising the energy would not give its equilibria. "
+            "Make the feature symmetric, for instance by returning the residuals of both orders. If the agents only weigh "
+            "it differently (a_i E_ij with a_i > 0), keep E_ij symmetric: dividing the own terms of agent i by a_i gives "
+            "the same game, and the decoded own weights can learn this"
         )

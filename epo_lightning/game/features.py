@@ -1,13 +1,15 @@
-"""The named features of an energy: quantities that an agent, or a pair of agents, keeps small.
+"""The named features of an energy: quantities that an agent, or a pair of agents, tries to keep small.
 
-An own feature is a *signal* of the trajectory (a control, its rate of change, the speed, the steering angle, the offset from
-a line or a goal), taken as it is, or as the amount by which it leaves its bounds (names that end in ``b``: the paper's soft
-constraints max(0, g(z))), or through a custom elementwise function. A pair feature is an elementwise function of the
-distance between two agents, or any function of their states and sizes. The *source* of a signal is declared; it fixes the
-structure of the signal's Jacobian, which is all that a solver needs to know
-(:mod:`~epo_lightning.game.feature_derivatives`).
+An own feature is a function of a *signal*. A signal is a quantity of one trajectory: a control, its rate of change, the
+speed, the steering angle, or the offset from a line or a goal. The feature is the signal itself, or the amount by which it
+leaves its bounds (names that end in ``b``; the paper's soft constraints max(0, g(z))), or a custom elementwise function.
 
-A custom feature needs no declaration: any differentiable function of the trajectory works, at lower speed::
+A pair feature is an elementwise function of the distance between two agents and of their *reach*, the sum of their radii, or
+any function of their states and sizes.
+
+Every feature declares its *source*, the quantity from which its signal is computed. The source fixes the structure of the
+Jacobian, and solvers need to know nothing else about a feature (:mod:`~epo_lightning.game.feature_derivatives`). A custom
+feature may be undeclared: any differentiable function of the trajectory works, but more slowly::
 
     @own_feature("lateral")                                   # [.., K, 4], [.., K, 2] -> [.., R]
     def lateral(states, controls):
@@ -46,18 +48,18 @@ SLOWEST_STEERING = 1.0
 
 
 class Source(Enum):
-    """Quantity that a feature's signal is read from, which fixes the structure of its Jacobian."""
+    """Quantity from which the signal of a feature is computed; it fixes the structure of the signal's Jacobian."""
 
     CONTROL = "control"
-    """A control at its own step: diagonal."""
+    """A control at every step: the Jacobian is diagonal."""
     RATE = "rate"
-    """The rate of change of a control: bidiagonal."""
+    """The rate of change of a control: the Jacobian is bidiagonal."""
     SPEED = "speed"
-    """The speed: all accelerations before it have the same derivative."""
+    """The speed: its derivative is dt by every earlier acceleration."""
     STEERING = "steering"
-    """The turn rate and the speed before the step at which it acts."""
+    """The steering angle: it depends on the turn rate of a step and on the speed before that step."""
     POSITION = "position"
-    """All positions: each depends on all controls before it."""
+    """All positions: each depends on all earlier controls."""
     FINAL_POSITION = "final_position"
     """The last position: it depends on all controls of the agent."""
     DISTANCE = "distance"
@@ -71,11 +73,11 @@ class OwnFeature:
     """One entry of c(u_i, g_i) in Eq. 10: a signal, and a function of it.
 
     Attributes:
-        source: quantity that the signal is read from.
-        signal: name of the signal, by which its bounds are given.
+        source: quantity from which the signal is computed.
+        signal: name of the signal, the key of its bounds in ``energy.bounds``.
         channel: index of the control, for signals of controls.
         bounded: whether the feature is zero within the bounds.
-        needs: input from scene or game that the signal refers to: ``goals``, ``reference``, ``reference_speed``, ``size``.
+        needs: further input of the signal: ``goals``, ``reference``, ``reference_speed``, ``size``; None for no other input.
         function: elementwise function of the signal, or of states and controls for the source TRAJECTORY.
     """
 
@@ -107,8 +109,8 @@ class PairFeature:
             agents, and of their sizes if it needs them.
         needs: ``size`` for a function of states that takes the agents' sizes too.
         stepwise: whether a function of states has one residual per step, which reads the states at that step alone.
-        extent: largest distance [m] from its position at which an agent of a given size can have an effect; None if there
-            is no limit.
+        extent: function from an agent's size to the radius [m] around its position within which it can affect others; None
+            if there is no limit.
     """
 
     source: Source

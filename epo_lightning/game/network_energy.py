@@ -21,8 +21,8 @@ from epo_lightning.scene import GameParameters, Scene
 class NetworkEnergy(nn.Module, Energy):
     """Network terms of agents and of pairs, computed from ``parameters.context``, and any named features.
 
-    The named features are those of :class:`~epo_lightning.game.feature_energy.FeatureEnergy`, with decoded weights: a
-    feature that works there works here.
+    The named features are those of :class:`~epo_lightning.game.feature_energy.FeatureEnergy`, including custom ones, with
+    decoded weights.
 
     Args:
         dynamics: the map from controls to states.
@@ -76,9 +76,9 @@ class NetworkEnergy(nn.Module, Energy):
         return {"context"} | (self.features.needs if self.features else set())
 
     @property
-    def heading(self) -> set[str]:
+    def goal_terms(self) -> set[str]:
         """Names of the named features of goals and lines."""
-        return self.features.heading if self.features else set()
+        return self.features.goal_terms if self.features else set()
 
     @abstractmethod
     def network_own(

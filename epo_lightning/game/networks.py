@@ -44,7 +44,7 @@ def squared_distances(
 ) -> Iterator[Float[Tensor, "..."]]:
     """Squared distances of two agents [m^2], step by step, without a gradient.
 
-    They are computed one step at a time, so that many pairs of candidates take one number each of memory.
+    They are computed one step at a time, so that the memory is one number per pair of candidates, not one per step.
     """
     (ours_x, ours_y), (theirs_x, theirs_y) = (states[..., :2].unbind(-1) for states in (first, second))
     for k in range(first.shape[-2]):

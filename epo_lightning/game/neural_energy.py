@@ -34,8 +34,8 @@ class NeuralEnergy(NetworkEnergy):
 
     Without named features this is JFP (Luo et al., CoRL 2022, Section 3.3) as far as published: JFP's own terms are the
     logits of the marginal decoder, here they are functions of the trajectory; the inputs of its pair network are not
-    published. With named features it is EBIOC (Xu et al., 2019), "features augmented by a network": EBIOC has a cost of one
-    agent among others with given trajectories; here all agents move, so that pairs have a term too.
+    published. With named features it is EBIOC (Xu et al., 2019), "features augmented by a network". EBIOC predicts one agent
+    and takes the trajectories of the others as given; here all agents move, so there is a term for pairs as well.
 
     Args:
         dynamics, width, horizon, scale, own, pair, bounds, pair_stride: see

@@ -25,11 +25,11 @@ _STILL = 1e-3
 class PairOrder:
     """The meaning of an order +1 or -1: agent i of a pair (i, j) is ahead of j in a direction n_ij, or behind.
 
-    - ``along``: n_ij is the mean heading of both at t0, and the order says which agent goes first (merges). Agents that swap
-      names swap the sign of their order. Where headings oppose each other, n_ij is their common line, towards positive x.
-    - ``across``: n_ij is their relative velocity v_i - v_j at t0, turned to the left, and the order says on which side they
-      pass: +1 where each leaves the other on its right. The sign is the same for both agents. Without a relative velocity,
-      n_ij is the line that joins them, turned; without that too, the y axis.
+    - ``along``: n_ij is the mean heading of both agents at t0, and the order says which agent goes first (merges). Swapping
+      the agents changes its sign. If the headings are opposite, n_ij is their common line towards positive x.
+    - ``across``: n_ij is the relative velocity v_i - v_j at t0, turned left by 90 degrees, and the order says on which side
+      they pass: +1 if each agent has the other on its right. Swapping the agents does not change it. Without a relative
+      velocity, n_ij is the turned direction from j to i; if the positions are the same as well, n_ij is the y axis.
 
     Attributes:
         direction: ``along`` or ``across``.
@@ -41,7 +41,7 @@ class PairOrder:
 
     @property
     def symmetric(self) -> bool:
-        """Whether the order keeps its sign when the two agents swap names."""
+        """Whether the order keeps its sign when the two agents are swapped."""
         return self.direction == ACROSS
 
     def directions(self, scene: Scene) -> Float[Tensor, "B P 2"]:
@@ -51,7 +51,7 @@ class PairOrder:
         axis = torch.stack((initial[..., HEADING].cos(), initial[..., HEADING].sin()), -1)
         if self.direction == ALONG:
             line = axis[:, first]
-            # Towards positive x, or towards positive y for upright lines, so that both agents of a pair agree on it.
+            # Towards positive x (positive y for lines parallel to y), so that the result does not depend on the agent.
             upright = line[..., 0].abs() < _STILL
             towards = torch.where(upright, line[..., 1], line[..., 0])
             line = torch.where((towards < 0)[..., None], -line, line)
@@ -78,10 +78,10 @@ class PairOrder:
     def observed(self, scene: Scene) -> tuple[Float[Tensor, "B P"], Bool[Tensor, "B P"]]:
         """The orders in the observed future, +1 where unknown, and the pairs whose order is known.
 
-        The agent that goes first (``along``) is the one ahead at the last step at which both were observed: when one
-        overtakes the other they are closest side by side, where neither is ahead. The passing side (``across``) is read at
-        the closest such step. An order is known for pairs observed together at some step, if it matters
-        (:meth:`matters`).
+        ``along`` is read at the last step at which both agents were observed: the agent that is ahead there goes first. (The
+        step of the smallest distance would not do, because during overtaking neither agent is ahead there.) ``across`` is
+        read at the step of the smallest distance at which both were observed. An order is known for pairs that were observed
+        together at some step, if it matters (:meth:`matters`).
 
         Raises:
             ValueError: the scene has no future.

@@ -1,4 +1,4 @@
-"""Pairs of agents i < j, in the one order that every pairwise tensor [.., P] has."""
+"""Pairs of agents i < j. Every tensor of pairs [.., P] has this order: (0, 1), (0, 2), .., (0, N-1), (1, 2), .."""
 
 from __future__ import annotations
 

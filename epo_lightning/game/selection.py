@@ -1,4 +1,4 @@
-"""Selection of some games of a batch, so that NaN in the others stays out of every autograd graph."""
+"""Selection of some games of a batch, so that NaN in the other games does not reach any gradient."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Function = Callable[[Scene, GameParameters, Tensor], tuple[Tensor, ...]]
 def games(parameters: GameParameters, scenes: Int[Tensor, " S"], modes: Int[Tensor, " S"]) -> GameParameters:
     """S games of a batch, each as a scene with one mode: [B, M, ...] becomes [S, 1, ...].
 
-    A tensor that is shared by all modes is taken for each of them.
+    A tensor with one entry for all modes, [B, 1, ...], is used for every chosen mode.
     """
     context = parameters.context
     chosen = dataclasses.replace(parameters, context=None).map(

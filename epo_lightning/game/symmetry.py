@@ -1,7 +1,7 @@
 """Test of whether a pair feature costs both agents the same, as a potential requires (Theorem 1).
 
 A function of the states of two agents is evaluated on trial agents of all sizes, 10 cm to 100 m apart, slow and fast, in all
-directions. A symmetric function always passes; an asymmetric one is found unless it is symmetric on all trial agents.
+directions. A symmetric function always passes; an asymmetric one is detected unless it is symmetric on all trial agents.
 """
 
 from __future__ import annotations

@@ -26,10 +26,10 @@ EQUILIBRIUM_METRICS = (
     "nash_gap",
     "nash_gap_relative",
 )
-"""Distance of the most likely joint mode from an equilibrium of its game (:class:`~epo_lightning.scene.Equilibrium`); of a
-scene's agents the largest Nash gap, and the largest one relative to the agent's own objective J_i."""
+"""Distance of the most likely joint mode from an equilibrium of its game (:class:`~epo_lightning.scene.Equilibrium`).
+``nash_gap`` is the largest gap of an agent, ``nash_gap_relative`` the largest gap divided by the agent's J_i."""
 MODE_METRICS = tuple(f"minSADE_{k}" for k in range(1, 17))
-"""The minSADE among the k most likely joint modes, for forecasts with several modes; k is 16 at most."""
+"""The minSADE among the k most likely joint modes, k = 1 .. 16, for forecasts with several modes."""
 COLUMNS = METRICS + INITIAL_METRICS + EQUILIBRIUM_METRICS + MODE_METRICS
 _OF_SUBSETS = len(METRICS + INITIAL_METRICS)
 
@@ -37,17 +37,17 @@ _OF_SUBSETS = len(METRICS + INITIAL_METRICS)
 class ForecastMetrics(Metric):
     """Means over scenes of all metrics of the tables in Section 5, as a torchmetrics Metric.
 
-    Absent agents (``Scene.agent_mask``) and unobserved steps (``Scene.future_mask``) do not count. The states are sums in
-    double precision, so that batches and processes of any sizes add up to the same mean: a float32 sum over the 60 000
-    scenes of a data set loses the digits that tables print.
+    Absent agents (``Scene.agent_mask``) and unobserved steps (``Scene.future_mask``) do not count. Sums are kept in double
+    precision, so that the mean does not depend on sizes of batches or numbers of processes: a float32 sum over the 60 000
+    scenes of a data set loses digits that tables print.
 
-    Forecasts with a measured equilibrium are scored by it as well, over all scenes but not by subset. A scene whose
-    measurement is not finite (a game that overflows) does not count there, because one such scene would make the mean of
-    all others infinite; a broken forecast still shows in the displacements, which are infinite then.
+    If a forecast has a measured equilibrium, its energies and Nash gaps are averaged as well, over all scenes but not by
+    subset. Values that are not finite (a game that overflows) are left out, because one of them would make the mean
+    infinite. Broken forecasts are still visible: their displacements are infinite.
 
     Args:
         subsets: names of the subsets that ``Scene.subset`` numbers, e.g. ``("executed", "alternative")`` for RPI. Each
-            gets its own scores, ``"executed/minADE"``; a scene with a number beyond the names belongs to none of them.
+            gets its own scores, ``"executed/minADE"``; a scene with another number belongs to no subset.
         shape: outline of the agents in overlap rates, ``disc`` or ``box``.
 
     Example:

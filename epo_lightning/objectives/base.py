@@ -22,15 +22,16 @@ class Objective(ABC):
 
     Attributes:
         terms: names of the weights lambda in the configuration.
-        through_solution: whether it needs the derivative of the minimiser's solution, or energies alone.
-        needs: properties of a minimiser (:mod:`epo_lightning.solvers.base`) of which it needs any one; none if empty.
-        of_energy: properties of an energy (:mod:`epo_lightning.game.energy`), all of which it needs.
+        through_solution: whether it needs the derivative of the minimiser's solution; otherwise it uses energies alone.
+        needs_from_solver: properties of a minimiser (:mod:`epo_lightning.solvers.base`), of which it must provide at least
+            one; empty if nothing is needed.
+        needs_from_energy: properties that the energy must offer (:mod:`epo_lightning.game.energy`).
     """
 
     terms: ClassVar[tuple[str, ...]]
     through_solution: ClassVar[bool] = False
-    needs: ClassVar[frozenset[str]] = frozenset()
-    of_energy: ClassVar[frozenset[str]] = frozenset()
+    needs_from_solver: ClassVar[frozenset[str]] = frozenset()
+    needs_from_energy: ClassVar[frozenset[str]] = frozenset()
     weights: Mapping[str, float]
 
     @abstractmethod
@@ -68,5 +69,5 @@ def checked_weights(
         if not number or not 0 <= value < math.inf:
             raise ConfigError(f"{key}.{name} must be a number, 0 or more, not {value!r}")
     if not any(weights.values()):
-        raise ConfigError(f"{key} are all 0, so nothing would be learned: give one of {list(names)} a positive weight")
+        raise ConfigError(f"{key} are all 0, so there is no loss: give at least one of {list(names)} a positive weight")
     return dict(weights)

@@ -20,7 +20,7 @@ DENSITIES = ("joint", "marginal")
 
 
 GOAL = 0.1
-"""Weight of the cross entropy of goals; energies over candidates seldom have any."""
+"""Default weight of the cross entropy of goals. (Most energies over candidates have no goals, so it need not be set.)"""
 
 
 @register("objective", "conditional")
@@ -30,10 +30,10 @@ class Conditional(Objective):
     - ``joint`` (JFP, Luo et al., CoRL 2022): -log p(k*_1, ..., k*_N) = E(k*) + log Z, the joint assignment of a scene.
     - ``marginal`` (DSDNet, Zeng et al., ECCV 2020): -log p(k*_i), averaged over agents.
 
-    Unobserved agents are summed out of the joint density, which is then that of the other agents, and do not count in the
-    other terms; scenes without observations cost nothing. k* is chosen among the candidates with a finite energy. Where
-    every k*_i is allowed but their combination is not, or where energies are NaN, the scene costs as much as the smallest
-    probability of its precision and has no gradient: an infinite energy has no derivative.
+    The joint density is that of the observed agents: unobserved ones are summed out (marginalised). In the other terms
+    unobserved agents do not count, and scenes without observations contribute zero. k*_i is chosen among the candidates
+    with a finite energy. If the combination of all k*_i has an infinite energy, or if energies are NaN, the scene
+    contributes -log of the smallest positive number, without a gradient.
 
     In the joint density, log Z sums over all assignments and the numerator over those of the observed choices. Both are
     exact where all assignments can be enumerated (:func:`~epo_lightning.solvers.discrete.assignments.partition`), for any
@@ -50,7 +50,7 @@ class Conditional(Objective):
 
     terms = ("density", "marginal", "regression", "goal")
     through_solution = True
-    needs = frozenset({TABLES})
+    needs_from_solver = frozenset({TABLES})
 
     def __init__(self, weights: Mapping[str, float], density: str = "joint") -> None:
         if density not in DENSITIES:

@@ -1,4 +1,4 @@
-"""Contrastive learning: energy of the observed strategy against that of a sample, as EBIOC's analysis (arXiv 1904.05453).
+"""Contrastive learning: energy of the observed strategy minus that of a sample ("analysis" in EBIOC, arXiv 1904.05453).
 
 The negative log-likelihood of p(u | o) = exp(-E(u; o)) / Z(o) has the gradient
 
@@ -33,22 +33,22 @@ class Contrastive(Objective):
 
     Every mode is a game of its own with one sample. Only the mode whose forecast is closest to the observed future is
     trained; the others would only learn to avoid their own forecasts. The observed controls are found by tracking
-    (:mod:`~epo_lightning.game.tracking`). The controls after an agent's last observed step are unknown and are filled in
-    with the sample's, so that both energies are of a whole game; a scene without observations has no gradient.
+    (:mod:`~epo_lightning.game.tracking`). The controls after an agent's last observed step are unknown; they are copied
+    from the sample, so that both energies are defined. A scene without observations has no gradient.
 
-    Besides the weighted terms, ``tracking`` is logged: the distance [m] between observed positions and those of the
-    controls that stand for them.
+    Besides the weighted terms, ``tracking`` is logged: the distance [m] between observed positions and those reproduced by
+    tracking.
 
     Args:
-        weights: lambda of ``contrastive``; of ``magnitude``, the squares of both energies, which keeps them from drifting
-            away together; of ``initial``, the distance between initial strategies and samples (cooperative training: the
-            network that proposes the start of the chains learns their end); of ``goal`` (unused where no goal is decoded)
+        weights: lambda of ``contrastive``; of ``magnitude``, the squares of both energies, without which a common offset of
+            both could grow without bound; of ``initial``, the distance between initial strategies and samples (cooperative
+            training: the network learns to start the chains where they end); of ``goal`` (unused if no goal is decoded);
             and of ``probability``, the cross entropy of the closest mode.
     """
 
     terms = ("contrastive", "magnitude", "initial", "goal", "probability")
-    needs = frozenset({SAMPLES, STATIONARY, PATH})
-    of_energy = frozenset({GRADIENT})
+    needs_from_solver = frozenset({SAMPLES, STATIONARY, PATH})
+    needs_from_energy = frozenset({GRADIENT})
 
     def __init__(self, weights: Mapping[str, float]) -> None:
         self.weights = checked_weights(weights, self.terms)
@@ -66,7 +66,7 @@ class Contrastive(Objective):
         controls, missed = observed_controls(energy.dynamics, scene)
         drawn = solution.controls.detach()[index, mode][:, None]
         followed = mask.any(-1)
-        taught = followed.any(-1)  # where nothing was observed, both energies are those of the sample
+        taught = followed.any(-1)  # without an observation, both energies are those of the sample
         shown = torch.where(demonstrated(scene)[:, None, ..., None], controls[:, None], drawn)
         of_shown, of_drawn = energy(scene, game, shown)[:, 0], energy(scene, game, drawn)[:, 0]
         sizes = torch.where(taught, of_shown.square() + of_drawn.square(), 0.0)
@@ -86,7 +86,7 @@ class Contrastive(Objective):
 def proposal(
     starts: Float[Tensor, "B M N K 4"], ends: Float[Tensor, "B M N K 4"], present: Bool[Tensor, "B N"]
 ) -> Float[Tensor, ""]:
-    """Mean distance [m] between the positions of initial strategies and those of what chains made of them."""
+    """Mean distance [m] between the positions of initial strategies and those of the samples that chains end at."""
     between = torch.where(present[:, None, :, None, None], starts[..., :2] - ends[..., :2], 0.0)
     distance = torch.linalg.vector_norm(between, dim=-1).mean((1, 3))
     return (distance.sum(-1) / present.sum(-1).clamp_min(1)).mean()

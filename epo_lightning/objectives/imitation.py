@@ -19,10 +19,9 @@ class Imitation(Objective):
     """The paper's loss, lambda_1 L_imit + lambda_2 L_goal + lambda_3 L_prob, through the derivative of the solution.
 
     Args:
-        weights: lambda of ``imitation``, ``goal`` (unused where no goal is decoded), ``probability`` and ``initial``. The
-            last one weighs the imitation loss of the initial strategies where no derivative reaches them through the
-            solution, and is unused elsewhere. Where orders of agents are decoded, their cross entropy takes the place of
-            ``probability``.
+        weights: lambda of ``imitation``, ``goal`` (unused if no goal is decoded), ``probability`` and ``initial``.
+            ``initial`` is the imitation loss of the initial strategies; it is used if no gradient reaches them through the
+            solution (``truncated``, ``implicit``). If orders of agents are decoded, ``probability`` is their cross entropy.
         power: exponent of the distances; the paper's is 1, TGL's 1.05.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
     """

@@ -4,10 +4,11 @@ With the gradient g and the Hessian H of E at the d demonstrated controls u,
 
     -log p(u) = 1/2 g^T H^-1 g - 1/2 log det H + d/2 log 2 pi,
 
-which is exact for quadratic energies. The first term pulls the minimum towards the observation, the second makes it as
-narrow there as the data allow. H is the Gauss-Newton matrix J^T J + eps I of the residuals' Jacobian J.
+which is exact for quadratic energies. The first term moves the minimum of E towards the observation; the second rewards
+large weights (a narrow density). H is the Gauss-Newton matrix J^T J + eps I of the residuals' Jacobian J.
 
-Controls that were not observed are integrated out. With the rows g_B and H_B of these, the density of the others has
+Let B be the controls that were not observed, and A the others. B is integrated out of the density; with the entries g_B of g
+and the block H_B of H,
 
     -log p(u_A) = (1/2 g^T H^-1 g - 1/2 log det H) - (1/2 g_B^T H_B^-1 g_B - 1/2 log det H_B) + d_A/2 log 2 pi.
 """
@@ -53,12 +54,12 @@ class Laplace(Objective):
     Args:
         weights: lambda of ``density``; of ``initial``, minSADE of the initial strategies, which the likelihood does not
             train; and of ``goal`` (no effect where no goal is decoded).
-        damping: eps, which keeps H positive definite for controls without any feature.
+        damping: eps, which keeps H positive definite if some controls have no effect on any feature.
     """
 
     terms = ("density", "initial", "goal")
-    needs = frozenset({PATH, STATIONARY, SAMPLES})  # a game for every mode, and strategies to start from
-    of_energy = frozenset({RESIDUALS})
+    needs_from_solver = frozenset({PATH, STATIONARY, SAMPLES})  # a game for every mode, and strategies to start from
+    needs_from_energy = frozenset({RESIDUALS})
 
     def __init__(self, weights: Mapping[str, float], damping: float = 1e-3) -> None:
         if not 0 <= damping < float("inf"):

@@ -25,7 +25,7 @@ def observed_future(scene: Scene) -> tuple[Float[Tensor, "B N K 4"], Bool[Tensor
 
 
 def goal_term(scene: Scene, forecast: JointForecast, weight: float) -> Terms:
-    """L_goal for forecasters that choose among goal candidates; empty for others."""
+    """The term L_goal for forecasters that choose among goal candidates; no term for others."""
     if forecast.goal_log_probabilities is None:
         return {}
     future, mask = observed_future(scene)

@@ -1,12 +1,12 @@
-"""Derivatives of solutions: what is backpropagated through the solution of a game (Table 1, column 3).
+"""Derivatives of solutions: how gradients are backpropagated through the solution of a game (Table 1, column 3).
 
 - ``unrolled`` (the paper's): through all S steps of the computation, also to the initial strategies.
-- ``truncated``: through the last few steps, with the iterate before them held constant.
+- ``truncated``: through the last few steps; the iterate at which they start is held constant.
 - ``implicit``: the derivative of the minimum that the steps approach (implicit function theorem), independent of the path.
-  It is right only where the solution is a minimum, so take many steps; a warning is given once if most of a batch are no
-  minima. A sample whose Hessian is not positive definite is no minimum: its gradient is zero and its status STOPPED. A
-  minimum does not move when all weights of a game are scaled together, so w . dL/dw = 0: the overall scale of the weights
-  is not learned and drifts. Fix one weight, or normalise.
+  It is correct only if the solution is a minimum, so use many steps; if more than half of the solutions of a batch are no
+  minima, a warning is given once. A sample whose Hessian is not positive definite is no minimum: its gradient is zero and
+  its status STOPPED. Scaling all weights of a game by the same factor does not move the minimum, so w . dL/dw = 0: the
+  overall scale of the weights is not learned and drifts. Fix one weight, or normalise the weights.
 - ``detached``: no derivative, for objectives that compare energies instead of solutions.
 """
 
@@ -35,18 +35,18 @@ class Backward(ABC):
     """The interface of derivatives: runs a minimiser and attaches a derivative to its solution.
 
     Attributes:
-        needs: properties of a minimiser, of which it must provide at least one; empty for none.
+        needs_from_solver: properties of a minimiser, of which it must provide at least one; empty if nothing is needed.
         teaches: whether gradients flow through the solution.
         teaches_start: whether gradients flow to the initial strategies.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset()
+    needs_from_solver: ClassVar[frozenset[str]] = frozenset()
     teaches: ClassVar[bool] = True
     teaches_start: ClassVar[bool] = False
 
     @property
-    def of_energy(self) -> frozenset[str]:
-        """Properties that an energy must offer."""
+    def needs_from_energy(self) -> frozenset[str]:
+        """Properties that the energy must offer."""
         return frozenset()
 
     @abstractmethod
@@ -59,7 +59,7 @@ class Backward(ABC):
 class Unrolled(Backward):
     """Differentiate every step (Section 4.3)."""
 
-    needs = frozenset({PATH, TABLES})
+    needs_from_solver = frozenset({PATH, TABLES})
     teaches_start = True
 
     def __call__(self, minimiser: Minimiser, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
@@ -75,7 +75,7 @@ class Truncated(Backward):
         steps: number of differentiated steps.
     """
 
-    needs = frozenset({STEPS})
+    needs_from_solver = frozenset({STEPS})
 
     steps: int = 1
 
@@ -110,7 +110,7 @@ class Implicit(Backward):
         hessian: ``exact``, or ``gauss_newton`` to leave out second derivatives of residuals.
     """
 
-    needs = frozenset({STATIONARY})
+    needs_from_solver = frozenset({STATIONARY})
 
     hessian: str = "exact"
 
@@ -119,7 +119,7 @@ class Implicit(Backward):
             raise ConfigError(f"unknown backward.hessian {self.hessian!r}: {nearest(str(self.hessian), HESSIANS)}")
 
     @property
-    def of_energy(self) -> frozenset[str]:
+    def needs_from_energy(self) -> frozenset[str]:
         """A gradient, and residuals for a Gauss-Newton matrix."""
         return frozenset({GRADIENT} if self.hessian == "exact" else {GRADIENT, RESIDUALS})
 

@@ -1,7 +1,7 @@
-"""The interface of minimisers: maps from an energy and initial strategies to joint strategies (Table 1, column 2).
+"""The interface of minimisers (solvers): from an energy and initial strategies to joint strategies (Table 1, column 2).
 
-Minimisers differ in the properties of the energy that they need and in those of the solution that they provide for
-learning. Both are declared, so that combinations that cannot work are refused before anything runs
+Minimisers differ in what they need from the energy and in what their solution provides for learning. Both are declared, so
+that combinations that cannot work are refused before anything runs
 (:mod:`epo_lightning.forecasters.combination`).
 """
 
@@ -15,8 +15,9 @@ from epo_lightning.game.energy import Energy
 from epo_lightning.scene import GameParameters, Scene, Solution
 
 PATH, STEPS, STATIONARY, SAMPLES, TABLES = "path", "steps", "stationary", "samples", "tables"
-"""Properties of a minimiser's solution: a path that can be differentiated; steps that can be interrupted and continued;
-strategies with a vanishing gradient; samples of exp(-E); or tables of candidates' energies and log-probabilities."""
+"""Properties that a minimiser can provide. PATH: its steps can be differentiated. STEPS: they can be interrupted and
+continued. STATIONARY: dE/du vanishes at its solution. SAMPLES: the solution is a sample of exp(-E). TABLES: the solution has
+energies and log-probabilities of candidates."""
 
 
 class Minimiser(ABC):
@@ -26,11 +27,12 @@ class Minimiser(ABC):
     others return constants. :mod:`~epo_lightning.solvers.backward` defines the derivative that is used for learning.
 
     Attributes:
-        needs: properties that an energy must offer (:mod:`epo_lightning.game.energy`).
-        provides: some of :data:`PATH`, :data:`STEPS`, :data:`STATIONARY`, :data:`SAMPLES` and :data:`TABLES`.
+        needs_from_energy: properties that the energy must offer (:mod:`epo_lightning.game.energy`).
+        provides: properties of the solution, of :data:`PATH`, :data:`STEPS`, :data:`STATIONARY`, :data:`SAMPLES`,
+            :data:`TABLES`.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset()
+    needs_from_energy: ClassVar[frozenset[str]] = frozenset()
     provides: ClassVar[frozenset[str]] = frozenset()
 
     @abstractmethod
@@ -67,10 +69,10 @@ class Stepwise(Minimiser):
     def run(
         self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Any = None
     ) -> tuple[Solution, Any]:
-        """Take a number of steps; returns the solution, and the memory to continue with.
+        """Take a number of steps; returns the solution, and a memory with which another call continues.
 
         Args:
-            memory: the memory that an earlier call returned; None at the start.
+            memory: the memory that an earlier call returned (such as the adaptive damping); None at the start.
         """
 
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:

@@ -266,7 +266,7 @@ def test_the_weight_of_accelerations_is_not_decoded():
 
 def test_the_energy_declares_its_needs():
     assert convex_energy().needs == {"goals", "reference_speed", "size", "order"}
-    assert convex_energy().heading == {"goal", "lateral"}
+    assert convex_energy().goal_terms == {"goal", "lateral"}
     alone = convex_energy(["acc", "lat_acc"], pair=())
     assert alone.needs == set()
     scene, game = convex_game()

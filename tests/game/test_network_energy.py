@@ -158,8 +158,8 @@ def test_features_are_added_to_the_networks(kind):
     assert both.weighted == (("goal", "lane", "acc", "velb"), ("proximity", "circles"))
     assert plain.weighted == ((), ())
     assert both.needs == {"goals", "reference"} | plain.needs
-    assert both.heading == {"goal", "lane"}
-    assert plain.heading == set()
+    assert both.goal_terms == {"goal", "lane"}
+    assert plain.goal_terms == set()
 
 
 def test_the_energy_is_an_exact_potential_of_the_agents_costs():

@@ -40,7 +40,7 @@ class EnergySuite:
         own, pair = energy.weighted
         assert set(own) <= set(energy.own)
         assert set(pair) <= set(energy.pair)
-        assert energy.heading <= set(energy.own)
+        assert energy.goal_terms <= set(energy.own)
         assert energy.offers <= {GRADIENT, RESIDUALS, FEATURES}
         assert energy.needs <= NEEDS
         assert ("order" in energy.needs) == (energy.pair_order is not None)

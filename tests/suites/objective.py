@@ -71,8 +71,8 @@ class ObjectiveSuite:
         return {name: value for name, (weight, value) in terms.items() if weight > 0}
 
     def test_terms_have_the_declared_names(self, objective, energy):
-        assert objective.needs <= {PATH, STEPS, STATIONARY, SAMPLES, TABLES}
-        assert objective.of_energy <= {GRADIENT, RESIDUALS, FEATURES}
+        assert objective.needs_from_solver <= {PATH, STEPS, STATIONARY, SAMPLES, TABLES}
+        assert objective.needs_from_energy <= {GRADIENT, RESIDUALS, FEATURES}
         assert set(objective.weights) == set(objective.terms)
         terms = self.terms(objective, energy, *self.game(energy))
         for name, (weight, value) in terms.items():

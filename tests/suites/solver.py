@@ -64,7 +64,7 @@ class SolverSuite:
 
     def test_declared_properties_have_their_types(self):
         minimiser = build("solver", self.config)
-        assert minimiser.needs <= {GRADIENT, RESIDUALS, FEATURES}
+        assert minimiser.needs_from_energy <= {GRADIENT, RESIDUALS, FEATURES}
         assert minimiser.provides <= {PATH, STEPS, STATIONARY, SAMPLES, TABLES}
         assert minimiser.provides
         assert (STEPS in minimiser.provides) == isinstance(minimiser, Stepwise)

@@ -10,11 +10,11 @@ minSADE   min_m mean_i mean_k e[m,i,k]        one mode for all agents of the sce
 minSFDE   min_m mean_i e[m,i,K]
 ========  ==================================  ==================================================
 
-Each metric takes its own best mode: the minSFDE need not belong to the mode of the minSADE.
+The best mode is chosen for each metric separately: minSFDE and minSADE may be those of different modes.
 
 Agents without any observed step, and for the final displacements those whose last step was not observed, are left out
-of the mean over agents. A scene without any agent left is NaN. A non-finite prediction at an observed step has an infinite
-displacement, so that a broken forecast cannot pass for an unobserved scene.
+of the mean over agents. The value of a scene without any agent left is NaN. A prediction that is not finite at an observed
+step has an infinite displacement, so that a broken forecast is not mistaken for a scene without observations.
 
 Example: two agents stand at the origin; mode 0 is right about the first one, mode 1 nearly right about the second one.
 
@@ -118,7 +118,7 @@ def _check_shapes(states: Tensor, future: Tensor, mask: Tensor) -> None:
     """Refuse shapes that would be broadcast, such as a future of one step.
 
     Raises:
-        ValueError: as said.
+        ValueError: predictions, future and mask differ in the number of scenes, agents or steps.
     """
     if states.dim() != 5 or future.dim() != 4 or states.shape[:1] + states.shape[2:4] != future.shape[:3]:
         raise ValueError(

@@ -9,7 +9,7 @@ from torch import Tensor
 def marginal_to_joint(
     states: Float[Tensor, "B M N K X"], agent_probabilities: Float[Tensor, "B M N"], *others: Float[Tensor, "B M N"]
 ) -> tuple[Float[Tensor, "B M N K X"] | Float[Tensor, "B M N"], ...]:
-    """Every agent's modes by decreasing probability: joint mode k consists of every agent's k-th most likely one.
+    """Order every agent's modes by decreasing probability, so that joint mode k is every agent's k-th most likely mode.
 
     The joint metrics of a marginal forecaster are defined like this (Section 5, Metrics). Equally likely modes keep
     their order.

@@ -27,7 +27,7 @@ Definition = Literal["jfp", "authors"]
 Shape = Literal["disc", "box"]
 
 TOUCH = 1e-6
-"""Overlaps that are less deep than this [m] are rounding errors of agents that touch."""
+"""Depth [m] up to which an overlap counts as touching (a rounding error)."""
 
 
 def overlap_rate(
@@ -42,7 +42,7 @@ def overlap_rate(
 
     Args:
         states: predictions of all agents at all steps, observed later or not.
-        probabilities: probabilities of the joint modes; of equally likely ones the first counts.
+        probabilities: probabilities of the joint modes; if several are the largest, the first of these modes is taken.
         size: length and width [m].
         agent_mask: agents that exist.
         definition: ``jfp`` or ``authors``, see the module.
@@ -50,7 +50,7 @@ def overlap_rate(
 
     Returns:
         One value per scene; NaN for a scene without agents. Where the predicted state of an agent is not finite, the value
-        is infinite, so that a broken forecast cannot pass for a consistent one.
+        is infinite, so that a broken forecast is not mistaken for one without overlaps.
 
     Raises:
         ConfigError: an unknown definition or shape.

@@ -1,8 +1,8 @@
 """Minimisers over finite sets: every agent has C candidates, and joint modes are the best of their C^N combinations.
 
 JFP (Luo et al., CoRL 2022) decodes the candidates and enumerates all combinations; DSDNet (Zeng et al., ECCV 2020) samples
-them from a model of motion and uses sum-product message passing. Energies need no gradient, and the minimum is exactly one
-of the combinations.
+them from a model of motion and uses sum-product message passing. Energies need no gradient, and the minimum over the finite
+set of combinations is exact (up to C^N = 4096; beyond that it is searched).
 """
 
 from __future__ import annotations

@@ -1,13 +1,14 @@
 """Factorisation of the damped Gauss-Newton matrix, a few nodes at a time: dynamic programming in blocks.
 
-At node s, earlier nodes affect later costs through three quantities only: the displacement of the next position, and the
-changes of nodes s and s - 1 (differences of nodes are controls, and differences of those their rates). With this state
-x = (dp_{s+1}, dz_{s-1}, dz_s) and the nodes Z = (dz_{s+1} .. dz_e) of a block, the block is eliminated by
+The nodes (speeds and headings after every step) are eliminated backwards in time, a block of nodes at a time. The nodes up
+to s affect the costs after s only through three quantities: the displacement of the next position, and the changes of the
+nodes s and s - 1 (a difference of nodes is a control, and a difference of controls is its rate). With this state x =
+(dp_{s+1}, dz_{s-1}, dz_s) and the nodes Z = (dz_{s+1} .. dz_e) of a block, the block is eliminated by
 
     L L^T = H_ZZ,   G = L^-1 H_Zx,   P = H_xx - G^T G,
 
-where P is the cost-to-go that the block before takes over. Blocks of about forty unknowns keep the operations few and
-large; the total cost is O(K N^3).
+where P is the cost-to-go, which is added to the costs of the block before. Blocks of about forty unknowns need few and large
+operations; the total cost is O(K N^3).
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Block:
         unknowns: number of unknowns; entries beyond them, up to n, are padding.
         moves: derivative dt M of later positions by the nodes, component and agent by axis and agent.
         factor: L.
-        gain: G^T; None for the first block, whose state is given.
+        gain: G^T; None for the first block, because the state at t0 is given and not an unknown.
     """
 
     unknowns: int
@@ -116,7 +117,7 @@ def factorise(
     failed = torch.zeros(group.count, dtype=torch.bool, device=damping.device)
     blocks: list[Block] = []
     cost: Tensor | None = None
-    # Undeclared features may couple any two steps: then there is one block of all.
+    # Undeclared features may couple any two steps, so that all nodes are one block.
     whole = model.blocks is not None or model.pair_blocks is not None
     for start, end in reversed([(0, model.at.steps)] if whole else bounds(model.at.steps, group.size)):
         block, cost, info = parts.eliminate(start, end, cost)
@@ -219,9 +220,10 @@ class _Parts:
         return Block(unknowns, right, matrix, gain.mT), own, info
 
     def _bands(self, matrix: Tensor, state: Tensor | None, start: int, end: int) -> Tensor:
-        """Add what differences of nodes cost, to the block's own matrix and to its rows against the state.
+        """Add the costs of controls, of their rates and of the nodes themselves to ``matrix`` and ``state``.
 
-        Every difference belongs to the block that holds its last node. Returns what falls to the state alone.
+        Controls and rates are differences of nodes. A difference belongs to the block of its last node. Returns the part of
+        the costs that depends on the state only.
         """
         width, count = 2 * self.size, end - start
         batch = len(matrix)

@@ -1,11 +1,11 @@
 """The compiled backend for CPUs: all steps in one call, their adjoint in another, one problem per vector lane.
 
 Every step is a linear-quadratic problem, which one backward and one forward recursion over time solve in O(K N^3); see
-`docs/solver.md` and `kernel/`. The library has a plain C interface: building it needs a C++ compiler only, and one build
-serves every version of Python and PyTorch.
+`docs/solver.md` and `kernel/`. The library has a plain C interface: building it needs only a C++ compiler, and one build
+works with every version of Python and PyTorch.
 
-The library's threads end before a call returns, and Python handles signals between calls only. An interrupt therefore never
-leaves a thread behind that writes to released memory; it waits for the call to end.
+The library's threads end before a call returns, and Python handles signals only between calls. A thread therefore never
+writes to memory that was released after an interrupt; the interrupt takes effect when the call has ended.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
 def say_once(reason: str) -> None:
     """Warn once per reason that plain PyTorch replaces the kernel."""
     warnings.warn(
-        f"{reason}. Plain PyTorch does the same, at a tenth of the speed or less; solver.backend=pytorch asks for it.",
+        f"{reason}. Plain PyTorch does the same, at a tenth of the speed or less; solver.backend=pytorch silences this.",
         stacklevel=2,
     )
 

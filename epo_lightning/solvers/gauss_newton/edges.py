@@ -15,7 +15,7 @@ from epo_lightning.scene import GameParameters, Scene
 
 @dataclass(frozen=True)
 class Edges:
-    """Pairs of agents, through all samples.
+    """A list of pairs of agents of all samples; agent i of sample s has the number s N + i, pair p the number s P + p.
 
     Attributes:
         first, second: numbers s N + i and s N + j of the agents.
@@ -85,8 +85,8 @@ class Edges:
     def spread_(self, onto: Float[Tensor, "S N *rest"], first: Tensor, second: Tensor) -> None:
         """Add values of edges to their first and second agents, in place.
 
-        On a CPU edge by edge, so that sums do not depend on the rest of the batch; on other devices with complete edges as a
-        product with the incidence matrix, which is deterministic, unlike parallel additions.
+        On a CPU values are added edge by edge, so that sums do not depend on the rest of the batch. On other devices, if all
+        pairs are edges, a product with the incidence matrix is used, which is deterministic, unlike parallel additions.
         """
         if onto.device.type == "cpu" or not self.every:
             onto.flatten(0, 1).index_add_(0, self.first, first).index_add_(0, self.second, second)

@@ -50,7 +50,7 @@ def expand(
 
     Args:
         energy, scene, parameters, controls: the game and where to expand it.
-        every_pair: whether all pairs are evaluated, or those alone that may interact.
+        every_pair: whether all pairs are evaluated, or only those that may interact.
         exact: whether the matrix is the Hessian, or its Gauss-Newton approximation without second derivatives of residuals.
     """
     at = Iterate.of(energy, scene, parameters, controls)
@@ -107,7 +107,10 @@ def expand(
 
 @dataclass
 class _Sums:
-    """Running sums over features, which the functions below add to.
+    """Running sums over features, to which the functions below add.
+
+    A *force* is a first derivative of the energy by a quantity, a *stiffness* a second derivative, and a *pull* holds both
+    for positions.
 
     Attributes:
         at, exact: as for :func:`expand`.
@@ -141,7 +144,7 @@ class _Sums:
         return cls(at, exact, zeros(), *(zeros(count, at.steps) for count in (2, 2, 5, 2, 2)))
 
     def crossed(self) -> Tensor:
-        """``cross``, made at first use."""
+        """The array ``cross``, allocated at first use."""
         if self.cross is None:
             self.cross = torch.zeros_like(self.node)
         return self.cross

@@ -1,8 +1,8 @@
 """Implicit differentiation of a minimum: the derivative of the solution by the game's parameters.
 
-At a minimum, grad E(u, p) = 0 for every p near by, so du/dp = -H^-1 d(grad E)/dp with the Hessian H of E. For a cotangent v
-of the solution, H mu = v, and the gradient is that of -<mu, grad E(u, p)> by p with u and mu held constant. It does not
-depend on the path of the minimisation: initial controls have no gradient.
+At a minimum u(p), grad E(u(p), p) = 0 for all p in a neighbourhood, so du/dp = -H^-1 d(grad E)/dp with the Hessian H of E.
+For a cotangent v of the solution, mu solves H mu = v, and the gradient by p is that of -<mu, grad E(u, p)> with u and mu
+held constant. It does not depend on the path of the minimisation, so initial controls have no gradient.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """An iterate of a Gauss-Newton solver: joint strategies, their trajectories, and the maps between controls and nodes.
 
-Unknowns are not the controls u but the speeds and headings z_l = z_0 + dt sum_{j<l} u_j at the nodes l = 1 .. K, because in
-them the model is nearly local. With e_l the heading's unit vector and e'_l the one to its left, a position changes as
+The solver's unknowns are not the controls u but the speeds and headings z_l = z_0 + dt sum_{j<l} u_j after every step,
+called nodes l = 1 .. K, because the second derivatives by z have a simple structure (:mod:`.quadratic_model`). With e_l the
+unit vector of the heading and e'_l the unit vector to its left, a position changes as
 
-    dp_k = dt sum_{l<k} M_l dz_l,   M_l = [e_l, v_l e'_l]     (explicit Euler; other integrators weigh l = k as well).
+    dp_k = dt sum_{l<k} M_l dz_l,   M_l = [e_l, v_l e'_l]     (explicit Euler; other integrators include l = k).
 
 Arrays are laid out [S, N, component, K] with S = B M samples; components of z and u are speed and heading, acceleration and
 turn rate.
@@ -23,7 +24,7 @@ from epo_lightning.scene import HEADING, SPEED, TURN_RATE, GameParameters, Scene
 
 
 def suffix_sums(values: Float[Tensor, "*rest K"]) -> Float[Tensor, "*rest K"]:
-    """Sums over this entry of the last dimension and all after it."""
+    """Reverse cumulative sums: entry k of the result is the sum of the entries k .. K of the last dimension."""
     return values.flip(-1).cumsum(-1).flip(-1)
 
 
@@ -143,7 +144,7 @@ class Iterate:
         return self.dt * (self.beta * following(sums) + (1.0 - self.beta) * sums)
 
     def node_directions(self) -> Float[Tensor, "D B M N K 2"]:
-        """The D = 2 K changes of controls that move one node alone, component after component."""
+        """The D = 2 K changes of controls that each move a single entry of z: all speeds first, then all headings."""
         unit = torch.eye(2 * self.steps, dtype=self.u.dtype, device=self.u.device)
         unit = self.to_controls(unit.view(-1, 1, 1, 1, 2, self.steps)).transpose(-1, -2)
         return unit.expand(-1, *self.controls.shape)

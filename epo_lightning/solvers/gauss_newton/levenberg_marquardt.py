@@ -1,8 +1,8 @@
 """The energy-based potential game layer (Section 4.3): S damped Gauss-Newton steps, differentiable.
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
-modes are solved at once and independently of each other: where a factorisation fails, that sample alone is tried again with
-more damping, and if that fails too it keeps its last good iterate. Two backends compute the steps
+modes are solved at once and independently of each other. If the factorisation of a sample fails, only this sample is tried
+again with more damping; if that fails as well, it keeps its last good iterate. Two backends compute the steps
 (:mod:`~epo_lightning.solvers.gauss_newton.compiled` and :mod:`~epo_lightning.solvers.gauss_newton.structured`); this module
 chooses the backend and, with adaptive damping, accepts or rejects steps.
 """
@@ -28,7 +28,7 @@ from epo_lightning.solvers.general import descent
 Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool], Solution]
 """(energy, scene, parameters, steps, step size, damping [B, M] or [B, M, N], keep iterates) -> solution.
 
-An agent with infinite damping keeps its controls exactly; the others are solved with its trajectory held fixed."""
+An agent with infinite damping keeps its controls exactly, and the steps of the other agents take its trajectory as fixed."""
 
 LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e7
 """Range of the adaptive damping."""
@@ -40,8 +40,8 @@ BACKENDS = ("auto", "pytorch", "compiled")
 class LevenbergMarquardt(Stepwise):
     """S steps of damped Gauss-Newton from the initial strategies (Section 4.3, "Differentiable Optimization").
 
-    The derivative of the solution is chosen by a :class:`~epo_lightning.solvers.backward.Backward`; called on its own, the
-    solver unrolls.
+    A :class:`~epo_lightning.solvers.backward.Backward` chooses the derivative of the solution. Without one, the solution is
+    differentiated by unrolling.
 
     Example::
 
@@ -54,13 +54,14 @@ class LevenbergMarquardt(Stepwise):
         step_size: alpha, 0 < alpha <= 1.
         damping: lambda >= 0, added to the diagonal of J^T J.
         keep_iterates: whether the solution carries u_0 .. u_S.
-        adaptive: whether every sample rejects steps that do not lower its energy and then multiplies its damping by 10 (up
-            to 1e7), and divides it by 10 after other steps (down to 1e-7). The decisions have no gradient.
+        adaptive: whether the damping of every sample is adapted: a step that does not lower the energy is rejected and the
+            damping multiplied by 10 (up to 1e7); another step is accepted and the damping divided by 10 (down to 1e-7).
+            These decisions have no gradient.
         test_steps: number of steps outside training; None for the same number.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it supports the game.
     """
 
-    needs = frozenset({FEATURES})
+    needs_from_energy = frozenset({FEATURES})
     provides = frozenset({PATH, STEPS, STATIONARY})
 
     steps: int = 2

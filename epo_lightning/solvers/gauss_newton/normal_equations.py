@@ -1,8 +1,9 @@
 """The normal equations of a feature energy as dense matrices: J^T r and J^T J, differentiable by the game's parameters.
 
-The layer's own factorisation (:mod:`~epo_lightning.solvers.gauss_newton.blocks`) never forms J^T J and has no determinant to
-differentiate; objectives that need both (:mod:`epo_lightning.objectives.laplace`) take this. Residuals of an agent depend on
-its own controls alone, and those of a pair on the controls of its two agents, so the matrix is assembled from small blocks.
+The solver's own factorisation (:mod:`~epo_lightning.solvers.gauss_newton.blocks`) never forms J^T J and has no
+differentiable determinant. This module is for objectives that need both (:mod:`epo_lightning.objectives.laplace`).
+Residuals of an agent depend on its own controls only, and those of a pair on the controls of its two agents, so the matrix
+consists of small blocks.
 
 Rows are ordered by channel: agent by agent, all accelerations before all turn rates.
 """
@@ -44,9 +45,9 @@ def normal_equations(
 ) -> tuple[Float[Tensor, "B M n"], Float[Tensor, "B M n n"]]:
     """The gradient J^T r and the upper half of H = J^T J + eps I, in double precision.
 
-    Both are differentiable with respect to the parameters. Absent agents have unit rows. The nearest point of a line slides
-    as an agent moves along it: how far an agent gets says nothing about how well it keeps to its lane. (Minimisers hold the
-    point, which makes steps shorter and changes no solution; a density would be changed.)
+    Both are differentiable with respect to the parameters. Absent agents have rows of the unit matrix. For lines, the exact
+    derivative is used (``slide`` of :func:`~epo_lightning.game.feature_derivatives.signal_and_change`), so that motion along
+    a line has no cost. (Solvers hold the nearest point fixed, which changes no solution but would change a density.)
 
     Args:
         energy, scene, parameters, controls: the game, and where to expand it.

@@ -1,12 +1,12 @@
-"""The adjoint of a Gauss-Newton step: derivatives of a quadratic model by everything it depends on, in closed form.
+"""The adjoint of a Gauss-Newton step: its gradient with respect to controls, weights and goals, in closed form.
 
-For constant changes mu (``adjoint``) and d (``step``) of the controls,
+For constant changes mu (``adjoint``) and d (``step``) of the controls, the gradient is that of the scalar
 
     phi(u, p) = -<J mu, r + J d>
 
-is differentiated by the controls u and by the weights and goals p. Every residual r = w c(z(u)) contributes by its own
-first and second derivatives, which the model holds; forces on controls, nodes and positions are collected and carried back
-to the controls at the end, as for the gradient of an energy.
+by the controls u and by the weights and goals p. The quadratic model holds the first and second derivatives of every
+residual r = w c(z(u)). Forces (derivatives of phi) on controls, nodes and positions are summed over the features and
+backpropagated to the controls at the end, as for the gradient of an energy.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Gradients:
     """The gradient of phi, without the parts of undeclared features, which need automatic differentiation.
 
     Attributes:
-        controls: by the controls.
-        own, pair: by the weights, by name of the feature.
-        goals: by the goals; None without a feature of goals.
+        controls: gradient by the controls.
+        own, pair: gradients by the weights, by name of the feature.
+        goals: gradient by the goals; None without a feature that needs goals.
     """
 
     controls: Float[Tensor, "S N 2 K"]
@@ -56,11 +56,11 @@ class _Changes:
 
 @dataclass(frozen=True)
 class _Forces:
-    """Forces that phi exerts, which the functions below add to in place.
+    """Derivatives of phi (forces), to which the functions below add in place.
 
     Attributes:
-        controls, nodes: on controls and nodes.
-        positions: on positions, on their change along mu, and on that along d.
+        controls, nodes: derivatives by controls and nodes.
+        positions: derivatives by positions, by their change along mu, and by their change along d.
     """
 
     controls: Float[Tensor, "S N 2 K"]

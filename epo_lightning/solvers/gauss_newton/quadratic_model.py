@@ -5,12 +5,12 @@ l >= l'
 
     M_l^T [dt^2 sum_{k>l} Q_k] M_l',   Q_k the second derivatives by p_k,
 
-so one thin matrix product gives the whole lower triangle. Everything else is a band: controls are first differences of z,
-their rates second ones, speeds stand on the diagonal, and steering angles couple a turn rate with the speed before it. The
-model holds these second derivatives ("stiffness" below); :mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and
-factorises them.
+so one matrix product with few columns gives the whole lower triangle. All other contributions are banded matrices: controls
+are first differences of z, their rates second differences, speeds contribute to the diagonal, and a steering angle couples a
+turn rate with the speed before it. The model holds the second derivatives by these quantities, called "stiffness" below;
+:mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and factorises the matrix.
 
-Pairs are a list of E edges between agents, numbered s N + i through all samples.
+Pairs are a list of E edges between agents. Agent i of sample s has the number s N + i.
 """
 
 from __future__ import annotations

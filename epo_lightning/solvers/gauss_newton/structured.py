@@ -1,14 +1,16 @@
 """Damped Gauss-Newton steps in PyTorch, on any device: the quadratic model of all samples, factorised in blocks.
 
-One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Two things happen around it.
+One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Read this module in this order: :func:`solve` takes
+the steps, :class:`_Step` is one step with its adjoint, :func:`factorise` solves for d.
 
-*Splitting.* Agents that no active pair connects are independent: on a CPU every sample is split into the connected
-components of its active pairs, and components of one size are factorised together. The solution of an agent then depends on
-its component alone, to the last bit, and a scene with few active pairs costs little more than its agents alone. On other
-devices finding the components would make the host wait; there every sample is one matrix, and no operation synchronises.
+*Splitting.* Agents that are not connected by active pairs are independent. On a CPU every sample is split into the connected
+components of its active pairs, and components of the same size are factorised together. The solution of an agent then
+depends on its component alone, to the last bit, and a scene with few active pairs takes little more time than its agents
+alone. On a GPU, finding the components would make the host wait; there every sample is one matrix, and no operation
+synchronises.
 
-*Differentiation* does not tape the factorisation. For a cotangent v of u + alpha d, one more solve with the same factor
-gives mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
+*Differentiation.* Autograd does not record the factorisation. For a cotangent v of u + alpha d, one more solve with the same
+factor gives mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
 
     phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
 
@@ -154,13 +156,128 @@ class Game:
         return by_controls, by
 
 
+class _Step(torch.autograd.Function):
+    """u -> u + alpha d with its adjoint; see the module's docstring."""
+
+    @staticmethod
+    def forward(ctx: Any, game: Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        parameters = game.with_tensors(tensors)
+        model = expand(game.energy, game.scene, parameters, controls, not game.split)
+        factors = factorise(model, game.damping, game.split)
+        step = factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
+        status = factors.status.view(controls.shape[:2])
+        moved = controls + game.step_size * step
+        solved = game.finite & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
+        keep = solved[..., None, None, None]
+        status = torch.where(solved, status, Status.STOPPED)
+        value = model.value.view(controls.shape[:2])
+        if any(ctx.needs_input_grad):
+            ctx.game, ctx.factors = game, factors
+            ctx.save_for_backward(torch.where(keep, step, 0.0), solved, *tensors)
+        ctx.mark_non_differentiable(status, value)
+        return torch.where(keep, moved, controls), status, value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        game, factors = ctx.game, ctx.factors
+        model = factors.model
+        step, solved, *tensors = ctx.saved_tensors
+        shape = cotangent.shape
+        adjoint = factors.solve(game.step_size * planar(cotangent))
+        adjoint = torch.where(solved.flatten()[:, None, None, None], adjoint, 0.0)
+        by_controls, by = game.pullback(model, tensors, adjoint, planar(step))
+        by_controls = torch.where(solved[..., None, None, None], by_controls, 0.0)
+        by = [torch.where(solved.view(*shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
+        return None, cotangent + by_controls, *by
+
+
+@dataclasses.dataclass(frozen=True)
+class Factors:
+    """The factorised matrices J^T J + lambda I of all samples.
+
+    Attributes:
+        model: the quadratic model.
+        groups: the sets of agents that were factorised together.
+        factors: the factors of each group.
+        status: a :class:`Status` per sample.
+        held: mask of the agents with infinite damping; None where damping is given per sample.
+    """
+
+    model: QuadraticModel
+    groups: list[Group]
+    factors: list[blocks.Factors]
+    status: Int[Tensor, " S"]
+    held: Bool[Tensor, "S N"] | None = None
+
+    def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
+        """(J^T J + lambda I)^-1 times a covector of the controls."""
+        exact = self.model.at.to_nodes(right.to(torch.float64))
+        parts = [f.solve(_gather(group, exact)) for f, group in zip(self.factors, self.groups, strict=True)]
+        solved = self.model.at.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
+        return solved if self.held is None else torch.where(self.held[..., None, None], 0.0, solved)
+
+
+def factorise(
+    model: QuadraticModel, damping: Float[Tensor, "S *agents"], split: bool, retry: bool | None = None
+) -> Factors:
+    """Factorise the matrices of all samples, of each component on its own where they are split.
+
+    With ``retry``, a matrix that is not positive definite is tried again with ten, a hundred, ... times the damping; the
+    other matrices are not affected. If none of the attempts succeeds, the status is STOPPED, and solves with this matrix
+    have no meaning.
+
+    Args:
+        model: the quadratic model of the energy.
+        damping: lambda of every sample, or of every agent.
+        split: whether samples are split into components.
+        retry: whether to try again with more damping; by default, if samples are split.
+    """
+    held = damping.isinf() if damping.dim() == 2 else None
+    if held is not None:
+        damping = damping.clamp_max(_HOLDING)
+    groups = _components(model, held) if split else [Group.whole(model.edges)]
+    factors = []
+    status = torch.zeros(model.at.samples, dtype=torch.long, device=damping.device)
+    for group in groups:
+        found, failed = blocks.factorise(model, damping, group)
+        outcome = torch.where(failed, Status.STOPPED, Status.SOLVED)
+        if (split if retry is None else retry) and failed.any():
+            _retry(model, damping, group, found, outcome)
+        factors.append(found)
+        if group.agents is None:
+            status = outcome
+        else:  # a sample has the worst status of its components
+            status = status.scatter_reduce(0, group.agents[:, 0] // model.at.agents, outcome, "amax")
+    return Factors(model, groups, factors, status, held)
+
+
+def _retry(
+    model: QuadraticModel,
+    damping: Float[Tensor, "S *agents"],
+    group: Group,
+    factors: blocks.Factors,
+    outcome: Int[Tensor, " C"],
+) -> None:
+    """Factorise matrices without a factor again with increasing damping; writes ``factors`` and ``outcome`` in place."""
+    raised = damping.clamp_min(LEAST_RAISED_DAMPING)
+    for _ in range(RETRIES):
+        raised = 10.0 * raised
+        where = (outcome == Status.STOPPED).nonzero()[:, 0]
+        if len(where) == 0:
+            return
+        again, failed = blocks.factorise(model, damping + raised, group.subset(where))
+        factors.put(where, again, ~failed)
+        outcome[where[~failed]] = Status.DAMPED
+
+
 def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) -> list[Group]:
     """The connected components of active pairs in every sample; absent and held agents are in no group."""
     edges = model.edges
     samples, agents = edges.samples, edges.agents
     moving = model.at.present.flatten()
     links = model.linked
-    if held is not None:  # a pair with a held agent acts on the other agent only, and connects nothing
+    if held is not None:  # a pair with a held agent affects only the other agent, so it connects no agents
         moving = moving & ~held.flatten()
         links = links & moving[edges.first] & moving[edges.second]
     linked = bool(links.all())
@@ -208,87 +325,15 @@ def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) 
     return groups
 
 
-@dataclasses.dataclass(frozen=True)
-class Factors:
-    """The factorised matrices J^T J + lambda I of all samples.
-
-    Attributes:
-        model: the quadratic model.
-        groups: the sets of agents that were factorised together.
-        factors: one per group.
-        status: a :class:`Status` per sample.
-        held: mask of the agents with infinite damping; None where damping is given per sample.
-    """
-
-    model: QuadraticModel
-    groups: list[Group]
-    factors: list[blocks.Factors]
-    status: Int[Tensor, " S"]
-    held: Bool[Tensor, "S N"] | None = None
-
-    def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
-        """(J^T J + lambda I)^-1 times a covector of the controls."""
-        exact = self.model.at.to_nodes(right.to(torch.float64))
-        parts = [f.solve(_gather(group, exact)) for f, group in zip(self.factors, self.groups, strict=True)]
-        solved = self.model.at.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
-        return solved if self.held is None else torch.where(self.held[..., None, None], 0.0, solved)
-
-
-def factorise(
-    model: QuadraticModel, damping: Float[Tensor, "S *agents"], split: bool, retry: bool | None = None
-) -> Factors:
-    """Factorise the matrices of all samples, of each component on its own where they are split.
-
-    With ``retry``, a matrix that is not positive definite gets ten, a hundred, ... times the damping, and the others are not
-    affected. Solutions with a matrix that has no factor at any damping (status STOPPED) are meaningless.
-
-    Args:
-        model: the quadratic model of the energy.
-        damping: lambda of every sample, or of every agent.
-        split: whether samples are split into components.
-        retry: whether to try again with more damping; by default, where samples are split.
-    """
-    held = damping.isinf() if damping.dim() == 2 else None
-    if held is not None:
-        damping = damping.clamp_max(_HOLDING)
-    groups = _components(model, held) if split else [Group.whole(model.edges)]
-    factors = []
-    status = torch.zeros(model.at.samples, dtype=torch.long, device=damping.device)
-    for group in groups:
-        found, failed = blocks.factorise(model, damping, group)
-        outcome = torch.where(failed, Status.STOPPED, Status.SOLVED)
-        if (split if retry is None else retry) and failed.any():
-            _retry(model, damping, group, found, outcome)
-        factors.append(found)
-        if group.agents is None:
-            status = outcome
-        else:  # a sample has the worst status of its components
-            status = status.scatter_reduce(0, group.agents[:, 0] // model.at.agents, outcome, "amax")
-    return Factors(model, groups, factors, status, held)
-
-
-def _retry(
-    model: QuadraticModel,
-    damping: Float[Tensor, "S *agents"],
-    group: Group,
-    factors: blocks.Factors,
-    outcome: Int[Tensor, " C"],
-) -> None:
-    """Factorise matrices without a factor again with increasing damping; writes ``factors`` and ``outcome`` in place."""
-    raised = damping.clamp_min(LEAST_RAISED_DAMPING)
-    for _ in range(RETRIES):
-        raised = 10.0 * raised
-        where = (outcome == Status.STOPPED).nonzero()[:, 0]
-        if len(where) == 0:
-            return
-        again, failed = blocks.factorise(model, damping + raised, group.subset(where))
-        factors.put(where, again, ~failed)
-        outcome[where[~failed]] = Status.DAMPED
-
-
 def planar(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "S N 2 K"]:
     """Controls in the layout of the quadratic model."""
     return controls.flatten(0, 1).transpose(-1, -2).contiguous()
+
+
+def _gather(group: Group, values: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "C n"]:
+    """Vectors of samples in the order of a group's unknowns."""
+    by_agent = values if group.agents is None else values.flatten(0, 1)[group.agents]
+    return by_agent.permute(0, 3, 2, 1).reshape(group.count, -1)
 
 
 def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tensor, "S N 2 K"]) -> Tensor:
@@ -301,48 +346,6 @@ def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tenso
             return by_agent.reshape(like.shape)
         rows[group.agents] = by_agent
     return rows.view_as(like)
-
-
-def _gather(group: Group, values: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "C n"]:
-    """Vectors of samples in the order of a group's unknowns."""
-    by_agent = values if group.agents is None else values.flatten(0, 1)[group.agents]
-    return by_agent.permute(0, 3, 2, 1).reshape(group.count, -1)
-
-
-class _Step(torch.autograd.Function):
-    """u -> u + alpha d with its adjoint; see the module's docstring."""
-
-    @staticmethod
-    def forward(ctx: Any, game: Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        parameters = game.with_tensors(tensors)
-        model = expand(game.energy, game.scene, parameters, controls, not game.split)
-        factors = factorise(model, game.damping, game.split)
-        step = factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
-        status = factors.status.view(controls.shape[:2])
-        moved = controls + game.step_size * step
-        solved = game.finite & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
-        keep = solved[..., None, None, None]
-        status = torch.where(solved, status, Status.STOPPED)
-        value = model.value.view(controls.shape[:2])
-        if any(ctx.needs_input_grad):
-            ctx.game, ctx.factors = game, factors
-            ctx.save_for_backward(torch.where(keep, step, 0.0), solved, *tensors)
-        ctx.mark_non_differentiable(status, value)
-        return torch.where(keep, moved, controls), status, value
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, cotangent: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        game, factors = ctx.game, ctx.factors
-        model = factors.model
-        step, solved, *tensors = ctx.saved_tensors
-        shape = cotangent.shape
-        adjoint = factors.solve(game.step_size * planar(cotangent))
-        adjoint = torch.where(solved.flatten()[:, None, None, None], adjoint, 0.0)
-        by_controls, by = game.pullback(model, tensors, adjoint, planar(step))
-        by_controls = torch.where(solved[..., None, None, None], by_controls, 0.0)
-        by = [torch.where(solved.view(*shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
-        return None, cotangent + by_controls, *by
 
 
 def _pullback_undeclared(

@@ -1,8 +1,8 @@
 """Derivatives of any energy as dense arrays, by automatic differentiation, for energies of unknown structure.
 
-Samples are independent of each other, so one product of Hessians and vectors serves all of them: a Hessian of n controls
-takes n products, whatever the batch. Rows and columns follow ``controls.flatten(2)``. Absent agents have a 1 on the diagonal
-and zeros elsewhere, so that they affect no factorisation and no solution.
+Samples are independent of each other, so one Hessian-vector product is computed for all samples at once: the Hessians of n
+controls take n products, whatever the size of the batch. Rows and columns have the order of ``controls.flatten(2)``. Absent
+agents have a 1 on the diagonal and zeros elsewhere, so that they affect neither factorisations nor solutions.
 """
 
 from __future__ import annotations
@@ -112,7 +112,8 @@ def attach(
 ) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
     """The controls of a solution with their implicit derivative, and a status.
 
-    At a minimum g(u, p) = dE/du = 0 for every game p near by, so du/dp = -H^-1 dg/dp. With u and H held constant,
+    At a minimum u(p), g(u(p), p) = dE/du = 0 for all p in a neighbourhood, so du/dp = -H^-1 dg/dp. With u and H held
+    constant,
 
         u - H^-1 (g(u, p) - g(u, p) held constant)
 

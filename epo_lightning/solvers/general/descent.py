@@ -61,8 +61,8 @@ def level(
 ) -> Bool[Tensor, "B M"]:
     """Mask of the samples whose energy is equal up to rounding and whose gradient is smaller.
 
-    Close to a minimum, energies resolve only distances of the square root of the machine precision; gradients resolve
-    smaller ones (Hager and Zhang 2005, approximate Wolfe conditions).
+    Close to a minimum, rounding errors hide changes of the energy for steps below about the square root of the machine
+    precision; the gradient still shows them (Hager and Zhang 2005, approximate Wolfe conditions).
     """
     flatter = trial_slope.flatten(2).norm(dim=-1) < slope.flatten(2).norm(dim=-1)
     return (trial_value <= value + rounding(value)) & flatter

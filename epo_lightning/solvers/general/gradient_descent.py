@@ -3,11 +3,12 @@
     u <- u - eta S^2 dE/du
 
 S = diag(scale) is a preconditioner per channel: this is gradient descent in u / S. Near a minimum with the Hessian H the
-steps converge if eta lambda_max(S H S) < 2 and diverge beyond that, so the stiffest direction limits eta, and a direction of
-eigenvalue lambda takes about 1 / (eta lambda) steps. On highways a turn rate moves positions more than an acceleration, by a
-factor of the speed, and a scale like [1, 0.03] makes both about equally stiff. A step that is too long raises the energy or
-makes it infinite or NaN: it is rejected, and the sample's next steps are half as long. This matters because weights are
-inferred: a game with stiff weights would diverge, and learning from the diverged controls would make it stiffer still.
+steps converge if eta lambda_max(S H S) < 2 and diverge otherwise, so the largest eigenvalue limits eta, and convergence
+along an eigenvector of eigenvalue lambda takes about 1 / (eta lambda) steps. On highways a turn rate moves positions about
+v times as much as an acceleration of the same number (v is the speed); a scale like [1, 0.03] makes their second
+derivatives about equal. A step that is too long raises the energy or makes it infinite or NaN: it is rejected, and the
+sample's next steps are half as long. This matters because weights are inferred: a game with large weights would diverge,
+and learning from diverged controls would make the weights larger still.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class GradientDescent(Stepwise):
         scale: diagonal of S for acceleration [m/s^2] and turn rate [rad/s].
     """
 
-    needs = frozenset({GRADIENT})
+    needs_from_energy = frozenset({GRADIENT})
     provides = frozenset({PATH, STEPS, STATIONARY})
 
     steps: int = 16
@@ -116,7 +117,8 @@ def descend(
     """Take steps u <- u - eta S^2 dE/du + noise S z from the initial strategies, with z ~ N(0, I).
 
     Differentiable if gradients are recorded; acceptance of steps has no gradient. Absent agents' controls are zero. With
-    noise, the energy of n controls stays about n / 2 above its lowest value, and steps up to ten times that are accepted.
+    noise, the energy of n controls is about n / 2 above its minimum, so steps up to ten times that amount above the lowest
+    energy so far are accepted.
 
     Args:
         energy, scene, parameters: the game.
@@ -149,7 +151,7 @@ def descend(
         moved = controls - step_size * reach * channels.square() * slope
         if noise:
             moved = moved + noise * reach.sqrt() * channels * torch.where(present, torch.randn_like(start), 0.0)
-        # The last gradient moves nothing, so it needs no graph.
+        # No further step uses the last gradient, so it needs no autograd graph.
         with torch.set_grad_enabled(torch.is_grad_enabled() and step < steps - 1):
             value, ahead, finite_there = _evaluate(energy, scene, parameters, moved, finite)
         good = finite_there & (value <= lowest + slack)

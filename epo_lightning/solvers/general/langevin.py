@@ -1,4 +1,4 @@
-"""Approximate samples of p(u | o) = exp(-E(u; o)) / Z by noisy gradient steps: the synthesis of EBIOC (arXiv 1904.05453).
+"""Approximate samples of p(u | o) = exp(-E(u; o)) / Z by noisy gradient steps ("synthesis" in EBIOC, arXiv 1904.05453).
 
     u <- u - (delta^2 / 2) S^2 dE/du + delta S z,   z ~ N(0, I)
 
@@ -49,7 +49,7 @@ class Langevin(Minimiser):
             :mod:`~epo_lightning.solvers.general.gradient_descent`.
     """
 
-    needs = frozenset({GRADIENT})
+    needs_from_energy = frozenset({GRADIENT})
     provides = frozenset({SAMPLES})
 
     steps: int = 16

@@ -46,7 +46,7 @@ class LBFGS(Minimiser):
         history: number of steps in the history.
     """
 
-    needs = frozenset({GRADIENT})
+    needs_from_energy = frozenset({GRADIENT})
     provides = frozenset({STATIONARY})
 
     steps: int = 200

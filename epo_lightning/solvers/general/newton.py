@@ -42,7 +42,7 @@ class Newton(Minimiser):
             larger than this; or where rounding errors prevent further improvement.
     """
 
-    needs = frozenset({GRADIENT})
+    needs_from_energy = frozenset({GRADIENT})
     provides = frozenset({STATIONARY})
 
     steps: int = 50
