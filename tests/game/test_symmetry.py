@@ -51,7 +51,9 @@ SYMMETRIC = {
 @pytest.mark.parametrize("name", ASYMMETRIC)
 def test_features_that_depend_on_the_order_are_refused(name):
     pair_feature(name)(ASYMMETRIC[name])
-    with pytest.raises(ConfigError, match=f"pair feature '{name}' is not symmetric.*the game has no potential.*a_i > 0"):
+    with pytest.raises(
+        ConfigError, match=f"pair feature '{name}' is not symmetric.*the game has no potential.*a_i > 0"
+    ):
         FeatureEnergy(["acc"], [name])
     with pytest.raises(ConfigError, match=f"'{name}' is not symmetric"):
         NeuralEnergy(Unicycle(), 4, 5, 1.0, pair=["proximity", name])
