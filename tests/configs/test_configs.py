@@ -232,7 +232,7 @@ def test_help_and_configurations_are_printed(epo: Epo, capsys: pytest.CaptureFix
         (["--version"], "epo_lightning"),
         (["config", "experiment=rpi/v_lstm_epo"], "step_size: 0.3"),
         (["config", "evaluate", "run=x"], "split: test"),
-        (["config", "check", "experiment=rpi/v_lstm_epo"], "is sound"),
+        (["config", "check", "experiment=rpi/v_lstm_epo"], "is valid"),
     ):
         assert epo(*words) == 0
         assert expected in capsys.readouterr().out
