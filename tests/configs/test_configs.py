@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from experiment import tiny
@@ -28,10 +30,15 @@ def names(folder: Path) -> list[str]:
     return sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
 
 
+@cache
+def of_experiment(name: str) -> dict[str, Any]:
+    """The configuration of an experiment, composed once; not to be changed."""
+    return compose("train", [f"experiment={name}"])
+
+
 @pytest.mark.parametrize("experiment", names(CONF / "experiment"))
 def test_experiments_can_be_built(experiment: str) -> None:
-    config = compose("train", [f"experiment={experiment}"])
-    settings = read(Settings, config)
+    settings = read(Settings, of_experiment(experiment))
     assembly.check(settings)
     assert settings.title != "untitled"
     assert settings.experiment == experiment.replace("highway/", "exid/")  # recorded with the data that it names
@@ -40,7 +47,7 @@ def test_experiments_can_be_built(experiment: str) -> None:
 @pytest.mark.parametrize("data", sorted(folder.name for folder in (CONF / "experiment").iterdir()))
 def test_titles_are_unique(data: str) -> None:
     rows = [name for name in names(CONF / "experiment") if name.startswith(f"{data}/")]
-    configs = [compose("train", [f"experiment={name}"]) for name in rows]
+    configs = [of_experiment(name) for name in rows]
     titles = [(config["title"], config["data"]["name"]) for config in configs]
     assert len(set(titles)) == len(titles)
 

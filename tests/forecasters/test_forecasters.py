@@ -144,6 +144,7 @@ def test_checkpoints_of_another_architecture_are_refused(tmp_path):
 
 def test_expensive_diagnostics_are_computed_for_a_share_of_scenes(monkeypatch):
     monkeypatch.setattr("epo_lightning.forecasters.epo.EXAMINED", 3)
+    monkeypatch.setattr("epo_lightning.solvers.diagnostics.quasi_newton._EVALUATIONS", 40)  # far from a minimum
     solver = {"name": "gradient_descent", "steps": 2, "step_size": 1e-3}
     forecaster = build_forecaster(model(EPO, energy={"name": "neural"}, solver=solver, horizon=5)).eval()
     scene = random_scene(6, 2, horizon=5)

@@ -201,7 +201,7 @@ def test_gradients_of_the_layer_equal_finite_differences(mode):
     scene, parameters = traffic(scenes=6, agents=3 if mode == "unrolled" else 2, apart=0.7)
     parameters = dataclasses.replace(parameters, initial_controls=0.2 * parameters.initial_controls)
     energy = FeatureEnergy(OWN, ["circles"])
-    few, many = LevenbergMarquardt(3), LevenbergMarquardt(120, 1.0, 1e-2)
+    few, many = LevenbergMarquardt(3), LevenbergMarquardt(60, 1.0, 1e-2)
     solve = dataclasses.replace(few if mode == "unrolled" else many, backend="pytorch")
     leaves = leaves_of(parameters)
     backward = Unrolled() if mode == "unrolled" else Implicit()
@@ -222,7 +222,7 @@ def test_gradients_of_the_layer_equal_finite_differences(mode):
     kinds = ["own_weights", "pair_weights", "goals", "initial_controls"]
     if mode == "implicit":
         kinds.pop()
-        again = solve.with_steps(40)
+        again = solve.with_steps(20)
         parameters = dataclasses.replace(parameters, initial_controls=solution.controls.detach())
     used = {"own_weights": OWN, "pair_weights": ["circles"]}
     for kind in kinds:

@@ -256,7 +256,7 @@ def test_undeclared_features_have_the_implicit_gradients_of_declared_ones(twins)
     parameters = random_game(scene, 1, 5, spread=0.1)
     parameters = dataclasses.replace(parameters, goals=torch.zeros_like(parameters.goals))
     weight, pair = parameters.own_weights["acc"], parameters.pair_weights["proximity"]
-    minimise = partial(Implicit(), LevenbergMarquardt(300, 1.0, 1e-1, backend="pytorch"))
+    minimise = partial(Implicit(), LevenbergMarquardt(60, 1.0, 1e-1, backend="pytorch"))
 
     def run(own, name):
         own = [*own, "acc"]  # or accelerations would have no minimum

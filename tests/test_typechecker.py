@@ -1,0 +1,52 @@
+"""Annotations are checked: arguments, results, and those of functions within functions at every call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jaxtyping
+import pytest
+import torch
+from jaxtyping import Float, jaxtyped
+from torch import Tensor
+from typechecker import check
+
+checked = jaxtyped(typechecker=check)
+
+
+@checked
+def rows(matrix: Float[Tensor, "n m"], count: int = 1) -> Float[Tensor, "{count} m"]:
+    """The first row, which has the promised shape for a count of one alone."""
+    return matrix[:1]
+
+
+def within(result: object) -> Callable[..., object]:
+    """A function that is defined anew at every call."""
+
+    @checked
+    def inner(vector: Float[Tensor, " n"], *, other: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        return vector if result is None else result
+
+    return inner
+
+
+def test_arguments_and_results_are_checked() -> None:
+    assert rows(torch.zeros(3, 2)).shape == (1, 2)
+    for wrong in (torch.zeros(3), torch.zeros(3, 2, dtype=torch.long), [[0.0]]):
+        with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):
+            rows(wrong)
+    with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):
+        rows(torch.zeros(3, 2), "one")
+    with pytest.raises(jaxtyping.TypeCheckError, match="return value"):
+        rows(torch.zeros(3, 2), 2)
+
+
+def test_functions_within_functions_are_checked_at_every_call() -> None:
+    two, three = torch.zeros(2), torch.zeros(3)
+    for _ in range(2):
+        assert within(None)(two, other=two) is two
+        assert within(three[:2])(two, other=two).shape == (2,)
+        with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):
+            within(None)(two, other=three)
+        with pytest.raises(jaxtyping.TypeCheckError, match="return value"):
+            within(three)(two, other=two)
