@@ -43,7 +43,7 @@ class Adam:
 
     def configure(self, parameters: Iterable[nn.Parameter], total_steps: float) -> dict[str, Any]:
         """Optimizer and schedule for Lightning's ``configure_optimizers``; the schedule lasts ``total_steps`` steps."""
-        adam = torch.optim.Adam(parameters, lr=self.lr)
+        adam = torch.optim.Adam(parameters, lr=self.lr, fused=True)  # one call for all parameters, not a dozen for each
         shape = _SCHEDULES[self.schedule]
         schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: shape(step / total_steps))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

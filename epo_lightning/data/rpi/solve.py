@@ -189,28 +189,6 @@ def solve_feedback(
     return x, u, False, iterations
 
 
-@njit(cache=True)
-def _solve_many(
-    start: Array, starts: Array, c: Array, goals: Array, w: float, feedback: bool, settings: Array
-) -> tuple[Array, Array, NDArray[np.bool_], Array]:
-    """The fields of :class:`Solutions` for start strategies [S, K, 4]."""
-    count, steps = starts.shape[:2]
-    states, controls = np.empty((count, steps + 1, 8)), np.empty((count, steps, 4))
-    converged, facts = np.empty(count, dtype=np.bool_), np.empty((count, 7))
-    for s in range(count):
-        if feedback:
-            x, u, done, iterations = solve_feedback(start, starts[s], c, goals, w, settings)
-        else:
-            x, u, done, iterations = solve_potential(start, starts[s], c, goals, w, np.ones(2), settings)
-        states[s], controls[s], converged[s] = x, u, done
-        robot, pedestrian, pair = game.costs(x, u, c, goals, w)
-        smallest, _, rotation, slowest = game.passage(x)
-        facts[s, 0], facts[s, 1], facts[s, 2] = robot + pair, pedestrian + pair, robot + pedestrian + pair
-        facts[s, 3], facts[s, 4], facts[s, 5] = smallest, rotation, slowest
-        facts[s, 6] = iterations
-    return states, controls, converged, facts
-
-
 @dataclass(frozen=True)
 class Solutions:
     """Solutions from S start strategies.
@@ -238,9 +216,24 @@ class Solutions:
 def solve(
     start: Array, starts: Array, constants: Array, goals: Array, weight: float, solver: str = "potential"
 ) -> Solutions:
-    """Solutions of the game with the start state ``start`` [8] from start strategies [S, K, 4]."""
-    settings = FeedbackSettings().array() if solver == "feedback" else PotentialSettings().array()
-    states, controls, converged, facts = _solve_many(
-        start, np.ascontiguousarray(starts), constants, goals, weight, solver == "feedback", settings
-    )
+    """Solutions of the game with the start state ``start`` [8] from start strategies [S, K, 4].
+
+    The loop over the starts is plain Python: compiled, it would compile both solvers anew, half a minute for nothing.
+    """
+    count, steps = starts.shape[:2]
+    states, controls = np.empty((count, steps + 1, 8)), np.empty((count, steps, 4))
+    converged, facts = np.empty(count, dtype=np.bool_), np.empty((count, 7))
+    for s, strategy in enumerate(np.ascontiguousarray(starts)):
+        if solver == "feedback":
+            x, u, done, iterations = solve_feedback(
+                start, strategy, constants, goals, weight, FeedbackSettings().array()
+            )
+        else:
+            x, u, done, iterations = solve_potential(
+                start, strategy, constants, goals, weight, np.ones(2), PotentialSettings().array()
+            )
+        states[s], controls[s], converged[s] = x, u, done
+        robot, pedestrian, pair = game.costs(x, u, constants, goals, weight)
+        smallest, _, rotation, slowest = game.passage(x)
+        facts[s] = robot + pair, pedestrian + pair, robot + pedestrian + pair, smallest, rotation, slowest, iterations
     return Solutions(states, controls, converged, facts[:, :2], *facts[:, 2:].T)
