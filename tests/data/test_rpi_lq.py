@@ -37,7 +37,7 @@ def test_lq_minimum_equals_the_dense_system(steps):
 
 
 def test_lq_minimum_reports_a_problem_without_minimum():
-    A, B, Q, q, R, r = dense.random_lq(np.random.default_rng(0))
+    A, B, Q, q, R, r = dense.random_lq(np.random.default_rng(0), 6, lq.STATES, lq.CONTROLS)
     assert not lq.lq_minimum(A, B, Q, q, -50 * R, r, 0.0)[0]
 
 
@@ -60,7 +60,7 @@ def test_lq_games_equal_coupled_riccati_equations_and_are_equilibria(owner):
 
 
 def test_one_player_feedback_game_is_the_minimum():
-    A, B, *costs = dense.random_lq(np.random.default_rng(5))
+    A, B, *costs = dense.random_lq(np.random.default_rng(5), 6, lq.STATES, lq.CONTROLS)
     _, gains, offsets = lq.lq_game(A, B, *(cost[None] for cost in costs), np.zeros(4, dtype=np.int64))
     _, same_gains, same_offsets, _ = lq.lq_minimum(A, B, *costs, 0.0)
     np.testing.assert_allclose(gains, same_gains, atol=1e-8)
