@@ -120,15 +120,22 @@ def build_rows(runs: Sequence[EvaluatedRun]) -> tuple[Row, ...]:
     rows = plain_rows(runs)
     backbones = list(dict.fromkeys([*BACKBONES, *(row.group[0] for row in rows)]))
     titles = list(dict.fromkeys(row.title for row in rows))
+    losses = list(dict.fromkeys(_relaxation(row) for row in rows))
 
     def order(row: Row) -> tuple[object, ...]:
-        """Sort key: the paper's goal first, baselines without a backbone last, rows of one title by their settings."""
+        """Sort key: the paper's goal first, rows of one loss together, baselines without a backbone last."""
         backbone, goal = row.group
         rank = FORECASTERS.index(row.forecaster) if row.forecaster in FORECASTERS else len(FORECASTERS)
         place = backbones.index(backbone)
-        return backbone == "", place, goal != "energy", goal, rank, titles.index(row.title), natural(row.settings)
+        loss = losses.index(_relaxation(row))
+        return backbone == "", place, goal != "energy", goal, loss, rank, titles.index(row.title), natural(row.settings)
 
     return _with_ranks(sorted(rows, key=order))
+
+
+def _relaxation(row: Row) -> float:
+    """Share of all modes in the row's imitation loss at the beginning of the training; 0 for the paper's loss."""
+    return float(row.runs[0].config["forecaster"].get("relaxation", 0.0))
 
 
 def _with_ranks(rows: Sequence[Row]) -> tuple[Row, ...]:

@@ -61,6 +61,19 @@ def test_rows_that_the_paper_does_not_have_follow_in_the_order_of_the_runs(tmp_p
     assert [row.name for row in table.rows] == ["Later", "V-LSTM + EPO", "Mine", "VIBES", "HiVT", "Zeta", "Alpha"]
 
 
+def test_rows_of_one_loss_stand_together_in_the_order_of_the_runs(tmp_path: Path) -> None:
+    rows = [
+        *(("SC, relaxed", "scene_consistent", 0.1), ("EPO, relaxed", "epo", 0.1)),
+        *(("EPO", "epo", 0.0), ("SC", "scene_consistent", 0.0)),
+    ]
+    runs = [
+        make_run(tmp_path / title, title, name, scores(0.1), settings={"forecaster.relaxation": share})
+        for title, name, share in rows
+    ]
+    (table,) = build_tables(collect(runs))
+    assert [row.name for row in table.rows] == ["SC, relaxed", "EPO, relaxed", "SC", "EPO"]
+
+
 def test_methods_that_learn_nothing_have_no_deviation_if_runs_agree(tmp_path: Path) -> None:
     for seed in range(3):
         make_run(tmp_path / f"cv{seed}", "Constant velocity", "constant_velocity", scores(0.5, 0.1 * seed), seed=seed)
