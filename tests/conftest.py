@@ -1,4 +1,4 @@
-"""Every test runs on one thread and with the shapes in the annotations checked."""
+"""Fixtures of all tests: one thread, and runtime checks of the shapes in annotations."""
 
 from __future__ import annotations
 

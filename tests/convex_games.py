@@ -15,7 +15,7 @@ OWN = ("goal", "lateral", "velref", "lat_vel", "acc", "lat_acc", "jerk", "lat_je
 
 
 class Unaware(ConvexEnergy):
-    """The same energy without its closed-form Hessian, so that solvers use automatic differentiation."""
+    """Convex energy without its closed-form Hessian, so that solvers use automatic differentiation."""
 
     hessian = None
 

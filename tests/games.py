@@ -104,7 +104,7 @@ def highway_scene(scenes: int = 3, agents: int = 4, *, candidates: int = 6, hori
 
 
 def reordered(scene: Scene, order: list[int]) -> Scene:
-    """The same scene with its agents in another order."""
+    """Scene with its agents in another order."""
     whose = ("history", "history_mask", "agent_mask", "future", "future_mask", "goal_candidates", "goal_mask")
     whose += ("goal_reference", "size", "kind", "references", "reference_mask", "reference_speed")
     fields = dict(vars(scene))
@@ -128,7 +128,7 @@ def random_game(
 
 
 def leaves_of(parameters: GameParameters) -> GameParameters:
-    """The same game as leaves of a graph: everything that a solution is differentiated by requires its gradient."""
+    """Game parameters as leaves of a graph, which require gradients."""
     return parameters.map(lambda tensor: tensor.clone().requires_grad_() if tensor.is_floating_point() else tensor)
 
 
@@ -168,7 +168,7 @@ def pad(
     vectors: int = 0,
     candidates: int = 0,
 ) -> Scene:
-    """The same scene with absent agents, lanes, vectors and goal candidates appended and unobserved steps put before its
+    """Padded scene: absent agents, lanes, vectors and goal candidates appended and unobserved steps put before its
     history, all of which hold ``filling``."""
 
     def grow(tensor: torch.Tensor | None, dim: int, count: int, value: float | bool, before: bool = False):

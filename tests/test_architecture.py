@@ -1,4 +1,4 @@
-"""Arrows between the rooms of the house point one way."""
+"""Layering of the package: imports between its top-level modules point one way."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ FLOORS = {
     },
     "report": {"scene", "registry", "metrics", "run_folder", "identity", "masking"},
 }
-"""What each room may import, besides itself; `experiment` and `cli` stand on top of everything."""
+"""Top-level modules that each one may import besides itself; `experiment` and `cli` may import all."""
 
 
 def imported_rooms(path: Path) -> set[str]:

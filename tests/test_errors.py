@@ -1,4 +1,4 @@
-"""Errors of the package survive the way from a worker process: they are pickled as their class and their arguments."""
+"""Errors of the package can be pickled, so that worker processes can return them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run's identity changes with what decides on its result, and with nothing else."""
+"""The identity of a run changes exactly with the settings that affect its result."""
 
 from __future__ import annotations
 

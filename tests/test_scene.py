@@ -1,4 +1,4 @@
-"""Scenes: what they refuse, and that their tensors move together."""
+"""Scenes: validation of tensors, and indexing and conversion of all of them together."""
 
 from __future__ import annotations
 

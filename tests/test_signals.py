@@ -1,4 +1,4 @@
-"""Every verb that is stopped by SIGTERM or Ctrl-C ends in one line with the exit status of that signal."""
+"""Every verb stopped by SIGTERM or Ctrl-C prints one line and exits with the status of that signal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The backbone of docs/extend.md, in the suite, as it stands there."""
+"""The backbone of docs/extend.md, unchanged, in the suite of backbones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "extend.md"
 
 
 def documented() -> tuple[dict[str, Any], dict[str, Any]]:
-    """What the section's blocks define, and the parts that they register, which are forgotten again."""
+    """Names defined by the code blocks of the section; the parts that they register are removed afterwards."""
     before = dict(parts("backbone"))
     section = PAGE.read_text().split("## A backbone")[1].split("\n## ")[0]
     defined: dict[str, Any] = {}

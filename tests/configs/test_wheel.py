@@ -1,4 +1,4 @@
-"""The wheel brings its configuration tree and the compiled layer along."""
+"""The wheel contains the configuration tree and the compiled layer."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_an_installed_wheel_works_from_any_folder(tmp_path: Path) -> None:
     assert solved.stdout.split() == [str(site), "True"]
 
     assert "title: V-LSTM + EPO" in epo("config", "experiment=rpi/v_lstm_epo")
-    assert "is sound" in epo("config", "check", "experiment=rpi/v_lstm_epo_goal", "budget=reduced")
+    assert "is valid" in epo("config", "check", "experiment=rpi/v_lstm_epo_goal", "budget=reduced")
     assert "rpi_main" in epo("train", "--help")
     assert "title: VIBES + EPO" in epo("config", "experiment=us101/vibes_epo")
     assert {"page.html.j2", "page.css", "page.js"} <= {path.name for path in (site / "epo_lightning/report").iterdir()}

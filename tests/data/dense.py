@@ -125,7 +125,7 @@ def coupled_riccati(A, B, Q, q, R, r, owner):
 
 
 def torch_costs(start: Tensor, u: Tensor, constants, goals: Tensor, weight: float) -> Tensor:
-    """What each agent pays [2], by cumulative sums in torch: nothing in common with the kernels but the formula."""
+    """Costs of both agents [2] by cumulative sums in torch, independent of the compiled kernels."""
     dt = constants.dt
     u = u.reshape(-1, 2, 2)
     first = start.reshape(2, 4)

@@ -1,4 +1,4 @@
-"""A set is complete and sound, or there is one sentence that says what, where and what to do."""
+"""A data set is complete and undamaged, or one error names the problem, the file and the remedy."""
 
 from __future__ import annotations
 

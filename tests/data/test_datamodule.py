@@ -1,4 +1,4 @@
-"""Batches: whole, in an order that depends on (seed, epoch) alone, and never from the test split by accident."""
+"""Batches: complete, in an order that depends only on (seed, epoch), and never from the test split during training."""
 
 from __future__ import annotations
 

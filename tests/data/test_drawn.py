@@ -1,4 +1,4 @@
-"""Drawn scenes are those of the real data but for their numbers, and always the same ones."""
+"""Drawn scenes: fields, shapes and types of the real data, and reproducible random values."""
 
 from __future__ import annotations
 

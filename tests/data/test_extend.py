@@ -1,4 +1,4 @@
-"""The recording format of docs/extend.md, run as it stands there."""
+"""The recording format of docs/extend.md, run unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Generation: the same bytes whatever the workers and interruptions, and records that are what they say."""
+"""Generation: equal bytes for any number of workers and interruptions, and records that are consistent."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_the_data_set_of_another_seed_is_refused(data, tmp_path):
 
 @pytest.mark.parametrize("busy", ["set", "pool"])
 def test_generation_waits_for_another_process(data, tmp_path, capsys, busy):
-    """What another process makes meanwhile, the set or its pool, is not made again."""
+    """A set or pool that another process completes in the meantime is not made again."""
     other = RPIData(root=str(tmp_path), **SMALL)
     pool = next(data.root.glob("rpi-pool-*"))
     making = {"set": data.folder, "pool": pool}[busy]

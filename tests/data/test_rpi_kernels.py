@@ -86,7 +86,7 @@ def test_the_linearisation_equals_differences():
 
 
 def test_the_exact_step_is_newtons():
-    """To first order in the offsets the policy's rollout moves the controls by -H^-1 g, with autograd's Hessian."""
+    """The policy's rollout changes the controls by -H^-1 g to first order in the offsets, with H from autograd."""
     start, u = situation(np.random.default_rng(3), wild=0.05)
     x, A, B, Q, q, R, r = expansion(start, u, 0.5, True)
     convex, gains, offsets, promised = lq_minimum(A, B, Q, q, R, r, 0.0)

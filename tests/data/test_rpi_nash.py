@@ -1,4 +1,4 @@
-"""Generated modes are equilibria: no agent finds anything better alone, says an optimiser that knows nothing of ours."""
+"""Generated modes are equilibria: an independent optimiser finds no better response of any single agent."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def sub_games(count, steps=(18, 24, 30, 36)):
 
 
 def gains(mode, noise, random, constant=False):
-    """What each agent wins by its own L-BFGS best response from a perturbed start, relative to its cost."""
+    """Gain of each agent by an L-BFGS best response from a perturbed start, relative to its cost."""
     u = mode.controls
     x = rollout(mode.start, u, CONSTANTS.dt)
     *own, pair = costs(x, u, C, mode.game.goals, mode.game.weight)

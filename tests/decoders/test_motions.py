@@ -1,4 +1,4 @@
-"""Candidates from a model of motion: what their rollouts look like."""
+"""Candidates from a model of motion: properties of their rollouts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Orders of pairs: the most likely ones against all of them, names that are swapped, and what was observed."""
+"""Orders of pairs: the most likely ones against full enumeration, permuted agents, and observed orders."""
 
 from __future__ import annotations
 

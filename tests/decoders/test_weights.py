@@ -1,4 +1,4 @@
-"""Where weights start, and whether the order of a pair counts."""
+"""Decoded weights: initial values, and symmetry with respect to the order of a pair."""
 
 from __future__ import annotations
 

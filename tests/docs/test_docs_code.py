@@ -1,4 +1,4 @@
-"""Every Python block of README and docs runs, most of them as they stand."""
+"""Every Python block of README and docs runs, most of them unchanged."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHEAPER = {
     '"cache/highway_sim-recordings-..."': repr(str(FIXTURE)),
     '("commonroad", "data/us101")': repr(("exid", str(FIXTURE))),
 }
-"""What is replaced in blocks that run here: fewer rounds, and recordings that are in the repository."""
+"""Replacements in blocks that are run: fewer iterations, and recordings of the repository."""
 BLOCKS = {
     f"{page.name}-{number}": block.text
     for page in PAGES

@@ -1,4 +1,4 @@
-"""Every command of README and docs: what does not run in another test of this folder composes, or names what exists."""
+"""Every command of README and docs: those that no other test of this folder runs must compose, or name existing files."""
 
 from __future__ import annotations
 

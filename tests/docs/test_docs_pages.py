@@ -1,4 +1,4 @@
-"""Links and paths of README and docs lead somewhere, and the site's table of contents knows every page."""
+"""Links and paths of README and docs have targets, and the site's table of contents has every page."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from epo_lightning.experiment.config.compose import tree
 
 FOLDERS = "docs|tests|conf|sweeps|benchmarks|epo_lightning|docker"
 GENERATED = ROOT / "docs" / "reference"
-"""What building the site makes from the code."""
+"""Pages that the build of the site generates from the code."""
 EXAMPLES = {"mine", "gru", "test_gru", "curvature", "test_curvature", "plain_csv"}
 """Files that the pages tell a reader to write."""
 

@@ -1,4 +1,4 @@
-"""History encoders against slow, obvious versions, and what they make of gaps."""
+"""History encoders against slow reference implementations, and their treatment of gaps."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_vectors_are_those_between_observed_neighbours(gappy):
                 for k in range(1, 8)
                 if seen[k - 1] and seen[k]
             ]
-            if not expected:  # where it is, and that it does not move as far as anybody knows
+            if not expected:  # one vector: its position, with a displacement of zero
                 expected = [[*states[-1].tolist(), *states[-1].tolist(), 0.0]]
             if gappy.agent_mask[b, i]:
                 torch.testing.assert_close(vectors[b, i, observed[b, i]], torch.tensor(expected))
@@ -105,7 +105,7 @@ def test_features_depend_on_a_single_observation(encoder, gappy):
 
 
 def test_the_transformer_depends_on_the_order_of_steps():
-    """The same two moves in the other order are another history."""
+    """Two histories with the same moves in different order."""
     scene = random_scene(1, 2, history=3)
     scene.history[0, 0, :, 0] = torch.tensor([0.0, 1.0, 0.0])
     scene.history[0, 1, :, 0] = torch.tensor([1.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""Checkpoints: which epoch is the best, what resuming restores, and that damaged ones and other scores are not taken."""
+"""Checkpoints: the best epoch, the state that resuming restores, and refusal of damaged files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""metrics.csv of a run: no row that was written is lost by a kill at any moment, or by a full disk."""
+"""metrics.csv of a run: a kill at any moment or a full disk loses no written row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Debugging does what it says: a few batches are learned by heart, the profile is there, the first bad number is named."""
+"""Debugging: overfitting of a few batches, the profile, and the location of the first nan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places on GPUs, which this needs none of: they are files."""
+"""Places on GPUs, which are files: no GPU is needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run does not know what started it: whatever the launcher, the same bytes."""
+"""Sweeps through every launcher: equal bytes of the results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs: the CSV file is the truth, dashboards are told the same, and none of them can disturb a run."""
+"""Logs: dashboards get the values of the CSV file, and cannot disturb a run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ STEP = "trainer/global_step"
 
 @pytest.fixture(autouse=True)
 def no_account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Nobody's key, server or database is used."""
+    """Environment without the user's keys, servers and databases."""
     for name in ("WANDB_API_KEY", "WANDB_BASE_URL", "WANDB_MODE", "MLFLOW_TRACKING_URI"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
@@ -65,7 +65,7 @@ def stopped(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def in_file(run: str, name: str) -> list[tuple[int, float]]:
-    """What metrics.csv says."""
+    """Contents of metrics.csv."""
     with Path(run, "logs", "metrics.csv").open(newline="") as file:
         return [(int(row["step"]), float(row[name])) for row in csv.DictReader(file) if row[name]]
 
@@ -75,7 +75,7 @@ def best_in_file(run: str) -> float:
 
 
 def wandb_folders(run: str) -> list[dict[str, Any]]:
-    """What W&B's own reader finds in the offline folders of a run, the oldest first."""
+    """Contents of the offline W&B folders of a run by W&B's own reader, oldest first."""
     files = sorted(Path(run).glob("logs/wandb/offline-run-*/*.wandb"))
     words = [sys.executable, "-m", "wandb", "leet", "inspect", "--summary", "--json"]
     found = [subprocess.run([*words, file], capture_output=True, text=True, check=True).stdout for file in files]

@@ -1,4 +1,4 @@
-"""Which precisions a run may have."""
+"""Precisions that a run may have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`epo predict`: which scenes are forecast, drawn and animated, and what is written of them."""
+"""`epo predict`: the chosen scenes, their pictures and animations, and the written files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run writes down about itself: readable for those whom the umask allows, without secrets, fit for a shell."""
+"""Records of a run: permissions by the umask, no secrets, commands quoted for a shell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs that were stopped at an awkward moment, or moved, or went to another machine: they end as if nothing had been."""
+"""Resuming of runs that were stopped at any moment, moved, or taken to another machine: equal results."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_a_run_terminated_outside_lightning_loops_ends_at_once(epo: Epo, monkeyp
 
 
 def give_to(run: str, accelerator: str) -> None:
-    """As if the run had begun on another machine."""
+    """Change the record as if the run had begun on another machine."""
     file = RunFolder(Path(run)).config_file
     file.write_text(file.read_text().replace("accelerator: cpu", f"accelerator: {accelerator}"))
     assert RunFolder(Path(run)).config()["trainer"]["accelerator"] == accelerator

@@ -1,4 +1,4 @@
-"""Run folders: what is in them, that equal runs are equal, and that a stopped run goes on as if it had not been."""
+"""Run folders: their contents, reproducibility, and continuation of stopped runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``epo report`` of a sweep: its own runs, by what it measures, and the states of those that are left out."""
+"""``epo report`` of a sweep: its own runs with its measurements, and the states of runs that are left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long a forecast takes: what is written, that it is the forecast's time, and that nobody has to train for it."""
+"""Time of a forecast: the written record, the measured interval, and measurements without training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A data set that costs nothing: two agents on nearly straight lines, drawn in memory from a seed.
+"""A tiny data set: two agents on nearly straight lines, drawn in memory from a seed.
 
 Run as a program it is `epo` with this part known, for tests that need a process of their own.
 """

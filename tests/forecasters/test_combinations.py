@@ -1,4 +1,4 @@
-"""Every energy with every minimiser, derivative and objective: it learns in a step, or is refused with a reason."""
+"""Combinations of energy, minimiser, derivative and objective: each is trained for a step or refused with a reason."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def section(kind: str, option: str) -> dict:
 
 
 SECTIONS = {kind: {option: section(kind, option) for option in options} for kind, options in OPTIONS.items()}
-# A few steps will do here, and small ones where nobody has learned weights that bear larger ones.
+# A few steps suffice here; they are small, because untrained weights do not allow larger ones.
 SECTIONS["solver"]["newton"]["steps"] = SECTIONS["solver"]["lbfgs"]["steps"] = 4
 SECTIONS["solver"]["gradient_descent"] |= {"steps": 3, "step_size": 1e-4}
 SECTIONS["solver"]["langevin"] |= {"steps": 3, "delta": 1e-2}

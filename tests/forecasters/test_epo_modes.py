@@ -1,4 +1,4 @@
-"""Which modes count and how likely they are, and what EPO's constructor refuses."""
+"""Modes of EPO and their probabilities, and combinations that its constructor refuses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def earlier(rows: list[Any]) -> list[bool]:
 @pytest.mark.parametrize("agents", [1, 2, 4])
 def test_probabilities_of_modes_are_products_of_orders_and_goals(agents):
     scene = highway_scene(6, agents)
-    scene.agent_mask[0, 0] = agents == 1  # somebody is absent, and somebody else has no candidate
+    scene.agent_mask[0, 0] = agents == 1  # one agent is absent, another one has no candidate
     scene.goal_mask[1, 0] = False
     forecaster = tgl(5)
     forecast = forecaster(scene)

@@ -1,4 +1,4 @@
-"""The rows of the paper's Table 1 besides EPO: what every forecaster must do, with energies and solvers of the family.
+"""The rows of the paper's Table 1 besides EPO, in the suite of forecasters, with energies and solvers of the family.
 
 Models are those of ``conf/experiment/table1``, over short horizons; solvers take fewer steps or candidates here, so that all
 joint assignments can be looked at with and without absent agents, which an enumeration counts too.
@@ -33,7 +33,7 @@ def written(row: str) -> dict[str, Any]:
 
 
 class _Row(ForecasterSuite):
-    """What rows have besides: a file, and an objective whose every term learns.
+    """A row of Table 1 as a configuration file, with an objective whose terms are all trained.
 
     Attributes:
         row: its name.
@@ -92,7 +92,7 @@ class Row(_Row):
         return random_scene(scenes, 2, history=5, horizon=HORIZON, **details)
 
     def lesson(self) -> Scene:
-        """Everybody speeds up at 1 m/s^2 and turns left at 1 rad/s, towards its goal."""
+        """Scenes in which all agents accelerate at 1 m/s^2 and turn left at 1 rad/s towards their goals."""
         scene = self.scene(8)
         future = Unicycle().rollout(scene.current, torch.ones(8, 2, HORIZON, 2), scene.dt)
         return dataclasses.replace(scene, future=future, goal_candidates=future[:, :, -1:, :2])
@@ -113,7 +113,7 @@ class HighwayRow(HighwaySuite, _Row):
 
 
 class Sampled(_Row):
-    """Samples are random in training: to compare two of them, real agents have to get the same noise in both."""
+    """Random samples in training: for comparisons, present agents must get the same noise in both forecasts."""
 
     def test_padding_does_not_change_training(self, monkeypatch):
         forecaster, scene = self.forecaster().train(), self.scene(6)
@@ -146,7 +146,7 @@ class DSDNet(_Row):
     learned = ("density", "marginal")
 
     def test_sampled_motions_are_not_trained(self):
-        """``regression`` tells how well they cover what happened."""
+        """The term ``regression`` only measures how well motions cover the observed future."""
         forecaster, scene = self.forecaster().train(), self.lesson()
         terms = forecaster.losses(scene, forecaster(scene))
         assert {name for name, (_, value) in terms.items() if not value.requires_grad} == {"regression"}
@@ -158,7 +158,7 @@ class TGL(_Row):
 
 
 class EBIOC(Sampled):
-    """Chains of four steps: a few updates make what was observed cheaper, and the forecast no better yet."""
+    """EBIOC with chains of four steps: a few updates lower the energy of the observed future, but not the error."""
 
     row = "ebioc"
     learned = ("contrastive",)
@@ -167,7 +167,7 @@ class EBIOC(Sampled):
 
 
 class Laplace(_Row):
-    """Whether an adaptive step is taken may hang on the last digit, which batches change: in float64 that is not seen."""
+    """Laplace. Acceptance of adaptive steps may depend on the last digit, which batches change; float64 avoids this."""
 
     row = "laplace"
     learned = ("density", "initial")

@@ -1,4 +1,4 @@
-"""The four forecasters: what all of them must do, and what each of them is."""
+"""The four forecasters: the common suite, and the properties of each."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class TestEPO(ForecasterSuite):
             self.forecaster().predict(scene)
 
     def test_masked_goals_are_ignored(self):
-        """Neither its value nor the origin attracts the agent."""
+        """A masked goal has no effect: neither its value nor the origin attracts the agent."""
         forecaster, scene = self.forecaster(), random_scene(2, 2)
         scene.goal_mask[0, 1] = False
         forecasts = []

@@ -1,4 +1,4 @@
-"""What a frame promises: forecasts move with the world, through extraction and network and back to the recording."""
+"""Frames: forecasts are equivariant to motions of the world, from extraction to the recording's coordinates."""
 
 from __future__ import annotations
 

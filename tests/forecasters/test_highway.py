@@ -120,7 +120,7 @@ def test_constant_velocity_keeps_heading_and_speed_on_a_map():
 
 
 def test_agents_without_a_future_have_no_gradient():
-    """Whatever stands behind a False of the future's mask leaves losses and gradients as they are."""
+    """Masked values of the future do not change losses and gradients."""
     for config in (EPO, TestSceneConsistent.config, TestMarginal.config):
         gradients = []
         for filling in (0.0, float("nan")):

@@ -46,13 +46,13 @@ class Row:
 
     @cached_property
     def moves(self) -> np.ndarray:
-        """What accelerations change of positions 1 .. K [K, K]: a step's velocity moves the next one."""
+        """Jacobian of positions 1 .. K with respect to accelerations [K, K]: the velocity of a step moves the next one."""
         steps = np.arange(STEPS)
         return DT**2 * np.clip(steps[:, None] - steps, 0, None)
 
     @cached_property
     def freely(self) -> np.ndarray:
-        """Where agents would be without accelerations [N, K]."""
+        """Positions of the agents without accelerations [N, K]."""
         return START[: self.agents, None] + DT * SPEED[: self.agents, None] * np.arange(1, STEPS + 1)
 
     def conditions(self, active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -79,7 +79,7 @@ class Row:
 
     @cached_property
     def equilibrium(self) -> np.ndarray:
-        """Accelerations [N, K] at which nobody's J_i has a slope, and nobody else is too close than was assumed."""
+        """Accelerations [N, K] at which every J_i is stationary, with the assumed pairs of agents too close."""
         active = np.zeros((self.agents, self.agents, STEPS), dtype=bool)
         for _ in range(20):
             matrix, vector = self.conditions(active)
@@ -122,13 +122,13 @@ class Row:
 
     @cached_property
     def controls(self) -> torch.Tensor:
-        """The equilibrium's, which keep everybody on the row."""
+        """Controls of the equilibrium, which keep all agents on the row."""
         along = torch.from_numpy(self.equilibrium)
         return torch.stack((along, torch.zeros_like(along)), -1)[None, None]
 
 
 def own_objective(controls: np.ndarray, i: int, position: np.ndarray, speed: np.ndarray) -> float:
-    """What both kinds of energy ask of an agent along the row, and half the squared ways from its goal."""
+    """Objective of an agent along the row for both kinds of energy, with half the squared distances from its goal."""
     w = {name: 0.5 * value**2 for name, value in WEIGHT.items()}
     way = position[-1] - np.array([GOAL[i], 0.0])
     value = w["goal"] * way @ way + w["velref"] * np.sum((speed - REFERENCE[i]) ** 2)
@@ -224,7 +224,7 @@ AGENTS = pytest.mark.parametrize("agents", [2, 3])
 EVERY_GAME = pytest.mark.parametrize("game", GAMES)
 TIGHT = {"tolerance": 1e-12}
 SPREAD = torch.tensor([0.5, 0.1], dtype=torch.float64)
-"""Of perturbations of accelerations [m/s^2] and turn rates [rad/s], or accelerations along and across."""
+"""Size of perturbations of accelerations [m/s^2] and turn rates [rad/s], or of accelerations along and across."""
 CONVERGED: dict[str, tuple[str, dict[str, Any]]] = {
     "epo": ("features", {"row": "rpi_epo", "steps": 600}),
     "laplace": ("features", {"row": "rpi_laplace", "steps": 40}),
@@ -253,7 +253,7 @@ def test_every_row_converges_to_the_equilibrium_in_closed_form(name: str, agents
     found = report(energy, scene, parameters, solution)
     assert found.nash_gap.max() < 1e-6
     assert solution.initial_energy.item() > 1.01 * solution.energy.item()
-    # Nobody was there before.
+    # No agent was present before.
     begun = dataclasses.replace(solution, controls=start)
     assert report(energy, scene, parameters, begun).nash_gap.min() > 1e-3
 
@@ -323,7 +323,7 @@ def test_rows_that_choose_find_the_equilibrium_among_candidates(name: str, agent
     torch.testing.assert_close(solution.controls[:, :1], row.controls, rtol=0, atol=0)
     assert (report(energy, scene, parameters, solution).nash_gap == 0).all()
 
-    # Another choice, whose gaps are those of a loop over everybody's candidates.
+    # Another choice; its gaps equal those of a loop over each agent's candidates.
     choice = [(k + 1 + i) % section["candidates"] for i, k in enumerate(where)]
     other = dataclasses.replace(solution, assignment=torch.tensor(choice)[None, None].expand(1, 3, agents))
     found = report(energy, scene, parameters, other)

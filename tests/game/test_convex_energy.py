@@ -1,4 +1,4 @@
-"""The convex energy against loops over agents and steps; its convexity, its symmetries, and what it refuses."""
+"""The convex energy against loops over agents and steps; its convexity, its symmetries, and invalid settings."""
 
 from __future__ import annotations
 

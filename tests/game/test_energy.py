@@ -207,7 +207,7 @@ def gap(distance, reach):
 
 
 def register_twins():
-    """The same functions once with and once without a declaration of their structure: reach is 2 m for all."""
+    """Pairs of equal features, with and without a declaration of their structure; the reach is 2 m for all."""
     for source, channel in (
         (Source.CONTROL, 0),
         (Source.CONTROL, 1),

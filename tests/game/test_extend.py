@@ -1,4 +1,4 @@
-"""The features of docs/extend.md, run as they stand there."""
+"""The features of docs/extend.md, run unchanged."""
 
 from __future__ import annotations
 

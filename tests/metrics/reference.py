@@ -1,4 +1,4 @@
-"""The metrics once more, as loops over scenes, modes, agents and steps, with shapely polygons: slow and obvious."""
+"""Reference implementation of the metrics, as slow loops over scenes, modes, agents and steps, with shapely polygons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the report on equilibria adds to the scores."""
+"""Scores of the equilibrium report."""
 
 from __future__ import annotations
 

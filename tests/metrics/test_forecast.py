@@ -1,4 +1,4 @@
-"""Metric classes: what the functions say, added up over batches, subsets and processes."""
+"""Metric classes: values of the functional metrics, accumulated over batches, subsets and processes."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_nan_forecast_has_infinite_scores() -> None:
 
 
 def test_absent_agents_do_not_count() -> None:
-    """Whatever the forecast, the future, its mask and the sizes hold for them."""
+    """Absent agents are ignored for any values in the forecast, the future, its mask and the sizes."""
     case, subset = big_case()
     present, observed = torch.rand(case.agent_mask.shape) < 0.7, torch.ones_like(case.mask)
     case = dataclasses.replace(

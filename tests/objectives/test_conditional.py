@@ -31,7 +31,7 @@ def scene_of(agents: int = AGENTS) -> Scene:
 
 
 def tables_of(scene: Scene, unary: Tensor, pair: Tensor, states: Tensor) -> Tables:
-    """What a minimiser makes of the tables; scenes that hold no numbers have no density."""
+    """Solution tables of a minimiser; scenes with nan have no density."""
     unary, pair = assignments.settle(unary, pair, scene.agent_mask)
     sound = ~unary.isnan().flatten(1).any(1)
     marginals, total = assignments.partition(torch.where(sound[:, None, None], unary, 0.0), pair, scene.agent_mask)
@@ -76,7 +76,7 @@ def nearest(scene: Scene, states: Tensor, number: int, agent: int) -> tuple[int,
 
 
 def partly_observed() -> Scene:
-    """One agent is absent, one of another scene was never observed and one in part; of the last scene, nobody was."""
+    """Scenes with an absent, an unobserved and a partly observed agent; in the last scene no agent is observed."""
     scene = scene_of()
     present, observed = scene.agent_mask.clone(), scene.future_mask.clone()
     present[0, 1] = observed[0, 1] = False

@@ -1,4 +1,4 @@
-"""Contrastive maximum likelihood against the exact likelihood's gradient, and what it must leave alone."""
+"""Contrastive maximum likelihood against the gradient of the exact likelihood, and parameters without a gradient."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run folders of several methods that infer a game, as a sweep over them leaves behind: same backbone, same forecaster."""
+"""Run folders of a sweep over several methods that infer a game, with the same backbone and forecaster."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run folders with all that a page can show: rows with seeds, logs, optimisation steps and runtimes."""
+"""Run folders for all sections of a page: rows with seeds, logs, optimisation steps and runtimes."""
 
 from __future__ import annotations
 

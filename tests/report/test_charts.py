@@ -1,4 +1,4 @@
-"""Charts of many runs: what they plot is what the runs say, and what is damaged or missing is said."""
+"""Charts of many runs: plotted values equal those of the runs, and damaged or missing files are noted."""
 
 from __future__ import annotations
 

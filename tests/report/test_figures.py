@@ -1,4 +1,4 @@
-"""Figures: written where asked, at the promised size, showing what differs; what cannot be drawn is said."""
+"""Figures: their files, sizes and contents, and errors for invalid inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Titles, commands and errors are text: no picture, page, table or spreadsheet takes them for anything else."""
+"""Titles, commands and errors are escaped in pictures, pages, tables and spreadsheets."""
 
 from __future__ import annotations
 

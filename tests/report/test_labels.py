@@ -1,4 +1,4 @@
-"""Rows of the same title are told apart by what differs, in words that an override would use."""
+"""Labels of rows with the same title: their differing settings, written as overrides."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LaTeX: compiled where pdflatex is installed; whatever a title holds stands in the table, not in the commands."""
+"""LaTeX tables: they compile where pdflatex is installed, with any characters in titles."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def two_groups(folder: Path) -> list[Table]:
 
 
 def compiled(folder: Path, *parts: str) -> str:
-    """The text of the PDF's log; fails with it where pdflatex fails."""
+    """Log of a successful pdflatex run; an error of pdflatex fails the test."""
     body = "\n".join(parts)
     document = (
         "\\documentclass{article}\n\\usepackage{booktabs,graphicx}\n\\begin{document}\n" + body + "\n\\end{document}\n"
@@ -72,7 +72,8 @@ def test_tables_with_any_characters_in_titles_compile(tmp_path: Path) -> None:
         make_run(tmp_path / "runs" / str(index), title, "marginal", scores(0.1 * index))
     (table,) = build_tables(collect(tmp_path / "runs"))
     sheet = Sheet(NASTY[0], NASTY, (NASTY, NASTY), left=5, ends=frozenset({0}))
-    compiled(tmp_path, to_latex(table), sheet_to_latex(sheet))
+    log = compiled(tmp_path, to_latex(table), sheet_to_latex(sheet))
+    assert "Missing character" not in log
 
 
 def test_special_characters_are_escaped() -> None:

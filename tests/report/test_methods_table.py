@@ -1,4 +1,4 @@
-"""One report of several methods: their order, their games, their modes and what they cost, by hand."""
+"""Report of several methods: order, games, modes and costs, compared with hand-computed values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .run_folders import make_run, scores
 
 
 def tables_of(folder: Path) -> dict[str, Table]:
-    """In the order in which a sweep lists its runs, not in that of the folders."""
+    """Runs in the order of the sweep, which differs from that of the folders."""
     return {table.title: table for table in build_tables(collect(of_methods(folder)))}
 
 

@@ -1,4 +1,4 @@
-"""The page in a real browser, from disk and without a network: every tab, sorting, legends, what stands behind a number."""
+"""The page in a real browser, from disk and without a network: tabs, sorting, legends, provenance of numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of traffic: to scale, in their place, the same however the recording lies, and saying what they leave out."""
+"""Pictures of traffic: scale, positions, independence of the recording's frame, and notes on omitted content."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The best setting of a search: by validation scores, over all seeds, with the words that train with it."""
+"""The best setting of a search: by validation scores over all seeds, with the overrides that train with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From run folders to rows: means, ranks, the paper's values, and what must not stand in one table."""
+"""Tables of run folders: means, ranks, the paper's values, and refusal of runs that are not comparable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Traffic scenes with forecasts, and what the tests of their pictures and animations look at."""
+"""Traffic scenes with forecasts for the tests of pictures and animations."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def traffic() -> Scene:
 
 
 def short() -> Scene:
-    """The same for a second and a half: animations take their time."""
+    """Traffic of one and a half seconds, for quick animations."""
     scene = traffic()
     return dataclasses.replace(
         scene,

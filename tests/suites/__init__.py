@@ -1,4 +1,4 @@
-"""What every part of a kind must do: subclass the suite of the kind, say which part, and inherit its tests."""
+"""Test suites for each kind of part: subclass the suite of the kind, name the part, and inherit its tests."""
 
 from .backbone import BackboneSuite
 from .dynamics import DynamicsSuite

@@ -1,4 +1,4 @@
-"""What every backbone must do."""
+"""Suite of every backbone."""
 
 from __future__ import annotations
 

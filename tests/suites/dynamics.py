@@ -1,4 +1,4 @@
-"""What every model of motion must do."""
+"""Suite of every model of motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every energy, and every feature of one, must do."""
+"""Suite of every energy and every feature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every forecaster must do."""
+"""Suite of every forecaster."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ class ForecasterSuite:
 
 
 class HighwaySuite(ForecasterSuite):
-    """The same on highway scenes, with every backbone; and the order of agents is of no consequence."""
+    """The suite on highway scenes with every backbone, and equivariance to the order of agents."""
 
     modes = 3
     goals = ("energy",)
@@ -184,7 +184,7 @@ class HighwaySuite(ForecasterSuite):
         return Scene(**{**vars(scene), "size": 20.0 * scene.size})
 
     def lesson(self) -> Scene:
-        """Everybody keeps the lane and brakes at 2 m/s^2."""
+        """Scenes in which all agents keep their lane and brake at 2 m/s^2."""
         scene = self.scene(8)
         scene.future[..., 0] -= (0.2 * torch.arange(1.0, 9.0)).square()
         scene.future[..., 1] = scene.current[..., 1, None]

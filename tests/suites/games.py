@@ -47,7 +47,7 @@ def game_of(energy: Energy, scenes: int = 3, agents: int = 3, starts: int = MODE
 
 
 def padded(scene: Scene, parameters: GameParameters, filling: float, agents: int = 2) -> tuple[Scene, GameParameters]:
-    """The same game with absent agents appended, for which every tensor holds ``filling``."""
+    """Game with absent agents appended, whose values are ``filling`` in every tensor."""
     given = scene.agent_mask.shape[1]
     _, second = torch.triu_indices(given + agents, given + agents, 1)
     real = second < given
@@ -80,7 +80,7 @@ def padded(scene: Scene, parameters: GameParameters, filling: float, agents: int
 def in_order(
     energy: Energy, scene: Scene, parameters: GameParameters, agents: list[int]
 ) -> tuple[Scene, GameParameters]:
-    """The same game with its agents in another order."""
+    """Game with its agents in another order."""
     first, second = torch.triu_indices(len(agents), len(agents), 1)
 
     def pairs(tensor: torch.Tensor | None, swapped: float = 1.0) -> torch.Tensor | None:
@@ -105,7 +105,7 @@ def in_order(
 
 
 def poisoned(scene: Scene) -> Scene:
-    """The same scenes but the second one, whose agents' present states are no numbers."""
+    """Scenes of which the second has nan as the present states of its agents."""
     history = scene.history.clone()
     history[1, :, -1] = torch.nan
     return dataclasses.replace(scene, history=history)

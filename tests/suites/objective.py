@@ -1,4 +1,4 @@
-"""What every training objective must do."""
+"""Suite of every training objective."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class ObjectiveSuite:
             torch.testing.assert_close(other[name], value, rtol=1e-6, atol=1e-8, msg=name)
 
     def test_unobserved_steps_do_not_change_the_loss(self, objective, energy):
-        """Neither its values nor, where nothing of a scene was observed, its gradient."""
+        """Neither the values nor, for a scene without observations, the gradient."""
         scene, game = self.game(energy)
         scene.future_mask[1] = False
         totals = []
@@ -128,7 +128,7 @@ class ObjectiveSuite:
         torch.testing.assert_close(totals[1], totals[0])
 
     def test_the_gradient_equals_finite_differences(self, objective, energy):
-        """By the weights of the game; through the solution for objectives that learn through it, else beside it."""
+        """The gradient with respect to the game's weights, through the solution for objectives that use its derivative."""
         scene, game = self.game(energy)
         constant = None if objective.through_solution else self.forecast(energy, scene, game)
 

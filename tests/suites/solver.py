@@ -1,4 +1,4 @@
-"""What every minimiser must do."""
+"""Suite of every minimiser."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class SolverSuite:
 
     @property
     def provides(self) -> frozenset[str]:
-        """What the minimiser provides in training."""
+        """Solution of the minimiser in training, with what it provides."""
         return build("solver", self.config).provides
 
     @pytest.fixture
@@ -130,7 +130,7 @@ class SolverSuite:
         torch.testing.assert_close(other.energy, expected.energy, rtol=1e-6, atol=1e-6)
 
     def test_the_path_has_the_derivative_of_what_was_computed(self, energy):
-        """By the weights and by the initial strategies, against finite differences."""
+        """Derivatives with respect to weights and initial strategies, against finite differences."""
         minimiser = self.minimiser()
         if PATH not in self.provides:
             pytest.skip("this minimiser provides no path")

@@ -1,4 +1,4 @@
-"""Recordings as a data module: splits without leaks, a cache that is complete or not there, errors that say what to do."""
+"""Recordings as a data module: splits without leaks, a complete or absent cache, errors with a remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From recordings to scenes: which agents, and what is known of them, against a loop over everything."""
+"""Scenes of recordings: their agents and observations, compared with a plain loop over all windows."""
 
 from __future__ import annotations
 

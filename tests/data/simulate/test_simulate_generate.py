@@ -1,4 +1,4 @@
-"""Folders of simulated recordings: complete or not there, the same for any number of workers, continued after a kill."""
+"""Folders of simulated recordings: complete or absent, equal for any number of workers, continued after a kill."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layouts: smooth lanes that do not cross, and maps whose lanelets hang together."""
+"""Layouts: smooth lanes that do not cross, and maps with connected lanelets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sweeps: every run once, whatever happens in between; failures seen; nothing lost, nothing done twice."""
+"""Sweeps: every run is trained exactly once, despite interruptions, and failures are reported."""
 
 from __future__ import annotations
 
@@ -328,7 +328,7 @@ def test_a_stopped_sweep_prints_a_note_and_leaves_no_process(
     while not list(tmp_path.glob("runs/rpi/*/*/checkpoints/last.ckpt")) and time.monotonic() < deadline:
         time.sleep(0.1)
     process.send_signal(how)
-    _, said = process.communicate(timeout=60)  # not before everybody who holds the pipe has ended
+    _, said = process.communicate(timeout=60)  # returns when all processes that hold the pipe have ended
     if not (launcher and how == signal.SIGTERM):  # joblib's parent has no handler of SIGTERM
         assert process.returncode == status
     if how == signal.SIGINT:

@@ -1,4 +1,4 @@
-"""Displacement metrics: by hand, against loops, and blind for what is not observed."""
+"""Displacement metrics: hand-computed values, plain loops, and masking of unobserved steps."""
 
 from __future__ import annotations
 

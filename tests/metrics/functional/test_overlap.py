@@ -1,4 +1,4 @@
-"""Overlap rates: by hand, against shapely's polygons, and blind for absent agents."""
+"""Overlap rates: hand-computed values, shapely's polygons, and masking of absent agents."""
 
 from __future__ import annotations
 

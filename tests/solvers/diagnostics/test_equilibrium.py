@@ -152,7 +152,7 @@ def test_gaps_of_a_linear_quadratic_game_are_those_of_the_closed_form(kind):
         assert found.nash_gap[0, i].item() == pytest.approx(gain, rel=1e-6)
     saved = 0.5 * slope @ np.linalg.solve(matrix, slope)
     assert (found.energy - found.optimum).item() == pytest.approx(saved, rel=1e-6)
-    # Turn rates have no slope: nobody is beside the row.
+    # Turn rates have zero gradients, as all agents are on the row.
     assert found.gradient_norm.item() == pytest.approx(np.linalg.norm(slope), rel=1e-10)
 
 

@@ -57,7 +57,7 @@ def keep(pair: torch.Tensor, agents: int, edges: list[tuple[int, int]]) -> torch
 
 
 def forbid(unary: torch.Tensor, pair: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same with some impossible candidates and pairs of them, with the first candidates of all agents possible."""
+    """Tables with some impossible candidates and pairs; the agents' first candidates stay possible."""
     never, not_both = torch.rand_like(unary) < 0.25, torch.rand_like(pair) < 0.25
     never[..., 0] = not_both[..., 0, 0] = False
     return unary.masked_fill(never, INF), pair.masked_fill(not_both, INF)

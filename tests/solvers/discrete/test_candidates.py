@@ -42,7 +42,7 @@ def played(scenes: int = 2, agents: int = 3, count: int = 3) -> tuple[Scene, Gam
 
 
 def with_absent(game: GameParameters) -> GameParameters:
-    """The same with an absent agent that holds NaN."""
+    """Scene and game with an absent agent whose values are nan."""
     controls = game.initial_controls
     wide = widen(dataclasses.replace(game, initial_controls=controls[:, :1]), 1)
     nothing = torch.full_like(controls[:, :, :1], NAN)

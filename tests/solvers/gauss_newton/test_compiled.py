@@ -166,7 +166,7 @@ def test_a_kernel_built_from_other_sources_is_noticed(tmp_path, monkeypatch):
 
 
 def test_a_missing_compiler_is_named(tmp_path):
-    """What the installation prints, and goes on."""
+    """The installation prints a note and continues."""
     for path in build.HERE.iterdir():
         if path.suffix in (".py", ".hpp", ".cpp"):
             shutil.copy(path, tmp_path)
@@ -193,7 +193,7 @@ def test_a_scene_that_changed_before_the_backward_pass_is_noticed():
 
 
 def test_a_step_is_as_exact_as_its_matrix_allows():
-    """Beside a QR factorisation of (J, sqrt(lambda) I), in units of eps cond(H) |d|; PyTorch solves a stiffer system."""
+    """Error against a QR factorisation of (J, sqrt(lambda) I) in units of eps cond(H) |d|; PyTorch's system is stiffer."""
     own = ("goal", "lane", "steer", "vel", "acc", "turnacc", "turnrb", "turnaccb")
     scene, damping = random_scene(8, 2, history=2, size=0.01, dtype=torch.float64), 1e-3
     parameters = random_game(scene, horizon=5, own=own, spread=0.1)
@@ -297,7 +297,7 @@ print(interrupted, overwritten)
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no interval timers on this system")
 def test_interrupts_leave_no_thread_that_writes_to_released_memory():
-    """Also the second interrupt, while the first one is handled; the results afterwards are those of before."""
+    """The second interrupt comes while the first one is handled; results afterwards equal those before."""
     path = [str(Path(__file__).parents[2]), str(Path(__file__).parents[3])]
     program = [sys.executable, "-c", _INTERRUPTS.format(path=path)]
     found = subprocess.run(program, check=True, timeout=300, capture_output=True, text=True)

@@ -70,7 +70,7 @@ def test_unrolled_gradients_equal_central_differences(size, bounds, agents):
 
 
 def test_a_linear_quadratic_game_is_solved_in_one_full_step():
-    """With speed and control features alone the energy is quadratic, and its minimiser is known in closed form."""
+    """An energy of speed and control features is quadratic, with a minimiser in closed form."""
     scene = random_scene(2, 2, history=2, dtype=torch.float64)
     parameters = random_game(scene, horizon=6)
     energy = FeatureEnergy(["vel", "acc", "turnr"], pair=[])

@@ -33,7 +33,7 @@ class TestStructured(BackendSuite):
 
 
 def dense(energy, scene, parameters, steps=2, damping=10.0):
-    """The same steps with a dense Jacobian and a taped general linear solver."""
+    """Reference steps with a dense Jacobian and a differentiable general linear solver."""
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
     unit = torch.eye(controls[0, 0].numel(), dtype=controls.dtype)
     directions = unit.view(-1, 1, 1, *controls.shape[2:]).expand(-1, *controls.shape)

@@ -27,8 +27,8 @@ def chains(own, weights, horizon=3):
     return FeatureEnergy(own=own, pair=[]), scene, parameters, many
 
 
-def within_error(samples, mean, covariance):
-    """Whether mean and covariance of samples [C, n] are what they should be, up to five standard errors."""
+def assert_within_error(samples, mean, covariance):
+    """Assert that mean and covariance of samples [C, n] are as given, up to five standard errors."""
     count = len(samples)
     deviation = (samples.mean(0) - mean).abs()
     assert (deviation < 5.0 * (covariance.diagonal() / count).sqrt()).all()
@@ -53,7 +53,7 @@ def test_samples_have_the_mean_and_covariance_of_the_linear_recursion():
     mean, covariance = start.flatten() - minimum, torch.zeros(6, 6, dtype=torch.float64)
     for _ in range(steps):
         mean, covariance = carry @ mean, carry @ covariance @ carry.T + delta**2 * spread.square().diag()
-    within_error(found, minimum + mean, covariance)
+    assert_within_error(found, minimum + mean, covariance)
 
 
 def test_long_chains_sample_the_density_widened_by_the_step_size():
@@ -64,7 +64,7 @@ def test_long_chains_sample_the_density_widened_by_the_step_size():
     curvature = torch.tensor([1.0, 4.0], dtype=torch.float64).repeat(2)
     widened = 1.0 / (curvature * (1.0 - 0.25 * delta**2 * curvature))
     assert widened[1] > 2.0 / curvature[1]  # by far more than the error of this test
-    within_error(found, torch.zeros(4, dtype=torch.float64), widened.diag())
+    assert_within_error(found, torch.zeros(4, dtype=torch.float64), widened.diag())
 
 
 def test_short_steps_sample_the_density_whatever_the_scale():

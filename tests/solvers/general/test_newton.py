@@ -141,7 +141,7 @@ def test_the_papers_energy_has_the_minimum_that_levenberg_marquardt_finds(minimi
 
 
 def test_newton_leaves_regions_with_an_indefinite_hessian():
-    """Where agents overlap, hinges make the Hessian indefinite, and undamped steps would raise the energy."""
+    """Overlapping agents: hinges make the Hessian indefinite, and undamped steps would raise the energy."""
     scene, game = feature_game(size=3.0)
     scene = dataclasses.replace(scene, dt=0.4)
     least = torch.linalg.eigvalsh(hessian(FEATURES, scene, game, game.initial_controls).detach())[..., 0]

@@ -14,7 +14,7 @@ import pytest
 from pyproj import Transformer
 
 ORIGIN = (351_000.0, 5_650_000.0)
-"""Where the local frame begins in UTM zone 32 [m]: near Cologne."""
+"""Origin of the local frame in UTM zone 32 [m], near Cologne."""
 _GLOBE = Transformer.from_crs("EPSG:32632", "EPSG:4326")
 
 

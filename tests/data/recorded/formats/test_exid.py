@@ -1,4 +1,4 @@
-"""exiD folders: everything in them is read as it was written, and what is wrong with them is said."""
+"""exiD folders: all contents are read as written, and errors in them are named."""
 
 from __future__ import annotations
 

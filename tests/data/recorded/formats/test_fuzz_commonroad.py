@@ -1,4 +1,4 @@
-"""Thousands of broken scenarios and tables: each is refused in one sentence or read with its losses counted, soon."""
+"""Fuzzing of scenarios and tables: each damaged file is refused in one sentence, or read with its losses counted."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ SCENARIO = scenario(*ELEMENTS)
 
 
 def outcome(read: Callable[[], Recording]) -> Recording | RecordingError:
-    """What a reader makes of a file; anything else than a recording or a refusal fails the test, as do warnings."""
+    """Recording or refusal that a reader gives for a file; other results, errors and warnings fail the test."""
     begin = time.perf_counter()
     try:
         with warnings.catch_warnings():
@@ -80,7 +80,7 @@ def outcome(read: Callable[[], Recording]) -> Recording | RecordingError:
 
 
 def break_text(draw: np.random.Generator, text: str) -> bytes:
-    """Cut, flip, repeat, swap, insert or change a digit, whatever the format."""
+    """Random damage to a file of any format: cut, flip, repeat, swap, insert or change a digit."""
     content = bytearray(text.encode())
     start, end = sorted(draw.integers(0, len(content), 2).tolist())
     digits = [at for at, byte in enumerate(content) if chr(byte).isdigit()]
@@ -142,7 +142,7 @@ def break_references(draw: np.random.Generator, root: Element) -> None:
 
 
 def accounted(recording: Recording, root: Element) -> None:
-    """Whatever the file holds is in the recording or counted as left out."""
+    """Every agent of the file is in the recording or counted as left out."""
     dropped = Counter(recording.dropped)
     moving = len(root.findall("dynamicObstacle")) + sum(
         (each.findtext("role") or "").strip() == "dynamic" for each in root.findall("obstacle")

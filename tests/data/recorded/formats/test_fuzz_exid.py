@@ -1,4 +1,4 @@
-"""Thousands of broken exiD files and Lanelet2 maps: each ends in one sentence, or in a recording that can be trusted."""
+"""Fuzzing of exiD files and Lanelet2 maps: each damaged file gives one sentence or a valid recording."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error")]
 
 TRIALS = 2500
 PATIENCE = 5.0
-"""No file may take longer than this [s]."""
+"""Longest allowed time for a file [s]."""
 VALUES = [
     *(
         "",
@@ -67,7 +67,7 @@ def warmed(tmp_path_factory):
 
 
 def attempt(read, folder, label):
-    """What was read, or None and the sentence that says why not."""
+    """The recording, or None with the message of the error."""
     started = time.perf_counter()
     try:
         found, problem = read(), ""

@@ -1,4 +1,4 @@
-"""Lanes are those of the Lanelet2 library: boundaries, centrelines, successors and neighbours."""
+"""Lanes equal those of the Lanelet2 library: boundaries, centrelines, successors and neighbours."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FZI_ORIGIN = (457_500.0, 5_428_000.0)
 
 
 class Library:
-    """What the Lanelet2 library makes of a map, for vehicles in an emergency: they may use the shoulder."""
+    """The Lanelet2 library's view of a map, for emergency vehicles, which may use the shoulder."""
 
     def __init__(self, path, origin):
         library = pytest.importorskip("lanelet2", reason="there is no lanelet2 wheel for this Python")
@@ -87,7 +87,7 @@ def test_the_fzi_map_is_read():
 
 
 def test_centrelines_of_the_fzi_map_equal_those_of_lanelet2():
-    """Also of footways, whose boundaries are less orderly."""
+    """Footways are included, whose boundaries are less regular."""
     library = Library(shared(FZI), FZI_ORIGIN)
     assert len(library.lanelets) == 371
     for lanelet in library.lanelets.values():
@@ -97,7 +97,7 @@ def test_centrelines_of_the_fzi_map_equal_those_of_lanelet2():
 
 
 def unique(osm):
-    """The same map without an id that is used twice, which the library needs."""
+    """Map without duplicate ids, as the library requires."""
     shift = {"way": 1000, "lanelet": 2000}
     ways = [(id + shift["way"], nodes, tags) for id, nodes, tags in osm.ways]
     lanelets = [
@@ -192,8 +192,8 @@ def test_closed_starts_and_repeated_nodes_are_read(tmp_path):
 
 @pytest.mark.parametrize(("noise", "share"), [(0.5, 1.0), (3.0, 0.95), (10.0, 0.95)])
 def test_centrelines_of_irregular_boundaries_equal_those_of_lanelet2(noise, share):
-    """Also where boundaries cross, come back and fold over, the centreline is the library's. A few of the worst hang on how
-    the library rounds: whether the first point of the centreline lies on the line between the bounds' first points."""
+    """Boundaries that cross, turn back or fold over. A few of the worst depend on how the library rounds: whether the first
+    point of the centreline lies on the line between the first points of the bounds."""
     library = pytest.importorskip("lanelet2", reason="there is no lanelet2 wheel for this Python").core
     random = np.random.default_rng(0)
 

@@ -1,4 +1,4 @@
-"""XML that is broken or hostile ends in one sentence, soon."""
+"""Broken or hostile XML gives one error sentence in a short time."""
 
 from __future__ import annotations
 
