@@ -1,4 +1,4 @@
-"""Costs of every row of a report: its training, its parameters, and a forecast where that was timed."""
+"""Costs of every row of a report: training, parameters, and the time of a forecast if measured."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TRAINED = ("training", "steps", "ms per step")
 
 
 def cost_sheets(tables: Sequence[Table], timings: Sequence[Timing]) -> list[Sheet]:
-    """For every data set the costs of the rows of its tables; nothing where no cost is known.
+    """Cost tables, one per data set with known costs.
 
     Times are means over seeds. Forecasts that were timed on different machines stand in columns of their own.
     """

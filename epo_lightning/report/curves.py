@@ -1,4 +1,4 @@
-"""Curves over many runs: how rows learn, and what more optimisation steps bring (the paper's S curve)."""
+"""Curves over many runs: scores over training, and over optimisation steps (the paper's S curve)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ METRIC = "val/minSADE"
 SIZE = (7.4, 3.7)
 """Width and height of a chart [inch]."""
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
-"""More rows than colours are told apart by how their lines are dashed."""
+"""Line styles, which distinguish rows of the same colour."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Curve:
     """One quantity of one row, over training steps or optimisation steps.
 
     Attributes:
-        name: of the row.
-        x: where it was measured.
-        mean, low, high: over the seeds: mean, smallest and largest value at every ``x``.
-        seeds: how many.
+        name: name of the row.
+        x: training or optimisation steps of the values.
+        mean, low, high: mean, smallest and largest value over the seeds at every ``x``.
+        seeds: number of seeds.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Curve:
 
     @classmethod
     def over_seeds(cls, name: str, values: Mapping[int, Sequence[float]]) -> Curve:
-        """From all values by where they were measured."""
+        """The curve of all values, given by step."""
         x = tuple(sorted(values))
         return cls(
             name,
@@ -63,14 +63,14 @@ class Curve:
 
 @dataclass(frozen=True)
 class StepsCurve:
-    """The S curve of rows that differ in nothing but their optimisation steps.
+    """The S curve of rows that differ only in their optimisation steps.
 
     Attributes:
-        name: of the row with the fewest steps, which stands for all.
-        split: on which data, and which part of it.
-        optimised, initial: minSADE over S of what the game's solution and of what the network alone predicts.
-        seeds: how many there are at every S; a sweep that is not done has fewer at some.
-        paper: the paper's curves belong beside it.
+        name: name of the row with the fewest steps.
+        split: data set and split of the scores.
+        optimised, initial: minSADE over S of the game's solution and of the initial strategies.
+        seeds: number of seeds at every S, smaller for unfinished parts of a sweep.
+        paper: whether the paper has this curve.
     """
 
     name: str
@@ -82,7 +82,7 @@ class StepsCurve:
 
 
 def learning_curves(rows: Iterable[Row], metric: str = METRIC) -> tuple[list[Curve], list[str]]:
-    """The validation score of every row over training steps, and a note for each row that cannot be shown.
+    """Learning curve of every row (validation score over training steps), and a note for each row without one.
 
     A row's curve ends where the first of its seeds stopped, so that its mean is always over all of them.
     """
@@ -127,9 +127,9 @@ def validation_log(file: Path, metric: str) -> dict[int, float]:
 
 
 def draw_learning(curves: Sequence[Curve], size: tuple[float, float] = SIZE, legend: bool = True) -> Figure:
-    """One line per row, and a band from its smallest to its largest seed.
+    """Figure of learning curves: one line per row, and a band from its smallest to its largest seed.
 
-    Lines and bands have the ids ``row<i>-line`` and ``row<i>-band``, by which a page can hide them.
+    Lines and bands have the ids ``row<i>-line`` and ``row<i>-band``, so that a page can hide them.
 
     Raises:
         ValueError: there is no curve.
@@ -164,7 +164,7 @@ def look(i: int) -> tuple[str, str | tuple[int, tuple[float, float]]]:
 
 
 def steps_curves(rows: Iterable[Row]) -> list[StepsCurve]:
-    """Rows that differ in nothing but ``solver.steps``, joined to curves over S."""
+    """S curves: rows that differ only in ``solver.steps``, joined."""
     series: dict[str, dict[int, list[Row]]] = {}
     for row in rows:
         if "minSADE" not in row.cells or row.runs[0].forecaster != "epo":
@@ -202,7 +202,7 @@ def steps_curves(rows: Iterable[Row]) -> list[StepsCurve]:
 
 
 def draw_steps(curve: StepsCurve, size: tuple[float, float] = SIZE, legend: bool = True) -> Figure:
-    """minSADE of optimised and initial strategies over the optimisation steps S, the paper's dashed beside them.
+    """Figure of minSADE of optimised and initial strategies over the optimisation steps S, with the paper's dashed.
 
     The ids are those of :func:`draw_learning`: rows 0 and 1 are ours, 2 and 3 the paper's.
     """
@@ -248,7 +248,7 @@ def steps_names(curve: StepsCurve) -> list[tuple[str, str, bool]]:
 
 
 def _line(axes: Axes, curve: Curve, gid: str, shade: float, label: str | None = None, **options: object) -> Line2D:
-    """A mean with its band; a band of one seed would be a line on a line."""
+    """Draw a mean, and its band if there are several seeds."""
     if curve.seeds > 1:
         axes.fill_between(
             curve.x,
@@ -264,7 +264,7 @@ def _line(axes: Axes, curve: Curve, gid: str, shade: float, label: str | None = 
 
 
 def _logarithmic(axes: Axes) -> None:
-    """A logarithmic axis whose ticks are read as what they are."""
+    """Set a logarithmic axis with ticks as plain numbers."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     low, high = axes.get_ylim()

@@ -1,4 +1,4 @@
-"""Joint predictions over what happened, as in the paper's Fig. 9."""
+"""Figures of joint predictions over the observed motion, as in the paper's Fig. 9."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ def joint_predictions(
     alternatives: Float[Tensor, "B N K 4"] | None = None,
     agents: Sequence[str] = AGENTS,
 ) -> Path:
-    """All joint modes of several forecasters over history and ground truth, one scene per row, one forecaster per column.
+    """Figure of all joint modes of several forecasters, one scene per row, one forecaster per column. Returns its path.
 
     A mode has one colour for all of its agents, which grows stronger with time. The most likely mode is drawn broad and
     the others narrow on top of it, so that modes that have collapsed into one are seen as such. Discs at the ends of
     trajectories have the size of the agents.
 
     Args:
-        scene: the scenes to draw, a handful; with futures, and with goals and sizes if they are to be drawn.
-        forecasts: by the name of the row in the tables; all of these scenes.
-        path: of the PNG.
-        alternatives: futures that would have been equally right (the other equilibrium); NaN where there are none.
-        agents: what to call the agents.
+        scene: a few scenes with futures; goals and sizes are drawn if present.
+        forecasts: forecasts of these scenes, by the name of the row in the tables.
+        path: path of the PNG.
+        alternatives: alternative futures (the other equilibrium); nan for scenes without one.
+        agents: names of the agents.
 
     Raises:
         ValueError: there is no forecast, or the scenes have no future.
@@ -76,7 +76,7 @@ def joint_predictions(
 
 
 def _draw_scene(axes: Axes, scene: Scene, other: Tensor | None, agents: Sequence[str]) -> None:
-    """Histories and observed futures of one scene (B = 1)."""
+    """Draw histories and observed futures of one scene (B = 1)."""
     centre = np.mean([np.concatenate(_observed(scene, i)).mean(0) for i in _present(scene)], axis=0)
     for i in _present(scene):
         history, future = _observed(scene, i)
@@ -93,7 +93,7 @@ def _draw_scene(axes: Axes, scene: Scene, other: Tensor | None, agents: Sequence
 
 
 def _draw_modes(axes: Axes, scene: Scene, forecast: JointForecast) -> None:
-    """Joint predictions, the most likely mode first and broadest."""
+    """Draw joint predictions, the most likely mode first and with the broadest lines."""
     handles = []
     probabilities = forecast.probabilities[0].double().numpy()
     for rank, m in enumerate(np.argsort(-probabilities, kind="stable")):
@@ -116,7 +116,7 @@ def _present(scene: Scene) -> list[int]:
 
 
 def _observed(scene: Scene, i: int) -> tuple[np.ndarray, np.ndarray]:
-    """Observed positions of an agent until t0 and after."""
+    """Observed positions of an agent, until t0 and afterwards."""
     assert scene.future is not None
     assert scene.future_mask is not None
     assert scene.history_mask is not None
@@ -125,7 +125,7 @@ def _observed(scene: Scene, i: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fading_line(axes: Axes, positions: np.ndarray, start: Color, end: Color, width: float, zorder: float) -> None:
-    """A trajectory whose colour goes from ``start`` to ``end`` with time."""
+    """Draw a trajectory whose colour changes from ``start`` to ``end``."""
     share = np.linspace(0, 1, max(len(positions) - 1, 1))[:, None]
     colors = (1 - share) * np.array(to_rgb(start)) + share * np.array(to_rgb(end))
     segments = np.stack([positions[:-1], positions[1:]], axis=1)
@@ -157,7 +157,7 @@ def _name(axes: Axes, name: str, where: np.ndarray, centre: np.ndarray) -> None:
 
 
 def _limits(axes: Axes, scene: Scene, forecasts: Sequence[JointForecast]) -> None:
-    """The same square piece of ground for all panels of a row, with everything in it."""
+    """Set equal square limits for all panels of a row, which include all positions."""
     agents = _present(scene)
     points = [part for i in agents for part in _observed(scene, i)]
     points += [f.states[0, :, agents, :, :2].double().reshape(-1, 2).numpy() for f in forecasts]
@@ -174,7 +174,7 @@ def _limits(axes: Axes, scene: Scene, forecasts: Sequence[JointForecast]) -> Non
 
 
 def _explain(figure: Figure, scene: Scene, columns: int, modes: int, alternatives: bool) -> None:
-    """One legend for what all panels share."""
+    """Add one legend for all panels."""
     handles = [
         Line2D([], [], color=HISTORY, lw=1.6, ls=(0, (1, 1)), marker="o", ms=3.5, markevery=[0], label="history"),
         Line2D([], [], color=TRUTH, lw=1.2, label="ground truth"),

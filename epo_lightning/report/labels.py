@@ -11,14 +11,14 @@ from typing import Any
 from epo_lightning.identity import differences, essence
 
 MOST, LONGEST, DIGITS = 4, 24, 3
-"""How many settings a label names, how long the text of one value may be, and with how many digits it is printed."""
+"""Largest number of settings in a label, largest length of a value's text, and number of its digits."""
 
 PLAIN, OTHER = re.compile(r"[\w./-]+", re.ASCII), re.compile(r"[-\d._e]+|true|false|null|nan|inf", re.IGNORECASE)
 """Text that needs no quotes, and text that would be read as something else without them."""
 
 
 def varying(configs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Settings of every configuration that are not the same in all of them, seeds apart.
+    """Settings of every configuration that differ between the configurations, without seeds.
 
     Returns:
         As many mappings from a setting's dotted key to its value, all with the same keys in the same order.
@@ -31,7 +31,7 @@ def varying(configs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def short_keys(keys: Sequence[str], config: Mapping[str, Any]) -> dict[str, str]:
-    """Every key's shortest ending that no other setting of the configuration has: ``lr`` for ``optimizer.lr``."""
+    """Shortest unambiguous ending of every key in the configuration: ``lr`` for ``optimizer.lr``."""
     known = {*_keys(essence(config)), *keys}
     return {key: next(ending for ending in _endings(key) if _is_alone(ending, known) or ending == key) for key in keys}
 
@@ -39,13 +39,13 @@ def short_keys(keys: Sequence[str], config: Mapping[str, Any]) -> dict[str, str]
 def labels(
     title: str, settings: Sequence[Mapping[str, Any]], config: Mapping[str, Any], rows: Sequence[str]
 ) -> list[str]:
-    """The names of rows that share a title.
+    """Labels of rows that share a title.
 
     Args:
-        title: what they share.
+        title: the shared title.
         settings: of every row, as :func:`varying` gives them.
         config: a resolved configuration of one of them.
-        rows: their identities, named where settings would be too many or do not tell rows apart.
+        rows: identities of the rows, used if there are too many settings or they do not distinguish rows.
     """
     keys = short_keys(list(settings[0]), config)
 
@@ -80,7 +80,7 @@ def value_text(value: Any) -> str:
 
 
 def natural(settings: Mapping[str, Any]) -> tuple[tuple[int, float, str], ...]:
-    """A key that sorts settings with numbers as numbers."""
+    """Sort key of settings, with numbers in numeric order."""
     return tuple(
         (0, float(value), "") if isinstance(value, int | float) else (1, 0.0, value_text(value))
         for _, value in sorted(settings.items())
@@ -88,7 +88,7 @@ def natural(settings: Mapping[str, Any]) -> tuple[tuple[int, float, str], ...]:
 
 
 def _rounded(value: Any) -> Any:
-    """A number with few digits: a search draws more than a label needs."""
+    """A number with few digits, since a search draws more than a label needs."""
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 

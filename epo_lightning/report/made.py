@@ -1,4 +1,4 @@
-"""Provenance of every row of a report: what is needed to check its numbers and to make them again."""
+"""Provenance of every row of a report, for checking and reproducing its numbers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class MadeRun:
 
     Attributes:
         seed, folder, command, commit, data_digest, parameters, steps, seconds, began: of the run.
-        versions: of the packages that made it.
+        versions: versions of the packages used.
     """
 
     seed: int
@@ -63,7 +63,7 @@ class Made:
 
 
 def how_made(tables: Sequence[Table], timings: Sequence[Timing] = ()) -> list[Made]:
-    """The rows of all tables, then the runs that were timed only."""
+    """Provenance of the rows of all tables, then of runs that were only timed."""
     rows = [_of_row(row) for row in distinct(tables)]
     known = {run.folder for row in rows for run in row.runs}
     return [*rows, *_timed([timing for timing in timings if str(timing.run.path) not in known])]
@@ -124,7 +124,7 @@ def _run(run: RunFolder, seed: int, command: str, commit: str, digest: str, para
 
 
 def short(commit: str) -> str:
-    """Enough of a commit to find it; ``+`` says that files had been changed since."""
+    """Abbreviated hash of a commit; ``+`` means uncommitted changes."""
     if not all(letter in "0123456789abcdef+" for letter in commit):
         return commit
     return commit[:10] + ("+" if commit.endswith("+") else "")

@@ -1,4 +1,4 @@
-"""Tables -> a terminal (rich), Markdown and CSV; :mod:`epo_lightning.report.latex` does LaTeX.
+"""Tables in the terminal (rich), in Markdown and as CSV; :mod:`epo_lightning.report.latex` writes LaTeX.
 
 The tables of comparisons and of best settings have no ranks and no second lines: they become a *sheet*, plain text in
 columns, which every format can show.
@@ -31,7 +31,7 @@ COMPARISON_LEGEND = (
 )
 
 GAMES = (
-    "Energies are those of the most likely joint mode: at the initial strategies (of candidates: everybody's cheapest "
+    "Energies are those of the most likely joint mode: at the initial strategies (with candidates: each agent's cheapest "
     "by itself), as forecast (solved), and at a tightly solved optimum near the forecast. The Nash gap is the most "
     "that an agent could gain by changing its strategy alone, by local search: a lower bound; for methods that choose "
     "among candidates, by taking another of its own candidates, where choosing the best joint one leaves nothing to "
@@ -52,15 +52,15 @@ COMPARISON_HEADER = (
 
 @dataclass(frozen=True)
 class Sheet:
-    """Text in columns.
+    """A table of plain text.
 
     Attributes:
-        title: above it.
+        title: title above the table.
         header: names of the columns.
-        lines: one text per column each.
-        left: how many columns from the left hold text; the others hold numbers.
-        ends: indices of lines below which a group ends.
-        note: how to read it, below it.
+        lines: rows, with one text per column.
+        left: number of leftmost columns with text; the others contain numbers.
+        ends: indices of the last lines of groups.
+        note: explanation below the table.
     """
 
     title: str
@@ -80,13 +80,13 @@ def signed(value: float, digits: int) -> str:
 
 
 def own_text(cell: Cell, column: Column) -> str:
-    """Mean ± deviation."""
+    """Mean and deviation of a cell as text."""
     mean = column.text(cell.mean)
     return mean if cell.deviation is None else f"{mean} ± {column.text(cell.deviation)}"
 
 
 def paper_text(row: Row, column: Column) -> str:
-    """The paper's value with the digits that it is printed with, or nothing."""
+    """The paper's value with the digits of the paper; empty if there is none."""
     cell = row.cells.get(column.metric)
     if cell is None or cell.paper is None:
         return ""
@@ -95,7 +95,7 @@ def paper_text(row: Row, column: Column) -> str:
 
 
 def difference_text(row: Row, column: Column) -> str:
-    """Ours minus the paper's, or nothing."""
+    """Difference of our value and the paper's as text; empty if the paper has none."""
     cell = row.cells.get(column.metric)
     return "" if cell is None or cell.difference is None else signed(cell.difference, column.digits)
 
@@ -103,11 +103,11 @@ def difference_text(row: Row, column: Column) -> str:
 def legend(
     tables: Sequence[Table], where: str = "in brackets", bold: str = "**Bold**", second: str = "<u>underlined</u>"
 ) -> str:
-    """How to read the numbers of tables: of what is in them, and of nothing else.
+    """Legend of tables, which explains only what they contain.
 
     Args:
-        where: the paper's values stand.
-        bold, second: these words, marked up as the best and the second best are.
+        where: position of the paper's values, such as ``below``.
+        bold, second: names of the markup of the best and second best values, themselves marked up.
     """
     cells = [
         row.cells[c.metric] for table in tables for row in table.rows for c in table.columns if c.metric in row.cells
@@ -161,7 +161,7 @@ def comparison_sheet(comparisons: Comparisons) -> Sheet:
 
 
 def _difference_texts(found: Difference, column: Column) -> tuple[str, str, str, str]:
-    """Mean, interval or why there is none, p-value and number of pairs."""
+    """Texts of mean, interval (or the reason for none), p-value and number of pairs."""
     mean = "" if found.mean is None else signed(found.mean, column.digits)
     if found.low is None or found.high is None or found.p is None:
         return mean, found.reason, "", str(found.n)
@@ -170,12 +170,12 @@ def _difference_texts(found: Difference, column: Column) -> tuple[str, str, str,
 
 
 def p_text(p: float) -> str:
-    """A p-value; below a thousandth its size says nothing more."""
+    """A p-value as text, ``< 0.001`` for smaller ones."""
     return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
 def settings_sheet(best: Sequence[BestSetting]) -> Sheet:
-    """One line per experiment: its best score, of how many settings, and the words that train with it."""
+    """Sheet with one line per experiment: its best score, number of settings, and the overrides that train with it."""
     lines = tuple(
         (
             entry.title,
@@ -191,7 +191,7 @@ def settings_sheet(best: Sequence[BestSetting]) -> Sheet:
 
 
 def to_rich(table: Table | Sheet) -> RichTable:
-    """For the terminal, where 80 columns have to do: deviations stand under their means, the paper's values below a row."""
+    """Table for a terminal of 80 columns: deviations below their means, the paper's values below each row."""
     rich = RichTable(title=table.title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     if isinstance(table, Sheet):
         rich.caption, rich.caption_justify = Text(table.note, style="dim") if table.note else None, "left"
@@ -226,7 +226,7 @@ def _rich_cell(row: Row, column: Column) -> Text:
 
 
 def to_markdown(table: Table | Sheet) -> str:
-    """A pipe table with its title; groups follow each other."""
+    """Markdown table with its title; groups follow each other."""
     if isinstance(table, Sheet):
         header, left, lines = table.header, table.left, [[_plain(text) for text in line] for line in table.lines]
     else:
@@ -242,7 +242,7 @@ def to_markdown(table: Table | Sheet) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text in which nothing is markup."""
+    """Text with Markdown's special characters escaped."""
     text = " ".join(text.split())
     for special in "\\|*`[]":
         text = text.replace(special, "\\" + special)
@@ -250,12 +250,12 @@ def _plain(text: str) -> str:
 
 
 def without_html(text: str) -> str:
-    """Markdown in which nothing is HTML."""
+    """Markdown with HTML escaped."""
     return text.replace("&", "&amp;").replace("<", "&lt;")
 
 
 def code(text: str) -> str:
-    """Text as code in Markdown, between more backticks than there are in it."""
+    """Text as Markdown code, delimited by more backticks than it contains."""
     fence = "`" * (max(map(len, re.findall("`+", text)), default=0) + 1)
     space = " " if text.startswith("`") or text.endswith("`") else ""
     return f"{fence}{space}{text}{space}{fence}"
@@ -271,7 +271,7 @@ def _markdown_cell(row: Row, column: Column) -> str:
 
 
 def to_csv(tables: Iterable[Table]) -> str:
-    """All scores of all rows in full precision, one per line, shown in a table or not."""
+    """CSV of all scores of all rows in full precision, one per line, including scores that no table shows."""
     lines: list[tuple[object, ...]] = []
     for row in distinct(tables):
         run = row.runs[0]
@@ -285,7 +285,7 @@ def to_csv(tables: Iterable[Table]) -> str:
 
 
 def comparisons_to_csv(comparisons: Iterable[Comparisons]) -> str:
-    """All comparisons in full precision, one metric per line."""
+    """CSV of all comparisons in full precision, one metric per line."""
     lines: list[tuple[object, ...]] = []
     for pair in (pair for entry in comparisons for pair in entry.pairs):
         run, seeds = pair.one.runs[0], " ".join(map(str, pair.seeds))
@@ -310,7 +310,7 @@ def _csv(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
 
 
 def _no_formula(cell: object) -> object:
-    """A cell that spreadsheets take for what it is: text that looks like a formula gets an apostrophe, numbers do not."""
+    """A CSV cell that no spreadsheet reads as a formula: text that looks like one gets an apostrophe, numbers do not."""
     if not isinstance(cell, str) or not cell.startswith(("=", "+", "-", "@", "\t", "\r")):
         return cell
     try:
@@ -321,6 +321,6 @@ def _no_formula(cell: object) -> object:
 
 
 def with_ends(rows: tuple[Row, ...]) -> Iterable[tuple[Row, bool]]:
-    """Every row, and whether it is the last of its group."""
+    """Rows, each with whether it is the last of its group."""
     following = [*(row.group for row in rows[1:]), None]
     return ((row, row.group != after) for row, after in zip(rows, following, strict=True))

@@ -1,4 +1,4 @@
-"""Evaluated runs, read from the folders that training and evaluation left behind."""
+"""Evaluated runs, read from their run folders."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ class EvaluatedRun:
     Attributes:
         path: the run folder.
         name: label of its row in tables.
-        seed: of the run.
+        seed: seed of the run.
         data: name of its data set.
         backbone, forecaster: names of its parts.
-        experiment: the configuration file it was made from, empty for none.
-        goal: which parts know a given goal, ``energy`` or ``all``.
+        experiment: name of its experiment file; empty for none.
+        goal: use of given goals, ``energy`` or ``all``.
         budget: name of its budget.
-        split: which part of the data it was evaluated on.
-        checkpoint: which of its checkpoints was evaluated.
-        data_digest: digest of the data it was evaluated on.
-        trained_digest: digest of the data it was trained on.
+        split: split on which it was evaluated.
+        checkpoint: name of the evaluated checkpoint.
+        data_digest: digest of the data on which it was evaluated.
+        trained_digest: digest of the data on which it was trained.
         metrics: scores by name, displacements in m.
-        git_commit: of the code; the installed version where there was no checkout.
-        command: that made it.
+        git_commit: commit of the code; the installed version outside a checkout.
+        command: command of the training.
         parameters: number of trained parameters, where known.
-        identity: hash of all that decides on its result.
-        row: the same without the seed: what the runs of one row of a table share.
+        identity: hash of all settings that affect its result.
+        row: the same hash without the seed, shared by the runs of a row.
         config: its resolved configuration.
     """
 
@@ -65,7 +65,7 @@ class EvaluatedRun:
 
     @property
     def learned(self) -> bool:
-        """Whether anything was trained: constant velocity knows neither a budget nor training data."""
+        """Whether the forecaster was trained; constant velocity has neither a budget nor training data."""
         return self.forecaster != "constant_velocity"
 
 
@@ -90,7 +90,7 @@ def find_runs(folder: str | Path) -> list[RunFolder]:
 
 
 def scored(run: RunFolder) -> list[Path]:
-    """The files with a run's scores: ``metrics.json`` of the test split first, then ``metrics-<split>.json``."""
+    """Files with a run's scores: ``metrics.json`` of the test split first, then ``metrics-<split>.json``."""
     files = [run.metrics_file(), *sorted(run.path.glob("metrics-*.json"))]
     return [file for file in files if file.is_file()]
 
@@ -99,7 +99,7 @@ def collect(runs: str | Path | Iterable[RunFolder]) -> list[EvaluatedRun]:
     """All evaluated runs, one entry for every split that a run was evaluated on.
 
     Args:
-        runs: run folders, or a folder in and below which they are looked for. Runs without scores are left out.
+        runs: run folders, or a folder that contains them at any depth. Runs without scores are left out.
 
     Raises:
         ConfigError: no folder, no run or no evaluated run (with the command that makes one), or a damaged file.
@@ -121,7 +121,7 @@ def _listed(runs: str | Path | Iterable[RunFolder]) -> list[RunFolder]:
 
 
 def read_run(run: RunFolder) -> list[EvaluatedRun]:
-    """Read one run folder: an entry for every split that it was evaluated on.
+    """Scores of one run folder, one entry for every split on which it was evaluated.
 
     Raises:
         ConfigError: a file is missing or damaged, or lacks an entry; the message names both and says what to do.

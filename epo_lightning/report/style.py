@@ -1,4 +1,4 @@
-"""How figures look: one set of colours that colour-blind readers can tell apart, and one way to save."""
+"""Style of figures: colours that colour-blind readers can distinguish, and reproducible files."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from epo_lightning.run_folder import write_bytes
 MODES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Okabe and Ito's colours; the first two modes are red and blue as in the paper."""
 AGENT_COLORS = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Agents, where colours do not stand for modes."""
+"""Colours of agents in figures where colours do not stand for modes."""
 VEHICLES = (*MODES, "#6A3D9A", "#8C510A")
-"""Agents of a traffic scene, where there are more than a few."""
+"""Colours of agents in traffic scenes with many agents."""
 ROAD, LANE = "#ECECEC", "#CFCFCF"
-"""Lanes, and the line in the middle of each."""
+"""Colours of lanes and of their centre lines."""
 HISTORY, TRUTH, OTHER = "#8A8A8A", "#111111", "#8A8A8A"
 AGENTS = ("robot", "pedestrian")
 """Names of the agents of the RPI environment."""
@@ -52,13 +52,13 @@ STYLE: dict[Any, Any] = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw in the style of this project and leave the reader's own settings as they were."""
+    """Context with matplotlib settings of this project; the user's settings are restored afterwards."""
     with mpl.rc_context(STYLE):
         yield
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write a PNG as a whole; the same picture gives the same bytes."""
+    """Write a PNG atomically; equal figures give equal bytes."""
     FigureCanvasAgg(figure)  # no display, and no figure that pyplot remembers
     path, picture = Path(path), io.BytesIO()  # a full disk would be an encoder's error without a file's name
     metadata = {"Software": None}
@@ -68,10 +68,10 @@ def save(figure: Figure, path: str | Path) -> Path:
 
 
 def svg(figure: Figure, name: str) -> str:
-    """A figure as a piece of HTML: an <svg> without a size of its own, whose text is text.
+    """A figure as an HTML <svg> element without a fixed size, with text as text.
 
     Args:
-        name: begins all ids, so that several figures live in one page.
+        name: prefix of all ids, so that several figures can be in one page.
     """
     FigureCanvasAgg(figure)
     text = io.StringIO()

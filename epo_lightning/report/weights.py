@@ -1,4 +1,4 @@
-"""Weights of the inferred games' energies."""
+"""Figure of the weights of inferred games."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from epo_lightning.report.style import AGENT_COLORS, AGENTS, save, style
 from epo_lightning.scene import JointForecast
 
 SMALLEST = 1e-6
-"""Squared weights below this are drawn here: on a logarithmic axis zero is infinitely far away."""
+"""Smallest squared weight on the logarithmic axis; smaller ones are drawn there."""
 
 
 def learned_weights(
     forecasts: JointForecast | Mapping[str, JointForecast], path: str | Path, agents: Sequence[str] = AGENTS
 ) -> Path:
-    """Distribution over scenes and modes of the squared weights w^2 that enter E = 1/2 sum w^2 c^2 (Eq. 10).
+    """Figure of the distribution over scenes and modes of the squared weights w^2 in E = 1/2 sum w^2 c^2 (Eq. 10).
 
     One row of panels per forecaster that infers a game: own weights by feature and agent, and weights of pairs. A dot is
     the median, the thick line holds half of the weights, the thin line nine tenths. The axis is logarithmic; weights of
     features with different units do not compare, those of two agents do.
 
     Args:
-        forecasts: of many scenes, one or several by the name of the row in the tables.
-        path: of the PNG.
-        agents: what to call the agents.
+        forecasts: forecasts of many scenes, one or several by the name of the row in the tables.
+        path: path of the PNG.
+        agents: names of the agents.
 
     Raises:
         ValueError: no forecast has inferred a game.
@@ -63,12 +63,12 @@ def learned_weights(
 
 
 def _power(value: float, _: object) -> str:
-    """A power of ten: ``10⁻³``"""
+    """A power of ten as text: ``10⁻³``."""
     return "10" + str(round(math.log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def _draw(axes: Axes, weights: Mapping[str, Tensor], colors: Sequence[str] = AGENT_COLORS) -> None:
-    """One line per feature (downwards) and agent: 5, 25, 50, 75 and 95 percent of the weights [any, agent]."""
+    """Draw the 5, 25, 50, 75 and 95 percent quantiles of the weights [any, agent], one line per feature and agent."""
     everything = []
     for line, values in enumerate(weights.values()):
         squared = values.detach().double().square().clamp_min(SMALLEST).cpu().numpy()

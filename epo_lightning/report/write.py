@@ -1,4 +1,4 @@
-"""The report: tables, how they were made, figures and the page that shows it all, in one folder."""
+"""The report as a folder: tables, their provenance, figures, and the page with all of them."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ from epo_lightning.run_folder import RunFolder, write_text
 
 @dataclass(frozen=True)
 class Report:
-    """Subject of a report.
+    """Runs and titles of a report.
 
     Attributes:
-        title: above everything.
-        command: that writes the report.
+        title: title of the report.
+        command: command that writes the report.
         runs: all run folders that have scores or were timed.
-        evaluated: what was scored in them.
-        left_out: the other run folders, and why they are left out.
-        sweep: the command that began the sweep, if the report is of one.
+        evaluated: scores of these runs.
+        left_out: the other run folders, each with the reason.
+        sweep: command that began the sweep; empty for a report of other runs.
     """
 
     title: str
@@ -57,7 +57,7 @@ class Report:
 
     @classmethod
     def of_folder(cls, folder: str | Path) -> Report:
-        """All runs in and below a folder.
+        """Report on all runs in and below a folder.
 
         Raises:
             ConfigError: as :func:`~epo_lightning.report.collect`.
@@ -76,7 +76,7 @@ class Report:
 
 
 def is_timed(run: RunFolder) -> bool:
-    """Whether it was measured how long the run's forecasts take."""
+    """Whether the time of the run's forecasts was measured."""
     return run.metrics_file("time").is_file()
 
 
@@ -98,12 +98,12 @@ def write_report(
     Nothing is written unless everything could be read, and every file is written as a whole.
 
     Args:
-        report: what to report on.
+        report: subject of the report.
         out: folder of the report.
-        figures: pictures that were drawn already.
-        preface: Markdown that stands before the tables, for what a reader has to know first.
-        notes: on what could not be drawn.
-        console: where to print; the terminal by default.
+        figures: existing pictures.
+        preface: Markdown before the tables, for caveats.
+        notes: notes on what could not be drawn.
+        console: output console; the terminal by default.
 
     Returns:
         The text of results.md.
@@ -190,14 +190,14 @@ def write_report(
 
 
 def _caveat(tables: Sequence[Table]) -> str:
-    """The preface in a sentence, for captions: tables of a paper are copied without what stands around them."""
+    """The preface in a sentence, for captions: tables are copied without the text around them."""
     budgets = sorted({run.budget for table in tables for row in table.rows for run in row.runs} - {"paper"})
     names = ", ".join(budgets or ["paper"])
     return f"Budget: {names}, other data or steps than the paper's: does not reproduce its table."
 
 
 def _summary(left_out: Sequence[tuple[str, str]]) -> str:
-    """``3 runs left out: 1 waiting, 2 failed``: the reasons are long, and stand in the files."""
+    """Summary of runs left out: ``3 runs left out: 1 waiting, 2 failed``; the files give the full reasons."""
     states = Counter(why.partition(":")[0] for _, why in left_out)
     named = ", ".join(f"{count} {state}" for state, count in states.items())
     runs = "run" if len(left_out) == 1 else "runs"
@@ -205,7 +205,7 @@ def _summary(left_out: Sequence[tuple[str, str]]) -> str:
 
 
 def _best(runs: Sequence[EvaluatedRun]) -> tuple[list[BestSetting], str]:
-    """The best settings where there was a search, and what is in the way of choosing them."""
+    """The best settings of searches, and notes on searches without a selection."""
     validated = [run for run in runs if run.split == "val"]
     try:
         return (best_settings(validated), "") if validated else ([], "")
