@@ -1,8 +1,8 @@
 """Trained forecasters that ship with the package, each as a run folder without logs.
 
-``rpi`` is V-LSTM + EPO with the remedy against modes that are never taught, trained on a fifth of the hard split of the
-robot-pedestrian data. Its run.json holds the command, commit, seed and data digest that it was made with, metrics.json its
-scores, and scenes.safetensors a few scenes of the test split. ``make checkpoint`` makes it again.
+``rpi`` is V-LSTM + EPO with a relaxed loss (:class:`~epo_lightning.losses.Relaxation`), trained on a fifth of the hard split
+of the robot-pedestrian data. Its run.json holds the command, commit, seed and data digest that it was made with,
+metrics.json its scores, and scenes.safetensors a few scenes of the test split. ``make checkpoint`` makes it again.
 """
 
 from __future__ import annotations

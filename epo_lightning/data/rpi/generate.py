@@ -1,8 +1,8 @@
 """Generation of RPI data sets: every main game is solved at every placement, and the pool of records is cut into splits.
 
 The pool has one file per main game and depends on the games alone; data sets with other splits or sizes share it. Every
-placement draws from its own random numbers, so the bytes do not depend on the number of workers, and a run that was killed
-continues with the first main game that is not finished. The pool may be deleted once the data sets are made.
+placement has its own random generator, so the files do not depend on the number of workers. If the command was killed, the
+next one continues with the first main game that is not finished. The pool may be deleted when the data sets have been made.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def set_folder(root: Path, config: Mapping[str, Any]) -> Path:
 
 
 def _play(seed: int, game: int, placement: int, placements: int, solver: str) -> tuple[Records, dict[str, int]]:
-    """Records of one placement of one main game, and what the solver counted."""
+    """Records of one placement of one main game, and the solver's counts."""
     constants = GameConstants()
     records, counts = play(seed, main_game(seed, game, placement, placements, constants), constants, solver)
     return {name: values.astype(_dtype(name)) for name, values in records.items()}, counts
@@ -121,7 +121,7 @@ def make_pool(
     with cache.locked(folder):
         with cache.writing(folder):
             folder.mkdir(exist_ok=True)
-            for rest in folder.glob(".game-*"):  # of a process that was killed while it wrote
+            for rest in folder.glob(".game-*"):  # incomplete files of a killed process
                 rest.unlink()
         _solve_missing(paths, config, workers, progress)
     games = [_read_game(path, name) for path in paths]

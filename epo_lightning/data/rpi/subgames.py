@@ -1,7 +1,8 @@
-"""Records of one placement of a main game: it is solved, each mode is executed, and a sub-game is solved every 0.1 s.
+"""Records of a main game with one placement of the pedestrian.
 
-The horizon shrinks: the sub-game at step k has the K - k steps that are left until the main game's end. Every sub-game
-gives one record: the history until k, and the modes of the future.
+The main game is solved, each of its modes is executed, and every 0.1 s the game from the current state on (a sub-game) is
+solved. The sub-game at step k has the remaining K - k steps of the main game. Every sub-game gives one record: the history
+until k, and the modes of the future.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from epo_lightning.data.recorded.tracks import TrackTable
 FURTHEST_LEADER = 250.0
 """Largest distance to a leader [m]."""
 HOPS = 6
-"""Number of consecutive lanes on which leaders are looked for."""
+"""Number of consecutive lanes on which leaders are searched."""
 
 
 def leaders(

@@ -16,7 +16,7 @@ from epo_lightning.registry import ConfigError, register
 
 @register("data", "highway_sim")
 class SimulatedHighway(RecordedData):
-    """Scenes from traffic that is simulated on motorway ramps, by way of recordings in exiD's format.
+    """Scenes from simulated traffic on motorway ramps. The simulation writes recordings in exiD's format.
 
     Args:
         recordings: number of recordings per layout.

@@ -1,8 +1,8 @@
-"""The guard between a training and its dashboards: whatever a dashboard does, the training goes on at its own pace.
+"""Separation of a training from its dashboards, so that a dashboard can neither stop nor delay the training.
 
-A thread of its own talks to each dashboard and takes rows from a queue. An exception there, a queue that has grown too long
-or an end that is never reached switches that dashboard off for the run, with one warning. The training only ever puts
-rows into a queue.
+Each dashboard has a thread that takes rows from a queue; the training only puts rows into the queue. If the thread raises an
+exception, the queue becomes too long, or the thread does not finish at the end of the run, the dashboard is switched off for
+this run, with one warning.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ BEHIND = 20_000
 
 
 class Aside(Logger):
-    """A dashboard as a Lightning logger that never raises and never waits, but at the end.
+    """Lightning logger for a dashboard. It never raises an exception, and waits for the dashboard only at the end of a run.
 
     Args:
-        dashboard: receives the rows.
-        patience: seconds that the end of the run waits for it.
+        dashboard: the dashboard that gets the rows.
+        patience: seconds to wait for the dashboard at the end of the run.
         past: rows that were logged before this process began.
     """
 
@@ -39,7 +39,7 @@ class Aside(Logger):
         self.off: str | None = None
         self._past = past
         self._queue: queue.Queue[Row | Ending] = queue.Queue(BEHIND)
-        # A daemon: a dashboard that never answers must not keep the process from ending.
+        # A daemon thread, because a dashboard that never answers must not keep the process alive.
         self._thread = threading.Thread(target=self._work, name=dashboard.label, daemon=True)
         self._thread.start()
 
@@ -58,7 +58,7 @@ class Aside(Logger):
         self._put((step or 0, dict(metrics)))
 
     def close(self, ending: Ending) -> None:
-        """Tell how the run ended; waits at most ``patience`` seconds for the dashboard."""
+        """Send the end of the run to the dashboard; waits at most ``patience`` seconds."""
         self._put(ending)
         self._thread.join(0.0 if self.off else self.patience)
         if self._thread.is_alive():
@@ -82,11 +82,11 @@ class Aside(Logger):
                 if ending:
                     self.dashboard.close(ending)
                     return
-        except BaseException as error:  # nothing that happens here is the training's business, SystemExit included
+        except BaseException as error:  # no error of a dashboard may reach the training, not even SystemExit
             self._switch_off(mask(" ".join(f"{type(error).__name__}: {error}".split()))[:300])
 
     def _waiting(self) -> tuple[list[Row], Ending | None]:
-        """The next row and all that come up soon after it, or the ending."""
+        """The next rows in the queue: the first one and those that arrive soon after it; and the ending, if it is there."""
         rows: list[Row] = []
         until = math.inf
         while True:
@@ -106,8 +106,8 @@ class Aside(Logger):
         self.off = why
         folder = self.dashboard.facts.folder
         print(
-            f"{self.dashboard.label}: switched off for this run ({why}). The run goes on, and its log is whole in "
-            f"{folder / 'logs' / 'metrics.csv'}: `epo evaluate run={folder}` fills the dashboard when it is back",
+            f"{self.dashboard.label}: switched off for this run ({why}). The run continues, and its complete log is in "
+            f"{folder / 'logs' / 'metrics.csv'}. When the dashboard works again, `epo evaluate run={folder}` sends it",
             file=sys.stderr,
             flush=True,
         )

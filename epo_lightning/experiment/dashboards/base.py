@@ -19,11 +19,11 @@ class Facts:
     """Name, identity and configuration of a run.
 
     Args:
-        id: the same for all processes that work on the run, and for no other run.
-        name: for people: title and seed.
-        group: the label of the sweep that it belongs to.
-        config: the resolved configuration, as far as it describes the run and not the place where it lies.
-        tags: what a table needs behind a number: identity, data_digest, commit.
+        id: unique identifier of the run, the same in all processes that work on it.
+        name: title and seed, for display.
+        group: label of the sweep that the run belongs to; None without a sweep.
+        config: the resolved configuration without folders and machine settings.
+        tags: identity, data_digest and commit.
         folder: the run folder.
     """
 
@@ -56,23 +56,23 @@ class Ending:
 
 
 class Dashboard(ABC):
-    """One dashboard of one run. Its methods may raise and may be slow: they are called aside from the training."""
+    """The interface of a dashboard for one run. Its methods may raise and be slow: they are called in a separate thread."""
 
     label: ClassVar[str]
     every: ClassVar[float] = 0.0
-    """Seconds for which rows are collected before they are sent together, where a request is slow."""
+    """Seconds during which rows are collected before they are sent together; positive for dashboards with slow requests."""
 
     def __init__(self, facts: Facts) -> None:
         self.facts = facts
 
     @abstractmethod
     def open(self) -> None:
-        """Begin the run, or go on where another process stopped."""
+        """Begin the run, or continue it where another process stopped."""
 
     @abstractmethod
     def log(self, rows: Sequence[Row]) -> None:
-        """Add rows; of a continued run, the first ones may be there already."""
+        """Add rows. For a continued run, the dashboard may have the first rows already."""
 
     @abstractmethod
     def close(self, ending: Ending) -> None:
-        """Say how it ended and wait until everything has arrived."""
+        """Send how the run ended, and wait until the dashboard has received everything."""

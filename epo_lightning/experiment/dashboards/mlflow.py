@@ -61,11 +61,11 @@ class MLflow(Dashboard):
         self._uri = f"{SQLITE}{runs.expanduser().resolve() / 'mlflow.db'}"
         self._known: dict[str, tuple[int, float]] = {}  # last step and value of each metric
         self._last = 0
-        self._ended: int | None = None  # when an earlier process ended the run, if it told all
+        self._ended: int | None = None  # time at which an earlier process ended the run; None if rows were added since
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """SQLite has one writer at a time, and MLflow makes its tables without asking who else does."""
+        """Context with a lock on an SQLite database: it allows one writer at a time, and MLflow does not lock its set-up."""
         if not self._uri.startswith(SQLITE):
             yield
             return
@@ -100,7 +100,7 @@ class MLflow(Dashboard):
                 self._parameters()
 
     def _artifacts(self) -> str:
-        """Beside the database; MLflow's own choice is the folder in which a process happens to run."""
+        """Folder of the artifacts, beside the database; MLflow's default would be the current folder of the process."""
         return (Path(self._uri.removeprefix(SQLITE)).parent / "mlflow").as_uri()
 
     def _latest(self, name: str) -> tuple[int, float]:
@@ -118,7 +118,7 @@ class MLflow(Dashboard):
         self._write((step, name, value) for step, metrics in rows for name, value in metrics.items())
 
     def _write(self, points: Iterable[tuple[int, str, float]], final: bool = False) -> None:
-        """Add the points that come after what is known of their metric; of final ones those that are not the same."""
+        """Add points with a later step than the last known one of their metric; final points also if the value differs."""
         from mlflow.entities import Metric
 
         now = int(time.time() * 1000)

@@ -26,7 +26,7 @@ class TensorBoard(Dashboard):
         folder = self.facts.folder / "logs"
         for old in folder.glob("events.out.tfevents.*"):
             old.unlink()
-        # The purge makes a TensorBoard that is open forget what it has read from the old files.
+        # With purge_step, a running TensorBoard drops the points that it has read from the old files.
         self._writer: Any = SummaryWriter(folder, flush_secs=10, purge_step=0)
 
     def log(self, rows: Sequence[Row]) -> None:
@@ -44,7 +44,7 @@ class TensorBoard(Dashboard):
         self._writer.close()
 
     def _hyperparameters(self, ending: Ending) -> None:
-        """The HPARAMS tab shows a run's parameters beside the metrics that are named together with them."""
+        """Write the run's parameters and summary together, which TensorBoard's HPARAMS tab requires."""
         from torch.utils.tensorboard.summary import hparams
 
         plain = {

@@ -17,22 +17,22 @@ from epo_lightning.experiment.config.settings import WandbSettings
 from epo_lightning.experiment.dashboards.base import ARTIFACTS, Dashboard, Ending, Facts, Row
 
 STEP = "trainer/global_step"
-"""The axis of all curves. W&B's own step only counts rows: joined after a `wandb sync`, it says nothing."""
+"""The x axis of all curves. W&B's own step counts rows, which has no meaning after `wandb sync` has joined several files."""
 QUIET = {
-    "console": "off",  # what is printed belongs to the terminal
+    "console": "off",  # do not upload what is printed
     "silent": True,
     "disable_git": True,  # run.json has the commit
     "disable_code": True,
     "save_code": False,
     "x_save_requirements": False,  # run.json has the versions that matter
-    "x_transaction_log_flush_interval": 1.0,  # seconds of which a kill may take the rows
+    "x_transaction_log_flush_interval": 1.0,  # seconds whose rows are lost at most if the process is killed
     "finish_timeout_raises": True,
 }
 """Features of W&B that are switched off because they cost time at every start, or print into other runs' lines."""
 
 
 class WandB(Dashboard):
-    """See the module. A continued run tells those of its rows that W&B has not got, neither there nor in earlier folders."""
+    """W&B dashboard. A continued run sends only the rows that neither the server nor the run's offline folders have."""
 
     label = "W&B"
 
@@ -44,7 +44,9 @@ class WandB(Dashboard):
         self._last = -1
 
     def open(self) -> None:
-        os.environ.setdefault("WANDB_SILENT", "true")  # its service process reads nothing else
+        os.environ.setdefault(
+            "WANDB_SILENT", "true"
+        )  # W&B's service process reads only this variable, not the settings
         wanted: str = self._settings.mode
         if wanted == "auto":
             wanted = os.environ.get("WANDB_MODE", "auto")

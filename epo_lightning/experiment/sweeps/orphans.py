@@ -1,4 +1,4 @@
-"""Workers end when the process of their sweep has died; their runs continue from the last epoch at the next start."""
+"""End of worker processes when the process of their sweep ends; their runs continue at the next start of the sweep."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from functools import cache
 
 @cache
 def end_with(driver: int) -> None:
-    """If this process is a child of the ``driver``, do not outlive it.
+    """End this process when the process ``driver`` ends, if it is a child of the driver.
 
-    Pools of processes (joblib's) otherwise work on, wait for more for ever, and hold the terminal. Jobs of a cluster are
-    no children of the sweep and go on.
+    Otherwise the worker processes of joblib would continue, wait for further work and keep the terminal occupied. Jobs of a
+    cluster are not children of the driver and continue.
     """
 
     def watch() -> None:

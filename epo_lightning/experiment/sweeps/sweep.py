@@ -1,16 +1,16 @@
-"""A sweep: many runs started by one command, of which each is trained once, however often the command is given.
+"""A sweep: many runs that one command starts. Each run is trained only once, even if the command is given again.
 
 ::
 
     <runs>/sweeps/<label>/
         sweep.json       the command, and every run: its overrides, its folder (relative to <runs>) and its identity
-        found/           the same of runs that a searching sweeper thought of, one file each
-        failures/        tracebacks of what went wrong in the last attempt, one file each
+        found/           the same for runs that a searching sweeper (Optuna) has chosen, one file each
+        failures/        tracebacks of runs that failed in the last attempt, one file each
         .lock            locked as long as the sweep runs
         report/          written by ``epo report <name>``
 
-The label is the sweep's name, with a hash of further overrides where there are any. The runs themselves lie where they
-would lie without a sweep, so that two sweeps share what is the same run.
+The label is the sweep's name, followed by a hash of the overrides that change results, if there are any. The runs have the
+same folders as without a sweep, so that a run that belongs to two sweeps is trained once.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ BESIDE = (
     *("callbacks.progress", "callbacks.refresh"),
     *("trainer.accelerator", "trainer.devices", "trainer.share", "trainer.threads"),
 )
-"""Overrides that do not make it another sweep: where and how visibly it runs."""
+"""Overrides that do not change a sweep's label: they only say where it runs and what is logged or shown."""
 
 
 class RunFailed(RuntimeError):
-    """A run of a sweep failed; all that is known of it is in the message, so that it can travel between processes."""
+    """Error for a failed run of a sweep. It has only a message, so that it can be sent to another process."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class Job:
     """One run of a sweep.
 
     Attributes:
-        overrides: what it was started with.
-        run: where it lies.
-        identity: what makes it this run.
-        title, seed: its name.
-        measures: what is measured when it is trained.
+        overrides: Hydra overrides of the run.
+        run: the run folder.
+        identity: identity of the run (:mod:`epo_lightning.identity`).
+        title, seed: title of its row, and its seed.
+        measures: measurements to be made after the training.
         data: name of its data set; empty in records of older versions.
     """
 
@@ -76,7 +76,7 @@ class Job:
 
     @classmethod
     def of(cls, config: Mapping[str, Any], overrides: Sequence[str]) -> Job:
-        """The job of a resolved configuration, which is checked; touches no file.
+        """The job of a resolved configuration, after a check of the configuration; writes no file.
 
         Raises:
             ConfigError: as :func:`assembly.check`.
@@ -91,7 +91,7 @@ class Job:
 
     @property
     def measured(self) -> bool:
-        """Whether all that is measured lies in the run's folder."""
+        """Whether the files of all measurements exist in the run folder."""
         return all(self.run.metrics_file(which).is_file() for which in self.measures)
 
 
@@ -103,7 +103,7 @@ class Sweep:
 
     @classmethod
     def of(cls, name: str, overrides: Sequence[str], runs: str | Path) -> Sweep:
-        """The sweep that a command line means; it may not have begun yet."""
+        """The sweep of a name and overrides; it may not have begun yet."""
         return cls(Path(runs).expanduser().absolute() / "sweeps" / label(name, overrides))
 
     @classmethod
@@ -111,7 +111,7 @@ class Sweep:
         """A sweep that has begun: the one with these overrides; without any, the latest of that name or label.
 
         Raises:
-            ConfigError: there is none; the message names those that there are.
+            ConfigError: no such sweep has begun; the message names the sweeps that have.
         """
         home = Path(runs).expanduser().absolute() / "sweeps"
         known = {sweep.label: sweep for sweep in cls.begun(runs)}
@@ -150,7 +150,7 @@ class Sweep:
 
     @property
     def jobs(self) -> list[Job]:
-        """All of its runs; of a sweep that searches, those that it has thought of so far."""
+        """All runs of the sweep; for a searching sweep, the runs that it has chosen so far."""
         found = [read_json(path) for path in sorted((self.folder / "found").glob("*.json"))]
         return [self._job(entry) for entry in [*self.record.get("jobs", []), *found]]
 
@@ -179,7 +179,7 @@ class Sweep:
         }
 
     def state(self, job: Job) -> State:
-        """State of a run, its scores included; a damaged folder has failed."""
+        """State of a run: ``done`` if it is trained and measured, ``failed`` also if its folder is damaged."""
         try:
             state = job.run.state
         except ConfigError:
@@ -191,7 +191,7 @@ class Sweep:
         return "failed" if state in ("waiting", "interrupted") and self._failure(job.run).is_file() else state
 
     def error(self, job: Job) -> str:
-        """Why a run failed, in one line; empty if it did not."""
+        """Error message of a failed run in one line; empty if it has not failed."""
         try:
             if self._failure(job.run).is_file():
                 return self._failure(job.run).read_text(encoding="utf-8").partition("\n")[0]
@@ -208,10 +208,10 @@ class Sweep:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep a second start of the same sweep away.
+        """Context with the lock of the sweep, which prevents a second start of the same sweep.
 
         Raises:
-            ConfigError: it runs already.
+            ConfigError: the sweep is running already.
         """
         from filelock import FileLock, Timeout
 
@@ -234,7 +234,7 @@ class Sweep:
     def begin(
         self, name: str, command: str, overrides: Sequence[str], jobs: Sequence[Job], stop_on_failure: bool
     ) -> None:
-        """Write down what is about to run; failures of earlier attempts are forgotten."""
+        """Write sweep.json with all runs, and delete the tracebacks of earlier attempts."""
         for failure in (self.folder / "failures").glob("*.txt"):
             failure.unlink()
         content = {
@@ -254,19 +254,19 @@ class Sweep:
 
     def lost(self, job: Job) -> None:
         """Record that the process of a run died without an error message."""
-        write_text(self._failure(job.run), "its process died, again and again (out of memory?)\n")
+        write_text(self._failure(job.run), "its process was killed in every attempt (out of memory?)\n")
 
     def work(self, config: Mapping[str, Any], overrides: Sequence[str]) -> float | None:
-        """Train and score one of the runs, in whatever process a launcher chose.
+        """Train and score one of the runs. A launcher calls this in a process of its choice.
 
         Returns:
-            the best validation score; None for a run that was left alone because another one failed.
+            the best validation score; None for a run that is skipped because another one failed (``--stop-on-failure``).
 
         Raises:
             RunFailed: the run failed; the sweep's folder holds the traceback.
         """
         record = self.record
-        # A worker on another machine may have started anywhere, and knows nothing of our environment.
+        # A worker on another machine may have another working folder and other environment variables.
         with contextlib.suppress(OSError):
             os.chdir(record["directory"])
         if record["cache"]:

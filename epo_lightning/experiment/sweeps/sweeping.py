@@ -1,4 +1,4 @@
-"""``epo sweep``: find out what is missing, have it done by a launcher, and say what became of it."""
+"""``epo sweep``: list the runs that are not done, run them by a launcher, and print the results."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from epo_lightning.run_folder import RunFolder, read_json
 from epo_lightning.schema import read
 
 ATTEMPTS = 3
-"""How often a launcher may break down in a sweep."""
+"""Number of times that the launcher of a sweep is started, if it breaks down."""
 
 
 def run(
     name: str, overrides: Sequence[str], extra: Sequence[str], task: Callable[..., Any], stop_on_failure: bool
 ) -> bool:
-    """Run what is missing of a sweep: new runs, and those that were interrupted or failed, from their last checkpoint.
+    """Run all runs of a sweep that are not done; interrupted and failed runs continue from their last checkpoint.
 
     Args:
-        name: of the file in ``sweeps/``.
-        overrides: of every run.
+        name: name of the file in ``sweeps/``.
+        overrides: overrides for every run.
         extra: folders that are searched for configurations first.
-        task: of the jobs; launchers send it to other processes, so it is a function at the level of a module.
-        stop_on_failure: begin no further run when one has failed.
+        task: function that does a job; at module level, because launchers send it to other processes.
+        stop_on_failure: whether no more runs are started after a failure.
 
     Returns:
         whether all runs are done.
@@ -47,14 +47,16 @@ def run(
     assembly.quiet()
     for given in overrides:
         if given.split("=")[0] in ("run_dir", "resume", "sweep", "sweeps"):
-            raise ConfigError(f"{given} makes no sense in a sweep, whose runs have folders of their own: leave it out")
+            raise ConfigError(
+                f"{given} cannot be set for a sweep, because each run has a folder of its own: leave it out"
+            )
     runs = _runs(overrides)
     sweep = Sweep.of(name, overrides, runs)
     words = [f"sweeps={name}", *overrides]
     # Absolute, because a worker on another machine may start in any folder.
     places = {"sweep": sweep.folder, "runs": sweep.root, "hydra.sweep.dir": sweep.folder}
     words += [f"{key}={value_text(str(place))}" for key, place in places.items()] + ["existing=continue"]
-    words += ["hydra/hydra_logging=none"]  # the news say it better
+    words += ["hydra/hydra_logging=none"]  # the printed news replace Hydra's own log
     jobs = _listed(sweep, words, extra)
     with sweep.lock():
         states = [sweep.state(job) for job in jobs]
@@ -104,7 +106,7 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Jo
 
 
 def _set_aside(run: RunFolder, settings: TrainerSettings) -> None:
-    """Keep a time that was measured on something else under another name, so that it is measured anew."""
+    """Rename ``runtime.json`` if it was measured on another device or number of threads, so that it is measured again."""
     file = run.metrics_file("time")
     if not file.is_file():
         return
@@ -120,7 +122,7 @@ def _set_aside(run: RunFolder, settings: TrainerSettings) -> None:
 def _launch(
     sweep: Sweep, jobs: Sequence[Job], words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]
 ) -> None:
-    """Have jobs done. A launcher that breaks down, because a worker was killed, say, is started again for what it left."""
+    """Run jobs by the launcher. If it breaks down (a worker was killed), it is started again for the remaining jobs."""
     left = list(jobs)
     for _ in range(ATTEMPTS):
         if not left:
@@ -142,7 +144,7 @@ def _launch(
 
 
 def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]) -> None:
-    """Go on with a sweep whose sweeper chooses as it goes: finish what it has thought of, then let it think further."""
+    """Continue a searching sweep: finish the runs that it has chosen already, then let the sweeper choose further runs."""
     found = sweep.jobs
     _launch(sweep, [job for job in found if sweep.state(job) != "done"], words, task, extra)
     trials = compose.trials("train", words, extra)
@@ -164,7 +166,7 @@ def known(extra: Sequence[str] = ()) -> dict[str, str]:
 
 
 def _description(comments: Sequence[str]) -> str:
-    """The first sentence of comment lines, which ends with a line that ends so, or before the command that follows it."""
+    """The first sentence of comment lines: up to a line that ends with a full stop or colon, or up to an example command."""
     text = ""
     for line in comments:
         text, _, command = f"{text} {line.lstrip('# ')}".strip().partition(":  ")
@@ -174,10 +176,10 @@ def _description(comments: Sequence[str]) -> str:
 
 
 def show(name: str | None, overrides: Sequence[str]) -> None:
-    """Print the state of every run of a sweep that has begun; without a name, how far each sweep is.
+    """Print the state of every run of a sweep that has begun; without a name, a summary of every sweep.
 
     Raises:
-        ConfigError: there is none of that name and overrides.
+        ConfigError: no sweep with that name and overrides has begun.
     """
     runs = _runs(overrides)
     if name is not None:
@@ -189,5 +191,5 @@ def show(name: str | None, overrides: Sequence[str]) -> None:
 
 
 def _runs(overrides: Sequence[str]) -> str:
-    """The folder that runs are written below, as Hydra reads it."""
+    """The folder below which runs are written: the override ``runs``, parsed by Hydra, or its default."""
     return str(compose.compose("train", [given for given in overrides if given.startswith("runs=")])["runs"])

@@ -1,4 +1,4 @@
-"""Looking at a sweep: the state of every run as a table, and news of them while it runs."""
+"""Display of a sweep: a table with the state of every run, and a printed line for every run that ends."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ STYLES: dict[State, str] = {
     "waiting": "",
 }
 POLL = 2.0
-"""Seconds between two looks at the run folders."""
+"""Seconds between two checks of the run folders."""
 
 
 def status(sweep: Sweep) -> Counter[State]:
-    """Print the state of every run; returns how many there are of each."""
+    """Print the state of every run; returns the number of runs in each state."""
     jobs = sweep.jobs
     states = [sweep.state(job) for job in jobs]
     names = names_of(jobs)
@@ -48,7 +48,7 @@ def status(sweep: Sweep) -> Counter[State]:
 
 
 def names_of(jobs: Sequence[Job]) -> dict[Path, str]:
-    """Names that tell runs apart: title and seed, with the data set and then the folder where those are not enough."""
+    """Unique names of runs: title and seed, with the data set and the folder only where they are needed."""
     data: dict[str, set[str]] = {}
     for job in jobs:
         data.setdefault(job.title, set()).add(job.data)
@@ -109,7 +109,7 @@ def result(job: Job) -> str:
 
 @contextmanager
 def news(sweep: Sweep) -> Iterator[None]:
-    """Print a line whenever a run is done or has failed, whoever runs it and wherever."""
+    """Context that prints a line whenever a run is done or has failed, in whatever process or machine it ran."""
     names = names_of(sweep.jobs)
     known = {job.run.path: sweep.state(job) for job in sweep.jobs}
     over = threading.Event()

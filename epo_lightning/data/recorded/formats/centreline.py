@@ -1,4 +1,8 @@
-"""Centreline of a lanelet, as the Lanelet2 library draws it (lanelet2_core, Lanelet.cpp)."""
+"""Centreline of a lanelet, as the Lanelet2 library computes it (lanelet2_core, Lanelet.cpp).
+
+A *rung* is a line between a point of the left and a point of the right boundary. The midpoints of the rungs are the
+centreline.
+"""
 
 from __future__ import annotations
 
@@ -120,10 +124,10 @@ def _climb(left: np.ndarray, right: np.ndarray, touching: bool) -> np.ndarray:
 
 
 def centreline(left: Polyline, right: Polyline, touching: bool = False) -> Polyline:
-    """The line midway between two boundaries, as the Lanelet2 library draws it (lanelet2_core, Lanelet.cpp).
+    """The line midway between two boundaries, as the Lanelet2 library computes it.
 
-    Rungs connect points of both boundaries, and their middles are the centreline. From one rung to the next, one of its ends
-    moves on to the nearest later point whose rung crosses no boundary, on the side where that rung is shorter.
+    From one rung to the next, one end stays and the other end moves to the nearest later point whose rung crosses no
+    boundary. Of the two ends, the one is moved that gives the shorter rung.
 
     Args:
         left, right: boundaries in driving direction [m].

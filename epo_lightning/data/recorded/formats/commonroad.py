@@ -37,15 +37,16 @@ SPEED_SIGNS = {"274", "274.1", "R2-1", "r301", "3.24", "R15", "C43", "B14", "Ρ-
 LATEST = 10_000_000
 """Largest time step."""
 ALIKE_BY_ID, ALIKE = 12, 40
-"""Numbers of steps with identical speeds, digit by digit, that identify a vehicle: with the same id, and with any id."""
+"""Numbers of consecutive identical speeds (as text) after which two obstacles count as the same vehicle: if their ids are
+the same, and whatever their ids are."""
 
 
 @register("format", "commonroad")
 def commonroad(folder: Path) -> list[RecordingSource]:
     """All scenarios below a folder.
 
-    Scenarios are cut out of longer recordings, and some overlap. Those that contain the same part of a vehicle's trajectory
-    form one group, named after the first of them; every other scenario is a group of its own.
+    Scenarios are cut out of longer recordings, and some overlap. Scenarios that contain the same part of a vehicle's
+    trajectory are one group with the name of the first of them; every other scenario is a group of its own.
 
     Raises:
         RecordingError: there is no scenario, two have the same name, or a file cannot be read.
@@ -64,7 +65,7 @@ def commonroad(folder: Path) -> list[RecordingSource]:
 
 
 def _groups(paths: Sequence[Path]) -> list[int]:
-    """For each file, the index of the first file with which it shares part of a trajectory, directly or through others."""
+    """For each file, the index of the first file of its group. Files that share part of a trajectory are in one group."""
     groups = list(range(len(paths)))
     seen: dict[int, int] = {}
     for index, path in enumerate(paths):
@@ -192,7 +193,7 @@ def _moving(root: Element, path: Path, dropped: Counter[str]) -> Iterator[Elemen
 def _state(state: Element, name: str, path: Path) -> tuple[float, float, float, float, float]:
     """Time step, x, y, orientation and speed; the speed is NaN if it is missing.
 
-    Of intervals and areas the middle is taken; times are rounded down to whole steps.
+    For intervals and areas, the middle is used; times are rounded down to whole steps.
     """
     time = _middle(_child(state, "time", name, path), f"time of {name}", path)
     if not 0 <= time <= LATEST:

@@ -43,7 +43,7 @@ LATEST = 10**9
 ZONE = 32
 """UTM zone of all locations."""
 FAR = 10.0
-"""Smallest distance [m] from all lines of all lanes at which a position is not on the map."""
+"""Distance [m] from the nearest line of a lane beyond which a position does not lie on the map."""
 SAMPLE = 5000
 """Largest number of positions that are compared with the map."""
 
@@ -176,8 +176,8 @@ def _tracks(setting: _Setting, files: _Files, dropped: Counter[str]) -> TrackTab
         raise_first(
             path,
             recording.to_numpy() != setting.recording,
-            f"recordingId is not {setting.recording} as in {files.recording_meta.name}: files of several recordings are "
-            "mixed up",
+            f"recordingId is not {setting.recording} as in {files.recording_meta.name}: files of several "
+            "recordings were mixed up: copy the recording's files again",
         )
     meta = meta.sort("trackId")
     ids, frame, heading = meta["trackId"].to_numpy(), rows["frame"].to_numpy(), rows["heading"].to_numpy()

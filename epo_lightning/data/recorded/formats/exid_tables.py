@@ -47,9 +47,9 @@ MISSING = (
     | dict.fromkeys(("laneWidth", "lonLaneletPos", "laneletLength", "odrRoadId", "odrSectionNo"), -1)
     | {"leadDV": -1000, "speedLimit": -1}
 )
-"""Numbers that stand for a missing value; where the number can be a value, as a lane offset of -1 m, see TOLD_BY."""
+"""Numbers that mean a missing value, by column. For columns in which -1 is a valid value see TOLD_BY."""
 TOLD_BY = {"latLaneCenterOffset": "laneletId", "odrLaneId": "odrRoadId"}
-"""Columns in which -1 is a value, each with the column that is missing where they are."""
+"""Columns in which -1 is a valid value (a lane offset of -1 m): they are missing where the other column is missing."""
 
 USED = ("recordingId", "trackId", "frame", "xCenter", "yCenter", "heading", "xVelocity", "yVelocity")
 """Columns of a tracks file that a :class:`TrackTable` is made of."""

@@ -111,7 +111,7 @@ def _number(cell: str) -> float:
 
 
 def _heading(agent: Int[np.ndarray, " T"], velocity: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, " T"]:
-    """Headings [rad]: the direction of walking; while standing, that of the last walking; before any walking, zero."""
+    """Headings [rad]: the direction of motion; a standing agent keeps its last direction (zero before its first motion)."""
     moving = (velocity != 0).any(axis=1)
     rows = np.arange(len(agent))
     before = np.maximum.accumulate(np.where(moving, rows, 0))
