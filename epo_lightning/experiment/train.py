@@ -112,7 +112,16 @@ def fit(
     forecaster: LightningModule,
     devices: int | list[int],
 ) -> None:
-    """Train from the beginning, or from the last finished epoch of the run, and record how it ended in run.json."""
+    """Train from the beginning, or from the last finished epoch of the run, and record the result in run.json.
+
+    Args:
+        settings: the checked settings of the run.
+        config: the same configuration as plain values, for dashboards and for processes on other devices.
+        run: the run folder, locked by the caller.
+        data: the data module.
+        forecaster: the forecaster with its initial weights.
+        devices: number or indices of devices, as :func:`.gpus.placed` yields them.
+    """
     started = time.monotonic()
     last = run.checkpoint("last") if run.checkpoint("last").is_file() else None
     step = _steps_in(last, forecaster) if last else 0

@@ -193,7 +193,7 @@ class _Step(torch.autograd.Function):
 
 
 @dataclasses.dataclass(frozen=True)
-class Factors:
+class Factorisation:
     """The factorised matrices J^T J + lambda I of all samples.
 
     Attributes:
@@ -220,7 +220,7 @@ class Factors:
 
 def factorise(
     model: QuadraticModel, damping: Float[Tensor, "S *agents"], split: bool, retry: bool | None = None
-) -> Factors:
+) -> Factorisation:
     """Factorise the matrices of all samples, of each component on its own where they are split.
 
     With ``retry``, a matrix that is not positive definite is tried again with ten, a hundred, ... times the damping; the
@@ -249,7 +249,7 @@ def factorise(
             status = outcome
         else:  # a sample has the worst status of its components
             status = status.scatter_reduce(0, group.agents[:, 0] // model.at.agents, outcome, "amax")
-    return Factors(model, groups, factors, status, held)
+    return Factorisation(model, groups, factors, status, held)
 
 
 def _retry(
