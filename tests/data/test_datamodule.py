@@ -83,6 +83,15 @@ def test_targets_are_both_modes_the_executed_or_a_sampled_one(targets):
         assert torch.equal(dataset[torch.arange(200)].subset, seen.subset)
 
 
+def test_sampled_targets_follow_the_seed_of_the_data(data):
+    drawn = []
+    for seed in (0, 1):
+        module = data(targets="sampled", seed=seed)
+        module.setup("fit")
+        drawn.append(module.dataset("train").mode)
+    assert not torch.equal(*drawn)
+
+
 def test_training_is_shuffled_by_seed_and_epoch_and_drops_the_rest(data):
     module = data(targets="executed")
     module.setup("fit")

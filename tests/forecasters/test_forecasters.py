@@ -9,7 +9,7 @@ import numpy
 import pytest
 import torch
 from games import random_scene
-from suites import LOSS_WEIGHTS, OWN, ForecasterSuite, model
+from suites import LOSS_WEIGHTS, OWN, ForecasterSuite, highway_model, model
 
 import epo_lightning
 from epo_lightning.forecasters import build_forecaster
@@ -42,6 +42,14 @@ class TestMarginal(ForecasterSuite):
         step = states[..., 1:, :2] - states[..., :-1, :2]
         torch.testing.assert_close(states[..., 1:, 3], step.norm(dim=-1) / 0.1, rtol=1e-3, atol=1e-3)
 
+    def test_a_standing_agent_keeps_its_heading(self):
+        forecaster, scene = self.forecaster(), random_scene(2, 2)
+        torch.nn.init.zeros_(forecaster.decoder.positions.output.weight)
+        torch.nn.init.zeros_(forecaster.decoder.positions.output.bias)
+        states = forecaster.predict(scene).states
+        still = torch.cat((scene.current[..., :3], torch.zeros(2, 2, 1)), -1)
+        assert torch.equal(states, still[:, None, :, None].expand_as(states))
+
 
 class TestSceneConsistent(ForecasterSuite):
     config = {"name": "scene_consistent", "modes": 2, "loss_weights": LOSS_WEIGHTS}
@@ -65,6 +73,13 @@ class TestEPO(ForecasterSuite):
         assert torch.equal(forecast.parameters.goals[:, 1], scene.goal_candidates[:, :, 0])
         total = sum(term.sum(-1) for term in (*forecast.own_energy.values(), *forecast.pair_energy.values()))
         torch.testing.assert_close(total, forecast.solution.energy)
+
+    def test_forecasts_take_the_solvers_steps_outside_training(self):
+        solver = {"name": "levenberg_marquardt", "steps": 1, "test_steps": 3}
+        forecaster, scene = self.forecaster(solver=solver), random_scene(3, 2)
+        for forecast, steps in ((forecaster.predict(scene), 3), (forecaster.train()(scene), 1)):
+            again = forecaster.solver.with_steps(steps)(forecaster.energy, scene, forecast.parameters)
+            assert torch.equal(again.controls, forecast.controls)
 
     def test_weights_start_at_their_configured_values(self):
         forecaster = self.forecaster()
@@ -164,3 +179,24 @@ def test_invalid_scenes_are_refused(monkeypatch):
     scene.size[1, 0] = 0.0
     with pytest.raises(ValueError, match=r"scene\.size\[1, 0\] is \[0\.0, 0\.0\]; length and width must be positive"):
         forecaster.predict(scene)
+
+
+@pytest.mark.parametrize(
+    ("name", "decoders"),
+    [("marginal", ["decoder"]), ("scene_consistent", ["probabilities"]), ("epo", ["goals", "probabilities"])],
+)
+def test_every_network_of_positions_has_the_unit_of_its_task(name, decoders):
+    config = {"name": name, "modes": 2, **({} if name == "epo" else {"loss_weights": LOSS_WEIGHTS})}
+    forecaster = build_forecaster(highway_model(config, scale=20.0))
+    networks = ["backbone", "backbone.history", "backbone.lanes", *decoders]
+    assert {network: forecaster.get_submodule(network).scale for network in networks} == dict.fromkeys(networks, 20.0)
+
+
+@pytest.mark.parametrize("config", [TestMarginal.config, TestSceneConsistent.config])
+def test_a_given_goal_is_told_to_the_network_if_asked_for_alone(config):
+    for goal, told in (("energy", False), ("all", True)):
+        forecaster = build_forecaster(model(config, goal=goal)).eval()
+        scene = random_scene(2, 2)
+        here = forecaster.predict(scene).states
+        scene.goal_candidates[:] += 1.0
+        assert torch.equal(forecaster.predict(scene).states, here) != told

@@ -99,6 +99,21 @@ def test_weights_of_one_and_several_forecasters_are_drawn(tmp_path: Path) -> Non
     assert not np.array_equal(pixels(zero), pixels(one))
 
 
+def test_weights_are_drawn_as_the_squares_that_enter_the_energy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = []
+    monkeypatch.setattr(weights, "save", lambda figure, path: figures.append(figure) or save(figure, path))
+    own = {"goal": torch.full((20, MODES, AGENTS), -3.0)}
+    pair = {"proximity": torch.full((20, MODES, 1), 0.1)}
+    equal = GameParameters(own, pair, torch.zeros(20, MODES, AGENTS, FUTURE, 2))
+    learned_weights(dataclasses.replace(forecast(scenes(20)), parameters=equal), tmp_path / "equal.png")
+    medians = [
+        [float(line.get_xdata()[0]) for line in axes.lines if line.get_marker() == "o"] for axes in figures[0].axes
+    ]
+    assert medians == [pytest.approx([9.0] * AGENTS), pytest.approx([0.01])]
+
+
 @pytest.mark.parametrize("spread", [0.01, 0.1, 0.4, 3.0])
 def test_numbers_below_narrow_weights_do_not_overlap(
     tmp_path: Path, spread: float, monkeypatch: pytest.MonkeyPatch

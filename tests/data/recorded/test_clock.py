@@ -89,6 +89,35 @@ def test_smoothing_equals_a_savitzky_golay_filter(seed):
     np.testing.assert_allclose(clock.state, np.concatenate(expected), atol=1e-8)
 
 
+def test_states_without_later_frames_are_those_of_their_own_times_also_between_frames():
+    def states(time):
+        heading = 0.2 + 0.3 * time
+        along = (2.0 + time) * np.cos(heading) + (0.6 * time - 1.0) * np.sin(heading)
+        return np.stack([2.0 * time + 0.5 * time**2, 0.3 * time**2 - time, heading, along], -1)
+
+    rate, dt, frame = 25.0, 0.1, np.arange(5, 105)
+    motion = states(frame / rate)
+    tracks = TrackTable(
+        rate=rate,
+        agent=np.zeros(100, int),
+        frame=frame,
+        position=motion[:, :2],
+        heading=motion[:, 2],
+        velocity=np.zeros((100, 2)),
+        ids=np.array([0]),
+        size=np.ones((1, 2)),
+        kind=np.array([0]),
+    )
+    clock, _ = stretches(tracks, dt, 1.0, shortest=1)
+    assert clock.ending is not None
+    time = dt * (clock.first[0] + np.arange(clock.count[0]))
+    whole = time * rate >= frame[24]  # 25 frames until then
+    assert 0 < whole.sum() < len(time)
+    assert clock.ending.shape[1] == 5, "steps that the centred window of a second would smooth with later frames"
+    for before in range(5):
+        np.testing.assert_allclose(clock.ending[whole, before], states(time[whole] - before * dt), atol=1e-9)
+
+
 def test_a_clock_faster_than_the_recording_is_refused():
     with pytest.raises(ConfigError, match=r"data\.windows\.dt=0\.02 .* 25 frames per second: use 0\.04"):
         stretches(traffic(curve(None), FOUR), 0.02, None, 1)

@@ -110,8 +110,9 @@ def test_windows_equal_those_of_a_plain_loop(seed, config):
     assert counts["windows"] == counts["scenes"] + dropped
 
 
-def test_a_scene_equals_the_states_of_the_recording():
-    of = recording(curve(700.0, 0.4, (4000.0, -900.0)))
+@pytest.mark.parametrize("rate", [25.0, 10.0])
+def test_a_scene_equals_the_states_of_the_recording(rate):
+    of = recording(curve(700.0, 0.4, (4000.0, -900.0)), rate=rate)
     scene, data = scenes_of(of)
     tracks = of.tracks
     for index, entry in enumerate(data.provenance(range(len(data)))):
@@ -119,7 +120,7 @@ def test_a_scene_equals_the_states_of_the_recording():
             rows = np.flatnonzero(tracks.ids[tracks.agent] == track)
             origin = scene.frame[index, :2].numpy()
             for states, steps in ((scene.history, np.arange(-9, 1)), (scene.future, np.arange(1, 21))):
-                at = rows[entry["frame"] + 5 * steps]
+                at = rows[entry["frame"] + round(0.2 * rate) * steps]
                 found = states[index, i].double().numpy()
                 np.testing.assert_allclose(found[:, :2] + origin, tracks.position[at], atol=1e-3)
                 np.testing.assert_allclose(found[:, 2], tracks.heading[at], atol=1e-5)
@@ -206,6 +207,17 @@ def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
         )
         scene, _ = scenes_of(dataclasses.replace(of, tracks=turned, lanes=None), config, "aligned")
         torch.testing.assert_close(scene.current[:, 0, 2], torch.zeros(len(scene.history)), rtol=0, atol=1e-5)
+
+
+def test_headings_begin_within_half_a_turn_and_go_on_without_a_jump():
+    of = recording(curve(100.0, 2.5), vehicles=((1, 5.0, 0, 25.0, None),))
+    scene, _ = scenes_of(of, WindowConfig(agents=1, least_agents=1, lane_change=False))
+    current = scene.current[:, 0, 2]
+    assert current.min() < -1.0, "the recording turns beyond half a turn"
+    assert current.max() > 2.9
+    assert (current.abs() <= np.pi + 1e-5).all()
+    way = torch.cat((scene.history, scene.future), 2)[:, 0, :, 2]
+    assert (way.diff(dim=1) - 25.0 * 0.2 / 100.0).abs().max() < 0.01
 
 
 def test_tracks_may_begin_and_end_at_any_time():

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from epo_lightning.data import cache
 from epo_lightning.data.simulate import config, generate, make_recordings
-from epo_lightning.data.simulate.layout import LAYOUTS
+from epo_lightning.data.simulate.layout import LAYOUTS, Layout
+from epo_lightning.data.simulate.traffic import Traffic
 from epo_lightning.registry import ConfigError, lookup
 
 SMALL = config(seed=3, recordings=2, minutes=0.25, layouts=[2])
@@ -91,6 +95,20 @@ def test_other_folders_are_not_overwritten(tmp_path: Path):
     (folder / cache.MANIFEST).write_text("{")
     with pytest.raises(cache.CacheError, match="not a readable manifest"):
         make_recordings(folder, SMALL)
+
+
+def test_every_recording_and_every_seed_has_traffic_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    drawn: list[tuple[int, ...]] = []
+
+    def simulate(place: Layout, seed: Sequence[int], seconds: float, folder: Path) -> Traffic:
+        drawn.append(tuple(np.random.default_rng(seed).integers(2**31, size=3).tolist()))
+        raise ConfigError("the seed is all that is asked for")
+
+    monkeypatch.setattr(generate, "simulate", simulate)
+    for seed, number in itertools.product((3, 4), range(3)):
+        with pytest.raises(ConfigError, match="all that is asked for"):
+            generate.record(tmp_path, "", number, LAYOUTS[2], seed, 2.0)
+    assert len(set(drawn)) == 6
 
 
 def test_recordings_with_many_implausible_vehicles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

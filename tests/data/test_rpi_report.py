@@ -1,0 +1,80 @@
+"""The report about a data set, on records whose numbers are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from epo_lightning.data.rpi import report
+from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, Records
+
+DT = 0.1
+
+
+def straight(count: int = 3) -> Records:
+    """Records, one step after the other, of two agents with constant velocities; the alternative mode is 0.5 m aside."""
+    time = DT * np.arange(-HISTORY, FUTURE + count)
+    states = np.zeros((2, len(time), 4))
+    for agent, (heading, speed, y) in enumerate(((0.0, 1.0, 0.0), (np.pi / 2, 2.0, -6.0))):
+        way = speed * time
+        states[agent] = np.stack(
+            [way * np.cos(heading), way * np.sin(heading) + y, np.full_like(way, heading), np.full_like(way, speed)], -1
+        )
+    futures = np.stack([states[:, HISTORY + 1 + k : HISTORY + 1 + k + FUTURE] for k in range(count)])
+    both = np.stack([futures, futures + np.array([0.5, 0.0, 0.0, 0.0])], 1)
+    return {
+        "history": np.stack([states[:, k : k + HISTORY + 1] for k in range(count)]),
+        "states": both,
+        "controls": np.zeros((count, 2, 2, FUTURE, 2)),
+        "modes": np.array([2] * (count - 1) + [1]),
+        "step": HISTORY + np.arange(count),
+        **{name: np.zeros(count, dtype=int) for name in ("game", "placement")},
+        "executed": np.ones(count, dtype=int),
+        "weight": np.full(count, 50.0),
+        "distance": np.full((count, 2), 1.5),
+        "cost": np.tile([2.0, 3.0], (count, 1)),
+        "gradient": np.tile([1e-5, 2e-5], (count, 1)),
+        "gain": np.array([[0.0, 0.0], [1e-3, 0.0], [0.0, 1.0]])[:count],
+    }
+
+
+def test_constant_velocity_is_right_about_agents_that_keep_theirs():
+    rows = straight()
+    found = report._errors(report.constant_velocity(rows["history"]), rows)
+    assert found["executed"] == pytest.approx({"ade": 0.0, "fde": 0.0}, abs=1e-9)
+    assert found["alternative"] == pytest.approx({"ade": 0.5, "fde": 0.5})
+
+
+def test_errors_are_means_over_steps_and_those_of_the_last_step():
+    rows = straight()
+    late = rows["states"][:, 0, ..., :2] + 0.1 * np.arange(1, FUTURE + 1)[:, None] * np.array([0.6, 0.8])
+    found = report._errors(late, rows)["executed"]
+    assert found == pytest.approx({"ade": 0.1 * (FUTURE + 1) / 2, "fde": 0.1 * FUTURE})
+
+
+def test_gains_costs_and_the_rest_of_the_mode_before():
+    rows = straight()
+    found = report._nash(rows)
+    assert found["executed"]["gain_share"] == pytest.approx(1 / 3)
+    assert found["alternative"]["gain_share"] == 0.0, "the last record has no alternative"
+    assert found["alternative"]["gradient_max"]["1"] == 2e-5
+    assert found["cost_ratio"]["0.5"] == 1.5
+    assert found["bellman"] == {"pairs": 2, "max": pytest.approx(0.0, abs=1e-9)}
+    rows["states"][1, 0, 1, 7, 2] += 0.3
+    assert report._bellman(rows)["max"] == pytest.approx(0.3)
+    rows["game"][:] = np.arange(3)
+    assert report._bellman(rows) == {"pairs": 0, "max": 0.0}
+
+
+def test_motion_is_measured_in_metres_and_seconds():
+    rows = straight()
+    rows["controls"][..., 0] = 0.1 * (-1.0) ** np.arange(FUTURE)
+    found = report._motion(rows, np.array([50.0, 90.0]))
+    assert found["acceleration_99"] == pytest.approx(0.1)
+    assert found["jerk_99"] == pytest.approx(0.2 / DT)
+    assert found["sade_between_modes"]["0.5"] == pytest.approx(0.5)
+    assert found["median_distance_by_weight"] == [[50.0, 1.5]]
+    assert found["euler_residual"] == pytest.approx(0.1 * DT), "these controls did not make these states"
+    between = np.linalg.norm(rows["states"][:, 0, 0, :, :2] - rows["states"][:, 0, 1, :, :2], axis=-1)
+    assert found["distance_executed"]["0"] == pytest.approx(between.min())
+    assert found["disc_overlaps"] == 0

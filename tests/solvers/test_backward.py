@@ -1,0 +1,69 @@
+"""The status of a solution with a derivative: that of its minimiser, and that of the derivative."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+import torch
+from games import leaves_of, random_game, random_scene
+
+from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.solvers.backward import Implicit, Truncated
+from epo_lightning.solvers.base import Stepwise
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+
+OWN = ("acc", "turnr")
+ENERGY = FeatureEnergy(OWN, [])
+SOLVED, DAMPED, STOPPED = int(Status.SOLVED), int(Status.DAMPED), int(Status.STOPPED)
+
+
+class Given(Stepwise):
+    """A minimiser that stays where it is and reports given statuses, one per call."""
+
+    steps = 2
+
+    def __init__(self, *statuses: int) -> None:
+        self.statuses = list(statuses)
+
+    def run(
+        self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Any = None
+    ) -> tuple[Solution, None]:
+        solution = LevenbergMarquardt(0)(energy, scene, parameters)
+        return dataclasses.replace(solution, status=torch.full_like(solution.status, self.statuses.pop(0))), None
+
+
+def resting_game() -> tuple[Scene, GameParameters]:
+    """A game whose minimum are controls of zero, where it starts."""
+    scene = random_scene(2, 2, history=2, dtype=torch.float64)
+    return scene, random_game(scene, 1, 4, OWN, spread=0.0)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "expected"),
+    [
+        (SOLVED, SOLVED, SOLVED),
+        (DAMPED, SOLVED, DAMPED),
+        (STOPPED, SOLVED, DAMPED),
+        (SOLVED, DAMPED, DAMPED),
+        (SOLVED, STOPPED, STOPPED),
+        (STOPPED, STOPPED, STOPPED),
+    ],
+)
+def test_the_status_of_truncated_steps_is_that_of_all_steps(first: int, last: int, expected: int) -> None:
+    solution = Truncated(1)(Given(first, last), ENERGY, *resting_game())
+    assert (solution.status == expected).all()
+
+
+@pytest.mark.parametrize("status", [SOLVED, DAMPED, STOPPED])
+def test_an_implicit_derivative_keeps_the_status_of_the_minimiser(status: int) -> None:
+    scene, parameters = resting_game()
+    solution = Implicit()(Given(status), ENERGY, scene, leaves_of(parameters))
+    assert (solution.status == status).all()
+    for weight in parameters.own_weights.values():
+        weight[1] = 0.0  # no minimum: any controls cost nothing
+    solution = Implicit()(Given(status), ENERGY, scene, leaves_of(parameters))
+    assert solution.status.flatten().tolist() == [status, STOPPED]
