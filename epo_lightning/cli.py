@@ -336,7 +336,7 @@ def _resume(folder: str, others: Sequence[str]) -> None:
 def _multirun(arguments: Arguments) -> None:
     """Check every job, then let Hydra launch them."""
     if arguments.verb != "train":
-        raise ConfigError(f"epo {arguments.verb} takes no -m: give it runs=<folder> to work on several runs")
+        raise ConfigError(f"epo {arguments.verb} has no option -m: use runs=<folder> for several runs")
     from epo_lightning.experiment.config import compose
 
     listed = compose.jobs("train", arguments.overrides, arguments.extra)

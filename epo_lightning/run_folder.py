@@ -56,8 +56,8 @@ def whole_file(path: Path, suffix: str = "") -> Iterator[Path]:
     It has the permissions that the umask leaves. Every OSError names ``path``.
 
     Args:
-        path: of the final file; its folder is made.
-        suffix: of the temporary name, for programs that choose a format by it.
+        path: path of the final file; its folder is created.
+        suffix: suffix of the temporary file's name, for programs that choose a format by it.
     """
     temporary = path.with_name(f".{path.name}-{secrets.token_hex(4)}{suffix}")
     with errors_naming(path):
@@ -78,7 +78,7 @@ def errors_naming(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno is None:  # not from the system: its text says all
+        if error.errno is None:  # not an error of the operating system: the message is complete
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 

@@ -341,7 +341,7 @@ class Solution(_Batch):
         initial_energy, energy: E at the initial strategies and at ``controls``.
         gradient_norm: Euclidean norm of dE/du at ``controls``.
         status: a :class:`Status` per scene and mode.
-        iterates: u_0 .. u_S, for solvers that are told to keep them.
+        iterates: u_0 .. u_S, for solvers with ``keep_iterates``.
         tables: energies of the candidates, for solvers that choose among candidates; the joint modes are then the most
             likely choices.
         assignment: index of the candidate that each agent takes in each mode, for the same solvers.

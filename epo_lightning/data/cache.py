@@ -137,7 +137,7 @@ def write(
 
     Args:
         folder: final place of the data set.
-        splits: for every split its tensors by name, records first.
+        splits: tensors by name for every split; the first dimension is the record.
         config: plain values from which the data set was made.
         report: plain values that describe it.
 

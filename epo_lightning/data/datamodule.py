@@ -74,7 +74,7 @@ class BatchSampler(DistributedSampler):
     class DistributedSampler is that Lightning does not replace this sampler by its own.
 
     Args:
-        dataset: its ``set_epoch`` is called as well.
+        dataset: the data set, whose ``set_epoch`` is called as well.
         batch_size: scenes per batch, of all ranks together.
         shuffle: whether the order is random; then an incomplete last batch is dropped.
         seed: seed of the random order.

@@ -207,7 +207,7 @@ class DrawnData(SceneDataModule):
             (no map, no goals).
         agents: number per scene; None for that of the task.
         scenes: number per split.
-        seed: of the draws, and of the order of batches unless a run sets its own.
+        seed: seed of the random scenes, and of the order of batches unless a run sets its own.
         batch_size: scenes per batch.
     """
 

@@ -170,7 +170,7 @@ def build_trainer(
 
     Args:
         settings: the section ``trainer``.
-        run: where Lightning may write.
+        run: the run folder, Lightning's default folder for files.
         callbacks: callbacks of the run, including a progress bar if one is wanted; debugging callbacks are added here.
         loggers: loggers of the run.
         devices: number or indices of devices, as :func:`.gpus.placed` yields them.

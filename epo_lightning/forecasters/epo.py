@@ -107,8 +107,8 @@ class EPO(Forecaster):
             )
         if initial == "motions" and not isinstance(energy.dynamics, Unicycle):
             raise ConfigError(
-                f"forecaster.initial=motions goes with dynamics=unicycle, not with {type(energy.dynamics).__name__}: "
-                "motions are those of a unicycle; choose decoded or zero"
+                f"forecaster.initial=motions needs dynamics=unicycle, not {type(energy.dynamics).__name__}: "
+                "the motions are those of a unicycle; choose decoded or zero"
             )
         if not 0 < control_scale < math.inf:
             raise ConfigError(f"forecaster.control_scale must be positive and finite, not {control_scale}")

@@ -29,7 +29,7 @@ def check_number(key: str, value: Any, zero: bool = False, finite: bool = True) 
 
     Args:
         key: name of the configuration key.
-        value: its value.
+        value: value of the key.
         zero: whether 0 is allowed.
         finite: whether infinity is refused.
 

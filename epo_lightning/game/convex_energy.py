@@ -177,8 +177,8 @@ class ConvexEnergy(Energy):
         check_number("energy.within [m]", self.within, finite=False)
         if not isinstance(self.dynamics, DoubleIntegrator):
             raise ConfigError(
-                f"energy=convex is convex for linear dynamics: it goes with dynamics=double_integrator, "
-                f"not with {type(self.dynamics).__name__}"
+                f"energy=convex is convex only for linear dynamics: it needs dynamics=double_integrator, "
+                f"not {type(self.dynamics).__name__}"
             )
 
     @property

@@ -133,7 +133,7 @@ class NetworkEnergy(nn.Module, Energy):
     def tables(
         self, scene: Scene, parameters: GameParameters, candidates: Float[Tensor, "B C N K 2"]
     ) -> tuple[Float[Tensor, "B N C"], Float[Tensor, "B P C C"]]:
-        """See :meth:`~epo_lightning.game.energy.Energy.tables`."""
+        """Tables of E_i and E_ij, see :meth:`~epo_lightning.game.energy.Energy.tables`."""
         self.validate(scene, parameters, candidates)
         controls = torch.where(scene.agent_mask[:, None, :, None, None], candidates, 0.0)
         states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)

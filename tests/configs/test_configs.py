@@ -205,7 +205,7 @@ MISTAKES = {
     "evaluate run=a split=train": "split must be one of test, val",
     "predict": "run=<value>",
     "report runs=nowhere": "nowhere",
-    "report -m runs=a,b": "takes no -m",
+    "report -m runs=a,b": "has no option -m",
     "generate worker=3": "'workers'",
 }
 

@@ -16,11 +16,11 @@ class Stretches:
     """States of agents at steps of a common clock. Row ``start + s - first`` of a stretch is its state at step s.
 
     Attributes:
-        dt: of the clock [s]; step s is at s dt, counted from the recording's frame 0.
+        dt: time step of the clock [s]; step s is at time s dt after the recording's frame 0.
         agent: index of the agent of each stretch.
-        first: its first step.
-        count: its number of steps.
-        start: its first row.
+        first: first step of each stretch.
+        count: number of steps of each stretch.
+        start: first row of each stretch.
         state: x, y [m], heading [rad], speed [m/s] of every row; headings are unwrapped.
         ending: for smoothed tracks, every row's state and the J - 1 states before it, estimated without later frames; None
             for tracks that are not smoothed. ``state`` is smoothed with later frames too, which is more accurate, but the
@@ -53,7 +53,7 @@ def stretches(
 
     Args:
         tracks: the recording.
-        dt: of the clock [s].
+        dt: time step of the clock [s].
         smoothing: length [s] of the window in which a parabola is fitted to positions and headings; None for data that
             are smooth already.
         shortest: smallest number of steps of a stretch; shorter ones are left out.

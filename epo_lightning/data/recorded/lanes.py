@@ -135,7 +135,7 @@ class LaneGraph:
         """This graph, after a check of its geometry and references.
 
         Args:
-            path: of the file, for error messages.
+            path: path of the file, for error messages.
 
         Raises:
             RecordingError: no lanes, a line without length or with coordinates that cannot be right, or a reference to

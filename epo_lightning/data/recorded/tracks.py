@@ -37,7 +37,7 @@ class TrackTable:
         rate: frames per second [Hz].
         agent: index of each row's agent, 0 .. A-1.
         frame: number of each row's frame.
-        position: of the centre [m].
+        position: position of the centre [m].
         heading: direction of the front, counter-clockwise from x [rad]; any number of turns.
         velocity: components along x and y [m/s].
         ids: identifier of each agent in the recording.
@@ -67,7 +67,7 @@ class TrackTable:
         """This table, after a check that its numbers are plausible.
 
         Args:
-            path: of the file, for error messages.
+            path: path of the file, for error messages.
 
         Raises:
             RecordingError: no rows, numbers that are not finite, implausible units, or an agent whose frames do not
@@ -138,7 +138,7 @@ class RecordingSource:
     """A recording that can be read: its name, its files and the function that reads them.
 
     Attributes:
-        name, group: those of the :class:`Recording`.
+        name, group: name and group of the :class:`Recording`.
         files: files of the recording; their contents identify a data set.
         read: function that reads the recording, possibly in another process; it must therefore be a function at module level
             or a partial of one. Raises :class:`RecordingError`.

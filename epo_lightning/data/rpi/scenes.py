@@ -34,7 +34,7 @@ class RPIDataset:
     Args:
         records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``states`` [R, 2 modes, 2, 40, 4] and ``modes`` [R].
         targets: ``executed``, ``both`` or ``sampled``.
-        seed: of the draws of ``sampled``.
+        seed: seed of the random modes of ``sampled``.
     """
 
     def __init__(self, records: Mapping[str, Tensor], targets: str = "both", seed: int = 0) -> None:
@@ -90,7 +90,7 @@ class RPIData(SceneDataModule):
 
     Args:
         root: folder of the cache; None for $EPO_CACHE or ``cache``.
-        seed: of the games, and of the order of batches unless a run sets its own.
+        seed: seed of the games, and of the order of batches unless a run sets its own.
         games: number of main games, each with its own w. A tenth, at least one, is for validation, and as many for test.
         placements: start positions of the pedestrian per main game.
         solver: ``potential`` (open-loop Nash equilibrium) or ``feedback`` (iterative LQ game).

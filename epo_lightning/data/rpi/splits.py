@@ -56,7 +56,7 @@ def assign(
 
     Args:
         split: rule, ``paper`` or ``hard``.
-        seed: of the random choice of records where a split has more than its size.
+        seed: seed of the random choice of records for splits that have more records than their size.
         weights: w of every main game.
         game, phi: main game and pedestrian's angle [rad] of every record.
         sizes: most records of each split; None keeps all.

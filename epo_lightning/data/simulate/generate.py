@@ -34,7 +34,7 @@ def config(
     """Configuration of simulated recordings: all values that they depend on.
 
     Args:
-        seed: of the traffic.
+        seed: seed of the traffic.
         recordings: number per layout.
         minutes: duration of each recording.
         layouts: ids of the layouts; None for all.
@@ -159,8 +159,8 @@ def make_recordings(folder: Path, config: Mapping[str, Any], workers: int | None
     file's size and SHA-256, and a summary of each recording.
 
     Args:
-        folder: its final place.
-        config: from :func:`config`.
+        folder: final path of the folder.
+        config: configuration of the recordings, from :func:`config`.
         workers: processes; None for one per core.
         progress: whether to report progress on standard error.
 

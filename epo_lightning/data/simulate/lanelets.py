@@ -24,7 +24,7 @@ class Lanelet:
     """A piece of a strip.
 
     Attributes:
-        id: its id in the map.
+        id: id of the lanelet in the map.
         strip: index into ``layout.strips``.
         begin, end: range of s [m].
     """
@@ -56,8 +56,8 @@ def write_map(layout: Layout, path: Path, spacing: float = 5.0) -> None:
     """Write a layout's map.
 
     Args:
-        path: of the ``.osm`` file.
-        spacing: of the points along a boundary [m].
+        path: path of the ``.osm`` file.
+        spacing: distance of the points along a boundary [m].
     """
     geographic = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
     pieces = lanelets(layout)

@@ -66,11 +66,11 @@ class Layout:
     """A motorway section.
 
     Attributes:
-        id, name: of the location; 0 is reserved for testing.
+        id, name: id and name of the location; the id 0 is reserved for testing.
         curvature: (s, curvature) [m, 1/m] of the reference curve, linear in between; positive turns left.
-        heading: of the reference curve at s = 0 [rad].
+        heading: heading of the reference curve at s = 0 [rad].
         origin: UTM zone 32N easting and northing [m] of s = 0, which is also the origin of the recordings.
-        width: of a lane [m].
+        width: width of a lane [m].
         limit: speed limit [m/s]; None without one.
         slope: largest slope dd/ds of the ramps.
         strips: all lanes, and shoulders.

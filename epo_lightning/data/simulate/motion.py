@@ -27,10 +27,10 @@ class Motion:
     Attributes:
         rate: frames per second [Hz].
         vehicle: index of each row's vehicle.
-        frame: from 0.
+        frame: number of each row's frame, from 0.
         s, d: along the reference curve and to its left [m].
-        position, velocity, acceleration: of the centre [m, m/s, m/s^2].
-        heading: of the vehicle's axis [rad].
+        position, velocity, acceleration: motion of the centre [m, m/s, m/s^2].
+        heading: heading of the vehicle's axis [rad].
         strip: index into ``layout.lanes`` of the lane that holds the centre.
         size: length and width of each vehicle [m].
         kind: class of each vehicle in exiD's terms.

@@ -24,7 +24,7 @@ class SimulatedHighway(RecordedData):
         layouts: ids of the layouts; null for all.
         dataset, windows, test, val_share, val_by, frame, scale, root, batch_size, share: as in
             :class:`~epo_lightning.data.recorded.recordings.RecordedData`.
-        seed: of the traffic and of the splits, and of the batches' order where a run sets no other.
+        seed: seed of the traffic and of the splits, and of the order of batches unless a run sets its own.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ WARM_UP = 90.0
 MARGIN = 1.0
 """Time [s] before and after the recorded time that the smoothing needs."""
 UNLIMITED = 130 / 3.6
-"""Speed [m/s] to which desired speeds are relative where there is no limit."""
+"""Reference [m/s] of desired speeds on roads without a speed limit."""
 RAMP_SPEED = 90 / 3.6
 """Speed limit on ramps [m/s]."""
 FASTEST = 60.0
@@ -50,7 +50,7 @@ class Traffic:
         front: s of the front bumper [m].
         aside: offset from the middle of the strip, positive to the left [m].
         size: length and width of each vehicle [m].
-        kind: of each vehicle, an index into CLASSES.
+        kind: class of each vehicle, an index into CLASSES.
         dropped: vehicles that were left out, by reason.
     """
 
@@ -298,9 +298,9 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path, 
 
     Args:
         layout: the road.
-        seed: of the drivers and of all random numbers of SUMO.
+        seed: seed of the drivers and of all random numbers of SUMO.
         seconds: duration after the warm-up.
-        folder: for SUMO's input files.
+        folder: folder for SUMO's input files.
         rate: steps per second [Hz].
 
     Raises:

@@ -37,7 +37,7 @@ class ParsedOnce(FileConfigSource):
 class TreeSource(ParsedOnce):
     """A folder in which ``rpi/v_lstm`` is an option of ``experiment``, so that ``glob('rpi/*')`` finds it.
 
-    ``experiment=us101/vibes`` is ``experiment=highway/vibes data=us101`` in one word: such a name has no file of its own.
+    ``experiment=us101/vibes`` means ``experiment=highway/vibes data=us101``; there is no file with the first name.
     """
 
     @staticmethod
@@ -90,7 +90,7 @@ class TreeSource(ParsedOnce):
 def recorded_name(experiment: str, data: str) -> str:
     """Name under which a run is recorded: ``us101/vibes`` for ``experiment=highway/vibes data=us101``.
 
-    Both ways to ask for a row on a data set lead to the same run folder, and rows on two data sets never to one.
+    Both ways to choose a row on a data set give the same run folder; rows on different data sets have different folders.
     """
     folder, _, row = experiment.partition("/")
     return f"{data}/{row}" if folder == "highway" and data in HIGHWAYS else experiment

@@ -1,4 +1,4 @@
-"""MLflow: a database on this machine that ``mlflow server`` shows, or a server that is told of it by MLFLOW_TRACKING_URI."""
+"""MLflow dashboard: a local database, which ``mlflow server`` shows, or the server whose address is MLFLOW_TRACKING_URI."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def tracking_uri(settings: MLflowSettings, default: str) -> str:
 
 
 class MLflow(Dashboard):
-    """See the module. A run is found again by its tag ``run``; rows that are there are not written twice."""
+    """MLflow dashboard of a run. A continued run is found by its tag ``run``; rows that it has are not written again."""
 
     label = "MLflow"
     every = 5.0

@@ -1,4 +1,4 @@
-"""TensorBoard: event files beside ``metrics.csv``, so that a run is called as its folder is."""
+"""TensorBoard dashboard: event files beside ``metrics.csv``, so that TensorBoard shows the run under its folder's name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, R
 
 
 class TensorBoard(Dashboard):
-    """See the module. A continued run is written anew from its rows: no point is there twice, and none is missing."""
+    """TensorBoard dashboard of a run. A continued run is written again from its rows: no point is missing or repeated."""
 
     label = "TensorBoard"
 

@@ -106,7 +106,7 @@ class WandB(Dashboard):
                 read = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True).stdout
                 told = max(told, int(json.loads(read)["summary"][STEP]))
             except (OSError, subprocess.SubprocessError, ValueError, KeyError):
-                continue  # nothing in it, or not to be read: a row told twice is the smaller evil
+                continue  # empty or unreadable: its rows are sent again, which is better than losing them
         return told
 
     def log(self, rows: Sequence[Row]) -> None:
@@ -146,7 +146,7 @@ def server() -> str:
 
 
 def has_key() -> bool:
-    """Whether a key lies in the environment, or where ``wandb login`` puts it."""
+    """Whether there is an API key in the environment or in the file that ``wandb login`` writes."""
     if os.environ.get("WANDB_API_KEY"):
         return True
     try:

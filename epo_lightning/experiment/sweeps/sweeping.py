@@ -79,7 +79,9 @@ def run(
 
 
 def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Job]:
-    """All runs of a sweep that says them beforehand, each once, with everything looked at that could stop one at its start.
+    """All runs of a sweep, each once, after a check of everything that could prevent a run from starting.
+
+    Searching sweeps choose their runs later, and have none here.
 
     Raises:
         ConfigError: a mistake in a configuration, a folder that holds something else, or data that is missing.

@@ -59,7 +59,7 @@ class Candidates(Minimiser):
         return self.candidates
 
     def games(self, modes: int) -> int:
-        """One game: the modes are different assignments in it."""
+        """Number of games: 1, because the modes are different assignments in one game."""
         return 1
 
     @abstractmethod

@@ -105,7 +105,7 @@ class Group:
         agents: numbers s N + i of the agents; None for all agents of all samples, in order.
         count, size: C and m.
         edges: indices of the edges within the sets; None for all edges.
-        component, first, second: for each of these edges, its set and the positions of both agents in the set.
+        component, first, second: index of the set of each edge, and indices of both agents within the set.
     """
 
     agents: Int[Tensor, "C m"] | None

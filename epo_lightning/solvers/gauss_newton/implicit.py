@@ -27,7 +27,7 @@ def attach(
 
     Args:
         energy, scene, parameters: the game.
-        controls: its solution.
+        controls: the solution of the game.
         exact: whether H is the Hessian or its Gauss-Newton approximation.
 
     Returns:

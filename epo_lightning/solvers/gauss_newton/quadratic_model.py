@@ -80,7 +80,7 @@ class Separation:
 
     Attributes:
         distance: distance of the two agents.
-        inverse: its inverse, zero where both are at the same point.
+        inverse: inverse of the distance, zero where both agents are at the same point.
         normal: unit vector from the second to the first, zero likewise.
     """
 

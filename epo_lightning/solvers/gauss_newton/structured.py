@@ -110,7 +110,7 @@ class Game:
 
     @cached_property
     def finite(self) -> Bool[Tensor, "B M"]:
-        """See :meth:`~epo_lightning.game.feature_energy.FeatureEnergy.finite`."""
+        """Mask of the games with finite inputs (:meth:`~epo_lightning.game.feature_energy.FeatureEnergy.finite`)."""
         return self.energy.finite(self.scene, self.parameters)
 
     def tensors(self, parameters: GameParameters) -> list[Tensor]:
@@ -221,7 +221,7 @@ class Factorisation:
 def factorise(
     model: QuadraticModel, damping: Float[Tensor, "S *agents"], split: bool, retry: bool | None = None
 ) -> Factorisation:
-    """Factorise the matrices of all samples, of each component on its own where they are split.
+    """Factorise the matrices of all samples; if samples are split, the matrix of each component separately.
 
     With ``retry``, a matrix that is not positive definite is tried again with ten, a hundred, ... times the damping; the
     other matrices are not affected. If none of the attempts succeeds, the status is STOPPED, and solves with this matrix

@@ -84,7 +84,7 @@ def gauss_newton(
     Differentiable with respect to controls and parameters if gradients are recorded.
 
     Raises:
-        ValueError: the energy is no sum of squares.
+        ValueError: the energy is not a sum of squares.
     """
     if RESIDUALS not in energy.offers:
         raise ValueError(
@@ -122,7 +122,7 @@ def attach(
 
     Args:
         energy, scene, parameters: the game.
-        controls: its solution.
+        controls: the solution of the game.
         exact: whether H is the Hessian or its Gauss-Newton approximation.
 
     Returns:

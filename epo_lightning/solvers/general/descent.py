@@ -121,7 +121,7 @@ def warn_if_far(
 
     Args:
         value: E at the solutions.
-        slope: its gradient g.
+        slope: gradient g of E at the solutions.
         step: H^-1 g.
         definite: whether H is positive definite.
     """

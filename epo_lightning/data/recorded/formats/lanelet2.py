@@ -99,7 +99,7 @@ def read_map(
     """The lanes for vehicles of a Lanelet2 map. A lanelet for both directions becomes one lane in the direction of its ways.
 
     Args:
-        path: of the .osm file.
+        path: path of the .osm file.
         origin: UTM coordinates of the local frame's origin [m].
         zone: UTM zone, 1 .. 60; None takes that of the middle of the map.
         dropped: the numbers of items that are left out are added to it, by reason.

@@ -48,7 +48,7 @@ def number(text: str | None, what: str, path: Path | str) -> float:
     Args:
         text: None if it is missing.
         what: name of the number and its element, for error messages.
-        path: of the file, for error messages.
+        path: path of the file, for error messages.
 
     Raises:
         RecordingError: it is missing or not a finite number.
