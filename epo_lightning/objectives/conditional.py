@@ -38,7 +38,7 @@ class Conditional(Objective):
     In the joint density, log Z sums over all assignments and the numerator over those of the observed choices. Both are
     exact where all assignments can be enumerated (:func:`~epo_lightning.solvers.discrete.assignments.partition`), for any
     solver: the probability is 1 at most and the loss 0 at least. For larger games, ten rounds of messages give both. Bethe's
-    log Z is no bound on the true one, so hard pair energies can make the loss negative there.
+    log Z is no bound on the true one, so large pair energies can make the loss negative there.
 
     Args:
         weights: lambda of ``density``; of ``marginal``, the cross entropy of every agent's candidates by their own energies

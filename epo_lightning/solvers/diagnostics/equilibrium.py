@@ -1,20 +1,20 @@
 """Distance of a forecast from an open-loop Nash equilibrium of its inferred game, comparable between rows of a table.
 
-In an equilibrium no agent can improve by changing its strategy alone. The Nash gap of agent i is the largest decrease of its
-objective J_i = E_i + sum_j E_ij while the others keep their strategies, and because E is a potential, E falls by as much
-(Theorem 1):
+In an equilibrium no agent can lower its objective by changing only its own strategy. The Nash gap of agent i is the largest
+decrease of its objective J_i = E_i + sum_j E_ij that it can reach while the others keep their strategies. Because E is a
+potential, E decreases by the same amount (Theorem 1):
 
     gap_i(u) = J_i(u) - min over u_i' of J_i(u_i', u_-i) = E(u) - min over u_i' of E(u_i', u_-i).
 
-For controls the minima are local ones, converged tightly: the *best response* of an agent is the better result of two
-minimisations, from its own strategy and from its strategy in the optimum, so that the gap is a lower bound. For candidates
-the minimum is taken over a row of a table, and exact.
+For controls, local minima are found with a small tolerance: the *best response* of an agent is the better result of two
+minimisations, which start at its own strategy and at its strategy in the optimum, so that the gap is a lower bound. For
+candidates, the minimum over a row of a table is exact.
 
 Only the most likely joint mode is evaluated, as for overlap rates. Every best response is a *world*: a copy of the scene in
 which one agent moves and the others are held. All worlds of a batch are solved in parallel, and converged ones are left out.
 
-Networks may be unbounded from below: if a minimisation ends while the energy is still falling fast, there is no minimum to
-compare with, and the optimum and the gaps of that scene are NaN.
+Networks may be unbounded from below: if a minimisation ends while the energy is still falling fast, no minimum is known, and
+the optimum and the gaps of that scene are NaN.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ _CURVED = 1e-10
 _TOLERANCE = 1e-10
 """Predicted decrease, relative to the value, below which a function is at its minimum."""
 _LATELY, _FALLING = 30, 1e-2
-"""A function that loses more than this fraction of its total decrease in the last 30 evaluations is not near a minimum."""
+"""If a function makes more than this fraction of its total decrease in its last 30 evaluations, it is not near a minimum."""
 _UPDATES = 3
 """Least number of updates before a predicted decrease counts: before them the inverse Hessian is a multiple of I."""
 _ENTRIES = 2**24
@@ -58,8 +58,8 @@ def minimise(evaluate: Evaluate, start: Float[Tensor, "W n"]) -> Minimum:
     """Minimise from ``start`` until the predicted decrease is below 1e-10 of the value, in at most 300 evaluations.
 
     Steps are shortened by quadratic interpolation or halved until they lower the value, so the result is never above the
-    start. A function with a start value that is not finite keeps its start, with ``found`` False. ``found`` is True for
-    functions that run out of evaluations, unless they lost more than 1 % of their total decrease in the last 30.
+    start. A function whose value at the start is not finite keeps its start, with ``found`` False. For a function that has
+    used all evaluations, ``found`` is False if more than 1 % of its total decrease was made in the last 30 of them.
     """
     many = max(1, _ENTRIES // max(1, start.shape[1] ** 2))
     numbers = torch.arange(len(start), device=start.device)

@@ -86,8 +86,9 @@ def sum_product(
         log Z   = sum_{i<j} log Z_ij + sum_i (1 - d_i) log Z_i
 
     with the normalisers Z_i and Z_ij of the beliefs about agents and pairs, and the number d_i of i's neighbours. All
-    messages are updated in every iteration. Exact for trees of interacting pairs, once messages have crossed them. For other
-    graphs it is accurate for soft pair energies and biased for hard ones, where it may not converge without damping.
+    messages are updated in every iteration. The result is exact if the interacting pairs form a tree and there are at least
+    as many iterations as its diameter. For other graphs it is accurate for small pair energies and biased for large ones,
+    with which it may not converge without damping.
 
     Args:
         unary, pair, mask: the tables, and the mask of present agents.

@@ -141,7 +141,7 @@ class SumProduct(Candidates):
 
     Attributes:
         iterations: number of message updates.
-        damping: weight of the old log-message in the new one, 0 <= damping < 1; useful for hard pair energies.
+        damping: weight of the old log-message in the new one, 0 <= damping < 1; useful if pair energies are large.
     """
 
     iterations: int = 10

@@ -1,7 +1,7 @@
 """Limited-memory BFGS, for any energy that has a gradient: it needs no Hessian, but more steps than Newton's method.
 
-``torch.optim.LBFGS`` has one history and one line search for all samples, so that a forecast would depend on its batch. Here
-every sample has its own.
+``torch.optim.LBFGS`` has one history and one line search for all samples, so that a forecast would depend on the other
+scenes of its batch. Here every sample has its own history and line search.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _SHORTEST = 1e-12
 class LBFGS(Minimiser):
     """Quasi-Newton steps with the two-loop recursion (Nocedal and Wright, Algorithm 7.4) and backtracking.
 
-    TGL's minimiser (history 65, at most 1000 iterations, tolerance 1e-3). Every evaluation is one step: a sample either
-    accepts the trial and takes a new direction, or shortens its step by quadratic interpolation. If a line search fails, the
-    history is dropped; if it fails again, the sample ends.
+    This is TGL's minimiser (with history 65, at most 1000 iterations, tolerance 1e-3). A step is one evaluation of energy
+    and gradient: a sample either accepts the trial point and gets a new direction, or shortens its step by quadratic
+    interpolation. If a line search fails, the history is deleted; if it fails again, the minimisation of the sample ends.
 
     Solutions are constants to automatic differentiation; use ``backward=implicit`` to learn through them.
 

@@ -29,9 +29,9 @@ class Newton(Minimiser):
     """Newton steps -(H + lambda I)^-1 grad E with damping lambda and a line search.
 
     If the matrix is not positive definite, lambda is multiplied by 10. A step that does not lower the energy is shortened by
-    the secant rule, which needs no further factorisation; if that does not help soon, lambda is multiplied by 10 as well. An
-    accepted full step divides lambda by 10. Every sample has its own lambda, which begins at 1e-3 and stays within
-    [1e-7, 1e7]. Convergence is quadratic near a minimum; with piecewise linear residuals
+    the secant rule, which needs no further factorisation. If a step would become shorter than 3 % of the full step, lambda
+    is multiplied by 10 instead. An accepted full step divides lambda by 10. Every sample has its own lambda, which begins
+    at 1e-3 and stays within [1e-7, 1e7]. Convergence is quadratic near a minimum; with piecewise linear residuals
     (:class:`~epo_lightning.solvers.general.dense.PiecewiseQuadratic`) a few steps suffice.
 
     Solutions are constants to automatic differentiation; use ``backward=implicit`` to learn through them.
