@@ -297,7 +297,7 @@ def test_configurations_can_be_built(name):
         ({"gap": float("nan")}, r"energy.gap \[m\] must be a number, 0 or more, and finite, not nan"),
         ({"within": 0.0}, r"energy.within \[m\] must be a number, positive, not 0.0"),
         ({"within": float("nan")}, r"energy.within \[m\] must be a number, positive, not nan"),
-        ({"dynamics": Unicycle()}, "dynamics=double_integrator, not with Unicycle"),
+        ({"dynamics": Unicycle()}, "dynamics=double_integrator, not Unicycle"),
     ],
 )
 def test_invalid_settings_are_refused(settings, message):
