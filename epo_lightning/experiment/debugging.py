@@ -151,7 +151,7 @@ class NonFinite(Callback):
             return
         terms = pl_module.losses(self._scene, pl_module(self._scene))  # type: ignore[operator]
         guilty = [name for name, (_, value) in terms.items() if not value.isfinite().all()]
-        self._stop(f"the loss is {float(loss)}" + (f", by its term {' and '.join(guilty)}" if guilty else ""))
+        self._stop(f"the loss is {loss.item()}" + (f", by its term {' and '.join(guilty)}" if guilty else ""))
 
     def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
         parameters = {name: each for name, each in pl_module.named_parameters() if each.grad is not None}
