@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ import torch
 from experiment.conftest import TINY, Epo
 
 import epo_lightning
-from epo_lightning.experiment import assembly, verbs
+from epo_lightning.experiment import assembly, timing, verbs
 from epo_lightning.experiment.callbacks import RandomStates
 from epo_lightning.experiment.config.settings import Settings, measures
 from epo_lightning.experiment.timing import SAMPLES, measure
@@ -81,6 +82,31 @@ def test_the_time_is_that_of_one_forecast_without_gradients(epo: Epo, tmp_path: 
     settings = read(Settings, run.config())
     assert 0.005 < measure(run, settings, Slow())["seconds"]["median"] < 0.05
     assert measure(run, settings)["seconds"]["median"] < 0.005
+
+
+def test_many_scenes_are_timed_and_none_while_caches_settle(
+    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = timed(epo, tmp_path, "experiment=exid/const_vel", "budget=untrained")
+    clock, scenes = [0.0], []
+
+    class Settling(torch.nn.Module):
+        """A forecaster whose first forecasts take seconds, and the others 1, 2, 3 .. ms by a clock of its own."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.inner = epo_lightning.load(run.checkpoint())
+
+        def forward(self, scene: epo_lightning.Scene) -> epo_lightning.JointForecast:
+            scenes.append(tuple(scene.current.flatten().tolist()))
+            counted = len(scenes) - timing.WARM_UP
+            clock[0] += 0.001 * counted if counted > 0 else 9.0
+            return self.inner(scene)
+
+    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    seconds = measure(run, read(Settings, run.config()), Settling())["seconds"]
+    assert seconds == pytest.approx({"mean": 0.0505, "median": 0.0505, "p10": 0.0109, "p90": 0.0901})
+    assert len(set(scenes)) > 10
 
 
 def test_an_untrained_run_has_a_complete_run_folder(untrained: RunFolder, epo: Epo) -> None:

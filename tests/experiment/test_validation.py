@@ -1,0 +1,41 @@
+"""When a training is validated, and when it stops early."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from experiment.conftest import TINY, Epo
+
+from epo_lightning.run_folder import RunFolder, read_log
+
+WORDS = ("train", "experiment=rpi/v_lstm_sc", *TINY, "trainer.max_epochs=4")
+"""Four epochs of four steps."""
+
+
+def validated(run: str) -> list[int]:
+    """The optimisation steps after which a run was validated, counted from zero."""
+    rows = read_log(RunFolder(Path(run)).logs / "metrics.csv")
+    return [int(row["step"]) for row in rows if row.get("val/minSADE")]
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ("trainer.validate_every=1", [3, 7, 11, 15]),
+        ("trainer.validate_every=2", [7, 15]),
+        ("trainer.validate_steps=3", [2, 5, 8, 11, 14]),
+    ],
+)
+def test_a_training_is_validated_as_often_as_configured(epo: Epo, setting: str, expected: list[int]) -> None:
+    assert epo(*WORDS, setting, "run_dir=run") == 0
+    assert validated("run") == expected
+
+
+@pytest.mark.parametrize(("least", "epochs"), [(0.0, 4), (100.0, 3)])
+def test_an_improvement_below_min_delta_is_none(epo: Epo, least: float, epochs: int) -> None:
+    words = ("optimizer.lr=0.0001", "callbacks.patience=2", f"callbacks.min_delta={least}")
+    assert epo(*WORDS, *words, "run_dir=run") == 0
+    rows = read_log(RunFolder(Path("run")).logs / "metrics.csv")
+    scores = [float(row["val/minSADE"]) for row in rows if row.get("val/minSADE")]
+    assert RunFolder(Path("run")).record["epochs"] == len(scores) == epochs
