@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 from experiment import tiny
 from experiment.conftest import TINY, Epo
 
@@ -307,6 +308,9 @@ def test_a_search_continues_after_a_stop(epo: Epo, capsys: pytest.CaptureFixture
     assert interrupted.finished
     assert len(sweep.jobs) == 3
     assert before < {str(job.run.path) for job in sweep.jobs}
+    found = yaml.safe_load((sweep.folder / "optimization_results.yaml").read_text())
+    scores = [job.run.record["best"]["val/minSADE"] for job in sweep.jobs]
+    assert found["best_value"] == pytest.approx(min(scores)), "the sweeper looks for the lowest score"
     capsys.readouterr()
     assert epo(*words, "hydra.sweeper.n_trials=3") == 0
     assert "3 runs: 3 done" in capsys.readouterr().out
