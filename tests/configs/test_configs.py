@@ -148,7 +148,7 @@ def test_the_first_table_is_small_hard_and_shows_the_remedy_first() -> None:
     ]
     assert [config["experiment"] for config in configs][2] == "rpi/v_lstm_epo_relaxed"
     assert [bool(remedy) for remedy in remedies] == [True, True, True, False, False]
-    assert all(config["data"]["split"] == "hard" and config["data"]["placements"] == 8 for config in configs)
+    assert all(config["data"]["split"] == "hard" and config["data"]["placements"] == 4 for config in configs)
 
 
 def test_searches_learn_from_scores_and_keep_what_they_learned() -> None:
