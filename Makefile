@@ -93,8 +93,8 @@ docs: $(DOCUMENTABLE)
 	$(BIN)/python -m sphinx -q -W --keep-going -j auto -b html docs build/docs
 
 checkpoint: $(INSTALLED)
-	$(EPO) generate data=rpi_hard_reduced
-	$(EPO) train experiment=rpi/v_lstm_epo_relaxed data=rpi_hard_reduced budget=reduced seed=0 score=test callbacks.progress=lines \
+	$(EPO) generate data=rpi_hard_reduced data.placements=8
+	$(EPO) train experiment=rpi/v_lstm_epo_relaxed data=rpi_hard_reduced data.placements=8 budget=reduced seed=0 score=test callbacks.progress=lines \
 		run_dir=runs/checkpoint existing=continue
 	$(BIN)/python -m epo_lightning.experiment.ship runs/checkpoint rpi
 
