@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from functools import cache
+from typing import Any
 
 import pytest
 import torch
@@ -28,15 +30,20 @@ MINIMA = (*STEPS, "newton", "lbfgs")
 TABLES = ("enumeration", "sum_product")
 
 
-def section(kind: str, option: str) -> dict:
-    return compose("train", ["experiment=rpi/v_lstm_epo", *f"{kind}={option}".split()])[kind]
+CHANGES = {
+    ("solver", "newton"): {"steps": 4},
+    ("solver", "lbfgs"): {"steps": 4},
+    ("solver", "gradient_descent"): {"steps": 3, "step_size": 1e-4},
+    ("solver", "langevin"): {"steps": 3, "delta": 1e-2},
+}
+"""A few steps suffice here; they are small, because untrained weights do not allow larger ones."""
 
 
-SECTIONS = {kind: {option: section(kind, option) for option in options} for kind, options in OPTIONS.items()}
-# A few steps suffice here; they are small, because untrained weights do not allow larger ones.
-SECTIONS["solver"]["newton"]["steps"] = SECTIONS["solver"]["lbfgs"]["steps"] = 4
-SECTIONS["solver"]["gradient_descent"] |= {"steps": 3, "step_size": 1e-4}
-SECTIONS["solver"]["langevin"] |= {"steps": 3, "delta": 1e-2}
+@cache
+def section(kind: str, option: str) -> dict[str, Any]:
+    """The configuration of a part, composed once; not to be changed."""
+    config = compose("train", ["experiment=rpi/v_lstm_epo", *f"{kind}={option}".split()])[kind]
+    return {**config, **CHANGES.get((kind, option), {})}
 
 
 def works(energy: str, solver: str, backward: str, objective: str) -> bool:
@@ -66,7 +73,7 @@ def configuration(chosen: dict[str, str]) -> dict:
     convex = chosen["energy"] == "convex"
     return model(
         {"name": "epo", "modes": 2},
-        **{kind: SECTIONS[kind][option] for kind, option in chosen.items()},
+        **{kind: section(kind, option) for kind, option in chosen.items()},
         dynamics={"name": "double_integrator" if convex else "unicycle"},
         horizon=6,
     )
