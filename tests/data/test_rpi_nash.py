@@ -81,9 +81,10 @@ def check(modes):
     assert (np.abs(alternative) < 1e-5).mean() > 0.9
 
 
-def test_no_agent_gains_by_deviating_in_200_sub_games():
-    modes = sub_games(200)
-    assert sum(mode.executed for mode in modes) >= 200
+@pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.slow)])
+def test_no_agent_gains_by_deviating_in_sub_games(count):
+    modes = sub_games(count)
+    assert sum(mode.executed for mode in modes) >= count
     check(modes)
 
 

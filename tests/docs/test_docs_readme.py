@@ -11,7 +11,7 @@ from docs.pages import ROOT, blocks, lines
 from experiment.conftest import epo  # noqa: F401 - a fixture
 
 README = ROOT / "README.md"
-DATA = ["data.games=10", "data.placements=1"]
+DATA = ["data.games=6", "data.placements=1"]
 CHEAPER = {
     "epo generate": [*DATA, "workers=1", "progress=false"],
     "epo train experiment=rpi/v_lstm_epo budget=long": [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shlex
 import shutil
 import zlib
@@ -15,17 +14,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 from torch import Tensor
 
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
+from epo_lightning.data.recorded.extraction import extract_to_file, is_complete, read_tables
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
-from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, extract, joined
+from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, joined
 from epo_lightning.data.workers import Report, finished
 from epo_lightning.registry import ConfigError, lookup, nearest, register
 from epo_lightning.schema import read
@@ -279,11 +277,11 @@ class RecordedData(SceneDataModule):
         tasks = [
             (source, self.windows, self.task.map, files[name])
             for name, source in recordings.items()
-            if not _complete(files[name])
+            if not is_complete(files[name])
         ]
         before = len(recordings) - len(tasks)
         report = Report(tasks, lambda task: task[0].name, "recording", "extracting", "extracted", before, progress)
-        for _ in finished(_extract_to_file, tasks, workers, report, f"finished recordings are kept in {work}"):
+        for _ in finished(extract_to_file, tasks, workers, report, f"finished recordings are kept in {work}"):
             pass
         tensors, about = {}, {}
         for split in SPLITS:
@@ -297,7 +295,7 @@ class RecordedData(SceneDataModule):
         counts: Counter[str] = Counter()
         tables = []
         for file in files:
-            columns, counted = _read_tables(file)
+            columns, counted = read_tables(file)
             counts.update(counted)
             # A recording without scenes still has its place in the order of recordings.
             tables.append(SceneTables(**columns) if columns else None)
@@ -348,38 +346,6 @@ def _fingerprint(file: Path) -> list[Any]:
             content.seek(place)
             checksum = zlib.crc32(content.read(PIECE), checksum)
     return [file.name, size, checksum]
-
-
-def _extract_to_file(source: RecordingSource, windows: WindowConfig, has_map: bool, file: Path) -> None:
-    """Extract the scenes of one recording into a file."""
-    recording = source.read()
-    if has_map and recording.lanes is None:
-        raise ConfigError(f"the recording {source.name} has no map: set data.map=false, or give it one")
-    if not has_map:
-        recording = dataclasses.replace(recording, lanes=None)
-    found, counts = extract(recording, windows)
-    columns = {}
-    if found is not None:
-        # safetensors writes the memory as it is, whatever the strides.
-        columns = {
-            field.name: np.ascontiguousarray(getattr(found, field.name)) for field in dataclasses.fields(SceneTables)
-        }
-    cache.write_file(file, save(columns, {"counts": json.dumps(counts)}))
-
-
-def _read_tables(file: Path) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Columns and counts of one recording, as :func:`_extract_to_file` wrote them."""
-    with safe_open(file, framework="np") as content:
-        counts = json.loads(content.metadata()["counts"])
-        return {name: content.get_tensor(name) for name in content.keys()}, counts  # noqa: SIM118 - not a mapping
-
-
-def _complete(file: Path) -> bool:
-    """Whether the file of a recording exists and can be read. It is renamed into place when it is complete."""
-    try:
-        return file.is_file() and bool(_read_tables(file)[1])
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError):
-        return False
 
 
 def _describe(scenes: SceneTables) -> dict[str, Any]:
