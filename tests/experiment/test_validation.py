@@ -1,4 +1,4 @@
-"""When a training is validated, and when it stops early."""
+"""When a training is validated, when it stops early, and which of its checkpoints is scored."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from experiment.conftest import TINY, Epo
 
-from epo_lightning.run_folder import RunFolder, read_log
+from epo_lightning.run_folder import RunFolder, read_json, read_log
 
 WORDS = ("train", "experiment=rpi/v_lstm_sc", *TINY, "trainer.max_epochs=4")
 """Four epochs of four steps."""
@@ -39,3 +39,14 @@ def test_an_improvement_below_min_delta_is_none(epo: Epo, least: float, epochs: 
     rows = read_log(RunFolder(Path("run")).logs / "metrics.csv")
     scores = [float(row["val/minSADE"]) for row in rows if row.get("val/minSADE")]
     assert RunFolder(Path("run")).record["epochs"] == len(scores) == epochs
+
+
+def test_a_run_is_scored_by_its_best_checkpoint(epo: Epo) -> None:
+    worsening = ("optimizer.lr=0.05", "trainer.limit_val_batches=1.0", "score=val")
+    assert epo(*WORDS, *worsening, "run_dir=run") == 0
+    run = RunFolder(Path("run"))
+    scores = [float(row["val/minSADE"]) for row in read_log(run.logs / "metrics.csv") if row.get("val/minSADE")]
+    assert scores[-1] > 1.01 * min(scores), "the last epoch is not the best one"
+    scored = read_json(run.metrics_file("val"))
+    assert scored["checkpoint"] == "best"
+    assert scored["metrics"]["minSADE"] == pytest.approx(min(scores), rel=1e-5)

@@ -192,6 +192,18 @@ def test_every_network_of_positions_has_the_unit_of_its_task(name, decoders):
     assert {network: forecaster.get_submodule(network).scale for network in networks} == dict.fromkeys(networks, 20.0)
 
 
+@pytest.mark.parametrize("config", [TestSceneConsistent.config, EPO])
+def test_decoded_controls_have_the_configured_scale(config):
+    start = {}
+    for scale in (0.3, 0.6):
+        torch.manual_seed(1)
+        forecaster = build_forecaster(model({**config, "control_scale": scale})).eval()
+        scene = random_scene(2, 2)
+        start[scale] = forecaster.strategies(forecaster.backbone(scene), scene)
+    torch.testing.assert_close(start[0.6], 2.0 * start[0.3])
+    assert (start[0.3] != 0).any()
+
+
 @pytest.mark.parametrize("config", [TestMarginal.config, TestSceneConsistent.config])
 def test_a_given_goal_is_told_to_the_network_if_asked_for_alone(config):
     for goal, told in (("energy", False), ("all", True)):

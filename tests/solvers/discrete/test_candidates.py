@@ -273,3 +273,14 @@ def test_configuration_files_state_the_defaults(name):
 def test_invalid_settings_are_refused(kind, wrong):
     with pytest.raises(ConfigError, match=f"solver.{next(iter(wrong))}"):
         kind(**wrong)
+
+
+def test_messages_are_updated_as_often_and_damped_as_configured():
+    unary, pair = torch.randn(2, 3, 4, dtype=torch.float64), torch.randn(2, 3, 4, 4, dtype=torch.float64)
+    mask = torch.ones(2, 3, dtype=torch.bool)
+    found, total = SumProduct(candidates=4, iterations=2, damping=0.5).density(unary, pair, mask)
+    expected = assignments.sum_product(unary, pair, mask, iterations=2, damping=0.5)
+    assert torch.equal(found, expected[0])
+    assert torch.equal(total, expected[1])
+    for iterations, damping in ((10, 0.5), (2, 0.0)):
+        assert not torch.equal(found, assignments.sum_product(unary, pair, mask, iterations, damping)[0])
