@@ -53,12 +53,13 @@ def _plain(value: Any, where: str) -> Any:
 
 def identity(config: Mapping[str, Any], data_digest: str) -> str:
     """The run's identity: sixteen hexadecimal digits of the hash of its essence and its data."""
-    return _hash({**essence(config), "data_digest": data_digest})
+    content = canonical({**essence(config), "data_digest": data_digest})
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 def row_identity(config: Mapping[str, Any], data_digest: str) -> str:
     """Identity of a row of a table: the identity of its runs computed without the seed, and so the same for all of them."""
-    return _hash({**essence(config), "seed": None, "data_digest": data_digest})
+    return identity({**config, "seed": None}, data_digest)
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
@@ -79,7 +80,3 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from _leaves(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
-
-
-def _hash(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(canonical(content).encode()).hexdigest()[:16]

@@ -29,7 +29,10 @@ def mask(value: Value) -> Value:
         value: text, or mappings and lists with text in them; other values are left as they are.
     """
     if isinstance(value, str):
-        return _text(value)  # type: ignore[return-value]
+        text: str = value
+        for pattern, replacement in _RULES if "://" in text else ():
+            text = pattern.sub(replacement, text)
+        return text  # type: ignore[return-value]
     if isinstance(value, Mapping):
         return {key: mask(entry) for key, entry in value.items()}  # type: ignore[return-value]
     if isinstance(value, list | tuple):
@@ -40,10 +43,3 @@ def mask(value: Value) -> Value:
 def is_masked(text: str) -> bool:
     """Whether a secret in the text has been masked."""
     return MASK in text and mask(text) == text
-
-
-def _text(text: str) -> str:
-    if "://" in text:
-        for pattern, replacement in _RULES:
-            text = pattern.sub(replacement, text)
-    return text

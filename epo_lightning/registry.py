@@ -94,15 +94,6 @@ def lookup(kind: str, name: str) -> Callable[..., Any]:
     return parts[name]
 
 
-def parameters(kind: str, name: str) -> Mapping[str, inspect.Parameter]:
-    """The arguments of a part's constructor by name: the schema of its configuration.
-
-    Raises:
-        ConfigError: as :func:`lookup`.
-    """
-    return inspect.signature(lookup(kind, name)).parameters
-
-
 def check(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:
     """Compare a part's configuration with its constructor's signature, without building it.
 
@@ -117,7 +108,7 @@ def check(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) ->
     if not config.get("name"):
         _load(kind)
         raise ConfigError(f"{kind}.name is missing: {nearest('', _PARTS.get(kind, {}))}")
-    schema = parameters(kind, config["name"])
+    schema = inspect.signature(lookup(kind, config["name"])).parameters
     keys = set(config) - {"name"}
     known = set(schema) - set(supplied)
     for key in sorted(keys - known):
@@ -139,11 +130,11 @@ def build(kind: str, config: Mapping[str, Any], **supplied: Any) -> Any:
         ConfigError: as :func:`check`, or a value that the part refuses.
     """
     check(kind, config, supplied)
+    part = lookup(kind, config["name"])
     arguments = {key: value for key, value in config.items() if key != "name"}
-    named = parameters(kind, config["name"])
-    arguments |= {key: value for key, value in supplied.items() if key in named}
+    arguments |= {key: value for key, value in supplied.items() if key in inspect.signature(part).parameters}
     try:
-        return lookup(kind, config["name"])(**arguments)
+        return part(**arguments)
     except ConfigError:
         raise
     except (TypeError, ValueError) as error:

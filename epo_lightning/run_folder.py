@@ -83,26 +83,21 @@ def errors_naming(path: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def write_bytes(path: Path, content: bytes | memoryview) -> None:
-    """Write ``path`` as a whole or not at all.
+def write_file(path: Path, content: str | bytes | memoryview) -> None:
+    """Write ``path`` as a whole or not at all; text in UTF-8.
 
     Raises:
         OSError: the folder is read-only or the disk is full; it names ``path``.
     """
     with whole_file(path) as temporary, temporary.open("wb") as file:
-        file.write(content)
+        file.write(content.encode("utf-8") if isinstance(content, str) else content)
         file.flush()
         os.fsync(file.fileno())
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write ``path`` as a whole or not at all, in UTF-8."""
-    write_bytes(path, text.encode("utf-8"))
-
-
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write ``content`` as indented JSON with sorted keys, atomically."""
-    write_text(path, json.dumps(content, indent=2, sort_keys=True, allow_nan=True) + "\n")
+    write_file(path, json.dumps(content, indent=2, sort_keys=True, allow_nan=True) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -290,7 +285,7 @@ class RunFolder:
         import yaml
 
         text = yaml.safe_dump(mask(dict(config)), sort_keys=False, default_flow_style=None, width=120)
-        write_text(self.config_file, HEADER + text)
+        write_file(self.config_file, HEADER + text)
         write_json(self.record_file, mask({**record, "status": TRAINING}))
 
     def update(self, **changes: Any) -> None:

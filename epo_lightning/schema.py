@@ -24,15 +24,11 @@ def read(schema: type[Section], values: Mapping[str, Any], where: str = "") -> S
     for key in values:
         if key not in hints:
             raise ConfigError(f"unknown key {prefix}{key}: {nearest(str(key), hints)}")
-    required = [f.name for f in dataclasses.fields(schema) if _required(f)]  # type: ignore[arg-type]
-    for key in required:
-        if key not in values:
-            raise ConfigError(f"missing key {prefix}{key}")
+    for entry in dataclasses.fields(schema):  # type: ignore[arg-type]
+        has_default = not entry.default is entry.default_factory is dataclasses.MISSING
+        if entry.name not in values and not has_default:
+            raise ConfigError(f"missing key {prefix}{entry.name}")
     return schema(**{key: _read(hints[key], value, prefix + key) for key, value in values.items()})
-
-
-def _required(entry: dataclasses.Field[Any]) -> bool:
-    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
 
 
 def _read(hint: Any, value: Any, where: str) -> Any:

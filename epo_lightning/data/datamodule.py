@@ -98,7 +98,8 @@ class BatchSampler(DistributedSampler):
             order = torch.randperm(count, generator=epoch_generator(self.seed, self.epoch))
         else:
             order = torch.arange(count)
-        rank, world = _rank()
+        together = torch.distributed.is_available() and torch.distributed.is_initialized()
+        rank, world = (torch.distributed.get_rank(), torch.distributed.get_world_size()) if together else (0, 1)
         if self.shuffle:
             check_share(self.batch_size, world)
         shares = (batch[rank::world] for batch in order.split(self.batch_size)[: len(self)])
@@ -127,13 +128,6 @@ def check_share(batch_size: int, world: int) -> None:
 def epoch_generator(seed: int, epoch: int) -> torch.Generator:
     """Random generator of one epoch. NumPy mixes seed and epoch into one number, because torch uses only 32 bits of it."""
     return torch.Generator().manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
-
-
-def _rank() -> tuple[int, int]:
-    """This process's rank and the number of processes."""
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        return torch.distributed.get_rank(), torch.distributed.get_world_size()
-    return 0, 1
 
 
 class SceneDataModule(LightningDataModule):

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
-from epo_lightning.run_folder import write_bytes
+from epo_lightning.run_folder import write_file
 
 
 class WholeCheckpoints(TorchCheckpointIO):
@@ -22,4 +22,4 @@ class WholeCheckpoints(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
         content = io.BytesIO()  # writing to the disk itself, torch would not report a full disk as an OSError
         torch.save(checkpoint, content)
-        write_bytes(Path(path), content.getbuffer())
+        write_file(Path(path), content.getbuffer())

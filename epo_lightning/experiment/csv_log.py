@@ -13,7 +13,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
-from epo_lightning.run_folder import RunFolder, errors_naming, read_log, write_text
+from epo_lightning.run_folder import RunFolder, errors_naming, read_log, write_file
 
 
 class CSVLog(Logger):
@@ -78,7 +78,7 @@ class CSVLog(Logger):
     def _replace(self, rows: Sequence[Mapping[str, Any]]) -> None:
         columns = sorted({name for row in rows for name in row})
         header = {name: name for name in columns}
-        write_text(self.file, _text(columns, [header, *rows]))
+        write_file(self.file, _text(columns, [header, *rows]))
         self._columns = columns
 
 

@@ -22,7 +22,7 @@ from torchmetrics import Metric
 
 from epo_lightning.experiment.config.settings import TrainerSettings
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_text
+from epo_lightning.run_folder import RunFolder, write_file
 from epo_lightning.scene import Scene
 
 WARM_UP, PROFILED = 5, 10
@@ -100,7 +100,7 @@ class Profile(Callback):
         order = "self_cuda_time_total" if torch.cuda.is_available() else "self_cpu_time_total"
         table = operations.table(sort_by=order, row_limit=ROWS, max_name_column_width=60)
         steps = self._steps - WARM_UP
-        write_text(
+        write_file(
             self.folder / "operations.txt", f"{steps} training steps, the most expensive operations first\n{table}"
         )
         running.export_chrome_trace(str(self.folder / "trace.json.gz"))

@@ -14,7 +14,7 @@ from epo_lightning.experiment.config.settings import PredictSettings, Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data
 from epo_lightning.experiment.pictures import choose, draw, forecast_of, spread
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_bytes, write_json
+from epo_lightning.run_folder import RunFolder, write_file, write_json
 from epo_lightning.scene import KINDS, JointForecast, Scene
 from epo_lightning.schema import read
 
@@ -75,7 +75,7 @@ def predict(settings: PredictSettings) -> list[Path]:
     forecast = forecast_of(forecaster, scenes)
     tensors = dict(_tensors(scenes, forecast))
     out.mkdir(parents=True, exist_ok=True)
-    write_bytes(tensors_file, save(tensors))
+    write_file(tensors_file, save(tensors))
     pictures = draw(settings, of_run.title, forecaster, scenes, forecast)
     index = {
         "run": str(run.path),

@@ -17,7 +17,7 @@ from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_data
 from epo_lightning.experiment.pictures import choose
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_bytes, write_json
+from epo_lightning.run_folder import RunFolder, write_file, write_json
 from epo_lightning.schema import read
 
 SCENES = 16
@@ -44,7 +44,7 @@ def ship(run: RunFolder, folder: Path) -> Path:
     weights = {key: content[key] for key in ("configuration", "state_dict")}
     packed.checkpoints.mkdir(exist_ok=True)
     WholeCheckpoints().save_checkpoint(weights, packed.checkpoint("best"))
-    write_bytes(folder / "scenes.safetensors", save(tensors, {"dt": str(scenes.dt)}))
+    write_file(folder / "scenes.safetensors", save(tensors, {"dt": str(scenes.dt)}))
     shutil.copyfile(run.metrics_file(), packed.metrics_file())
     digest = hashlib.sha256(packed.checkpoint("best").read_bytes()).hexdigest()
     write_json(packed.record_file, {**run.record, "sha256": digest})

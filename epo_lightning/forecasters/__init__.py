@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from epo_lightning import pretrained
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.checkpoint import read_checkpoint
-from epo_lightning.registry import ConfigError, build, check, nearest, parameters
+from epo_lightning.registry import ConfigError, build, check, lookup, nearest
 from epo_lightning.task import TASK_KEYS, Task
 
 __all__ = ["Forecaster", "Task", "build_forecaster", "check_model", "load"]
@@ -67,7 +68,7 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
     """
     check_model(model)
     task = Task.from_config(model)
-    named = parameters("forecaster", model["forecaster"]["name"])
+    named = inspect.signature(lookup("forecaster", model["forecaster"]["name"])).parameters
     parts: dict[str, Any] = {"task": task}
     # Parts that the forecaster does not take are not built: drawing their initial weights would change those of the others.
     if "backbone" in named:

@@ -44,7 +44,11 @@ class Combination:
     @classmethod
     def of(cls, **chosen: Any) -> Combination:
         """Build from the four parts."""
-        return cls(**chosen, names={kind: _name(kind, part) for kind, part in chosen.items()})
+        names = {
+            kind: next((name for name, known in parts(kind).items() if type(part) is known), type(part).__name__)
+            for kind, part in chosen.items()
+        }
+        return cls(**chosen, names=names)
 
     @property
     def obstacle(self) -> str | None:
@@ -99,11 +103,6 @@ class Combination:
             }
             working = list(two)[:6]
         raise ConfigError(f"{obstacle}. With this instead it works: {', or '.join(working)}")
-
-
-def _name(kind: str, part: Any) -> str:
-    """The registered name of a part."""
-    return next((name for name, known in parts(kind).items() if type(part) is known), type(part).__name__)
 
 
 def _and(what: Iterable[str]) -> str:

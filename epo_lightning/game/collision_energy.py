@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from epo_lightning.game.checks import check_number, check_whole
+from epo_lightning.checks import check_number, check_whole
 from epo_lightning.game.circles import disc, length_of, row_extent, row_overlap
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.network_energy import NetworkEnergy

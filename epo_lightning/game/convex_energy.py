@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.game.checks import check_number
+from epo_lightning.checks import check_number
 from epo_lightning.game.circles import disc
 from epo_lightning.game.double_integrator import DoubleIntegrator, rotate
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy, check_names

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.game.checks import check_whole, is_number
+from epo_lightning.checks import check_whole, is_number
 from epo_lightning.game.circles import disc, separation
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, check_names

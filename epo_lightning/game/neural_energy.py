@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from epo_lightning.game.checks import check_whole
+from epo_lightning.checks import check_whole
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.energy import GRADIENT
 from epo_lightning.game.network_energy import NetworkEnergy

@@ -13,7 +13,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from epo_lightning.run_folder import write_bytes
+from epo_lightning.run_folder import write_file
 
 MODES = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Okabe and Ito's colours; the first two modes are red and blue as in the paper."""
@@ -63,7 +63,7 @@ def save(figure: Figure, path: str | Path) -> Path:
     path, picture = Path(path), io.BytesIO()  # a full disk would be an encoder's error without a file's name
     metadata = {"Software": None}
     figure.savefig(picture, format="png", dpi=DPI, bbox_inches="tight", pad_inches=0.08, metadata=metadata)
-    write_bytes(path, picture.getbuffer())
+    write_file(path, picture.getbuffer())
     return path
 
 

@@ -32,7 +32,7 @@ from epo_lightning.report.selection import BestSetting, best_settings
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import Table, build_tables
 from epo_lightning.report.timings import places, read_timings, timing_sheet
-from epo_lightning.run_folder import RunFolder, write_text
+from epo_lightning.run_folder import RunFolder, write_file
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def write_report(
     for chart in charts:
         save(chart.draw(chart.wide, True), out / "figures" / f"{chart.name}.png")
     for name, text in files.items():
-        write_text(out / name, text)
+        write_file(out / name, text)
     console = console or Console()
     for note in notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -19,7 +19,7 @@ from typing import ClassVar
 
 import torch
 
-from epo_lightning.game.checks import check_whole
+from epo_lightning.checks import check_whole
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register

@@ -14,7 +14,7 @@ from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import of_sweep, report
 from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_json, write_text
+from epo_lightning.run_folder import RunFolder, write_file, write_json
 
 
 def begin(runs: Path, name: str, folders: dict[str, str | None], score: str | list[str] = "test") -> Sweep:
@@ -52,7 +52,7 @@ def test_a_sweep_reports_its_runs_and_the_states_of_the_others(runs: Path) -> No
     finish(make_run(runs / "elsewhere", "Not of the sweep", "marginal", scores(0.1)))
     make_run(runs / "c", "V-LSTM", "marginal", None, seed=2)
     sweep = begin(runs, "rpi_main", dict.fromkeys(("a", "b", "c", "d", "e")))
-    write_text(sweep.folder / "failures" / "e.txt", "ValueError: it broke\n\ntraceback\n")
+    write_file(sweep.folder / "failures" / "e.txt", "ValueError: it broke\n\ntraceback\n")
     subject = of_sweep(sweep)
     assert (subject.title, subject.command) == ("rpi_main", "epo report rpi_main")
     assert [run.path.name for run in subject.evaluated] == ["a", "b"]

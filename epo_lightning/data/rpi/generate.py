@@ -52,16 +52,6 @@ def pool_config(seed: int, games: int, placements: int, solver: str) -> dict[str
     }
 
 
-def set_config(pool: Mapping[str, Any], split: str, sizes: Sequence[int] | None) -> dict[str, Any]:
-    """Configuration of a data set: all values that its records depend on."""
-    return {"pool": dict(pool), "split": split, "sizes": None if sizes is None else list(sizes)}
-
-
-def set_folder(root: Path, config: Mapping[str, Any]) -> Path:
-    """Folder of the data set of a configuration."""
-    return root / f"rpi-{cache.digest(config)[:12]}"
-
-
 def _play(seed: int, game: int, placement: int, placements: int, solver: str) -> tuple[Records, dict[str, int]]:
     """Records of one placement of one main game, and the solver's counts."""
     constants = GameConstants()
@@ -155,22 +145,13 @@ def _solve_missing(paths: Sequence[Path], config: Mapping[str, Any], workers: in
             del solved[game]
 
 
-def make_set(
-    root: Path,
-    pool: Mapping[str, Any],
-    split: str,
-    sizes: Sequence[int] | None,
-    workers: int | None,
-    progress: bool,
-    command: str = "",
-) -> Path:
+def make_set(folder: Path, config: Mapping[str, Any], workers: int | None, progress: bool, command: str = "") -> Path:
     """The folder of a data set, made now unless it exists already.
 
     Args:
-        root: folder of the cache.
-        pool: configuration of the pool, see :func:`pool_config`.
-        split: rule by which records are assigned to splits.
-        sizes: most records of training, validation and test; None for all.
+        folder: where it lies, or will lie, in the cache.
+        config: its configuration: ``pool`` (see :func:`pool_config`), ``split`` (the rule by which records are assigned to
+            splits) and ``sizes`` (most records of training, validation and test; None for all).
         workers: processes; None for one per core.
         progress: whether to report progress.
         command: makes this set; for error messages.
@@ -180,18 +161,16 @@ def make_set(
             was killed.
         OSError: the disk is full or read-only.
     """
-    config = set_config(pool, split, sizes)
-    folder = set_folder(root, config)
-    if not cache.make_once(folder, lambda: _make_set(folder, root, config, workers, progress)):
+    if not cache.make_once(folder, lambda: _make_set(folder, config, workers, progress)):
         cache.verify(folder, command, config)
     return folder
 
 
-def _make_set(folder: Path, root: Path, config: Mapping[str, Any], workers: int | None, progress: bool) -> None:
+def _make_set(folder: Path, config: Mapping[str, Any], workers: int | None, progress: bool) -> None:
     from epo_lightning.data.rpi.report import describe
 
     pool, split = config["pool"], config["split"]
-    records, counts = make_pool(root, pool, workers, progress)
+    records, counts = make_pool(folder.parent, pool, workers, progress)
     constants = GameConstants()
     weights = np.array([main_game(pool["seed"], game, 0, 1, constants).weight for game in range(pool["games"])])
     indices = assign(split, pool["seed"], weights, records["game"], records["phi"], config["sizes"])

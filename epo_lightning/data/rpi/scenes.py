@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from epo_lightning.checks import check_whole
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset, epoch_generator
@@ -72,18 +73,6 @@ class RPIDataset:
         )
 
 
-def _whole(name: str, value: Any, least: int, why: str) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise ConfigError(f"data.{name} is {value!r}, expected a whole number of at least {least}: {why}")
-    return value
-
-
-def _one_of(name: str, value: Any, known: Sequence[str]) -> str:
-    if value not in known:
-        raise ConfigError(f"unknown data.{name} {value!r}: {nearest(str(value), known)}")
-    return value
-
-
 @register("data", "rpi")
 class RPIData(SceneDataModule):
     """The robot-pedestrian interaction data: generated once by ``epo generate``, then read from the cache.
@@ -119,29 +108,32 @@ class RPIData(SceneDataModule):
     ) -> None:
         super().__init__(batch_size, seed, share)
         self.root = Path(root).expanduser() if root else cache.default_root()
-        self.games = _whole("games", games, 3, "training, validation and test need main games of their own")
-        self.placements = _whole("placements", placements, 1, "a main game needs a start position of the pedestrian")
-        self.solver = _one_of("solver", solver, SOLVERS)
-        self.split = _one_of("split", split, RULES)
-        self.targets = _one_of("targets", targets, TARGETS)
+        check_whole("data.games", games, least=3)  # training, validation and test have main games of their own
+        check_whole("data.placements", placements)
+        self.games, self.placements = games, placements
+        named = {"solver": (solver, SOLVERS), "split": (split, RULES), "targets": (targets, TARGETS)}
+        for name, (value, known) in named.items():
+            if value not in known:
+                raise ConfigError(f"unknown data.{name} {value!r}: {nearest(str(value), known)}")
+        self.solver, self.split, self.targets = solver, split, targets
         if sizes is not None and (isinstance(sizes, str) or len(sizes) != len(SPLITS)):
             raise ConfigError(f"data.sizes is {sizes!r}, expected three numbers ({', '.join(SPLITS)}) or null for all")
-        why = "an empty split is of no use"
-        self.sizes = None if sizes is None else [_whole("sizes", size, 1, why) for size in sizes]
+        for size in sizes or ():
+            check_whole("data.sizes", size)
+        self.sizes = None if sizes is None else list(sizes)
 
     @property
     def config(self) -> dict[str, Any]:
         """Configuration of the data set: all values that its files depend on."""
-        from epo_lightning.data.rpi.generate import pool_config, set_config
+        from epo_lightning.data.rpi.generate import pool_config
 
-        return set_config(pool_config(self.seed, self.games, self.placements, self.solver), self.split, self.sizes)
+        pool = pool_config(self.seed, self.games, self.placements, self.solver)
+        return {"pool": pool, "split": self.split, "sizes": self.sizes}
 
     @property
     def folder(self) -> Path:
         """Folder of the data set, whether or not it exists."""
-        from epo_lightning.data.rpi.generate import set_folder
-
-        return set_folder(self.root, self.config)
+        return self.root / f"rpi-{cache.digest(self.config)[:12]}"
 
     @property
     def digest(self) -> str:
@@ -175,8 +167,8 @@ class RPIData(SceneDataModule):
         from epo_lightning.data.rpi.generate import make_set
 
         if workers is not None:
-            _whole("workers", workers, 1, "the games are solved by worker processes")
-        return make_set(self.root, self.config["pool"], self.split, self.sizes, workers, progress, self.command)
+            check_whole("workers", workers)
+        return make_set(self.folder, self.config, workers, progress, self.command)
 
     def report(self) -> dict[str, Any]:
         """The report that was written with the data set.

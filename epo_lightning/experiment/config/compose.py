@@ -64,13 +64,13 @@ def hydra(extra: Sequence[str] = ()) -> Iterator[Hydra]:
     root = tree()
     for source in (TreeSource, SweepsSource):
         SourcesRegistry.instance().register(source)
-    path = create_config_search_path(f"{TreeSource.scheme()}://{root / 'conf'}")
+    path = create_config_search_path(f"tree://{root / 'conf'}")
     # The folder `sweeps` lies beside conf/, because users look for the tables of the paper there.
-    path.append("sweeps", f"{SweepsSource.scheme()}://{root}", SearchPathQuery(provider="main"))
+    path.append("sweeps", f"beside://{root}", SearchPathQuery(provider="main"))
     for folder in reversed(extra):
         if not Path(folder).is_dir():
             raise ConfigError(f"--config-dir {folder}: the folder does not exist")
-        address = f"{TreeSource.scheme()}://{Path(folder).resolve()}"
+        address = f"tree://{Path(folder).resolve()}"
         path.prepend("command-line", address, SearchPathQuery(provider="main"))
     GlobalHydra.instance().clear()
     try:
@@ -98,6 +98,8 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     Raises:
         ConfigError: an interpolation of a key that does not exist, or a value that is still missing.
     """
+    from hydra.core.global_hydra import GlobalHydra
+
     choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
     values = _plain_values(config)
     if choices.get("experiment"):
@@ -106,15 +108,10 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     if "trainer" in values:
         own = canonical(essence({**values, "seed": None}))
         words = tuple(f"{group}={choices[group]}" for group in ("experiment", "budget") if choices.get(group))
-        same = own == _as_written(words, _search_path())
+        search_path = GlobalHydra.instance().config_loader().get_search_path().get_path()
+        same = own == _as_written(words, tuple(entry.path for entry in search_path))
         values["variant"] = "" if same else hashlib.sha256(own.encode()).hexdigest()[:6]
     return values
-
-
-def _search_path() -> tuple[str, ...]:
-    from hydra.core.global_hydra import GlobalHydra
-
-    return tuple(entry.path for entry in GlobalHydra.instance().config_loader().get_search_path().get_path())
 
 
 @cache

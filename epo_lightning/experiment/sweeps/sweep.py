@@ -35,7 +35,7 @@ from epo_lightning.identity import identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.runs import data_name
-from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_json, write_text
+from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_file, write_json
 from epo_lightning.schema import read
 
 State = Literal["waiting", "running", "interrupted", "failed", "done"]
@@ -254,7 +254,7 @@ class Sweep:
 
     def lost(self, job: Job) -> None:
         """Record that the process of a run died without an error message."""
-        write_text(self._failure(job.run), "its process was killed in every attempt (out of memory?)\n")
+        write_file(self._failure(job.run), "its process was killed in every attempt (out of memory?)\n")
 
     def work(self, config: Mapping[str, Any], overrides: Sequence[str]) -> float | None:
         """Train and score one of the runs. A launcher calls this in a process of its choice.
@@ -284,7 +284,7 @@ class Sweep:
         except Exception as error:
             message = mask(f"{type(error).__name__}: {' '.join(str(error).split())}")
             message = message.replace(f"{self.root}{os.sep}", f"{os.path.relpath(self.root)}{os.sep}")
-            write_text(self._failure(run), f"{message}\n\n{mask(traceback.format_exc())}")
+            write_file(self._failure(run), f"{message}\n\n{mask(traceback.format_exc())}")
             raise RunFailed(f"{settings.title}, seed {settings.seed}: {message}") from None
         return next(iter(run.record.get("best", {}).values()), None)
 

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from epo_lightning.game.checks import check_number, check_whole, is_number
+from epo_lightning.checks import check_number, check_whole, is_number
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status, Tables

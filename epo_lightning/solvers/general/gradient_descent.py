@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.game.checks import check_number, check_whole, is_number
+from epo_lightning.checks import check_number, check_whole, is_number
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.selection import evaluated
 from epo_lightning.registry import ConfigError, register

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import torch
 
-from epo_lightning.game.checks import check_number
+from epo_lightning.checks import check_number
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.registry import register
 from epo_lightning.scene import GameParameters, Scene, Solution

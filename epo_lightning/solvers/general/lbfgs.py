@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.game.checks import check_number, check_whole
+from epo_lightning.checks import check_number, check_whole
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.registry import register
 from epo_lightning.scene import GameParameters, Scene, Solution
