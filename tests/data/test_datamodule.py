@@ -7,7 +7,7 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from epo_lightning.data import cache, datamodule
+from epo_lightning.data import cache
 from epo_lightning.data.datamodule import BatchSampler, Subset
 from epo_lightning.data.drawn import DrawnData
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
@@ -174,6 +174,12 @@ def test_a_resumed_run_gets_the_same_batches(data, tmp_path, targets):
     assert len({tuple(ids) for _, ids, _ in whole}) > len(whole) // 2
 
 
+def pretend_rank(monkeypatch, rank, world):
+    """Let this process appear as one of several that train together."""
+    for name, value in {"is_initialized": True, "get_rank": rank, "get_world_size": world}.items():
+        monkeypatch.setattr(torch.distributed, name, lambda value=value: value)
+
+
 @pytest.mark.parametrize("world", [2, 4])
 @pytest.mark.parametrize("shuffle", [True, False])
 def test_the_shares_of_ranks_are_the_batches_of_one_process(monkeypatch, shuffle, world):
@@ -182,7 +188,7 @@ def test_the_shares_of_ranks_are_the_batches_of_one_process(monkeypatch, shuffle
     assert len(whole) == len(sampler) == (6 if shuffle else 7)
     shares = []
     for rank in range(world):
-        monkeypatch.setattr(datamodule, "_rank", lambda rank=rank: (rank, world))
+        pretend_rank(monkeypatch, rank, world)
         assert len(sampler) == len(whole)
         shares.append([batch.tolist() for batch in sampler])
         assert all(len(batch) == 8 // world for batch in shares[-1][:6])
@@ -193,7 +199,7 @@ def test_the_shares_of_ranks_are_the_batches_of_one_process(monkeypatch, shuffle
 
 
 def test_a_batch_that_ranks_cannot_share_evenly_is_refused(monkeypatch):
-    monkeypatch.setattr(datamodule, "_rank", lambda: (0, 3))
+    pretend_rank(monkeypatch, 0, 3)
     with pytest.raises(ConfigError, match=r"data\.batch_size is 8, which trainer\.devices=3 do not divide evenly"):
         next(iter(BatchSampler(RPIDataset(records(51), "executed"), 8, shuffle=True, seed=0)))
 
