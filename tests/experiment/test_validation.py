@@ -1,4 +1,4 @@
-"""When a training is validated, when it stops early, and which of its checkpoints is scored."""
+"""The order of a training's scenes, its validations, its early stop, and how its best checkpoint is scored."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ from pathlib import Path
 import pytest
 from experiment.conftest import TINY, Epo
 
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.compose import compose
+from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS
 from epo_lightning.run_folder import RunFolder, read_json, read_log
+from epo_lightning.schema import read
 
 WORDS = ("train", "experiment=rpi/v_lstm_sc", *TINY, "trainer.max_epochs=4")
 """Four epochs of four steps."""
@@ -50,3 +55,23 @@ def test_a_run_is_scored_by_its_best_checkpoint(epo: Epo) -> None:
     scored = read_json(run.metrics_file("val"))
     assert scored["checkpoint"] == "best"
     assert scored["metrics"]["minSADE"] == pytest.approx(min(scores), rel=1e-5)
+
+
+def test_the_equilibrium_of_games_is_measured_in_tests_and_not_in_validations(epo: Epo) -> None:
+    assert epo("train", "experiment=rpi/v_lstm_epo", *TINY, "score=test", "run_dir=run") == 0
+    run = RunFolder(Path("run"))
+    assert set(EQUILIBRIUM_METRICS) < read_json(run.metrics_file())["metrics"].keys()
+    logged = {name for row in read_log(run.logs / "metrics.csv") for name in row}
+    assert "val/minSADE" in logged
+    assert not {f"val/{name}" for name in EQUILIBRIUM_METRICS} & logged
+
+
+def test_runs_of_different_seeds_see_the_same_scenes_in_different_orders() -> None:
+    orders = []
+    for seed in (0, 0, 1):
+        words = ["experiment=rpi/v_lstm_sc", "data=drawn", "data.scenes=64", "budget=smoke", f"seed={seed}"]
+        data, _ = assembly.build(read(Settings, compose("train", words)))
+        data.setup("fit")
+        orders.append([number for scene in data.train_dataloader() for number in scene.id.tolist()])
+    assert orders[0] == orders[1] != orders[2]
+    assert sorted(orders[0]) == sorted(orders[2])
