@@ -52,6 +52,7 @@ def test_a_run_is_scored_by_its_best_checkpoint(epo: Epo) -> None:
     run = RunFolder(Path("run"))
     scores = [float(row["val/minSADE"]) for row in read_log(run.logs / "metrics.csv") if row.get("val/minSADE")]
     assert scores[-1] > 1.01 * min(scores), "the last epoch is not the best one"
+    assert run.record["best"] == {"val/minSADE": pytest.approx(min(scores))}
     scored = read_json(run.metrics_file("val"))
     assert scored["checkpoint"] == "best"
     assert scored["metrics"]["minSADE"] == pytest.approx(min(scores), rel=1e-5)
