@@ -318,7 +318,7 @@ def _single(arguments: Arguments) -> None:
     config = compose(arguments.verb, words, arguments.extra)
     from epo_lightning.experiment import verbs
 
-    verbs.RUN[arguments.verb](config, words)
+    verbs.RUN[arguments.verb](config, [*words, *(f"--config-dir={folder}" for folder in arguments.extra)])
 
 
 def _resume(folder: str, others: Sequence[str]) -> None:

@@ -50,11 +50,11 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     _print_report(data.report())
     dataset = settings.data.get("dataset", "rpi")
     row = f"{dataset}/v_lstm_epo"
+    kept = [word for word in overrides if word.startswith(("data=", "data.", "--config-dir="))]
     if dataset in HIGHWAYS or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
-        kept = (word for word in overrides if word.startswith(("data=", "data.")) and word != f"data={dataset}")
-        words = [f"experiment={row}", *kept]
+        words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]
     else:
-        words = [f"experiment={'exid' if data.task.map else 'ucy'}/v_lstm_epo", *overrides]
+        words = [f"experiment={'exid' if data.task.map else 'ucy'}/v_lstm_epo", *kept]
     print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
 
 

@@ -62,7 +62,10 @@ def test_old_names_work_in_globs_and_sweeps() -> None:
 
 def test_rows_from_recordings_to_the_table(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert epo("generate", "data=exid", *DATA, "progress=false", "workers=1") == 0
-    assert "next: epo train experiment=exid/v_lstm_epo data.folder=" in capsys.readouterr().out
+    (following,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]
+    assert following.startswith("next: epo train experiment=exid/v_lstm_epo data.folder=")
+    assert "--config-dir=" in following, "the command finds the configurations that this one found"
+    assert "workers=1" not in following
     for row in ("const_vel", "hivt_m_sc", "vibes_epo", "v_lstm_epo_no_goal"):
         assert epo("train", f"experiment=exid/{row}", *DATA, "budget=smoke", "callbacks.progress=none") == 0, row
     assert epo("evaluate", "runs=runs") == 0

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from experiment import tiny
 from experiment.conftest import TINY, Epo
 from report.run_folders import make_run, scores
 
@@ -147,7 +148,8 @@ def test_recorded_commands_can_be_given_to_a_shell(epo: Epo) -> None:
     for number, title in enumerate(titles):
         assert epo("train", ROW, *TINY, f"run_dir=run{number}", title, "score=test") == 0, title
         record = RunFolder(Path(f"run{number}")).record
-        assert shlex.split(record["command"]) == ["epo", "train", ROW, *TINY, title, "score=test"]
+        words = ["epo", "train", ROW, *TINY, title, "score=test", f"--config-dir={tiny.CONF}"]
+        assert shlex.split(record["command"]) == words
         assert epo("report", f"runs=run{number}", f"out=report{number}") == 0, title
     assert epo("train", "-m", ROW, *TINY, titles[0], "seed=0") == 0
     (run,) = Path("runs").rglob("run.json")
