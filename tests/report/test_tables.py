@@ -63,12 +63,12 @@ def test_rows_that_the_paper_does_not_have_follow_in_the_order_of_the_runs(tmp_p
 
 def test_rows_of_one_loss_stand_together_in_the_order_of_the_runs(tmp_path: Path) -> None:
     rows = [
-        *(("SC, relaxed", "scene_consistent", 0.1), ("EPO, relaxed", "epo", 0.1)),
-        *(("EPO", "epo", 0.0), ("SC", "scene_consistent", 0.0)),
+        *(("SC, relaxed", "scene_consistent", 0.1, "forecaster"), ("EPO, relaxed", "epo", 0.1, "objective")),
+        *(("EPO", "epo", 0.0, "objective"), ("SC", "scene_consistent", 0.0, "forecaster")),
     ]
     runs = [
-        make_run(tmp_path / title, title, name, scores(0.1), settings={"forecaster.relaxation": share})
-        for title, name, share in rows
+        make_run(tmp_path / title, title, name, scores(0.1), settings={f"{section}.relaxation": share})
+        for title, name, share, section in rows
     ]
     (table,) = build_tables(collect(runs))
     assert [row.name for row in table.rows] == ["SC, relaxed", "EPO, relaxed", "SC", "EPO"]
