@@ -28,7 +28,8 @@ TESTABLE := $(VENV)/.testable
 
 install: $(INSTALLED)
 
-KERNEL := $(wildcard epo_lightning/solvers/gauss_newton/kernel/*.?pp)
+KERNEL_FOLDER := epo_lightning/solvers/gauss_newton/kernel
+KERNEL := $(wildcard $(KERNEL_FOLDER)/*.?pp)
 SOURCES := pyproject.toml constraints.txt $(KERNEL)
 
 define virtual_environment
@@ -37,15 +38,17 @@ $(PYTHON) -m venv $(VENV)
 $(if $(TORCH_INDEX),$(BIN)/pip install -q --no-compile --index-url $(TORCH_INDEX) -c constraints.txt torch)
 endef
 
+# The compiled layer is built beside the download of the packages; the installation waits for it, or builds it if this failed.
+kernel = $(PYTHON) $(KERNEL_FOLDER)/build.py > /dev/null 2>&1 &
 # --no-compile: Python compiles the modules that are used, when they are used, instead of twelve thousand at once.
 $(INSTALLED): $(SOURCES)
 	$(call virtual_environment,a minute or two and the download)
-	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[local]'
+	$(kernel) $(BIN)/pip install -q --no-compile -c constraints.txt -e '.[local]'
 	touch $@
 
 $(TESTABLE): $(SOURCES)
 	$(call virtual_environment,with everything that tests need: a few minutes and the download)
-	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[dev,docs]'
+	$(kernel) $(BIN)/pip install -q --no-compile -c constraints.txt -e '.[dev,docs]'
 	touch $(INSTALLED) $(DOCUMENTABLE) $@
 
 $(DOCUMENTABLE): $(INSTALLED)
@@ -61,7 +64,7 @@ run: $(INSTALLED)
 	@echo "V-LSTM forecasts each agent by itself, +SC all agents together, +EPO as solutions of a game that it infers: both joint rows must be"
 	@echo "far below V-LSTM, and +EPO below +SC (minSADE, minSFDE in metres; smaller is better). These three rows are trained with a remedy"
 	@echo "against modes that are never taught. The two rows below them have the paper's plain loss: with so little training it is a coin toss"
-	@echo "whether all modes learn, hence the remedy (docs/results.md). This was a tenth of the data and six epochs; the paper's settings take a day:"
+	@echo "whether all modes learn, hence the remedy (docs/results.md). This was a tenth of the data and eight epochs; the paper's settings take a day:"
 	@echo "  $(EPO) generate && $(EPO) sweep rpi_main && $(EPO) report rpi_main"
 
 test: $(TESTABLE)
@@ -75,7 +78,6 @@ smoke: $(TESTABLE)
 
 # The kernel under AddressSanitizer and UndefinedBehaviorSanitizer, in a library of its own, built by Clang. One test limits the
 # address space, of which the sanitizers reserve terabytes.
-KERNEL_FOLDER := epo_lightning/solvers/gauss_newton/kernel
 asan: $(TESTABLE)
 	$(BIN)/python -m epo_lightning.solvers.gauss_newton.kernel.build --sanitize
 	EPO_KERNEL=$(CURDIR)/$(KERNEL_FOLDER)/epo_kernel.sanitized.so.1 \

@@ -19,6 +19,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -89,6 +91,19 @@ def _run(commands: list[list[str]]) -> None:
             raise OSError(f"{shlex.join(command)} ended with {process.returncode}\n{words[-2000:]}")
 
 
+@contextmanager
+def _alone(target: Path) -> Iterator[None]:
+    """Context in which no other process builds the same library: the second of two waits, and finds it up to date."""
+    try:
+        import fcntl
+    except ImportError:  # Windows: both build
+        yield
+        return
+    with target.with_suffix(".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def build(target: Path = LIBRARY) -> None:
     """Compile and link, unless the library is up to date.
 
@@ -98,13 +113,18 @@ def build(target: Path = LIBRARY) -> None:
     Raises:
         OSError: there is no compiler, or it fails; the message holds its output.
     """
+    with _alone(target):
+        if target != SANITIZED:
+            try:
+                load(target)
+                return
+            except OSError:
+                pass  # missing or stale: it is replaced once the new one has been built
+        _build(target)
+
+
+def _build(target: Path) -> None:
     sanitized = target == SANITIZED
-    if not sanitized:
-        try:
-            load(target)
-            return
-        except OSError:
-            pass  # missing or stale: it is replaced once the new one has been built
     compiler = [_found("clang++")] if sanitized else _compiler()
     x86 = platform.machine().lower() in ("x86_64", "amd64") and not sanitized
     # A sanitized library runs where it was built: one level of instructions, the machine's own.
