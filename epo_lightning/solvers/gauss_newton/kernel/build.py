@@ -93,15 +93,21 @@ def _run(commands: list[list[str]]) -> None:
 
 @contextmanager
 def _alone(target: Path) -> Iterator[None]:
-    """Context in which no other process builds the same library: the second of two waits, and finds it up to date."""
+    """Context in which no other process builds the same library: the second of two waits, and finds it up to date.
+
+    The folder itself is locked, so that no file is left. On Windows there is no lock.
+    """
     try:
         import fcntl
-    except ImportError:  # Windows: both build
+    except ImportError:
         yield
         return
-    with target.with_suffix(".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    folder = os.open(target.parent, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
         yield
+    finally:
+        os.close(folder)
 
 
 def build(target: Path = LIBRARY) -> None:
