@@ -306,6 +306,7 @@ def _config(arguments: Arguments) -> None:
 
 
 def _single(arguments: Arguments) -> None:
+    """Compose the configuration of a verb and run the verb (:data:`.experiment.verbs.RUN`)."""
     resumed = [word for word in arguments.overrides if word.startswith("resume=")]
     if arguments.verb == "train" and resumed:
         _resume(resumed[-1].partition("=")[2], [word for word in arguments.overrides if word not in resumed])
@@ -330,7 +331,7 @@ def _resume(folder: str, others: Sequence[str]) -> None:
     from epo_lightning.experiment import verbs
     from epo_lightning.run_folder import RunFolder
 
-    verbs.resume(RunFolder.open(folder))
+    verbs.resume_and_print(RunFolder.open(folder))
 
 
 def _multirun(arguments: Arguments) -> None:
@@ -404,7 +405,7 @@ def job_of_sweep(config: DictConfig) -> float | None:
         from epo_lightning.experiment.sweeps.sweep import Sweep
 
         return Sweep(Path(values["sweep"])).work(values, overrides)
-    return verbs.train(values, overrides)
+    return verbs.train_and_print(values, overrides)
 
 
 if __name__ == "__main__":

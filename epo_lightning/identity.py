@@ -32,7 +32,7 @@ ELSEWHERE = (
 
 
 SHARES = ("trainer.limit_train_batches", "trainer.limit_val_batches")
-"""Keys for which 1 and 1.0 differ: a whole number is a number of batches, a number with a point a share of all batches."""
+"""Keys for which 1 and 1.0 differ: 1 is a number of batches, and 1.0 is a share of all batches."""
 
 
 def essence(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def identity(config: Mapping[str, Any], data_digest: str) -> str:
 
 
 def row_identity(config: Mapping[str, Any], data_digest: str) -> str:
-    """Identity of a row of a table: the identity of its runs computed without the seed, and so the same for all of them."""
+    """Identity of a row of a table: that of its runs, but without the seed, and therefore the same for all of them."""
     return identity({**config, "seed": None}, data_digest)
 
 

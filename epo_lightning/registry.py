@@ -5,9 +5,9 @@ A part is registered where it is written::
     @register("backbone", "v_lstm")
     class VLSTM(nn.Module): ...
 
-and built from a mapping whose ``name`` selects the part and whose other keys are the arguments of its constructor. Other
-packages add parts through the entry-point group ``epo_lightning.parts``: an entry point names a module, and importing that
-module registers its parts.
+It is built from a mapping (a section of the configuration): ``name`` selects the part, and the other keys are the
+arguments of its constructor. Other packages add parts through the entry-point group ``epo_lightning.parts``: an entry
+point names a module, and importing that module registers its parts.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ _HOMES = {
     "optimizer": "optimizers",
     "solver": "solvers",
 }
-"""Module or folder of this package that holds the parts of each kind. A new file in the folder is found by itself."""
+"""Module or folder of this package that holds the parts of each kind. New files in a folder are found automatically."""
 
 
 @cache
 def _load(kind: str) -> None:
-    """Import all modules that may register parts of a kind; called when a part of the kind is looked up first."""
+    """Import all modules that may register parts of a kind; called before the first look-up of a part of this kind."""
     if kind in _HOMES:
         home = import_module(f"epo_lightning.{_HOMES[kind]}")
         for module in pkgutil.walk_packages(getattr(home, "__path__", []), f"{home.__name__}."):

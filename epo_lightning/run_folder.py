@@ -15,7 +15,7 @@
         progress.json          step and machine of the training; exists only while it runs
         .lock                  locked as long as a process works on the run; the system releases it when the process dies
 
-Files are replaced as a whole, so a reader never sees an incomplete one, whenever the writing process is killed.
+Files are replaced as a whole, so a reader never sees an incomplete one, even if the writing process is killed.
 ``metrics.json`` holds no time, path or version, so that two equal runs give the same bytes.
 """
 
@@ -42,7 +42,7 @@ TRAINING, FINISHED, FAILED = "training", "finished", "failed"
 State = Literal["waiting", "running", "interrupted", "failed", "finished"]
 """State of a run. Waiting: it has not begun. Interrupted: it has begun, no process works on it, and no error is recorded."""
 SILENCE = 600.0
-"""Seconds without a sign of life after which a run on another machine, whose locks may not be seen here, is interrupted."""
+"""Seconds without new progress after which a run on another machine, whose lock may be invisible here, is interrupted."""
 
 
 LOCK = ".lock"
@@ -84,7 +84,7 @@ def errors_naming(path: Path) -> Iterator[None]:
 
 
 def write_file(path: Path, content: str | bytes | memoryview) -> None:
-    """Write ``path`` as a whole or not at all; text in UTF-8.
+    """Write ``path`` completely or not at all; text in UTF-8.
 
     Raises:
         OSError: the folder is read-only or the disk is full; it names ``path``.
@@ -184,7 +184,7 @@ class RunFolder:
 
     @property
     def exists(self) -> bool:
-        """Whether anything was written here; a config.yaml alone, left by a kill before the run began, does not count."""
+        """Whether anything was written here; a config.yaml alone does not count: a run that was killed at once leaves it."""
         if not self.path.is_dir():
             return self.path.exists()
         entries = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}

@@ -230,7 +230,7 @@ class Scene(_Batch):
 
 
 def _check_tensor(name: str, value: Any, numbers: str, shape: tuple[str | int, ...], sizes: dict[str, int]) -> None:
-    """Compare one field of a scene with its declared type and shape; sizes of dimensions are added to ``sizes`` by letter.
+    """Compare a field of a scene with its declared type and shape, and store the size of each dimension letter in ``sizes``.
 
     Raises:
         TypeError: not a tensor.
@@ -364,9 +364,9 @@ class Equilibrium(_Batch):
 
     Attributes:
         initial, energy: E at the strategies from which the solver started, and at the forecast.
-        optimum: E at the local minimum that a tightly converged descent from the forecast reaches; never above ``energy``.
-            NaN where the descent of the energy, or of one agent's objective, ended while it was still falling: energies
-            that are networks need not have a minimum.
+        optimum: E at the local minimum that a descent from the forecast reaches; never above ``energy``. NaN if the
+            energy, or one agent's objective, was still falling when its descent ended: energies that are networks may
+            have no minimum.
         gradient_norm: Euclidean norm of dE/du at the forecast; NaN where strategies are chosen among candidates.
         nash_gap: decrease of J_i when agent i alone changes to a local best response; zero for absent agents, NaN where
             ``optimum`` is NaN.
@@ -458,5 +458,6 @@ def log_probabilities(probabilities: Tensor, logits: Tensor | None, dim: int) ->
     logs = probabilities.clamp_min(least).log()
     if logits is None:
         return logs
-    # Both are exact for probabilities that are not tiny, but differ in the last digit: results of earlier versions repeat.
+    # For probabilities that are not tiny, both formulas are correct but differ in the last digit. The first one is used
+    # there, so that the results of earlier versions are reproduced exactly.
     return torch.where(probabilities > math.sqrt(least), logs, logits.log_softmax(dim))

@@ -86,7 +86,7 @@ def describe(hint: Any) -> str:
 
 
 def check_part(kind: str, values: Any, supplied: Sequence[str] = ()) -> None:
-    """Check the section of a part against its constructor: keys by :func:`registry.check`, types by its annotations.
+    """Check the section of a part: its keys (:func:`registry.check`), and its values against the constructor's annotations.
 
     Raises:
         ConfigError: as :func:`registry.check`, or a value of another type.

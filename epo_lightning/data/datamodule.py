@@ -36,8 +36,8 @@ class SceneDataset(Protocol):
 class Subset:
     """A random share of the scenes of a data set, in their original order (``data.share``).
 
-    The draw does not depend on the run's seed, so that every run of a table sees the same scenes. (The named subsets of
-    ``Scene.subset``, for which metrics are reported, are something else.)
+    The draw does not depend on the run's seed, so that every run of a table sees the same scenes. (``Scene.subset`` is not
+    related: it numbers the named subsets for which metrics are reported.)
 
     Args:
         whole: the data set.
@@ -68,10 +68,10 @@ class Subset:
 class BatchSampler(DistributedSampler):
     """Index tensors of the batches of an epoch.
 
-    Lightning calls ``set_epoch`` of a loader's sampler before each epoch, with the epoch that a checkpoint restored; the
-    order follows from the seed and that number. In distributed training, rank r of n takes the indices r, r + n, r + 2n,
-    ... of every batch, so that all ranks together see the batch that one process would see. The only purpose of the base
-    class DistributedSampler is that Lightning does not replace this sampler by its own.
+    Lightning calls ``set_epoch`` of a loader's sampler before each epoch; after a checkpoint was restored, the number
+    continues from there. The order follows from the seed and this number. In distributed training, rank r of n takes the
+    indices r, r + n, r + 2n, ... of every batch, so that all ranks together see the batch that one process would see.
+    The only purpose of the base class DistributedSampler is that Lightning does not replace this sampler by its own.
 
     Args:
         dataset: the data set, whose ``set_epoch`` is called as well.
@@ -91,8 +91,8 @@ class BatchSampler(DistributedSampler):
             self.scenes.set_epoch(epoch)
 
     def __iter__(self) -> Iterator[Tensor]:
-        # A generator function draws the order with the first batch: Lightning creates the iterator of a resumed run
-        # before it sets the epoch.
+        # Because this is a generator function, the order is drawn when the first batch is requested. Lightning creates the
+        # iterator of a resumed run before it calls `set_epoch`.
         count = len(self.scenes)
         if self.shuffle:
             order = torch.randperm(count, generator=epoch_generator(self.seed, self.epoch))
@@ -101,10 +101,10 @@ class BatchSampler(DistributedSampler):
         together = torch.distributed.is_available() and torch.distributed.is_initialized()
         rank, world = (torch.distributed.get_rank(), torch.distributed.get_world_size()) if together else (0, 1)
         if self.shuffle:
-            check_share(self.batch_size, world)
-        shares = (batch[rank::world] for batch in order.split(self.batch_size)[: len(self)])
+            check_divisible(self.batch_size, world)
+        of_rank = (batch[rank::world] for batch in order.split(self.batch_size)[: len(self)])
         # The last batch may have fewer scenes than there are ranks; some ranks then have none.
-        yield from (share for share in shares if len(share))
+        yield from (indices for indices in of_rank if len(indices))
 
     def __len__(self) -> int:
         """Batches of the epoch, the same on every rank."""
@@ -112,7 +112,7 @@ class BatchSampler(DistributedSampler):
         return count // self.batch_size if self.shuffle else -(-count // self.batch_size)
 
 
-def check_share(batch_size: int, world: int) -> None:
+def check_divisible(batch_size: int, world: int) -> None:
     """Check that all ranks have the same number of scenes, so that the mean over ranks is the mean over scenes.
 
     Raises:
@@ -120,13 +120,13 @@ def check_share(batch_size: int, world: int) -> None:
     """
     if batch_size % world:
         raise ConfigError(
-            f"data.batch_size is {batch_size}, which trainer.devices={world} do not divide evenly: it is the number of "
-            "scenes of a step on all devices together"
+            f"data.batch_size is {batch_size}, which trainer.devices={world} do not divide evenly: batch_size is the number "
+            "of scenes of a step on all devices together"
         )
 
 
 def epoch_generator(seed: int, epoch: int) -> torch.Generator:
-    """Random generator of one epoch. NumPy mixes seed and epoch into one number, because torch uses only 32 bits of it."""
+    """Random generator of one epoch. NumPy mixes seed and epoch into one number of 32 bits; torch uses no more bits."""
     return torch.Generator().manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
 
 

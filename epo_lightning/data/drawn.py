@@ -34,20 +34,20 @@ HEADWAY = 25.0
 
 
 @dataclass(frozen=True)
-class Kind:
-    """A kind of random scenes (RPI, highway, pedestrians): the sizes of its task, and the function that draws its tables.
+class Preset:
+    """Sizes of one sort of random scenes (RPI, highway, pedestrians), and the function that draws their tables.
 
     Attributes:
         agents: default number of agents.
         history: number H of observed steps.
         task: sizes and units, those of the real data.
-        tables: function from (scenes, agents, kind, generator) to the columns of records of this task.
+        tables: function from (scenes, agents, preset, generator) to the columns of records of this task.
     """
 
     agents: int
     history: int
     task: Task
-    tables: Callable[[int, int, Kind, torch.Generator], dict[str, Tensor]]
+    tables: Callable[[int, int, Preset, torch.Generator], dict[str, Tensor]]
 
     @property
     def time(self) -> Tensor:
@@ -70,26 +70,26 @@ def _curves(start: Tensor, heading: Tensor, speed: Tensor, turn: Tensor, time: T
     return torch.stack((x, y, angle, speed[..., None].expand_as(angle)), -1)
 
 
-def _walkers(scenes: int, agents: int, kind: Kind, draw: torch.Generator, apart: float) -> Tensor:
+def _walkers(scenes: int, agents: int, preset: Preset, draw: torch.Generator, apart: float) -> Tensor:
     """States [scenes, agents, H + K, 4] of agents that all pass a common point at a distance of about ``apart`` [m]."""
     speed = _between(0.7, 1.5, scenes, agents, draw=draw)
     heading = _between(-torch.pi, torch.pi, scenes, agents, draw=draw)
     turn = _between(-0.1, 0.1, scenes, agents, draw=draw)
-    half = 0.5 * kind.task.horizon * kind.task.dt
+    half = 0.5 * preset.task.horizon * preset.task.dt
     way = torch.stack((heading.cos(), heading.sin()), -1)
     start = _between(-apart, apart, scenes, agents, 2, draw=draw) - half * speed[..., None] * way
-    return _curves(start, heading, speed, turn, kind.time)
+    return _curves(start, heading, speed, turn, preset.time)
 
 
-def _rpi(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
+def _rpi(scenes: int, agents: int, preset: Preset, draw: torch.Generator) -> dict[str, Tensor]:
     """Records with two modes each: both agents meet, and continue with different turn rates in each mode."""
-    states = _walkers(scenes, agents, kind, draw, apart=0.5)
-    history, now = states[:, :, : kind.history], states[:, :, kind.history - 1]
+    states = _walkers(scenes, agents, preset, draw, apart=0.5)
+    history, now = states[:, :, : preset.history], states[:, :, preset.history - 1]
     turn = _between(-0.1, 0.1, scenes, 2, agents, draw=draw)
     start, heading, speed = (
         now[:, None, :, part].expand(-1, 2, *[-1] * dims) for part, dims in ((slice(2), 2), (2, 1), (3, 1))
     )
-    futures = _curves(start, heading, speed, turn, kind.time[kind.history :])
+    futures = _curves(start, heading, speed, turn, preset.time[preset.history :])
     return {
         "history": history.float(),
         "goals": futures[:, 0, :, -1, :2].float(),
@@ -98,11 +98,11 @@ def _rpi(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[st
     }
 
 
-def _recorded(states: Tensor, present: Tensor, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
+def _recorded(states: Tensor, present: Tensor, preset: Preset, draw: torch.Generator) -> dict[str, Tensor]:
     """The columns of scene tables without a map; every agent of every scene has its own row."""
     scenes, agents = present.shape
     rows = states.flatten(0, 1).float()
-    history, future = rows[:, : kind.history], rows[:, kind.history :]
+    history, future = rows[:, : preset.history], rows[:, preset.history :]
     member = torch.arange(scenes * agents, dtype=torch.int32).view(scenes, agents)
     return {
         "history": history,
@@ -121,21 +121,21 @@ def _recorded(states: Tensor, present: Tensor, kind: Kind, draw: torch.Generator
     }
 
 
-def _pedestrians(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
+def _pedestrians(scenes: int, agents: int, preset: Preset, draw: torch.Generator) -> dict[str, Tensor]:
     """Columns of scenes with at least two pedestrians each."""
-    states = _walkers(scenes, agents, kind, draw, apart=3.0)
+    states = _walkers(scenes, agents, preset, draw, apart=3.0)
     count = torch.randint(min(2, agents), agents + 1, (scenes, 1), generator=draw)
     rows = scenes * agents
     return {
-        **_recorded(states, torch.arange(agents) < count, kind, draw),
+        **_recorded(states, torch.arange(agents) < count, preset, draw),
         "size": torch.full((rows, 2), 0.5),
         "kind": torch.full((rows,), KINDS.index("pedestrian")),
     }
 
 
-def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dict[str, Tensor]:
+def _highway(scenes: int, agents: int, preset: Preset, draw: torch.Generator) -> dict[str, Tensor]:
     """Columns of scenes on a straight road, with vehicles one behind the other; about a third of them change lane."""
-    rows, time = scenes * agents, kind.time
+    rows, time = scenes * agents, preset.time
     order = torch.rand(scenes, agents, dtype=torch.float64, generator=draw).argsort(1)
     lane, place = order % LANES, order // LANES
     along = HEADWAY * (place - 0.5 * ((agents - 1) // LANES)) + _between(-5.0, 5.0, scenes, agents, draw=draw)
@@ -155,8 +155,8 @@ def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dic
     sideways = side[..., None] * 0.5 * torch.pi / length * (torch.pi * share).sin()
     states = torch.stack((x, y, torch.atan2(sideways, forwards), torch.hypot(forwards, sideways)), -1)
 
-    now, pace = states[:, :, kind.history - 1].flatten(0, 1), speed.flatten()
-    until = kind.task.horizon * kind.task.dt
+    now, pace = states[:, :, preset.history - 1].flatten(0, 1), speed.flatten()
+    until = preset.task.horizon * preset.task.dt
     far = pace * until + 0.5 * ACCELERATING * until**2
     near = pace * until - 0.5 * BRAKING * until**2
     middle = LANE_WIDTH * (lane.flatten()[:, None] + torch.arange(1, -2, -1))  # left, own, right
@@ -174,7 +174,7 @@ def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dic
     points = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * torch.linspace(0.0, 1.0, VECTORS + 1)
     truck = torch.rand(rows, generator=draw) < 0.2
     return {
-        **_recorded(states, torch.ones(scenes, agents, dtype=torch.bool), kind, draw),
+        **_recorded(states, torch.ones(scenes, agents, dtype=torch.bool), preset, draw),
         "size": torch.where(truck[:, None], torch.tensor([12.0, 2.5]), torch.tensor([4.6, 1.9])),
         "kind": torch.where(truck, KINDS.index("truck"), KINDS.index("car")),
         "candidates": lines(near, far, PER_LINE).flatten(1, 2),
@@ -185,17 +185,17 @@ def _highway(scenes: int, agents: int, kind: Kind, draw: torch.Generator) -> dic
     }
 
 
-LIKE: Mapping[str, Kind] = {
-    "rpi": Kind(RPIData.num_agents, 19, RPIData.task, _rpi),
-    "highway": Kind(
+LIKE: Mapping[str, Preset] = {
+    "rpi": Preset(RPIData.num_agents, 19, RPIData.task, _rpi),
+    "highway": Preset(
         WindowConfig.agents,
         WindowConfig.history,
         Task(WindowConfig.horizon, WindowConfig.dt, shape="box", candidates=LINES * PER_LINE, map=True, scale=20.0),
         _highway,
     ),
-    "pedestrians": Kind(4, 8, Task(12, 0.4, candidates=0, scale=5.0), _pedestrians),
+    "pedestrians": Preset(4, 8, Task(12, 0.4, candidates=0, scale=5.0), _pedestrians),
 }
-"""Kinds of random scenes by the name in ``data.like``."""
+"""The sorts of random scenes, by the name in ``data.like``."""
 
 
 @register("data", "drawn")
@@ -217,13 +217,13 @@ class DrawnData(SceneDataModule):
         super().__init__(batch_size, seed)
         if like not in LIKE:
             raise ConfigError(f"unknown data.like {like!r}: {nearest(str(like), LIKE)}")
-        self.like, self.kind = like, LIKE[like]
+        self.like, self.preset = like, LIKE[like]
         if agents is not None and not 1 <= agents <= MOST_AGENTS:
             raise ConfigError(f"data.agents must be between 1 and {MOST_AGENTS}, or null for the task's, not {agents}")
         if scenes < 1:
             raise ConfigError(f"data.scenes must be 1 or more, not {scenes}")
-        self.num_agents, self.scenes = self.kind.agents if agents is None else agents, scenes
-        self.task = self.kind.task
+        self.num_agents, self.scenes = self.preset.agents if agents is None else agents, scenes
+        self.task = self.preset.task
 
     @property
     def digest(self) -> str:
@@ -246,7 +246,7 @@ class DrawnData(SceneDataModule):
         draw = torch.Generator().manual_seed(len(SPLITS) * self.seed + SPLITS.index(split))
         if self.like == "rpi":
             # Every record becomes two scenes, one per mode.
-            tables = self.kind.tables(-(-self.scenes // 2), self.num_agents, self.kind, draw)
+            tables = self.preset.tables(-(-self.scenes // 2), self.num_agents, self.preset, draw)
             return RPIDataset(tables, seed=self.seed)
-        tables = self.kind.tables(self.scenes, self.num_agents, self.kind, draw)
+        tables = self.preset.tables(self.scenes, self.num_agents, self.preset, draw)
         return RecordedScenes(tables, self.task.dt, "aligned", [split])

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 
 class _Sum(torch.autograd.Function):
-    """Differentiable sum of a tensor over all processes, whose losses are summed as well."""
+    """Sum of a tensor over all processes. Its derivative assumes that the losses of all processes are summed as well."""
 
     @staticmethod
     def forward(ctx: Any, tensor: Tensor) -> Tensor:
@@ -57,8 +57,9 @@ class _MaskedBatchNorm(nn.BatchNorm1d):
         count = values.new_full((1,), len(values))
         own = values.sum(0) / count.clamp_min(1)
         parts = torch.cat([count, own, (values - own).square().sum(0)])
-        # One exchange: every process fills its own row of a table and adds zeros to the others. Means and squares around
-        # them are combined afterwards, because a difference of large sums would lose digits.
+        # One exchange: every process fills its own row of a table, and the sum over processes is the whole table. Each
+        # row has the process's mean and its squared deviations from that mean. Sums and sums of squares would be simpler
+        # to combine, but their difference would lose digits.
         table = _Sum.apply(torch.stack([parts if r == rank else torch.zeros_like(parts) for r in range(world)]))
         counts, means, squares = table.split([1, values.shape[1], values.shape[1]], 1)
         total = counts.sum().clamp_min(1)
@@ -94,8 +95,9 @@ class MLP(nn.Module):
         self.norms = nn.ModuleList(normalisation(size) for size in sizes[1:])
         self.output = nn.Linear(sizes[-1], outputs, bias=bias)
         if norm == "batch":
-            # Batch normalisation cancels these biases, so their gradients are rounding errors. Adam would make full-size
-            # steps of them, with an effect in evaluation, because the running means follow the biases with a delay.
+            # Batch normalisation cancels these biases, so their gradients are only rounding errors, which Adam would
+            # scale to steps of normal size. In evaluation such steps have an effect, because the running means follow
+            # with a delay.
             for linear in hidden:
                 linear.bias.requires_grad_(False)
 

@@ -24,8 +24,8 @@ class OwnWeights(nn.Module):
         width: size of the agent features.
         modes: number M of joint modes.
         features: names of the own features; without any there is no network.
-        start: weights at a network output of zero, one number for all features or numbers by name (others: 1). The weight is
-            start * (1 + output), because features have different units and magnitudes, and so have their weights.
+        start: weights at a network output of zero: one number for all features, or numbers by name (1 for names that are
+            missing). The weight is start * (1 + output): features differ in unit and magnitude, and so do their weights.
     """
 
     start: Tensor

@@ -21,7 +21,7 @@ from lightning.pytorch.strategies import Strategy
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from epo_lightning import registry
-from epo_lightning.data.datamodule import check_share
+from epo_lightning.data.datamodule import check_divisible
 from epo_lightning.experiment import debugging
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings
@@ -68,7 +68,7 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
         mlflow.check(settings.logger.mlflow)
     data = build_data(settings.data)
     data.order_seed = settings.seed
-    check_share(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)
+    check_divisible(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)
     forecaster = build_model(settings, data)
     check_monitor(settings.callbacks.monitor, data.task)
     return data, forecaster
@@ -77,7 +77,8 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
 def check_monitor(monitor: str, task: Task) -> None:
     """Refuse to monitor a score that no forecaster logs.
 
-    A score that only this forecaster does not log is refused after the first validation (:mod:`.callbacks`).
+    A known score that this particular forecaster does not log is refused later, after the first validation
+    (:mod:`.callbacks`).
 
     Raises:
         ConfigError: an unknown name, with the nearest known one.
@@ -232,8 +233,9 @@ def naming(settings: TrainerSettings, run: RunFolder) -> Iterator[None]:
 def signals() -> Iterator[None]:
     """Context in which an interrupted training ends with an error: Ctrl-C as KeyboardInterrupt, SIGTERM as exit status 143.
 
-    Lightning's Trainer ends silently after Ctrl-C, and after SIGTERM with the exit status of success. It checks for a
-    SIGTERM only between two batches; here one that arrives before the first or during the last batch counts as well.
+    Without it, Lightning's Trainer ends silently after Ctrl-C, and ends with the exit status of success after SIGTERM.
+    Lightning notices a SIGTERM only between two batches; this context also notices one before the first batch and one during
+    the last batch.
     """
     main = threading.current_thread() is threading.main_thread()
     told = False
@@ -241,7 +243,8 @@ def signals() -> Iterator[None]:
     def end(*_: object) -> None:
         nonlocal told
         told = True
-        if signal.getsignal(signal.SIGTERM) is end:  # otherwise Lightning's handler is installed and calls this one
+        # If another handler is installed, it is Lightning's: it has called this one, and Lightning ends the training.
+        if signal.getsignal(signal.SIGTERM) is end:
             raise SIGTERMException(128 + signal.SIGTERM)
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)} if main else {}

@@ -52,7 +52,7 @@ class RandomStates(Callback):
         self._restored = state_dict
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restore the states. The checkpoint was written at the end of an epoch; this epoch's order is not drawn yet."""
+        """Restore the states. They were stored at the end of an epoch, and this epoch has not drawn any number yet."""
         if self._restored is None:
             return
         states, self._restored = self._restored, None

@@ -20,6 +20,6 @@ class WholeCheckpoints(TorchCheckpointIO):
     """Checkpoint writer that writes a temporary file in the same folder and renames it."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
-        content = io.BytesIO()  # writing to the disk itself, torch would not report a full disk as an OSError
+        content = io.BytesIO()  # if torch wrote to the disk, a full disk would not be reported as an OSError
         torch.save(checkpoint, content)
         write_file(Path(path), content.getbuffer())

@@ -22,8 +22,8 @@ from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import read
 
 
-def followed(devices: int, run: RunFolder) -> bool:
-    """Train as a follower if Slurm started this process as one; returns whether it did.
+def trained_as_follower(devices: int, run: RunFolder) -> bool:
+    """Train as a follower if Slurm started this process as a follower; returns whether this is the case.
 
     Raises:
         ConfigError: see :func:`here` and :func:`follow`.

@@ -51,7 +51,7 @@ def scores(run: RunFolder, monitor: str) -> dict[str, float]:
 
 @contextmanager
 def open_logs(settings: Settings, config: Mapping[str, Any], run: RunFolder, step: int = 0) -> Iterator[list[Logger]]:
-    """Context with the loggers of a run, the CSV file first. At its end they are closed; after an exception, as failed.
+    """Context with the loggers of a run, the CSV file first. They are closed at its end; after an exception, they report it.
 
     If several processes train one run together, only the first one has loggers.
 

@@ -40,7 +40,8 @@ class Diverged(ConfigError):
 def folder_for(settings: Settings) -> RunFolder:
     """The run's folder, ``<runs>/<experiment>/<budget>-s<seed>``; ``run_dir`` replaces it.
 
-    A run with other settings than its experiment and budget have gets ``-<variant>`` at the end, a hash of its settings.
+    If the settings differ from those of the experiment and the budget, the name ends with ``-<variant>``, a hash of the
+    settings.
     """
     if settings.run_dir:
         return RunFolder(Path(settings.run_dir).expanduser())
@@ -66,7 +67,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
     seed_everything(settings.seed, workers=True, verbose=False)
     data, forecaster = assembly.build(settings)
     run = begun or folder_for(settings)
-    if settings.trainer.devices > 1 and follower.followed(settings.trainer.devices, run):
+    if settings.trainer.devices > 1 and follower.trained_as_follower(settings.trainer.devices, run):
         return run
     if begun is None:
         refuse_occupied(settings, run)
@@ -95,8 +96,8 @@ def resume(run: RunFolder) -> None:
     """Continue a run that was stopped, with its own configuration, from its last finished epoch.
 
     Raises:
-        ConfigError: the run is finished, its checkpoint or data is not the one that it began with, or another process works
-            on it.
+        ConfigError: the run is finished, its data has changed, its checkpoint is damaged or belongs to another
+            architecture, or another process works on the run.
     """
     config = run.config()
     if run.finished and distributed.here(read(Settings, config).trainer.devices).leads:
@@ -192,7 +193,7 @@ def refuse_other(run: RunFolder, config: dict[str, Any], data_digest: str) -> No
 
 
 def _keep_unlearned(trainer: Trainer, model: LightningModule, data: Any, run: RunFolder) -> None:
-    """Validate a forecaster once that has nothing to learn (no parameters, or zero steps), and write its checkpoints."""
+    """Validate once and write the checkpoints, for a forecaster with nothing to learn (no parameters, or zero steps)."""
     trainer.validate(model, data, verbose=False)
     run.checkpoints.mkdir(parents=True, exist_ok=True)
     trainer.save_checkpoint(run.checkpoint("last"))

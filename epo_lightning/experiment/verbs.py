@@ -1,4 +1,7 @@
-"""Verbs of the command line, and the lines that they print at their end."""
+"""Verbs of the command line: each function reads the settings, calls the module that does the work, and prints the outcome.
+
+``train_and_print`` calls :func:`.train.train`, ``evaluate_and_print`` calls :func:`.evaluate.evaluate`, and so on.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,7 @@ def check(verb: str, config: dict[str, Any]) -> Any:
     return settings
 
 
-def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
+def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Make the data set unless it exists, and print its report."""
     settings = check("generate", config)
     from epo_lightning.experiment import assembly
@@ -58,22 +61,23 @@ def generate(config: dict[str, Any], overrides: Sequence[str]) -> None:
     print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
 
 
-def train(config: dict[str, Any], overrides: Sequence[str]) -> float | None:
-    """Train a run, and print its best score and its folder. Returns the best score."""
-    from epo_lightning.experiment import train as training
+def train_and_print(config: dict[str, Any], overrides: Sequence[str]) -> float | None:
+    """Train a run, and print its best score and its folder; returns the best score."""
+    from epo_lightning.experiment import train
 
-    return _trained(training.train(config, overrides))
-
-
-def resume(run: RunFolder) -> float | None:
-    """Continue a run, and print its best score and its folder. Returns the best score."""
-    from epo_lightning.experiment import train as training
-
-    training.resume(run)
-    return _trained(run)
+    return _print_trained(train.train(config, overrides))
 
 
-def _trained(run: RunFolder) -> float | None:
+def resume_and_print(run: RunFolder) -> float | None:
+    """Continue a run, and print its best score and its folder; returns the best score."""
+    from epo_lightning.experiment import train
+
+    train.resume(run)
+    return _print_trained(run)
+
+
+def _print_trained(run: RunFolder) -> float | None:
+    """Print a run's parameters, best score and folder, and the next command; returns the best score."""
     record = run.record
     best = next(iter(record.get("best", {}).items()), None)
     score = f", best {best[0]} {best[1]:.4f}" if best and best[1] is not None else ""
@@ -84,12 +88,12 @@ def _trained(run: RunFolder) -> float | None:
     return best[1] if best else None
 
 
-def evaluate(config: dict[str, Any], overrides: Sequence[str]) -> None:
+def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Score runs, and print the headline metrics."""
     settings = check("evaluate", config)
-    from epo_lightning.experiment.evaluate import evaluate as score
+    from epo_lightning.experiment.evaluate import evaluate
 
-    for run, file, metrics in score(config):
+    for run, file, metrics in evaluate(config):
         shown = ", ".join(f"{name} {metrics[name]:.4f}" for name in HEADLINE if name in metrics)
         print(f"{run.path} ({settings.split}): {shown}")
         if file != run.metrics_file(settings.split):
@@ -100,21 +104,21 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str]) -> None:
         print(f"next: epo report runs={settings.runs or settings.run} out=report")
 
 
-def predict(config: dict[str, Any], overrides: Sequence[str]) -> None:
+def predict_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Write forecasts and figures, and print their paths."""
     settings = check("predict", config)
-    from epo_lightning.experiment.predict import predict as forecast
+    from epo_lightning.experiment.predict import predict
 
-    written = forecast(settings)
+    written = predict(settings)
     print("\n".join(f"wrote {path}" for path in written))
 
 
-def report(config: dict[str, Any], overrides: Sequence[str]) -> None:
+def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Write tables and figures of all evaluated runs below a folder, and print the path of the page."""
     settings = check("report", config)
-    from epo_lightning.experiment.report import report as write
+    from epo_lightning.experiment.report import report
 
-    print(f"wrote {write(settings) / 'index.html'}")
+    print(f"wrote {report(settings) / 'index.html'}")
 
 
 def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
@@ -157,9 +161,9 @@ def _number(value: Any) -> str:
 
 
 RUN: dict[str, Callable[[dict[str, Any], Sequence[str]], Any]] = {
-    "generate": generate,
-    "train": train,
-    "evaluate": evaluate,
-    "predict": predict,
-    "report": report,
+    "generate": generate_and_print,
+    "train": train_and_print,
+    "evaluate": evaluate_and_print,
+    "predict": predict_and_print,
+    "report": report_and_print,
 }

@@ -25,10 +25,10 @@ SUPPLIED: Mapping[str, tuple[str, ...]] = {
     "optimizer": (),
     "forecaster": ("task", "optimizer", "backbone", "dynamics", "energy", "solver", "backward", "objective"),
 }
-"""Constructor arguments, by kind of part, that :func:`build_forecaster` supplies and a configuration must not set. A
-constructor gets those that are in its signature. The kinds are in the order in which parts are built."""
+"""Arguments that :func:`build_forecaster` supplies to the constructors of each kind of part; a configuration must not set
+them. A constructor gets only those that are in its signature. The kinds are in the order in which parts are built."""
 GOALS = ("energy", "all")
-"""Choices of who gets a given goal: ``energy``, the energy alone (the paper), or ``all``, the network's input as well."""
+"""Uses of a given goal: ``energy``, in the energy only (the paper); ``all``, also as an input of the network."""
 
 
 def check_model(model: Mapping[str, Any]) -> None:
@@ -48,8 +48,8 @@ def check_model(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"unknown goal {model['goal']!r}: {nearest(str(model['goal']), GOALS)}")
     if model["goal"] == "all" and model.get("candidates", 1) > 1:
         raise ConfigError(
-            f"goal is 'all', but this data gives no goal as an input of the network, only {model['candidates']} candidates "
-            "for each agent: use goal=energy, with which the forecaster chooses among the candidates"
+            f"goal is 'all', which needs one given goal per agent as an input of the network, but this data has "
+            f"{model['candidates']} candidates per agent: use goal=energy, and the forecaster chooses among the candidates"
         )
     for kind, supplied in SUPPLIED.items():
         check(kind, model[kind], supplied)
@@ -70,7 +70,8 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
     task = Task.from_config(model)
     named = inspect.signature(lookup("forecaster", model["forecaster"]["name"])).parameters
     parts: dict[str, Any] = {"task": task}
-    # Parts that the forecaster does not take are not built: drawing their initial weights would change those of the others.
+    # Parts that the forecaster does not take are not built: drawing their initial weights would use random numbers, and the
+    # initial weights of the other parts would change.
     if "backbone" in named:
         parts["backbone"] = build(
             "backbone", model["backbone"], goal_input=model["goal"] == "all", map_input=task.map, scale=task.scale

@@ -29,7 +29,7 @@ KINDS = ("energy", "solver", "backward", "objective")
 
 @dataclass(frozen=True)
 class Combination:
-    """One part of each of the four kinds. Classes may stand for parts, because the declarations are class attributes.
+    """One part of each of the four kinds: instances, or only their classes, because declarations are class attributes.
 
     Attributes:
         names: registered names of the parts, by kind; for messages.
@@ -79,7 +79,8 @@ class Combination:
         for kind in KINDS:
             for name, part in parts(kind).items():
                 if name != self.names[kind]:
-                    # Derivatives have defaults for all settings, and the needs of some depend on a setting.
+                    # What a derivative needs may depend on its settings, so an instance is required; all settings have
+                    # defaults.
                     changed = part() if kind == "backward" else part
                     word = f"an energy named {name}" if kind == "energy" else f"{kind}={name}"
                     yield word, replace(self, **{kind: changed}, names={**self.names, kind: name})

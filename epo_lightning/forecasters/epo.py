@@ -35,22 +35,22 @@ from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.task import Task
 
 INITIAL = ("decoded", "zero", "motions")
-"""Sources of the initial strategies, which are the candidates for solvers that choose among candidates: decoded by the
-network, controls of zero (the paper's ablation "no init"), or a mixture of motions of the unicycle."""
+"""Sources of the initial strategies: decoded by the network, controls of zero (the paper's ablation "no init"), or a mixture
+of motions of the unicycle. For solvers that choose among candidates, these strategies are the candidates."""
 
 EXAMINED = 512
-"""Number of evenly spread test scenes in which the Nash gap is measured, for energies where this is slow.
+"""Number of test scenes, spread evenly, in which the Nash gap is measured if this is slow.
 
-It is slow for energies that are not made of named features, unless the solution has tables of candidates."""
+It is fast for energies of named features and for solutions with tables of candidates; then it is measured in all scenes."""
 
 
 @register("forecaster", "epo")
 class EPO(Forecaster):
     """Forecaster whose network infers a game (weights, goals, initial strategies), and whose solver minimises its energy.
 
-    Goals: if the data has several goal candidates and the energy a term for goals or lanes, an agent's goal in mode m is its
-    m-th most likely candidate, and it follows the reference line of that candidate. A single candidate is a given goal, the
-    same in all modes.
+    Goals: a single candidate is a given goal, the same in all modes. If there are several candidates, and the energy has a
+    term for goals or lanes, an agent's goal in mode m is its m-th most likely candidate, and the agent follows the reference
+    line of that candidate.
 
     Modes: most minimisers solve one game per mode. A minimiser that chooses among candidate strategies solves one game, and
     its M best joint choices are the modes.
@@ -62,9 +62,9 @@ class EPO(Forecaster):
         backward: the derivative of the solution.
         objective: the training objective.
         modes: number M of joint modes.
-        own_start: own weights before training (at a network output of zero); the output is scaled by the same numbers. One
-            number for all features, or numbers by feature name; features that are not named have 1. On highways ``vel``,
-            which pulls speeds towards zero, has to start small.
+        own_start: own weights before training; the weight is own_start * (1 + network output). One number for all features,
+            or numbers by feature name; features that are not named have 1. On highways ``vel``, which pulls speeds towards
+            zero, has to start small.
         pair_start: pair weight at a network output of zero.
         symmetric_pairs: whether pair weights are the same in both orders of two agents, so that forecasts do not depend on
             the order of agents.
@@ -221,7 +221,8 @@ class EPO(Forecaster):
         if TABLES in self.solver.provides:
             return None
         starts = parameters.initial_controls
-        # Without a gradient if a gradient reaches the initial strategies through the solution (backward=unrolled).
+        # With backward=unrolled, a gradient reaches the initial strategies through the solution. Their states, which the
+        # loss term `initial` uses otherwise, then need no gradient.
         starts = starts.detach() if self.differentiate.teaches_start else starts
         return self.energy.dynamics.rollout(self.energy.initial(scene), starts, scene.dt)
 

@@ -2,9 +2,9 @@
 
     E(u; o) = sum_i E_i(u_i; o) + sum_{i<j} E_ij(u_i, u_j; o)
 
-Agent i's own objective is J_i = E_i + sum_j E_ij. Pair terms are symmetric, so dE/du_i = dJ_i/du_i: no agent can improve
-its objective by changing its strategy alone if and only if no such change lowers the energy (Theorem 1). All methods of the
-paper's Table 1 use an energy through these terms only.
+Agent i's own objective is J_i = E_i + sum_j E_ij. Pair terms are symmetric, so a change of u_i alone changes J_i and E
+by the same amount: a minimum of E is a Nash equilibrium (Theorem 1). All methods of the paper's Table 1 use an energy
+through these terms only.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from epo_lightning.registry import ConfigError, nearest, parts
 from epo_lightning.scene import GameParameters, Scene
 
 GRADIENT, RESIDUALS, FEATURES = "gradient", "residuals", "features"
-"""Optional properties of an energy: a useful gradient with respect to the controls; residuals, the energy being half the sum
-of their squares; named features, whose Jacobians have a structure that the fast solver uses."""
+"""Optional properties of an energy. GRADIENT: its gradient by the controls is useful. RESIDUALS: it is half the sum of
+squares of residuals. FEATURES: its residuals are named features, whose Jacobians have a structure that the fast solver
+uses."""
 
 _TABLE_ENTRIES = 2_000_000
 """Largest number of (pair of candidates, step) entries that are evaluated together, which bounds the memory."""
@@ -94,8 +95,8 @@ class Energy(ABC):
     ) -> dict[str, Float[Tensor, "B C N"]]:
         """Values of the own terms E_i by name, zero for absent agents.
 
-        ``states`` and ``controls`` hold C strategies of every agent. ``parameters`` hold C games, one for each of them, or
-        one game for all of them.
+        ``states`` and ``controls`` hold C strategies of every agent. ``parameters`` hold C games, one for each strategy, or
+        one game for all strategies.
         """
 
     @abstractmethod

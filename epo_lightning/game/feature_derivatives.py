@@ -35,7 +35,7 @@ class Derivatives(NamedTuple):
 
 
 def differentiate(function: Callable[..., Tensor], value: Tensor, *others: Tensor, second: bool = False) -> Derivatives:
-    """Value and first derivative of an elementwise function by its first argument; with ``second``, the second one as well.
+    """Value and first derivative of an elementwise function by its first argument; with ``second``, also the second one.
 
     The derivatives can be differentiated again by autograd.
     """
@@ -135,9 +135,9 @@ def add_linear_force(
     node: Float[Tensor, "*batch 2 K"],
     dt: float,
 ) -> None:
-    """Backpropagate a gradient by a linear signal (``force``) to the controls, or to speed and heading (``node``), in place.
+    """Backpropagate the gradient by a linear signal (``force``); the adjoint of :func:`linear_signal`.
 
-    This is the adjoint of :func:`linear_signal`.
+    Adds to the gradient by the controls (``control``) or, for speeds, to that by speed and heading (``node``), in place.
     """
     match feature.source:
         case Source.CONTROL:
@@ -168,9 +168,9 @@ def signal_and_change(
         states, controls: the trajectories.
         moved, directions: the changes of states and controls.
         around: the other inputs of the signal.
-        slide: for lines, whether the derivative takes into account that the nearest point of the line moves along with the
-            agent (the exact derivative). Otherwise the point is held fixed, as the solver does: the line then also resists
-            motion along it, so steps are shorter, but the solution is the same.
+        slide: only for lines: whether the nearest point of the line moves when the agent moves, which gives the exact
+            derivative. If False, the point is held fixed, as in the solver. Motion along the line then seems to have a
+            cost, so the solver's steps are shorter, but they lead to the same solution.
     """
     match feature.source:
         case Source.CONTROL | Source.RATE | Source.SPEED:
@@ -201,7 +201,7 @@ def signal_and_change(
 def nearest_point(
     position: Float[Tensor, "*batch K 2"], line: Float[Tensor, "*#batch Q 2"]
 ) -> tuple[Float[Tensor, "*batch K 2"], Float[Tensor, "*batch K 2"]]:
-    """The nearest point of a polyline, and the unit tangent of its segment; zero if the point is an end of a segment.
+    """The nearest point of a polyline, and the unit tangent there; the tangent is zero if the point is an end of a segment.
 
     Differentiable with respect to the position; the choice of the segment is held constant (the first one on a tie).
     """
@@ -268,12 +268,12 @@ def speed_before(states: Float[Tensor, "*batch K 4"], initial: Float[Tensor, "*#
 def undeclared_change(
     function: Callable[..., Tensor], at: tuple[Tensor, Tensor], directions: tuple[Tensor, Tensor], *others: Tensor
 ) -> tuple[Float[Tensor, "*batch R"], Float[Tensor, "D *batch R"]]:
-    """Value of a function, and its change along D directions (their first dimension), by forward-mode differentiation.
+    """Value of a function, and its change along D directions, by forward-mode automatic differentiation.
 
     Args:
         function: function of two tensors that vary and of ``others``, which are constant.
         at: values of the two tensors.
-        directions: D directions of both tensors.
+        directions: D directions of both tensors, stacked in a new first dimension.
         others: further arguments, held constant.
     """
     value = function(*at, *others)
@@ -295,7 +295,8 @@ def undeclared_change_by_agent(
         moved: changes [D, .., L, 4] of both.
         sizes: lengths and widths of both, for features that need them.
     """
-    if feature.stepwise:  # eight derivatives per step, by the states of both, instead of D changes of each agent
+    # A residual of one step has only eight derivatives: by the 4 + 4 numbers of both states. The changes follow from these.
+    if feature.stepwise:
         unit = torch.eye(8, dtype=both[0].dtype, device=both[0].device)
         unit = unit.view(8, *[1] * (both[0].dim() - 1), 8).expand(-1, *both[0].shape[:-1], -1)
         value, by_state = undeclared_change(feature.function, both, (unit[..., :4], unit[..., 4:]), *sizes)

@@ -35,7 +35,7 @@ class FeatureEnergy(Energy):
     """The potential of Eqs. 10 and 11, E = 1/2 sum_i |w_i c(u_i, g_i)|^2 + 1/2 sum_{i<j} |w_ij d(u_i, u_j)|^2.
 
     Every named feature has a weight of its own: a residual is w c, so weights enter the energy squared and their sign has
-    no effect. Because the pair terms are symmetric, a minimiser of E is an open-loop Nash equilibrium in which agent i
+    no effect. Because the pair terms are symmetric, a minimum of E is an open-loop Nash equilibrium in which agent i
     minimises its own terms plus the pair terms it takes part in (Theorem 1).
 
     A pair with a weight of exactly zero does not interact: solvers skip it, and because weights enter squared, its weight
@@ -138,8 +138,8 @@ class FeatureEnergy(Energy):
             ValueError: shapes or names of scene, parameters and controls that do not fit together.
         """
         self.validate(scene, parameters, controls)
-        still = controls.new_zeros(0, *controls.shape)
-        return {name: residual for name, residual, _ in self._features(scene, parameters, controls, still)}
+        no_direction = controls.new_zeros(0, *controls.shape)
+        return {name: residual for name, residual, _ in self._features(scene, parameters, controls, no_direction)}
 
     def linearisation(
         self,
@@ -161,16 +161,22 @@ class FeatureEnergy(Energy):
         """Name, weighted residual and its change along every direction, feature by feature."""
         controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
         states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
-        moved = self.dynamics.tangent(states, directions, scene.dt)
-        yield from self._of_agents(scene, parameters, (states, controls), (moved, directions))
+        change = self.dynamics.tangent(states, directions, scene.dt)
+        yield from self._of_agents(scene, parameters, (states, controls), (change, directions))
         first, second = pairs(controls.shape[2], controls.device)
-        both, apart = (states[:, :, first], states[:, :, second]), (moved[:, :, :, first], moved[:, :, :, second])
-        yield from self._of_pairs(scene, parameters, both, apart)
+        both = states[:, :, first], states[:, :, second]
+        yield from self._of_pairs(scene, parameters, both, (change[:, :, :, first], change[:, :, :, second]))
 
     def _of_agents(
         self, scene: Scene, parameters: GameParameters, at: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]
     ) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Weighted own features of states and controls, and their change along changes of both."""
+        """Name, weighted residual and its change of every own feature.
+
+        Args:
+            scene, parameters: the game.
+            at: states and controls.
+            moved: their changes along D directions, in the first dimension.
+        """
         around = self.surroundings(scene, parameters)
         for name in self.own:
             yield name, *self.own_residual(name, scene, parameters, around, at, moved)
@@ -191,7 +197,7 @@ class FeatureEnergy(Energy):
             name: the feature.
             scene, parameters, around: the game.
             at: states and controls.
-            moved: changes of both.
+            moved: their changes along D directions, in the first dimension.
             slide: see :func:`~epo_lightning.game.feature_derivatives.signal_and_change`.
         """
         feature = self.own_features[name]
@@ -208,16 +214,22 @@ class FeatureEnergy(Energy):
         return weight * value, weight * change
 
     def _of_pairs(
-        self, scene: Scene, parameters: GameParameters, both: tuple[Tensor, Tensor], apart: tuple[Tensor, Tensor]
+        self, scene: Scene, parameters: GameParameters, both: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]
     ) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Weighted pair features of the states of both agents, and their change along changes of both."""
+        """Name, weighted residual and its change of every pair feature.
+
+        Args:
+            scene, parameters: the game.
+            both: states of the first and of the second agents.
+            moved: their changes along D directions, in the first dimension.
+        """
         if not self.pair:
             return
         agents = scene.agent_mask.shape[1]
         first, second = pairs(agents, scene.agent_mask.device)
-        both, apart = ((self.at_pair_steps(one), self.at_pair_steps(other)) for one, other in (both, apart))
+        both, moved = ((self.at_pair_steps(one), self.at_pair_steps(other)) for one, other in (both, moved))
         distance, normal = separation(both[0][..., :2], both[1][..., :2])
-        closing = (normal * (apart[0] - apart[1])[..., :2]).sum(-1)
+        closing = (normal * (moved[0] - moved[1])[..., :2]).sum(-1)
         for name, pair in self.pair_features.items():
             if pair.declared:
                 value, slope, _ = pair_derivatives(pair, distance, self.reach(scene)[:, None, :, None])
@@ -225,7 +237,7 @@ class FeatureEnergy(Energy):
                 change = slope * closing
             else:
                 sizes = [self.size(scene)[:, None, members, None] for members in (first, second) if pair.needs]
-                value, change = undeclared_change(pair.function, both, apart, *sizes)
+                value, change = undeclared_change(pair.function, both, moved, *sizes)
             exists = pair_mask(scene)[:, None, :, None]
             weight = self.pair_weight(scene, parameters, name)[..., None]
             yield name, weight * torch.where(exists, value, 0.0), weight * torch.where(exists, change, 0.0)
@@ -238,8 +250,8 @@ class FeatureEnergy(Energy):
         controls: Float[Tensor, "B C N K 2"],
     ) -> dict[str, Float[Tensor, "B C N"]]:
         """1/2 |w c|^2 by own feature."""
-        still = states.new_zeros(0, *states.shape), controls.new_zeros(0, *controls.shape)
-        features = self._of_agents(scene, parameters, (states, controls), still)
+        no_direction = states.new_zeros(0, *states.shape), controls.new_zeros(0, *controls.shape)
+        features = self._of_agents(scene, parameters, (states, controls), no_direction)
         return {name: 0.5 * residual.square().sum(-1) for name, residual, _ in features}
 
     def pair_terms(
@@ -250,8 +262,8 @@ class FeatureEnergy(Energy):
         second: Float[Tensor, "B C P K 4"],
     ) -> dict[str, Float[Tensor, "B C P"]]:
         """1/2 |w d|^2 by pair feature."""
-        still = first.new_zeros(0, *first.shape)
-        features = self._of_pairs(scene, parameters, (first, second), (still, still))
+        no_direction = first.new_zeros(0, *first.shape)
+        features = self._of_pairs(scene, parameters, (first, second), (no_direction, no_direction))
         return {name: 0.5 * residual.square().sum(-1) for name, residual, _ in features}
 
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
@@ -314,8 +326,8 @@ class FeatureEnergy(Energy):
     def finite(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
         """Mask of the games whose inputs are finite.
 
-        Only inputs are checked whose NaN or infinity might not show in the solution: weights of pairs that never touch,
-        positions of agents that no feature refers to, and points of reference lines other than the nearest.
+        It checks only inputs whose NaN or infinity may have no effect on the solution: weights of pairs that never touch,
+        positions of agents that no feature uses, and points of reference lines that are never the nearest.
         """
         present = scene.agent_mask
         finite = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)
@@ -363,7 +375,7 @@ class FeatureEnergy(Energy):
         return index, scene.reference_mask[index] & present
 
     def own_weight(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B M N"]:
-        """Weights of an own feature, zero for absent agents and where the line to follow does not exist."""
+        """Weights of an own feature: zero for absent agents, and for features of lines, where the line does not exist."""
         active = scene.agent_mask[:, None]
         if self.own_features[name].needs == "reference":
             _, active = self._followed(scene, parameters)

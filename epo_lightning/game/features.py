@@ -108,7 +108,7 @@ class PairFeature:
         function: elementwise function of distance and reach; for the source TRAJECTORY, function of the states of both
             agents, and of their sizes if it needs them.
         needs: ``size`` for a function of states that takes the agents' sizes too.
-        stepwise: whether a function of states has one residual per step, which reads the states at that step alone.
+        stepwise: whether a function of states returns one residual per step that depends only on the states at that step.
         extent: function from an agent's size to the radius [m] around its position within which it can affect others; None
             if there is no limit.
     """
@@ -126,7 +126,7 @@ class PairFeature:
 
     @cached_property
     def asymmetry(self) -> tuple[float, float] | None:
-        """Costs of two agents in both orders if they differ (:mod:`~epo_lightning.game.symmetry`); None if they do not."""
+        """Costs of two trial agents in both orders (:mod:`~epo_lightning.game.symmetry`); None if the costs are equal."""
         if self.declared:
             return None
         return symmetry.difference(self.function, sizes=self.needs == "size")
@@ -191,8 +191,8 @@ def own_feature(
     Args:
         name: the feature's name in ``energy.own``.
         source: CONTROL, RATE or SPEED for an elementwise function of that one signal; TRAJECTORY for any differentiable
-            function of an agent's states [.., K, 4] and controls [.., K, 2], elementwise over all leading dimensions,
-            that returns residuals [.., R].
+            function from an agent's states [.., K, 4] and controls [.., K, 2] to residuals [.., R], independently for all
+            leading dimensions.
         channel: ``ACCELERATION`` or ``TURN_RATE``, for signals of controls.
 
     Raises:
@@ -215,9 +215,9 @@ def pair_feature(
     Args:
         name: the feature's name in ``energy.pair``.
         source: DISTANCE for an elementwise function of distance [.., K] and reach [.., 1], the sum of both radii;
-            TRAJECTORY for any differentiable function of the states [.., K, 4] of the first and of the second agent,
-            elementwise over all leading dimensions, that returns residuals [.., R]; energies refuse it if its sum of
-            squares changes when the two agents are swapped. Both see only the steps at which the energy evaluates pairs.
+            TRAJECTORY for any differentiable function from the states [.., K, 4] of the first and of the second agent to
+            residuals [.., R], independently for all leading dimensions. Energies refuse a function whose sum of squares
+            changes when the two agents are swapped. K counts only the steps at which the energy evaluates pairs.
         needs: ``size`` for a function of states that also takes the lengths and widths [.., 1, 2] of the first and of the
             second agent, zero for absent agents.
 

@@ -21,14 +21,14 @@ class Objective(ABC):
     """The interface of all objectives: weighted, named terms from a scene with its future and a forecast of it.
 
     Attributes:
-        terms: names of the weights lambda in the configuration.
+        term_names: names of the terms, which are also the names of the weights lambda in the configuration.
         through_solution: whether it needs the derivative of the minimiser's solution; otherwise it uses energies alone.
-        needs_from_solver: properties of a minimiser (:mod:`epo_lightning.solvers.base`), of which it must provide at least
-            one; empty if nothing is needed.
+        needs_from_solver: properties (:mod:`epo_lightning.solvers.base`) of which the minimiser must provide at least one;
+            empty if nothing is needed.
         needs_from_energy: properties that the energy must offer (:mod:`epo_lightning.game.energy`).
     """
 
-    terms: ClassVar[tuple[str, ...]]
+    term_names: ClassVar[tuple[str, ...]]
     through_solution: ClassVar[bool] = False
     needs_from_solver: ClassVar[frozenset[str]] = frozenset()
     needs_from_energy: ClassVar[frozenset[str]] = frozenset()

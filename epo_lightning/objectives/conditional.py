@@ -48,14 +48,14 @@ class Conditional(Objective):
         density: ``joint`` or ``marginal``.
     """
 
-    terms = ("density", "marginal", "regression", "goal")
+    term_names = ("density", "marginal", "regression", "goal")
     through_solution = True
     needs_from_solver = frozenset({TABLES})
 
     def __init__(self, weights: Mapping[str, float], density: str = "joint") -> None:
         if density not in DENSITIES:
             raise ConfigError(f"unknown objective.density {density!r}: {nearest(str(density), DENSITIES)}")
-        self.weights = checked_weights({"goal": GOAL, **weights}, self.terms)
+        self.weights = checked_weights({"goal": GOAL, **weights}, self.term_names)
         self.density = density
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:

@@ -46,12 +46,12 @@ class Contrastive(Objective):
             and of ``probability``, the cross entropy of the closest mode.
     """
 
-    terms = ("contrastive", "magnitude", "initial", "goal", "probability")
+    term_names = ("contrastive", "magnitude", "initial", "goal", "probability")
     needs_from_solver = frozenset({SAMPLES, STATIONARY, PATH})
     needs_from_energy = frozenset({GRADIENT})
 
     def __init__(self, weights: Mapping[str, float]) -> None:
-        self.weights = checked_weights(weights, self.terms)
+        self.weights = checked_weights(weights, self.term_names)
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
         future, mask = observed_future(scene)

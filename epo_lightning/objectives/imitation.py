@@ -26,7 +26,7 @@ class Imitation(Objective):
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
     """
 
-    terms = ("imitation", "goal", "probability", "initial")
+    term_names = ("imitation", "goal", "probability", "initial")
     through_solution = True
 
     def __init__(
@@ -38,7 +38,7 @@ class Imitation(Objective):
     ) -> None:
         if power < 1:
             raise ValueError(f"power must be 1 or more, not {power}")
-        self.weights = checked_weights(weights, self.terms)
+        self.weights = checked_weights(weights, self.term_names)
         self.power = power
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
 

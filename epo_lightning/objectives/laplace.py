@@ -57,14 +57,14 @@ class Laplace(Objective):
         damping: eps, which keeps H positive definite if some controls have no effect on any feature.
     """
 
-    terms = ("density", "initial", "goal")
+    term_names = ("density", "initial", "goal")
     needs_from_solver = frozenset({PATH, STATIONARY, SAMPLES})  # a game for every mode, and strategies to start from
     needs_from_energy = frozenset({RESIDUALS})
 
     def __init__(self, weights: Mapping[str, float], damping: float = 1e-3) -> None:
         if not 0 <= damping < float("inf"):
             raise ValueError(f"objective.damping must be 0 or more, and finite, not {damping}")
-        self.weights = checked_weights(weights, self.terms)
+        self.weights = checked_weights(weights, self.term_names)
         self.damping = damping
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:

@@ -3,10 +3,10 @@
 - ``unrolled`` (the paper's): through all S steps of the computation, also to the initial strategies.
 - ``truncated``: through the last few steps; the iterate at which they start is held constant.
 - ``implicit``: the derivative of the minimum that the steps approach (implicit function theorem), independent of the path.
-  It is correct only if the solution is a minimum, so use many steps; if more than half of the solutions of a batch are no
-  minima, a warning is given once. A sample whose Hessian is not positive definite is no minimum: its gradient is zero and
-  its status STOPPED. Scaling all weights of a game by the same factor does not move the minimum, so w . dL/dw = 0: the
-  overall scale of the weights is not learned and drifts. Fix one weight, or normalise the weights.
+  It is correct only if the solution is a minimum, so use many steps. A sample whose Hessian is not positive definite is
+  not a minimum: its gradient is zero and its status STOPPED. If most of the solutions of a batch are not minima, a warning
+  is given once. Scaling all weights of a game by the same factor does not move the minimum, so w . dL/dw = 0: the overall
+  scale of the weights is not learned and drifts. Fix one weight, or normalise the weights.
 - ``detached``: no derivative, for objectives that compare energies instead of solutions.
 """
 
@@ -35,7 +35,7 @@ class Backward(ABC):
     """The interface of derivatives: runs a minimiser and attaches a derivative to its solution.
 
     Attributes:
-        needs_from_solver: properties of a minimiser, of which it must provide at least one; empty if nothing is needed.
+        needs_from_solver: properties of which the minimiser must provide at least one; empty if nothing is needed.
         teaches: whether gradients flow through the solution.
         teaches_start: whether gradients flow to the initial strategies.
     """

@@ -36,7 +36,7 @@ def test_tasks_are_the_real_ones(like, tmp_path):
     pretended, genuine = DrawnData(like), real(like, tmp_path)
     assert (pretended.task, pretended.num_agents) == (genuine.task, genuine.num_agents)
     if like != "rpi":
-        assert pretended.kind.history == genuine.windows.history
+        assert pretended.preset.history == genuine.windows.history
 
 
 @pytest.mark.parametrize("like", ["rpi", "highway"])
@@ -57,7 +57,7 @@ def test_fields_shapes_and_types_are_the_real_ones(like, tmp_path):
 def test_drawn_scenes_have_plausible_values(like, agents):
     scene = drawn(like, agents=agents, scenes=64)
     assert len(scene.history) == 64
-    assert scene.history.shape[1] == (agents or DrawnData(like).kind.agents)
+    assert scene.history.shape[1] == (agents or DrawnData(like).preset.agents)
     assert scene.finite.all()
     assert scene.agent_mask.any(1).all()
     states = torch.cat((scene.history, scene.future), 2)[scene.agent_mask]

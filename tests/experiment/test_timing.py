@@ -142,10 +142,10 @@ def test_a_run_that_lacks_what_it_was_asked_for_is_not_ready_for_a_report(
         config = untrained.config() | {"score": asked}
         untrained.begin(config, untrained.record)
         untrained.update(status="finished")
-        verbs._trained(untrained)
+        verbs._print_trained(untrained)
         assert f"next: epo evaluate run={untrained.path}" in capsys.readouterr().out
         write_json(untrained.metrics_file(name), {})
-        verbs._trained(untrained)
+        verbs._print_trained(untrained)
         left = "report" if asked is None else "evaluate"
         assert f"next: epo {left} run" in capsys.readouterr().out
         untrained.metrics_file(name).unlink()

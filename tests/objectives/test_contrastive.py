@@ -271,4 +271,4 @@ def test_a_scene_without_a_future_is_refused():
 def test_the_configuration_file_states_the_defaults():
     given = yaml.safe_load(CONF.read_text())
     assert given.pop("name") == "contrastive"
-    assert tuple(Contrastive(**given).weights) == Contrastive.terms
+    assert tuple(Contrastive(**given).weights) == Contrastive.term_names

@@ -348,4 +348,4 @@ def test_the_configuration_states_the_default():
     assert given.pop("name") == "laplace"
     part = Laplace(**given)
     assert part.damping == Laplace(part.weights).damping
-    assert tuple(part.weights) == Laplace.terms
+    assert tuple(part.weights) == Laplace.term_names

@@ -73,7 +73,7 @@ class ObjectiveSuite:
     def test_terms_have_the_declared_names(self, objective, energy):
         assert objective.needs_from_solver <= {PATH, STEPS, STATIONARY, SAMPLES, TABLES}
         assert objective.needs_from_energy <= {GRADIENT, RESIDUALS, FEATURES}
-        assert set(objective.weights) == set(objective.terms)
+        assert set(objective.weights) == set(objective.term_names)
         terms = self.terms(objective, energy, *self.game(energy))
         for name, (weight, value) in terms.items():
             assert value.shape == ()

@@ -80,7 +80,8 @@ class RPIData(SceneDataModule):
     Args:
         root: folder of the cache; None for $EPO_CACHE or ``cache``.
         seed: seed of the games, and of the order of batches unless a run sets its own.
-        games: number of main games, each with its own w. A tenth, at least one, is for validation, and as many for test.
+        games: number of main games, each with its own w. A tenth of them (at least one) is for validation, and another
+            tenth for testing.
         placements: start positions of the pedestrian per main game.
         solver: ``potential`` (open-loop Nash equilibrium) or ``feedback`` (iterative LQ game).
         split: ``paper`` (unseen games) or ``hard`` (unseen w and directions).

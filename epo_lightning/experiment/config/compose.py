@@ -92,8 +92,9 @@ def compose(name: str, overrides: Sequence[str] = (), extra: Sequence[str] = ())
 def resolve(config: DictConfig) -> dict[str, Any]:
     """A configuration as plain Python values, with every interpolation replaced and without the section ``hydra``.
 
-    Adds ``experiment``, and ``variant``: empty if the settings that decide on the result are those of the experiment's file
-    and the budget's file, otherwise six digits of a hash of these settings without the seed.
+    Adds ``experiment`` and ``variant``. ``variant`` is empty if all settings that decide on the result have the values
+    of the experiment's file and the budget's file. Otherwise it is six digits of a hash of those settings, without the
+    seed.
 
     Raises:
         ConfigError: an interpolation of a key that does not exist, or a value that is still missing.
@@ -116,9 +117,9 @@ def resolve(config: DictConfig) -> dict[str, Any]:
 
 @cache
 def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> str | None:
-    """The essence (:func:`~epo_lightning.identity.essence`) of the options ``words`` alone, without a seed, as JSON text.
+    """The essence (:func:`~epo_lightning.identity.essence`) of a configuration with the overrides ``words`` only, as JSON.
 
-    None if they do not compose without further overrides.
+    The seed is left out. None if the configuration cannot be composed with these overrides alone.
     """
     from hydra.core.global_hydra import GlobalHydra
     from hydra.types import RunMode
@@ -127,7 +128,7 @@ def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> str | N
     try:
         config = loader.load_configuration("train", list(words), run_mode=RunMode.RUN)
         return canonical(essence({**_plain_values(config), "seed": None}))
-    except Exception:  # a mandatory value is given by the overrides of this run only
+    except Exception:  # a mandatory value is missing: only the other overrides of the run give it
         return None
 
 
@@ -182,7 +183,7 @@ def launch(
 ) -> Sequence[JobReturn]:
     """Hand these jobs to the launcher that the configuration chooses.
 
-    Unlike Hydra's sweeper it writes no multirun.yaml, which would hold the secrets of the command line.
+    Unlike Hydra's sweeper, this function writes no multirun.yaml, which would contain passwords of the command line.
 
     Returns:
         one entry per job, with its result or the exception that it raised.
@@ -287,7 +288,7 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
                 config_name=name, overrides=kept, run_mode=RunMode.RUN, with_log_configuration=False
             )
             break
-        except Exception:  # other overrides are wrong as well: without any of them, the tree still has the names
+        except Exception:  # other overrides are wrong as well: try again without any, which is enough to list the keys
             continue
     walked: list[str] = []
     for word in key.replace("/", ".").split("."):

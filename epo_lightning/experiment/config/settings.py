@@ -18,8 +18,8 @@ Measured = Literal["test", "val", "time"]
 """Measurements of a run: its scores on a split, or the time of a forecast."""
 PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective", "optimizer")
 MOST_PROCESSES = 1024
-"""Largest number of threads, devices or workers: a larger one is a typing error, which would otherwise end in a crash of
-the process without a clear message."""
+"""Largest number of threads, devices or workers. A larger number is a typing error, and would crash the process without a
+clear message."""
 PRECISIONS = ("32-true", "64-true")
 """Precisions that the solvers support, by Lightning's names."""
 

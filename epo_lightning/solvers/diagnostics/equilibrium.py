@@ -35,7 +35,7 @@ from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scen
 from epo_lightning.solvers.diagnostics import quasi_newton
 from epo_lightning.solvers.gauss_newton import structured
 from epo_lightning.solvers.gauss_newton.expansion import expand
-from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LEAST_DAMPING, MOST_DAMPING, Backend, backend
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LEAST_DAMPING, MOST_DAMPING, Backend, choose_backend
 
 _GAUSS_NEWTON, _NEWTON = 20, 60
 """Largest numbers of steps. Gauss-Newton steps are cheap; Newton steps converge where residuals stay large."""
@@ -146,7 +146,7 @@ def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent:
     if start.numel() == 0:
         return _nowhere(start)
     energy.validate(scene, game, start)
-    solve = backend("auto", energy, scene, game)
+    solve = choose_backend("auto", energy, scene, game)
     damping = start.new_full((len(start), 1), _START)
     here = solve(energy, scene, game, 0, 1.0, damping, False)
     controls, value = here.controls.clone(), here.energy.clone()

@@ -30,7 +30,7 @@ _ALIGNED = 16
 and the result of a sample must not depend on its position in a batch."""
 
 
-def bounds(steps: int, agents: int) -> list[tuple[int, int]]:
+def block_bounds(steps: int, agents: int) -> list[tuple[int, int]]:
     """First node (exclusive) and last node (inclusive) of every block; each has two nodes at least."""
     count = max(1, steps // max(2, _UNKNOWNS // (2 * agents)))
     edges = [steps * block // count for block in range(count + 1)]
@@ -43,7 +43,7 @@ class Block:
 
     Attributes:
         unknowns: number of unknowns; entries beyond them, up to n, are padding.
-        moves: derivative dt M of later positions by the nodes, component and agent by axis and agent.
+        moves: derivatives dt M of all later positions by the nodes; rows are (component, agent), columns are (axis, agent).
         factor: L.
         gain: G^T; None for the first block, because the state at t0 is given and not an unknown.
     """
@@ -119,7 +119,7 @@ def factorise(
     cost: Tensor | None = None
     # Undeclared features may couple any two steps, so that all nodes are one block.
     whole = model.blocks is not None or model.pair_blocks is not None
-    for start, end in reversed([(0, model.at.steps)] if whole else bounds(model.at.steps, group.size)):
+    for start, end in reversed([(0, model.at.steps)] if whole else block_bounds(model.at.steps, group.size)):
         block, cost, info = parts.eliminate(start, end, cost)
         blocks.insert(0, block)
         failed |= info != 0
@@ -166,7 +166,8 @@ class _Parts:
         width, count = 2 * self.size, end - start
         batch = len(self.moves)
         moves = self.moves[:, start:end]
-        # The state moves all positions of the block and after it; node l moves those after l.
+        # ahead[l]: sum of the stiffness of all positions after node start + l, which are those that this node moves. The
+        # state's displacement moves all positions from this block on.
         ahead = self.position.new_zeros(batch, count + 1, width, width)
         ahead[:, :-1] = self.position[:, start:end].flip(1).cumsum(1).flip(1)
         if cost is not None:
@@ -174,7 +175,7 @@ class _Parts:
         beta = self.model.at.beta
         later = ahead[:, 1:]
         if beta != 1.0:
-            # Position l also moves with 1 - beta of node l, which enters the diagonal twice.
+            # Node l also moves position l, by the share 1 - beta. On the diagonal this share should be squared; see below.
             later = later + (1.0 - beta) * self.position[:, start:end]
         by_axis = later.view(batch, count, 2, self.size, width)
         unknowns = count * width
@@ -236,7 +237,7 @@ class _Parts:
         first[:, 2:] -= control
         diagonal[:, 2:] += self.node[:, start:end]
         if self.rate.shape[2]:
-            # Of controls l and l + 1, for l = start - 1 .. end - 2: the first one of all has none before it.
+            # Rates between the controls l and l + 1, for l = start - 1 .. end - 2. At start = 0 there is no control before.
             low = max(start - 1, 0)
             rate, shift = self.rate[:, low : end - 1], low - (start - 1)
             diagonal[:, shift:-2] += rate
@@ -247,12 +248,12 @@ class _Parts:
             second[:, shift + 2 :] += rate
         bands = [band.view(batch, count + 2, width) for band in (diagonal, first, second)]
         for offset, band in enumerate(bands):
-            # Entry a of band o couples node a with node a - o; nodes 2 and after are the block's.
+            # Entry a of the band with this offset couples node a with node a - offset; the block begins with node 2.
             inner = band[:, 2 + offset :].flatten(1)
             if inner.shape[1]:
                 matrix.diagonal(-offset * width, 1, 2).add_(inner)
         if self.cross.shape[2]:
-            # The speed of a node with its heading (rows of headings, columns of speeds), and with the next heading.
+            # Stiffness between the speed of a node (column) and two headings (rows): of the same node, and of the next one.
             nodes = matrix.mT.unflatten(1, (count, 2, self.size)).unflatten(4, (count, 2, self.size))
             here, following = self.cross[:, start:end].unbind(2)
             heading_by_speed = nodes[:, :, 0, :, :, 1].diagonal(0, 2, 4).transpose(1, 2)  # [C, T, T, m]

@@ -1,11 +1,14 @@
-"""The compiled backend for CPUs: all steps in one call, their adjoint in another, one problem per vector lane.
+"""The compiled backend for CPUs: one call of the kernel takes all steps, another one computes their adjoint.
+
+A *problem* is the game of one scene and mode. Problems are solved side by side, one in each entry (lane) of a vector
+register.
 
 Every step is a linear-quadratic problem, which one backward and one forward recursion over time solve in O(K N^3); see
 `docs/solver.md` and `kernel/`. The library has a plain C interface: building it needs only a C++ compiler, and one build
 works with every version of Python and PyTorch.
 
-The library's threads end before a call returns, and Python handles signals only between calls. A thread therefore never
-writes to memory that was released after an interrupt; the interrupt takes effect when the call has ended.
+The library's threads end before a call returns, and Python handles signals only between calls. An interrupt therefore takes
+effect when the call has ended, and no thread can write to memory that was released because of the interrupt.
 """
 
 from __future__ import annotations
@@ -22,7 +25,15 @@ from torch.autograd.function import once_differentiable
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Solution
 from epo_lightning.solvers.gauss_newton.kernel import interface
-from epo_lightning.solvers.gauss_newton.kernel.interface import MOST_AGENTS, OWN, SIGNALS, Address, Game, Gradients, Run
+from epo_lightning.solvers.gauss_newton.kernel.interface import (
+    MOST_AGENTS,
+    OWN,
+    SIGNALS,
+    Address,
+    EpoGame,
+    EpoGradients,
+    EpoRun,
+)
 
 
 def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
@@ -47,7 +58,8 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
 def say_once(reason: str) -> None:
     """Warn once per reason that plain PyTorch replaces the kernel."""
     warnings.warn(
-        f"{reason}. Plain PyTorch does the same, at a tenth of the speed or less; solver.backend=pytorch silences this.",
+        f"{reason}. Plain PyTorch does the same, at a tenth of the speed or less; solver.backend=pytorch silences this "
+        "warning.",
         stacklevel=2,
     )
 
@@ -64,7 +76,7 @@ def solve(
     """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
 
     The solution is differentiable with respect to weights, goals and initial controls. Problems are shared out among
-    ``torch.get_num_threads()`` threads; results do not depend on their number. An interrupt waits for the call to end.
+    ``torch.get_num_threads()`` threads; results do not depend on the number of threads.
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates)
     if call.record:
@@ -135,7 +147,7 @@ class _Call:
             kept.append(tensor)
             return tensor
 
-        game = self.game = Game(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt)
+        game = self.game = EpoGame(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt)
         game.pair_stride = min(energy.pair_stride, horizon + 1)
         for index, name in enumerate(SIGNALS):
             if name in energy.bounds:
@@ -179,7 +191,7 @@ class _Call:
         self.damping = _as(controls.dtype, damping).contiguous()
         by_agent = damping.dim() == 3
         self.start = controls.detach().contiguous()
-        self.arguments = Run(
+        self.arguments = EpoRun(
             steps=self.steps,
             step_size=step_size,
             damping=self.damping.data_ptr(),
@@ -207,13 +219,16 @@ class _Call:
         _check(interface.library().epo_solve(self.doubles, self.game, self.arguments, threads, tape))
 
     def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor | None]:
-        """Gradients by the inputs for cotangents of the controls (overwritten by their gradient), iterates and states."""
+        """Gradients by ``inputs``, for cotangents of the final controls, of all iterates and of the states.
+
+        ``controls`` is overwritten: on return it holds the gradient by the initial controls.
+        """
         batch, modes, agents = self.controls.shape[:3]
         new = self.controls.new_zeros
         own = new((len(self.own), batch, modes, agents))
         pair = new((batch, modes, agents * (agents - 1) // 2)) if self.pair else None
         goals = new((batch, modes, agents, 2)) if self.goals else None
-        gradients = Gradients(controls=controls.data_ptr())
+        gradients = EpoGradients(controls=controls.data_ptr())
         if iterates is not None:
             gradients.iterates = iterates.data_ptr()
         if states is not None:
@@ -241,11 +256,12 @@ class _Unrolled(torch.autograd.Function):
     def forward(ctx: Any, call: _Call, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         call.run()
         ctx.call = call
-        # The kernel reads these tensors again in the backward pass: saved, a change in place raises an error.
+        # The kernel reads these tensors again in the backward pass. Because they are saved, autograd raises an error if
+        # one of them was changed in place.
         ctx.save_for_backward(*inputs, *call.kept)
         ctx.set_materialize_grads(False)
         iterates = [iterate.clone() for iterate in call.iterates] if call.keep_iterates else []
-        # A node that holds its own output is a reference cycle: its memory would wait for the garbage collector.
+        # The autograd node would hold its own output, a reference cycle, which only the garbage collector could free.
         states, call.states = call.states, None
         return call.iterates[-1].clone(), states, *iterates
 
@@ -269,7 +285,7 @@ class _Unrolled(torch.autograd.Function):
 
 
 def _as(dtype: torch.dtype, tensor: Tensor) -> Tensor:
-    # `to` takes a microsecond even where nothing is to be done, and there are twenty tensors.
+    # `to` takes a microsecond even if the type is right already, and there are twenty tensors.
     return tensor if tensor.dtype == dtype else tensor.to(dtype)
 
 

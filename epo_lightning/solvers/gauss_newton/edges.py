@@ -49,7 +49,10 @@ class Edges:
     def near(
         cls, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B M N K 4"]
     ) -> Edges:
-        """The pairs that may interact: both agents are present, a weight is not zero, and their bounding boxes overlap."""
+        """The pairs that may interact: both agents are present, a pair weight is not zero, and the agents come close.
+
+        They come close if the bounding boxes of their trajectories, widened by their extents, overlap.
+        """
         batch, modes, agents = states.shape[:3]
         weights = torch.stack([energy.pair_weight(scene, parameters, name) for name in energy.pair])
         matters = (weights != 0).any(0)

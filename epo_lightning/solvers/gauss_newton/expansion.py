@@ -51,7 +51,8 @@ def expand(
     Args:
         energy, scene, parameters, controls: the game and where to expand it.
         every_pair: whether all pairs are evaluated, or only those that may interact.
-        exact: whether the matrix is the Hessian, or its Gauss-Newton approximation without second derivatives of residuals.
+        exact: whether the matrix is the Hessian. Otherwise it is the Gauss-Newton approximation, which leaves out the second
+            derivatives of residuals.
     """
     at = Iterate.of(energy, scene, parameters, controls)
     sums = _Sums.zeros(at, exact)
@@ -114,8 +115,9 @@ class _Sums:
 
     Attributes:
         at, exact: as for :func:`expand`.
-        agent_value: energy by agent; that of a pair is added to the first agent of the sample.
-        control_force, node_force: gradients by controls and by nodes, without the part by positions.
+        agent_value: own energy of each agent. The energy of all pairs of a sample is added to the sample's first agent.
+        control_force, node_force: gradients by controls and by nodes, without the part that acts through positions
+            (``pull``).
         pull: gradient x, y and stiffness xx, xy, yy at positions.
         control, rate, node, cross, blocks, pair_position, pair_blocks: see :class:`QuadraticModel`.
     """
@@ -202,7 +204,7 @@ def _add_steering(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
         stiffness = [part + force * by for part, by in zip(stiffness, second, strict=True)]
     sums.control_force[:, :, TURN_RATE] += force * by_turn_rate
     sums.control[:, :, TURN_RATE] += stiffness[0]
-    # The initial speed is no unknown; the speed of node l acts together with the turn rate between nodes l and l + 1.
+    # The steering angle of a step depends on the speed at the node before the step. The initial speed is not an unknown.
     sums.node_force[:, :, 0, :-1] += (force * by_speed)[..., 1:]
     sums.node[:, :, 0, :-1] += stiffness[2][..., 1:]
     cross = stiffness[1][..., 1:] / at.dt

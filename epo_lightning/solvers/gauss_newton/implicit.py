@@ -60,6 +60,6 @@ class _Attach(torch.autograd.Function):
         factors, tensors = ctx.factors, ctx.saved_tensors
         definite = factors.status != Status.STOPPED
         adjoint = torch.where(definite[:, None, None, None], factors.solve(planar(cotangent)), 0.0)
-        _, by = ctx.game.pullback(factors.model, tensors, adjoint, torch.zeros_like(adjoint))
+        _, by = ctx.game.gradient_of_phi(factors.model, tensors, adjoint, torch.zeros_like(adjoint))
         by = [torch.where(definite.view(*g.shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
         return None, None, None, *by

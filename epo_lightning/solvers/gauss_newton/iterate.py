@@ -43,7 +43,7 @@ class Iterate:
         around: inputs of the own features besides the trajectory.
         u, x: controls and states, by sample.
         unit, left: unit vectors of the headings, and those to their left.
-        moves: M_l, the change of velocities with speed and heading: [S, N, component, xy, K].
+        moves: M_l, the derivatives of velocities (x, y) by the component speed and by the component heading.
     """
 
     energy: FeatureEnergy
@@ -123,21 +123,24 @@ class Iterate:
         return self.u[:, :, TURN_RATE], before, self.by_sample(self.around.wheelbase)
 
     def to_nodes(self, covector: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
-        """A gradient by the nodes, from one by the controls: u_l = (z_{l+1} - z_l) / dt."""
+        """The gradient by the nodes z that follows from a gradient by the controls, because u_l = (z_{l+1} - z_l) / dt."""
         return (covector - following(covector)) / self.dt
 
     def to_controls(self, change: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
-        """The change of the controls that makes a change of the nodes."""
+        """The change of the controls that causes a given change of the nodes."""
         return torch.diff(change, dim=-1, prepend=torch.zeros_like(change[..., :1])) / self.dt
 
     def to_positions(self, velocity: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
-        """The change of positions with a change of the velocities at the nodes."""
+        """The change of the positions that a change of the velocities at the nodes causes."""
         sums = velocity.cumsum(-1)
         before = torch.nn.functional.pad(sums[..., :-1], (1, 0))
         return self.dt * (before if self.beta == 1.0 else self.beta * before + (1.0 - self.beta) * sums)
 
     def to_velocities(self, force: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
-        """A gradient by the velocities at the nodes, from one by positions: the adjoint of :meth:`to_positions`."""
+        """The gradient by the velocities at the nodes that follows from a gradient by positions.
+
+        This is the adjoint of :meth:`to_positions`.
+        """
         sums = suffix_sums(force)
         if self.beta == 1.0:
             return self.dt * following(sums)

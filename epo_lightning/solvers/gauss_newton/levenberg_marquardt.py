@@ -28,7 +28,7 @@ from epo_lightning.solvers.general import descent
 Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool], Solution]
 """(energy, scene, parameters, steps, step size, damping [B, M] or [B, M, N], keep iterates) -> solution.
 
-An agent with infinite damping keeps its controls exactly, and the steps of the other agents take its trajectory as fixed."""
+An agent with infinite damping keeps its controls exactly; its trajectory is then a constant for the other agents."""
 
 LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e7
 """Range of the adaptive damping."""
@@ -54,8 +54,8 @@ class LevenbergMarquardt(Stepwise):
         step_size: alpha, 0 < alpha <= 1.
         damping: lambda >= 0, added to the diagonal of J^T J.
         keep_iterates: whether the solution carries u_0 .. u_S.
-        adaptive: whether the damping of every sample is adapted: a step that does not lower the energy is rejected and the
-            damping multiplied by 10 (up to 1e7); another step is accepted and the damping divided by 10 (down to 1e-7).
+        adaptive: whether the damping of every sample is adapted: a step that lowers the energy is accepted, and the damping
+            is divided by 10 (down to 1e-7); any other step is rejected, and the damping is multiplied by 10 (up to 1e7).
             These decisions have no gradient.
         test_steps: number of steps outside training; None for the same number.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it supports the game.
@@ -109,7 +109,7 @@ class LevenbergMarquardt(Stepwise):
         damping = start.new_full(start.shape[:2], self.damping) if memory is None else memory
         if start.numel() == 0:
             return descent.nothing(start), damping
-        solve = backend(self.backend, energy, scene, parameters)
+        solve = choose_backend(self.backend, energy, scene, parameters)
         if not self.adaptive:
             return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates), damping
         solution = solve(energy, scene, parameters, 0, self.step_size, damping, True)
@@ -124,11 +124,15 @@ class LevenbergMarquardt(Stepwise):
         return solution if self.keep_iterates else dataclasses.replace(solution, iterates=None), damping
 
 
-def backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Backend:
-    """The function that computes the steps of a game.
+def choose_backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Backend:
+    """The function that computes the steps of a game: ``solve`` of :mod:`.compiled` or of :mod:`.structured`.
+
+    Args:
+        name: the setting ``backend``.
+        energy, scene, parameters: the game.
 
     Raises:
-        ValueError: the chosen backend cannot solve this game.
+        ValueError: ``name`` is ``compiled``, and the kernel cannot solve this game.
     """
     if name == "pytorch":
         return structured.solve
@@ -154,7 +158,8 @@ def _chosen(better: Tensor, trial: Solution, before: Solution, keep_iterates: bo
         initial_energy=before.initial_energy,
         energy=torch.where(better, trial.energy, before.energy),
         gradient_norm=torch.where(better, trial.gradient_norm, before.gradient_norm),
-        # A step without a factor counts as rejected; a sample with a NaN or infinite energy takes no step at all.
+        # If the matrix of a step cannot be factorised, the step counts as rejected. A sample whose energy is NaN or
+        # infinite takes no step at all, because no comparison of energies accepts one.
         status=torch.where(before.energy.isfinite(), before.status.maximum(accepted), Status.STOPPED),
         iterates=(*before.iterates, controls) if keep_iterates else before.iterates,
     )

@@ -5,8 +5,8 @@ For constant changes mu (``adjoint``) and d (``step``) of the controls, the grad
     phi(u, p) = -<J mu, r + J d>
 
 by the controls u and by the weights and goals p. The quadratic model holds the first and second derivatives of every
-residual r = w c(z(u)). Forces (derivatives of phi) on controls, nodes and positions are summed over the features and
-backpropagated to the controls at the end, as for the gradient of an energy.
+residual r = w c(z(u)). The derivatives of phi by controls, nodes and positions (called *forces*) are summed over the
+features, and at the end they are backpropagated to the controls, as for the gradient of an energy.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ class _Forces:
 
     Attributes:
         controls, nodes: derivatives by controls and nodes.
-        positions: derivatives by positions, by their change along mu, and by their change along d.
+        positions: three derivatives, stacked in dimension 2: by the positions, by the change of positions along mu, and by
+            their change along d.
     """
 
     controls: Float[Tensor, "S N 2 K"]
@@ -101,7 +102,7 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
 
 
 def _forces_along_mu(model: QuadraticModel, changes: _Changes) -> _Forces:
-    """Minus the diagonal stiffness times mu, and no force on positions."""
+    """Initial values of the forces: minus the diagonal stiffness times mu for controls and nodes, zero for positions."""
     mu = changes.controls[0]
     control = -model.control * mu
     node = -model.node * changes.nodes[0]
@@ -112,7 +113,8 @@ def _forces_along_mu(model: QuadraticModel, changes: _Changes) -> _Forces:
     return _Forces(control, node, mu.new_zeros(samples, agents, 3, 2, steps))
 
 
-# Each of the following returns J mu and r + J d of one feature, both without its weight.
+# Each of the following four functions adds the forces of one feature, as far as the diagonal stiffness does not contain them
+# (:func:`_forces_along_mu`). It returns J mu (``along_mu``) and r + J d (``ahead``), both without the feature's weight.
 
 
 def _pull_signal(term: SignalTerm, changes: _Changes, forces: _Forces, dt: float) -> tuple[Tensor, Tensor]:
@@ -130,7 +132,6 @@ def _pull_signal(term: SignalTerm, changes: _Changes, forces: _Forces, dt: float
 def _pull_steering(
     model: QuadraticModel, term: SteeringTerm, changes: _Changes, forces: _Forces
 ) -> tuple[Tensor, Tensor]:
-    """Adds the forces beyond the diagonal stiffness."""
     square = term.weight.square()
     turned = changes.controls[:, :, :, TURN_RATE]
     faster = torch.nn.functional.pad(changes.nodes[:, :, :, 0, :-1], (1, 0))

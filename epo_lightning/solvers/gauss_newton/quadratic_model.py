@@ -48,7 +48,7 @@ class SteeringTerm:
 
 @dataclass(frozen=True)
 class LaneTerm:
-    """The offset from the nearest point of a line, and the unit tangent there, zero at the end of a segment."""
+    """The offset from the nearest point of a line, and the unit tangent there, which is zero at the ends of segments."""
 
     weight: Float[Tensor, "S N 1"]
     offset: Float[Tensor, "S N 2 K"]
@@ -81,7 +81,7 @@ class Separation:
     Attributes:
         distance: distance of the two agents.
         inverse: inverse of the distance, zero where both agents are at the same point.
-        normal: unit vector from the second to the first, zero likewise.
+        normal: unit vector from the second agent to the first, zero where both are at the same point.
     """
 
     distance: Float[Tensor, "E L"]
@@ -108,9 +108,11 @@ class QuadraticModel:
         at: the iterate.
         value: E(u), by sample.
         gradient: dE/du.
-        control, rate, node: diagonal stiffness of the controls, of their rates (zero at K - 1; None without features of
-            rates), and of the nodes.
-        cross: stiffness between a node's speed and the heading there, and at the next node; None for zero.
+        control, node: diagonal stiffness of the controls and of the nodes.
+        rate: diagonal stiffness of the controls' rates, zero at the last entry (there are K - 1 rates); None if no feature
+            uses a rate.
+        cross: stiffness between the speed of a node and two headings, that of the same node and that of the next; None if it
+            is zero.
         position: stiffness xx, xy and yy of the positions.
         blocks: dense stiffness of the nodes by undeclared own features; None without.
         edges: the pairs that were evaluated.

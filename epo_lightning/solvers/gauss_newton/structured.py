@@ -1,7 +1,7 @@
 """Damped Gauss-Newton steps in PyTorch, on any device: the quadratic model of all samples, factorised in blocks.
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Read this module in this order: :func:`solve` takes
-the steps, :class:`_Step` is one step with its adjoint, :func:`factorise` solves for d.
+the steps, :class:`_Step` is one step with its adjoint, :func:`factorise` prepares the solution for d.
 
 *Splitting.* Agents that are not connected by active pairs are independent. On a CPU every sample is split into the connected
 components of its active pairs, and components of the same size are factorised together. The solution of an agent then
@@ -10,11 +10,12 @@ alone. On a GPU, finding the components would make the host wait; there every sa
 synchronises.
 
 *Differentiation.* Autograd does not record the factorisation. For a cotangent v of u + alpha d, one more solve with the same
-factor gives mu = (J^T J + lambda I)^-1 alpha v, and every gradient is that of the scalar
+factor gives mu = (J^T J + lambda I)^-1 alpha v. With the scalar
 
     phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
 
-in closed form (:mod:`~epo_lightning.solvers.gauss_newton.pullback`), to which v itself is added for u.
+the gradient by the parameters p is dphi/dp, and that by the controls u is v + dphi/du. Both are computed in closed form
+(:mod:`~epo_lightning.solvers.gauss_newton.pullback`).
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from epo_lightning.solvers.gauss_newton.pullback import pullback
 from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
 RETRIES = 4
-"""Number of times that the damping of a sample without a Cholesky factor is raised tenfold."""
+"""Number of times that a failed Cholesky factorisation is repeated with more damping."""
 LEAST_RAISED_DAMPING = 1e-3
-"""Smallest damping from which raising starts."""
+"""Repetition k adds 10^k times the damping, but at least 10^k times this number."""
 _HOLDING = 1e30
 """Finite stand-in for infinite damping in the matrices, which avoids inf - inf."""
 
@@ -99,7 +100,7 @@ def solve(
 
 @dataclasses.dataclass(frozen=True)
 class Game:
-    """A game with the settings that are the same in every step."""
+    """A game, the step size and the damping: everything that stays the same from step to step."""
 
     energy: FeatureEnergy
     scene: Scene
@@ -133,10 +134,10 @@ class Game:
             goals=goals[0] if goals else self.parameters.goals,
         )
 
-    def pullback(
+    def gradient_of_phi(
         self, model: QuadraticModel, tensors: Sequence[Tensor], adjoint: Tensor, step: Tensor
     ) -> tuple[Tensor, list[Tensor]]:
-        """The gradient of phi by the controls and by the game's tensors."""
+        """The gradient of phi by the controls and by :meth:`tensors`, with the parts of declared and undeclared features."""
         shape = model.at.controls.shape
         found = pullback(model, adjoint, step)
         by_controls = found.controls.transpose(-1, -2).reshape(shape)
@@ -186,7 +187,7 @@ class _Step(torch.autograd.Function):
         shape = cotangent.shape
         adjoint = factors.solve(game.step_size * planar(cotangent))
         adjoint = torch.where(solved.flatten()[:, None, None, None], adjoint, 0.0)
-        by_controls, by = game.pullback(model, tensors, adjoint, planar(step))
+        by_controls, by = game.gradient_of_phi(model, tensors, adjoint, planar(step))
         by_controls = torch.where(solved[..., None, None, None], by_controls, 0.0)
         by = [torch.where(solved.view(*shape[:2], *[1] * (g.dim() - 2)), g, 0.0) for g in by]
         return None, cotangent + by_controls, *by
@@ -223,9 +224,9 @@ def factorise(
 ) -> Factorisation:
     """Factorise the matrices of all samples; if samples are split, the matrix of each component separately.
 
-    With ``retry``, a matrix that is not positive definite is tried again with ten, a hundred, ... times the damping; the
-    other matrices are not affected. If none of the attempts succeeds, the status is STOPPED, and solves with this matrix
-    have no meaning.
+    With ``retry``, the factorisation of a matrix that is not positive definite is repeated with more and more damping
+    (:data:`RETRIES`); the other matrices are not affected. If no attempt succeeds, the status is STOPPED, and the results of
+    :meth:`Factorisation.solve` for this matrix have no meaning.
 
     Args:
         model: the quadratic model of the energy.

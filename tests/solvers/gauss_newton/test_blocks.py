@@ -39,7 +39,7 @@ def test_solutions_are_those_of_the_dense_matrix(integrator, agents, horizon, ow
 
 @pytest.mark.parametrize(("steps", "agents"), [(2, 1), (3, 8), (20, 4), (40, 2), (41, 3), (80, 64)])
 def test_blocks_cover_all_nodes_two_at_least_at_a_time(steps, agents):
-    edges = blocks.bounds(steps, agents)
+    edges = blocks.block_bounds(steps, agents)
     assert [start for start, _ in edges] == [0] + [end for _, end in edges[:-1]]
     assert edges[-1][1] == steps
     assert all(end - start >= 2 for start, end in edges)

@@ -342,10 +342,10 @@ def test_a_constant_that_differs_from_the_kernel_is_named(monkeypatch, name, val
 
 
 def test_a_structure_that_differs_from_the_kernel_is_named(monkeypatch):
-    class Run(ctypes.Structure):
-        _fields_ = (("extra", ctypes.c_int64), *interface.Run._fields_)
+    class EpoRun(ctypes.Structure):
+        _fields_ = (("extra", ctypes.c_int64), *interface.EpoRun._fields_)
 
-    monkeypatch.setattr(interface, "Run", Run)
+    monkeypatch.setattr(interface, "EpoRun", EpoRun)
     with pytest.raises(RuntimeError, match=r"EpoRun\.damping is 24 in Python and 16\.0.*EpoRun\.extra.*sizeof EpoRun"):
         interface.find.__wrapped__()
 

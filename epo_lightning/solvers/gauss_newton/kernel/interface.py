@@ -39,8 +39,8 @@ MOST_AGENTS = 64
 Address, Integer, Real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
 
-class Game(ctypes.Structure):
-    """The game as the kernel reads it: sizes, addresses and strides of its tensors, in `EpoGame`'s order."""
+class EpoGame(ctypes.Structure):
+    """The game as the kernel reads it: sizes, addresses and strides of its tensors; fields as in `game.hpp`."""
 
     _fields_ = (
         *((name, Integer) for name in ("B", "M", "N", "K", "lines", "points", "pair_stride")),
@@ -60,8 +60,8 @@ class Game(ctypes.Structure):
     )
 
 
-class Run(ctypes.Structure):
-    """The arguments and outputs of a solve, in `EpoRun`'s order."""
+class EpoRun(ctypes.Structure):
+    """The arguments and outputs of a solve; fields as in `game.hpp`."""
 
     _fields_ = (
         ("steps", Integer),
@@ -76,8 +76,8 @@ class Run(ctypes.Structure):
     )
 
 
-class Gradients(ctypes.Structure):
-    """Cotangents that the adjoint reads and gradients that it adds to, in `EpoGradients`' order."""
+class EpoGradients(ctypes.Structure):
+    """Cotangents that the adjoint reads and gradients that it adds to; fields as in `game.hpp`."""
 
     _fields_ = (
         ("controls", Address),
@@ -96,7 +96,8 @@ class _Entry(ctypes.Structure):
 def layout() -> dict[str, float]:
     """Sizes, offsets and constants that this module shares with the kernel, under the names of `layout.hpp`."""
     found: dict[str, float] = {}
-    for name, structure in (("EpoGame", Game), ("EpoRun", Run), ("EpoGradients", Gradients)):
+    for structure in (EpoGame, EpoRun, EpoGradients):
+        name = structure.__name__
         found[f"sizeof {name}"] = ctypes.sizeof(structure)
         found |= {f"{name}.{field[0]}": getattr(structure, field[0]).offset for field in structure._fields_}
     found |= {name.upper(): index for index, name in enumerate(OWN)} | {"OWN_COUNT": len(OWN)}
@@ -150,9 +151,9 @@ def find() -> ctypes.CDLL | str:
             "`python -m epo_lightning.solvers.gauss_newton.kernel.build` builds it"
         )
     _check_layout(loaded)
-    run = (ctypes.POINTER(Game), ctypes.POINTER(Run))
+    run = (ctypes.POINTER(EpoGame), ctypes.POINTER(EpoRun))
     loaded.epo_solve.argtypes = (Integer, *run, Integer, ctypes.POINTER(Address))
-    loaded.epo_differentiate.argtypes = (Address, *run, ctypes.POINTER(Gradients))
+    loaded.epo_differentiate.argtypes = (Address, *run, ctypes.POINTER(EpoGradients))
     loaded.epo_release.argtypes, loaded.epo_release.restype = (Address,), None
     for name in ("epo_solve", "epo_differentiate", "epo_levels"):
         getattr(loaded, name).restype = Integer
