@@ -53,7 +53,9 @@ MEANING = {
 
 
 def predict(settings: PredictSettings) -> list[Path]:
-    """Write ``forecasts.safetensors``, ``index.json`` and ``figures/`` for scenes spread over a split.
+    """Write ``forecasts.safetensors``, ``figures/`` and ``index.json`` for scenes spread over a split.
+
+    The index is written last: a folder without it was left by an interrupted command, and the next one completes it.
 
     Returns:
         the files that were written.
@@ -67,7 +69,7 @@ def predict(settings: PredictSettings) -> list[Path]:
     run = RunFolder.open(settings.run)
     out = Path(settings.out).expanduser()
     tensors_file, index_file = out / "forecasts.safetensors", out / "index.json"
-    if tensors_file.exists() or index_file.exists():
+    if index_file.exists():
         raise ConfigError(f"{out} holds forecasts already: nothing is overwritten; choose another out=<folder>")
     of_run = read(Settings, run.config())
     forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))

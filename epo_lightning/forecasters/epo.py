@@ -95,6 +95,7 @@ class EPO(Forecaster):
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         _check_needs(energy, task)
+        energy.check_horizon(task.horizon)
         chooses = TABLES in solver.provides
         if modes < 1:
             raise ConfigError(f"forecaster.modes must be 1 or more, not {modes}")
@@ -110,6 +111,8 @@ class EPO(Forecaster):
                 f"forecaster.initial=motions needs dynamics=unicycle, not {type(energy.dynamics).__name__}: "
                 "the motions are those of a unicycle; choose decoded or zero"
             )
+        if not math.isfinite(pair_start):
+            raise ConfigError(f"forecaster.pair_start must be finite, not {pair_start}")
         if not 0 < control_scale < math.inf:
             raise ConfigError(f"forecaster.control_scale must be positive and finite, not {control_scale}")
         super().__init__(task, optimizer)
@@ -308,7 +311,7 @@ def _checked(
         all_features: all own terms of the energy.
 
     Raises:
-        ConfigError: an unknown feature, a feature whose weight is fixed, or a weight that is not positive.
+        ConfigError: an unknown feature, a feature whose weight is fixed, or a weight that is not positive and finite.
     """
     named, known = start if isinstance(start, Mapping) else {"all": start}, {"all", *features, *OWN_FEATURES}
     for name, value in named.items():
@@ -319,6 +322,6 @@ def _checked(
             )
         if name not in known:
             raise ConfigError(f"unknown feature forecaster.own_start.{name}: {nearest(name, known)}")
-        if not value > 0:
-            raise ConfigError(f"forecaster.own_start must be positive, but {name} would start at {value}")
+        if not 0 < value < math.inf:
+            raise ConfigError(f"forecaster.own_start must be positive and finite, but {name} would start at {value}")
     return start

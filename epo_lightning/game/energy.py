@@ -112,6 +112,13 @@ class Energy(ABC):
         A pair term must be symmetric: swapping the two agents does not change it.
         """
 
+    def check_horizon(self, steps: int) -> None:  # noqa: B027 - most energies are defined for every horizon
+        """Check that the energy is defined for controls of K = ``steps`` steps.
+
+        Raises:
+            ValueError: it is not; the message says which horizons are possible.
+        """
+
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
         """Check that scene, parameters and controls fit together.
 

@@ -266,6 +266,20 @@ class FeatureEnergy(Energy):
         features = self._of_pairs(scene, parameters, (first, second), (no_direction, no_direction))
         return {name: 0.5 * residual.square().sum(-1) for name, residual, _ in features}
 
+    def check_horizon(self, steps: int) -> None:
+        """Check that the features are defined for controls of K = ``steps`` steps.
+
+        Raises:
+            ValueError: a horizon of less than two steps, or shorter than ``pair_stride``.
+        """
+        if steps < 2:
+            raise ValueError(f"controls span K = {steps} step(s); an energy needs at least 2")
+        if self.pair and self.pair_stride > steps:
+            raise ValueError(
+                f"energy.pair_stride={self.pair_stride} evaluates pairs at no step: controls span K = {steps} steps; "
+                f"choose 1 to {steps}"
+            )
+
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
         """Check that scene, parameters and controls fit together.
 
@@ -276,13 +290,7 @@ class FeatureEnergy(Energy):
         super().validate(scene, parameters, controls)
         batch, agents = scene.agent_mask.shape
         modes, steps = controls.shape[1], controls.shape[3]
-        if steps < 2:
-            raise ValueError(f"controls span K = {steps} step(s); an energy needs at least 2")
-        if self.pair and self.pair_stride > steps:
-            raise ValueError(
-                f"energy.pair_stride={self.pair_stride} evaluates pairs at no step: controls span K = {steps} steps; "
-                f"choose 1 to {steps}"
-            )
+        self.check_horizon(steps)
         for kind, names, given, count in (
             ("own_weights", self.own, parameters.own_weights, agents),
             ("pair_weights", self.pair, parameters.pair_weights, agents * (agents - 1) // 2),

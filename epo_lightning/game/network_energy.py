@@ -58,6 +58,7 @@ class NetworkEnergy(nn.Module, Energy):
         self.features: FeatureEnergy | None = None
         if own or pair or bounds:
             self.features = FeatureEnergy(own, pair, bounds or {}, dynamics, pair_stride)
+            self.features.check_horizon(horizon)
         for name in (*own, *pair):
             if name in (self.term, self.pair_term):
                 raise ConfigError(

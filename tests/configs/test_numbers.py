@@ -42,7 +42,9 @@ REFUSED = {
     "solver.steps": (-1, 1.5, NAN),
     "forecaster.modes": (0, -1, 1.5),
     "forecaster.control_scale": (0.0, -1.0, NAN, INF),
-    "energy.pair_stride": (0, -1, 1.5),
+    "forecaster.own_start": (0.0, -1.0, NAN, INF),
+    "forecaster.pair_start": (NAN, INF, -INF),
+    "energy.pair_stride": (0, -1, 1.5, 41),  # the horizon has 40 steps
     "objective.weights.imitation": (-1.0, NAN, INF),
 }
 CASES = [(key, value) for key, values in REFUSED.items() for value in values]

@@ -165,6 +165,9 @@ def test_forecasts_are_written_with_an_index(epo: Epo, refused: Callable[..., st
     assert set(tensors) == set(index["tensors"])
     assert Path("out/figures/joint_predictions.png").stat().st_size > 1000
     assert "nothing is overwritten" in refused("predict", "run=run", "out=out")
+    Path("out/index.json").unlink()  # an interrupted command leaves no index
+    assert epo("predict", "run=run", "out=out", "scenes=4", "figures=1") == 0
+    assert load_file("out/forecasts.safetensors")["states"].shape == (4, 2, 2, 40, 4)
 
 
 def test_a_sweep_trains_every_row_and_the_report_shows_them(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
