@@ -38,7 +38,7 @@ HOST = "127.0.0.1"
 PATIENCE = 600.0
 """Longest wait for the other processes to connect to the store [s]."""
 GRACE = 10.0
-"""Longest wait for followers to exit by themselves, or for a failure of one to show [s]."""
+"""Longest wait for followers to exit by themselves, or for the failure of a follower to become visible [s]."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Place:
     Attributes:
         rank: rank of this process; 0 is the leader.
         world: number of processes.
-        port: port of the store; 0 if the leader starts the others, and so may take any free port.
+        port: port of the store; 0 if the leader starts the other processes itself and can choose any free port.
     """
 
     rank: int = 0
@@ -61,7 +61,7 @@ class Place:
 
 
 def here(devices: int) -> Place:
-    """The place of this process in a run on ``devices`` devices: rank 0, except in the further tasks of a Slurm step.
+    """The place of this process in a run on ``devices`` devices: its Slurm rank if Slurm started a task per device, else 0.
 
     Raises:
         ConfigError: Slurm has started another number of tasks, or tasks on several nodes.

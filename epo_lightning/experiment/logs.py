@@ -78,7 +78,7 @@ def open_logs(settings: Settings, config: Mapping[str, Any], run: RunFolder, ste
 
 
 def publish(run: RunFolder) -> None:
-    """Send everything in the run folder to the run's dashboards: after an evaluation, or if one was not reachable before."""
+    """Send the contents of the run folder to the run's dashboards, after an evaluation or if a dashboard was unreachable."""
     config = run.config()
     settings = read(Settings, config)
     _close(_dashboards(settings, config, run), settings, run, failed=False)
@@ -102,7 +102,7 @@ def _dashboards(settings: Settings, config: Mapping[str, Any], run: RunFolder) -
 def _facts(settings: Settings, config: Mapping[str, Any], run: RunFolder) -> Facts:
     record = run.record
     key = record.get("identity") or identity(config, str(record.get("data_digest")))
-    # The id also has the second in which the run began: if it is begun again (with corrected code), it is a new curve.
+    # The second in which the run began is part of the id. A run that begins anew (with corrected code) is then a new curve.
     began = "".join(filter(str.isdigit, str(record.get("began", ""))))
     sweep = Path(settings.sweep).name if settings.sweep else None
     return Facts(

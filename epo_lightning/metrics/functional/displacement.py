@@ -12,8 +12,8 @@ minSFDE   min_m mean_i e[m,i,K]
 
 The best mode is chosen for each metric separately: minSFDE and minSADE may be those of different modes.
 
-Agents without any observed step, and for the final displacements those whose last step was not observed, are left out
-of the mean over agents. The value of a scene without any agent left is NaN. A prediction that is not finite at an observed
+Agents without any observed step are left out of the mean over agents; final displacements also leave out agents whose last
+step was not observed. If no agent is left, the value of the scene is NaN. A prediction that is not finite at an observed
 step has an infinite displacement, so that a broken forecast is not mistaken for a scene without observations.
 
 Example: two agents stand at the origin; mode 0 is right about the first one, mode 1 nearly right about the second one.

@@ -49,8 +49,8 @@ def overlap_rate(
         shape: ``disc`` or ``box``.
 
     Returns:
-        One value per scene; NaN for a scene without agents. Where the predicted state of an agent is not finite, the value
-        is infinite, so that a broken forecast is not mistaken for one without overlaps.
+        One value per scene; NaN for a scene without agents. If a predicted state is not finite, the value is infinite, so
+        that a broken forecast is not mistaken for one without overlaps.
 
     Raises:
         ConfigError: an unknown definition or shape.

@@ -6,8 +6,8 @@ unit vector of the heading and e'_l the unit vector to its left, a position chan
 
     dp_k = dt sum_{l<k} M_l dz_l,   M_l = [e_l, v_l e'_l]     (explicit Euler; other integrators include l = k).
 
-Arrays are laid out [S, N, component, K] with S = B M samples; components of z and u are speed and heading, acceleration and
-turn rate.
+Arrays are laid out [S, N, component, K] with S = B M samples. Component 0 is speed (of z) or acceleration (of u), component
+1 is heading or turn rate. (The kernel and `docs/solver.md` have heading first, and their M contains the factor dt.)
 """
 
 from __future__ import annotations
