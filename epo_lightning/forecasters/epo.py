@@ -122,8 +122,8 @@ class EPO(Forecaster):
         games, starts = solver.games(modes), solver.starts(modes)
         width, scale, horizon = backbone.width, task.scale, task.horizon
         own, pair = energy.weighted
-        start = _checked(own_start, own, energy.own)
-        ranges = {} if motions is None and initial != "motions" else _ranges(motions)
+        start = _check_start(own_start, own, energy.own)
+        ranges = {} if motions is None and initial != "motions" else _check_motions(motions)
         # Do not change the order: every module draws its initial weights from the same sequence of random numbers.
         self.own_weights = OwnWeights(width, games, own, start)
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs)
@@ -211,10 +211,10 @@ class EPO(Forecaster):
         """
         if solution.assignment is not None:
             stopped = (solution.status == Status.STOPPED).any(1, keepdim=True)
-            return _once(-torch.where(stopped, 0.0, solution.energy), solution.assignment)
+            return _without_repeats(-torch.where(stopped, 0.0, solution.energy), solution.assignment)
         if orders is not None:
             choices = orders.order if goals.chosen is None else torch.cat((orders.order.long(), goals.chosen), -1)
-            return _once(orders.log_probability + goals.log_probability, choices)
+            return _without_repeats(orders.log_probability + goals.log_probability, choices)
         assert self.probabilities is not None
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
         return self.probabilities(z, solution.states[..., :2], current[..., :2], scene.agent_mask)
@@ -280,12 +280,12 @@ def _check_needs(energy: Energy, task: Task) -> None:
         )
 
 
-def _once(score: Tensor, modes: Tensor) -> Tensor:
+def _without_repeats(score: Tensor, modes: Tensor) -> Tensor:
     """Logits [B, M] of modes, -inf for a mode that repeats an earlier one."""
     return torch.where(repeated(modes), -torch.inf, score)
 
 
-def _ranges(motions: Mapping[str, float] | None) -> dict[str, float]:
+def _check_motions(motions: Mapping[str, float] | None) -> dict[str, float]:
     """Largest acceleration and curvature of initial motions.
 
     Raises:
@@ -300,10 +300,10 @@ def _ranges(motions: Mapping[str, float] | None) -> dict[str, float]:
     return given
 
 
-def _checked(
+def _check_start(
     start: float | Mapping[str, float], features: Sequence[str], all_features: Sequence[str]
 ) -> float | Mapping[str, float]:
-    """Check of ``own_start``. Names of features that this energy does not have are accepted and have no effect.
+    """The configured ``own_start`` after a check. Names of features that are not in this energy have no effect.
 
     Args:
         start: the configured value.
