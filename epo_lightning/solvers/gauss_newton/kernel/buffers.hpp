@@ -1,4 +1,4 @@
-// Memory that is kept for the next call: mapping fresh pages costs more time than the arithmetic done in them.
+// Memory that is kept for the next call, because mapping new pages takes more time than the arithmetic in them.
 #pragma once
 
 #include <cstddef>
@@ -21,7 +21,7 @@ class Buffer {
         auto& left = pool().left;
         std::size_t best = left.size();
         for (std::size_t i = 0; i < left.size(); ++i)
-            // A much larger piece is kept for a larger array.
+            // A piece of more than twice the size is not taken: it is left for a larger array.
             if (left[i].second >= count && left[i].second <= 2 * count + kSmall && (best == left.size() || left[i].second < left[best].second))
                 best = i;
         if (best == left.size()) {
@@ -63,7 +63,7 @@ class Buffer {
         std::vector<std::pair<Vec<T>*, std::size_t>> left;
         std::size_t kept = 0;
     };
-    // Never destroyed: arrays may outlive the end of the program's main function.
+    // The pool is never destroyed, because arrays may be released after the program's main function has ended.
     static Pool& pool() {
         static Pool* const instance = new Pool;
         return *instance;

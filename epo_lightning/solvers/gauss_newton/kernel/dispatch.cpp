@@ -1,8 +1,8 @@
-// The functions that Python calls, in the best version that this processor can run.
+// The functions that Python calls; each uses the best instructions that this processor has.
 //
-// A call shares its problems out among threads of its own and joins them before it returns. An interrupt cannot come in
-// between: Python handles signals between two of its own instructions, and the whole call is one of them. The arrays that
-// the threads write to, which belong to the caller, therefore outlive the threads.
+// A call starts threads, distributes its problems over them, and waits until they have ended. An interrupt cannot end the call
+// earlier, because Python handles signals only between two of its own instructions, and the call is a single instruction. The
+// threads write to arrays of the caller; these arrays therefore exist until the threads have ended.
 
 #include <algorithm>
 #include <atomic>
@@ -53,8 +53,8 @@ struct Handle {
     }
 };
 
-/// Runs body(0) .. body(count - 1), each on a thread of its own, and returns when all have ended: 0, or 1 where memory was
-/// missing. The calling thread takes the first, and those for which the system has no thread left.
+/// Runs body(0) .. body(count - 1) in parallel and waits until all have ended. Returns 0, or 1 if there was not enough memory. The
+/// calling thread runs body(0), and every body for which the system cannot start another thread.
 template <class Body>
 int64_t in_parallel(int64_t count, const Body& body) {
     std::atomic<int64_t> outcome{0};
@@ -91,12 +91,13 @@ int64_t epo_levels() { return int64_t(levels.size()); }
 /// Sizes, offsets and constants, up to an entry without a name.
 const EpoLayoutEntry* epo_layout() { return kLayout; }
 
-/// Use level 0 (plain) to `epo_levels() - 1` (the best, and the default) from now on; for the tests, which compare the levels.
+/// Chooses the level of instructions for all later calls: 0 (plain) to `epo_levels() - 1` (the best, and the default). Tests use it
+/// to compare the levels.
 void epo_choose(int64_t level) { chosen = levels[level]; }
 
-/// Solves all problems on up to `threads` threads, in whole registers of problems, so that results do not depend on them.
-/// `*tape` becomes the data for `epo_differentiate`, or null where nothing is recorded; `epo_release` frees it.
-/// Returns 0, or 1 where there was not enough memory; then there is no tape.
+/// Solves all problems on up to `threads` threads. Every thread gets whole registers of problems, so that results do not depend on
+/// the number of threads. `*tape` becomes the data for `epo_differentiate`, or null if nothing is recorded; `epo_release` frees it.
+/// Returns 0, or 1 if there was not enough memory; in that case there is no tape.
 int64_t epo_solve(int64_t doubles, const EpoGame* game, const EpoRun* run, int64_t threads, void** tape) {
     *tape = nullptr;
     try {
@@ -116,7 +117,7 @@ int64_t epo_solve(int64_t doubles, const EpoGame* game, const EpoRun* run, int64
     }
 }
 
-/// The adjoint of a call of `epo_solve`, on as many threads. Returns 0, or 1 where there was not enough memory.
+/// The adjoint of a call of `epo_solve`, on the same number of threads. Returns 0, or 1 if there was not enough memory.
 int64_t epo_differentiate(const void* tape, const EpoGame* game, const EpoRun* run, const EpoGradients* gradients) {
     const Handle& handle = *static_cast<const Handle*>(tape);
     const auto differentiate = handle.doubles ? handle.level->differentiate_double : handle.level->differentiate_float;

@@ -15,14 +15,15 @@ enum Control { ACCELERATION, TURN_RATE };
 /// Signals that can have bounds.
 enum Bounded { BOUND_VEL, BOUND_ACC, BOUND_TURNR, BOUND_JERK, BOUND_TURNACC, BOUND_COUNT };
 
-/// Outcome of a problem: all steps taken; some with a raised damping only; or the last good iterate kept.
+/// Outcome of a problem. SOLVED: all steps were taken. DAMPED: some steps were possible only with more damping. STOPPED: a step
+/// was not possible, and the iterate before it was kept.
 enum Status { SOLVED, DAMPED, STOPPED };
 
 constexpr int64_t kMostAgents = 64;         // contacts are a 64-bit mask per agent
 constexpr double kWheelbase = 0.6;          // distance between the axles as a share of a vehicle's length
-constexpr double kSlowestSteering = 1.0;    // speed [m/s] below which steering angles are those of this speed
-constexpr int64_t kRetries = 4;             // number of tenfold increases of the damping of a group that has no factor
-constexpr double kLeastRaisedDamping = 1e-3;  // smallest value from which the damping is raised
+constexpr double kSlowestSteering = 1.0;    // [m/s]; at lower speeds, a steering angle is computed with this speed
+constexpr int64_t kRetries = 4;             // number of times that a failed factorisation is repeated with more damping
+constexpr double kLeastRaisedDamping = 1e-3;  // repetition k adds 10^k times the damping, but at least 10^k times this
 
 extern "C" {
 
@@ -48,7 +49,8 @@ struct EpoGame {
     const void* reference_speed;  // [B, N]
 };
 
-/// S steps from `start`, with absent agents' controls at zero. All arrays of controls are [B, M, N, K, 2]: acceleration, turn rate.
+/// Arguments and results of S steps from `start`, in which the controls of absent agents are zero. Every array of controls is
+/// [B, M, N, K, 2]: acceleration, turn rate.
 struct EpoRun {
     int64_t steps;
     double step_size;
@@ -66,7 +68,8 @@ struct EpoRun {
     int64_t* status;           // [B, M] of type Status
 };
 
-/// Cotangents in, gradients out. `controls` is the cotangent of u_S on entry and of u_0 on return.
+/// Cotangents that the adjoint reads, and gradients that it writes. `controls` is the cotangent of u_S on entry and that of u_0 on
+/// return.
 struct EpoGradients {
     void* controls;            // [B, M, N, K, 2]
     const void* iterates;      // [S + 1, B, M, N, K, 2] further cotangents of u_0 .. u_S, or null

@@ -36,7 +36,8 @@ INLINE void violation(Vec<T> value, const double* bound, Vec<T>& excess, Vec<T>&
 /// Index of a control of agent i among the m unknowns of a step, which are in the order (heading, speed).
 INLINE int unknown(int i, int channel) { return 2 * i + (channel == ACCELERATION); }
 
-/// Gauss-Newton model of a sum of squared residuals of one signal: energy, first derivative (pull) and second (stiffness).
+/// Gauss-Newton model of half the sum of squared residuals of one signal: the energy, its first derivative (pull) and its second
+/// derivative (stiffness).
 template <class T>
 struct Model {
     Vec<T> energy{}, pull{}, stiffness{};
@@ -56,7 +57,8 @@ struct Model {
     }
 };
 
-/// Derivative of phi = -<J mu, r + J d> by one signal (its cotangent); gradients by the weights are added on the way.
+/// Derivative of phi = -<J mu, r + J d> by one signal (the cotangent of the signal). Adding a feature also adds to the gradient by
+/// its weight.
 template <class T>
 struct Adjoint {
     Vec<T> along_mu, along_d, cotangent{};
@@ -202,7 +204,8 @@ struct Group {
                 p.heading[0][lane] = start[2];
                 p.speed[0][lane] = start[3];
             }
-            // Changes are summed separately: added to large coordinates one by one, small steps would be rounded away.
+            // The changes are summed on their own and then added to the initial state: if each small change were added to a large
+            // coordinate, most of its digits would be lost to rounding.
             Vec<T> x{}, y{}, turned{}, faster{};
             for (int k = 0; k < K; ++k) {
                 sincos<T>(p.heading[k], p.sine[k], p.cosine[k]);
@@ -240,12 +243,12 @@ struct Group {
         }
     }
 
-    /// Computes the nearest points of the reference lines in the memory of `found`, and with TANGENTS their unit tangents.
+    /// Computes the nearest points of the reference lines, with TANGENTS also the unit tangents there, and writes them to `found`.
     template <bool TANGENTS>
     void find_nearest(const Nearest<T>& found) {
         nearest = found;
         Vec<T>* segments = arena.take((game.points - 1) * 5);
-        // Four states share each load of a segment, and their chains of comparisons are independent of each other.
+        // Four states at a time: each segment is loaded once for all four, and the processor can overlap their comparisons.
         for (int i = 0; i < count.agents(); ++i) {
             load_line(i, segments);
             int k = 1;
@@ -343,7 +346,7 @@ struct Group {
         Vec<T> best[STATES], near_x[STATES], near_y[STATES], inside[STATES], ahead_x[STATES], ahead_y[STATES];
         for (int q = 0; q < STATES; ++q) {
             best[q] = splat<T>(T(INFINITY));
-            // Without a comparison that holds, an input is NaN; the nearest point is NaN then as well.
+            // If no comparison below is true, an input is NaN, and the nearest point stays NaN.
             near_x[q] = near_y[q] = splat<T>(T(NAN));
             inside[q] = ahead_x[q] = ahead_y[q] = zero;
         }

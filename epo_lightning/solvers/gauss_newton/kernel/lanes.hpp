@@ -112,7 +112,7 @@ INLINE bool any(Mask<T> mask) {
     return seen != 0;
 }
 
-/// Elements of two vectors in turns: of their first halves, or of their second.
+/// Interleaves the first halves of two vectors, a0 b0 a1 b1 ..; with SECOND, their second halves.
 template <class T, bool SECOND, std::size_t... I>
 INLINE Vec<T> zip(Vec<T> a, Vec<T> b, std::index_sequence<I...>) {
     constexpr int W = Lanes<T>::W, from = SECOND ? W / 2 : 0;
@@ -123,7 +123,8 @@ INLINE Vec<T> zip(Vec<T> a, Vec<T> b, std::index_sequence<I...>) {
 #endif
 }
 
-/// Rows become columns: v[i][j] and v[j][i] change places. Every perfect shuffle moves one bit of i to j.
+/// Transposes W vectors of W elements: exchanges v[i][j] and v[j][i]. Each of the log2(W) interleavings moves one bit of the index
+/// i to the index j.
 template <class T>
 INLINE void transpose(Vec<T>* v) {
     constexpr int W = Lanes<T>::W;
@@ -138,7 +139,7 @@ INLINE void transpose(Vec<T>* v) {
     }
 }
 
-/// Read an array per lane: put(e, v) gets element e of all of them.
+/// Reads W arrays of equal length, one for each lane, and calls put(e, v) with the vector v of their elements e.
 template <class T, class Put>
 INLINE void gather(const T* const* rows, int length, const Put& put) {
     constexpr int W = Lanes<T>::W;
@@ -156,7 +157,8 @@ INLINE void gather(const T* const* rows, int length, const Put& put) {
     }
 }
 
-/// Write an array per lane, except where its address is null: get(e) is element e of all of them.
+/// Writes W arrays of equal length, one for each lane; get(e) returns the vector of their elements e. Arrays with a null address are
+/// left out.
 template <class T, class Get>
 INLINE void scatter(const Get& get, int length, T* const* rows) {
     constexpr int W = Lanes<T>::W;

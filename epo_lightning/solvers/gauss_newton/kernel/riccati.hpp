@@ -25,7 +25,7 @@ struct Count {
     INLINE int controls() const { return 2 * agents(); }
 };
 
-/// C[R x S] -= sum_k A[k][0..R) B[k][0..S), or C = -sum where it is fresh, held in registers.
+/// Subtracts sum_k A[k][0..R) B[k][0..S) from C [R, S]; with FRESH, the old values of C count as zero. The sum is held in registers.
 template <class T, int R, int S, bool FRESH = false>
 INLINE void subtract_products(Vec<T>* C, int ldc, const Vec<T>* A, int astep, int arow, const Vec<T>* B, int bstep, int depth) {
     Vec<T> sum[R][S];
@@ -43,8 +43,8 @@ INLINE void subtract_products(Vec<T>* C, int ldc, const Vec<T>* A, int astep, in
         for (int j = 0; j < S; ++j) C[i * ldc + j] = sum[i][j];
 }
 
-/// Overwrite the lower triangle of H [m, m] with its Cholesky factor, reciprocals on the diagonal.
-/// Lanes of `positive` turn false where a pivot is not positive.
+/// Overwrites the lower triangle of H [m, m] with its Cholesky factor, whose diagonal entries are stored as reciprocals.
+/// Sets the lanes of `positive` to false in which a pivot is not positive.
 template <class T, int N>
 INLINE void factorise(Count<N> count, Vec<T>* H, Mask<T>& positive) {
     const int m = count.controls();
@@ -62,7 +62,7 @@ INLINE void factorise(Count<N> count, Vec<T>* H, Mask<T>& positive) {
     }
 }
 
-/// X [m, S] <- L^-1 X, two rows at a time; m is even.
+/// Overwrites X [m, S] with L^-1 X, two rows at a time; m is even.
 template <class T, int N, int S>
 INLINE void eliminate(Count<N> count, const Vec<T>* L, Vec<T>* X, int ldx) {
     const int m = count.controls();
@@ -76,19 +76,20 @@ INLINE void eliminate(Count<N> count, const Vec<T>* L, Vec<T>* X, int ldx) {
     }
 }
 
-/// Entry (i, j) of a symmetric array of which the lower triangle is kept.
+/// Entry (i, j) of a symmetric array that stores only its lower triangle.
 template <class T>
 INLINE Vec<T>& mirrored(Vec<T>* A, int lda, int i, int j) {
     return i >= j ? A[i * lda + j] : A[j * lda + i];
 }
 
-/// Columns of Z for agent i at step k: motion (x, y) by heading and by speed.
+/// The nonzero entries of Z for one agent at one step: derivatives of its displacement (x, y) by its heading and by its speed.
 template <class T>
 struct Motion {
     Vec<T> x_heading, y_heading, x_speed, y_speed;
 };
 
-/// H_cc, with the curvature of controls on its diagonal, out of P+ = P of the next state with its stage costs.
+/// Writes H_cc to `H`. `P` is the cost-to-go of the next state, including that state's own costs; `curvature` [m] holds second
+/// derivatives of the costs of the controls, which are added to the diagonal.
 template <class T, int N>
 INLINE void control_block(Count<N> count, Vec<T>* P, T dt, const Vec<T>* curvature, Vec<T>* H) {
     const int m = count.controls(), ld = 3 * m;
@@ -100,8 +101,9 @@ INLINE void control_block(Count<N> count, Vec<T>* P, T dt, const Vec<T>* curvatu
     }
 }
 
-/// P <- A' P A, except for the controls' part, and G <- H_cx before its elimination.
-/// `coupling` [n] couples turn rates with their agents' speeds; `rates` [m] couples controls with those before.
+/// Replaces P by A' P A, where A is the transition to the next state, and writes H_cx to G. The rows of P that belong to the
+/// controls are not computed here; `eliminate_controls` sets them. `coupling` [n] is the second derivative by an agent's turn rate
+/// and its speed, and `rates` [m] the stiffness of the rates, which couples each control with that of the step before.
 template <class T, int N>
 INLINE void transition(
     Count<N> count, Vec<T>* P, T dt, const Motion<T>* Z, const Vec<T>* coupling, const Vec<T>* rates, Vec<T>* G) {
@@ -116,16 +118,17 @@ INLINE void transition(
             row[v] = dt * mirrored<T>(P, ld, m + r, v) + P[(2 * m + r) * ld + v] + by_x * Z[a].x_speed + by_y * Z[a].y_speed;
         }
         row[2 * m + r] = -rates[r];
-        // Above the diagonal, only entries of the diagonal blocks are read.
+        // Of the entries above the diagonal, only those in the diagonal blocks of 4 x 4 are read later; these must be zero.
         for (int j = r + 1; j % 4 != 0 && j < m; ++j) row[2 * m + j] = Vec<T>{};
     }
     for (int a = 0; a < n; ++a) G[2 * a * ld + m + 2 * a + 1] += coupling[a];
-    // Rows z of P, all columns p first: H_zp = P_zp + Z' P_pp; then H_zz = P_zz + Z' P_pz + H_zp Z with the old P_zp.
+    // The rows z of P become H_zp = P_zp + Z' P_pp and H_zz = P_zz + Z' P_pz + H_zp Z. The term Z' P_pz needs the old P_zp, so it
+    // is added first; then P_zp is replaced by H_zp, and H_zp Z is added.
     for (int a = 0; a < n; ++a) {
         Vec<T>* heading = P + (m + 2 * a) * ld;
         Vec<T>* speed = heading + ld;
         for (int b = 0; b <= a; ++b) {
-            // Z' P_pz: column block b of rows z needs the old P_zp of agent b against positions of agent a.
+            // Z' P_pz: the block of agents (a, b) needs the old entries of P_zp in the rows of agent b and the columns of agent a.
             const Vec<T>* heading_b = P + (m + 2 * b) * ld + 2 * a;
             const Vec<T>* speed_b = heading_b + ld;
             heading[m + 2 * b] += Z[a].x_heading * heading_b[0] + Z[a].y_heading * heading_b[1];
@@ -151,7 +154,8 @@ INLINE void transition(
     }
 }
 
-/// Columns [from, from + S) of P -= G' G, from the diagonal down; of the controls' rows keep nothing of the next step.
+/// Subtracts G' G from columns [from, from + S) of P, in the rows from the diagonal downwards. The controls' rows are overwritten
+/// by -G' G, because their old values belong to the controls of the next step.
 template <class T, int N, int S>
 INLINE void subtract_square(Count<N> count, Vec<T>* P, const Vec<T>* G, int from) {
     const int m = count.controls(), ld = 3 * m;
@@ -168,7 +172,7 @@ INLINE void subtract_square(Count<N> count, Vec<T>* P, const Vec<T>* G, int from
     }
 }
 
-/// G <- L^-1 G and P <- P - G' G, with the stiffness of `rates` [m] in the controls' part.
+/// Replaces G by L^-1 G, then P by P - G' G, and adds the stiffness `rates` [m] to the diagonal of the controls' part of P.
 template <class T, int N>
 INLINE void eliminate_controls(Count<N> count, const Vec<T>* L, const Vec<T>* rates, Vec<T>* G, Vec<T>* P) {
     const int m = count.controls(), ld = 3 * m;
@@ -190,8 +194,10 @@ INLINE void eliminate_controls(Count<N> count, const Vec<T>* L, const Vec<T>* ra
     for (int c = 2 * m; c < ld; ++c) P[c * ld + c] += rates[c - 2 * m];
 }
 
-/// One step back of the linear terms: y of the next state, with its stage costs, and h of the controls, to y of this state.
-/// `h` becomes L^-1 h, which the forward recursion needs; `first` is the step whose state is given.
+/// Takes the linear terms one step back in time. On entry `y` is the gradient of the cost-to-go by the next state, including that
+/// state's own costs, and `h` the gradient of this step's costs by its controls. On return `y` belongs to the state of this step
+/// (the caller adds the derivatives of this step's costs by the state), and `h` is L^-1 times the whole gradient by the controls,
+/// which the forward recursion needs. In the first step (`first`) the state is given, so its `y` is not computed.
 template <class T, int N>
 INLINE void pull_linear(
     Count<N> count, const Vec<T>* L, const Vec<T>* G, T dt, const Motion<T>* Z, bool first, Vec<T>* y, Vec<T>* h) {
@@ -213,7 +219,7 @@ INLINE void pull_linear(
         for (int r = j - 2 * m; r < m; ++r) y[j] -= G[r * ld + j] * h[r];
 }
 
-/// One step forward: the change of the controls, -L^-T (h + G x), written to `c`, and the state that follows.
+/// Takes one step forward in time: writes the change of the controls, -L^-T (h + G x), to `c`, and replaces x by the next state.
 template <class T, int N>
 INLINE void push_state(
     Count<N> count, const Vec<T>* L, const Vec<T>* G, T dt, const Motion<T>* Z, bool first, const Vec<T>* h, Vec<T>* x, Vec<T>* c) {

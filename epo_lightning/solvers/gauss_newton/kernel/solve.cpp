@@ -1,7 +1,8 @@
 // S steps for a range of problems, and their adjoint. Compiled once for every level of instructions; see dispatch.cpp.
 //
-// Each step splits every problem into groups of agents that presently touch each other (the connected components of the graph
-// of active pairs), because only those share a factorisation; groups of one size are solved side by side, a lane each.
+// In each step, every problem is split into groups of agents that overlap at the current iterate: the connected components of the
+// graph of active pairs. Each group has a factorisation of its own. Groups of the same size are solved together, one per lane of
+// the vector registers.
 
 #include <algorithm>
 #include <cstring>
@@ -135,7 +136,7 @@ template <class T>
 struct StepTape {
     Plan plan;
     std::vector<Buffer<T>> factors, nearest;  // by group size, group after group
-    std::vector<char> taken;               // whether a problem of the range took the step
+    std::vector<char> taken;               // by problem of the range: whether it took the step
 };
 
 template <class T>
@@ -144,7 +145,8 @@ struct Tape {
     std::vector<StepTape<T>> steps;
 };
 
-/// Calls `body(Group, group's index, items, lanes in use)` for every group of a plan, with the size known when compiled up to 4.
+/// Calls body(group, index, lanes in use) for every W groups of the same size; `index` counts these calls, from 0 for each size. For up
+/// to 4 agents, the number of agents is known at compile time.
 template <class T, class Body>
 void for_each_group(const EpoGame& game, Arena<T>& arena, const Plan& plan, const T* controls, const Body& body) {
     constexpr int W = Lanes<T>::W;
@@ -176,8 +178,8 @@ INLINE bool finite(T value) {
     return value - value == 0;
 }
 
-/// Whether the inputs of a problem are finite and its lines exist, for inputs that the results may not depend on: the weight
-/// of a pair that never touches, and the points of a line that are not the nearest.
+/// Whether the reference lines of a problem exist and its inputs are finite. It checks the inputs whose NaN may not show in the
+/// result, such as the weight of a pair that never touches, or points of a line that are never the nearest.
 template <class T>
 bool valid(const EpoGame& game, int64_t problem) {
     const int64_t b = problem / game.M, m = problem % game.M;
@@ -211,7 +213,7 @@ template <class T>
 std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t first, int64_t last) {
     constexpr int W = Lanes<T>::W;
     const int64_t row = game.K * 2, size = game.N * row;
-    const bool record = run.record != 0, lanes = game.own[LANE] != nullptr;
+    const bool record = run.record != 0, has_lines = game.own[LANE] != nullptr;
     auto tape = std::make_unique<Tape<T>>(Tape<T>{first, last, {}});
     T* const energies[2] = {static_cast<T*>(run.initial_energy), static_cast<T*>(run.energy)};
     T* const norm = static_cast<T*>(run.gradient_norm);
@@ -244,15 +246,15 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
             const std::size_t groups = step.plan.groups(n, W);
             if (groups && (record || !reused[n]))
                 (record ? step.factors : reused)[n] = Buffer<T>((record ? groups : 1) * Factors<T>::size(n, game.K));
-            if (groups && record && lanes) step.nearest[n] = Buffer<T>(groups * Nearest<T>::size(n, game.K));
+            if (groups && record && has_lines) step.nearest[n] = Buffer<T>(groups * Nearest<T>::size(n, game.K));
         }
         if (s == 0) std::fill(energies[0] + first, energies[0] + last, T(0));
         for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
             const int n = group.count.agents();
             group.load_parameters();
-            if (lanes && record)
+            if (has_lines && record)
                 group.template find_nearest<true>(Nearest<T>::at(step.nearest[n].data() + index * Nearest<T>::size(n, game.K), n, game.K));
-            else if (lanes)
+            else if (has_lines)
                 group.template find_nearest<false>(Nearest<T>::at(arena.take(Nearest<T>::size(n, game.K)), n, game.K));
             Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game.K) : reused[n].data();
             const auto factors = Factors<T>::at(memory, n, game.K);
@@ -305,7 +307,7 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
     for_each_group<T>(game, arena, make_plan<T>(game, arena, first, last, controls), controls, [&](auto& group, int64_t, int filled) {
         const int n = group.count.agents();
         group.load_parameters();
-        if (lanes) group.template find_nearest<false>(Nearest<T>::at(arena.take(Nearest<T>::size(n, game.K)), n, game.K));
+        if (has_lines) group.template find_nearest<false>(Nearest<T>::at(arena.take(Nearest<T>::size(n, game.K)), n, game.K));
         Vec<T> energy, squared;
         evaluate(group, energy, squared);
         for (int lane = 0; lane < filled; ++lane) {

@@ -13,7 +13,8 @@ struct Factors {
     static Factors at(Vec<T>* memory, int n, int64_t K) { return {memory, memory + std::size_t(K) * 4 * n * n}; }
 };
 
-/// Stage costs of state k + 1, as they enter P [3m, 3m] and y [3m] (either may be null), and their energy.
+/// Adds the second derivatives of the costs of a state to P [3m, 3m] (unless it is null) and their gradient to y [3m]; returns
+/// their energy.
 template <class T, int N>
 INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>* y) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
@@ -71,11 +72,12 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>
     return energy;
 }
 
-/// Costs of control step k: of the controls, of their change since the step before, and of steering at the speed before.
+/// First and second derivatives (pull and stiffness) of the costs of step k: of its controls, of their change since the step
+/// before, and of the steering angle, which depends on the turn rate and on the speed before the step.
 template <class T>
 struct ControlCosts {
-    Vec<T>*pull, *rate_pull, *stiffness, *rate_stiffness;  // [m]; the first one holds both kinds of pull
-    Vec<T>*speed_pull, *speed_stiffness, *coupling;        // [n], by steering
+    Vec<T>*pull, *rate_pull, *stiffness, *rate_stiffness;  // [m]; pull and stiffness include those of rates
+    Vec<T>*speed_pull, *speed_stiffness, *coupling;        // [n], of steering angles
     Vec<T> energy;
 
     ControlCosts(Arena<T>& arena, int n)
@@ -126,10 +128,10 @@ INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* 
     }
 }
 
-/// The damped Gauss-Newton direction of every lane, [n, K] turn rates and accelerations; its factors; the energy.
-/// `positive` says in which lanes the damped matrix is positive definite.
+/// Computes the damped Gauss-Newton direction of every lane: the changes [n, K] of turn rates (`turn`) and accelerations
+/// (`thrust`). Also writes the factors, the energy, and a mask of the lanes in which the damped matrix is positive definite.
 ///
-/// The damping [n] is per agent. Where it is infinite, the reciprocal pivots are zero, and so is the direction.
+/// Every agent has its own damping [n]. Infinite damping makes the reciprocal pivots zero, and therefore the direction as well.
 template <class T, int N>
 void solve_step(
     const Group<T, N>& g, const Vec<T>* damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust, Vec<T>& energy,
@@ -167,7 +169,7 @@ void solve_step(
     push(g, factors, h, turn, thrust);
 }
 
-/// mu = H^-1 v for a cotangent v [n, K] of turn rates and accelerations, in place.
+/// Overwrites a cotangent v [n, K] of turn rates and accelerations with mu = H^-1 v.
 template <class T, int N>
 void solve_adjoint(const Group<T, N>& g, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
@@ -186,11 +188,11 @@ void solve_adjoint(const Group<T, N>& g, const Factors<T>& factors, Vec<T>* turn
     push(g, factors, h, turn, thrust);
 }
 
-/// Energy, and the squared norm of its gradient.
+/// Computes the energy and the squared norm of its gradient.
 template <class T, int N>
 void evaluate(const Group<T, N>& g, Vec<T>& energy, Vec<T>& squared_norm) {
     const int n = g.count.agents(), m = 2 * n;
-    Vec<T>* y = g.arena.take(3 * m);  // costates of positions and of (heading, speed); pulls of the rates one step later
+    Vec<T>* y = g.arena.take(3 * m);  // gradients by positions and by (heading, speed); pulls of the next rates
     Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
     ControlCosts<T> costs(g.arena, n);
     for (int e = 0; e < 3 * m; ++e) y[e] = Vec<T>{};
@@ -218,7 +220,8 @@ struct ParameterGradients {
     Vec<T>*own, *pair, *goal_x, *goal_y;  // [OWN_COUNT, n], [pairs], [n], [n]
 };
 
-/// The pairs' part of `differentiate` at one state: adds to the position cotangents [n, 6] and to the pairs' weights.
+/// The part of `differentiate` that belongs to the pairs, at one state: adds to the cotangents `sums` [n, 6] of positions and to the
+/// gradient by the pairs' weights.
 template <class T, int N>
 INLINE void differentiate_pairs(
     const Group<T, N>& g, int state, const std::vector<Tangent<T>>& first, const std::vector<Tangent<T>>& second, Vec<T>* sums,
@@ -250,10 +253,11 @@ INLINE void differentiate_pairs(
         }
 }
 
-/// Adds d phi / d u to the cotangent [n, K] and d phi / d parameters to `by`, phi = -<J mu, r + J d> with mu and d constant.
+/// Adds the gradient of phi = -<J mu, r + J d>, with mu and d held constant: by the controls to the cotangent [n, K] (`bar_turn`,
+/// `bar_thrust`), and by the parameters to `by`.
 ///
-/// Cotangents of positions (P), of their tangents along mu (P1) and d (P2), and of speeds are gathered backwards in time and
-/// go back through the rollout as suffix sums.
+/// The loop runs backwards in time. It sums the derivatives of phi by positions (P), by the tangents of positions along mu (P1) and
+/// along d (P2), and by speeds. These suffix sums are backpropagated through the rollout to the controls.
 template <class T, int N>
 void differentiate(
     const Group<T, N>& g, Vec<T>* mu_turn, Vec<T>* mu_thrust, Vec<T>* d_turn, Vec<T>* d_thrust, Vec<T>* bar_turn,
@@ -279,7 +283,7 @@ void differentiate(
             Vec<T>* s = sums + 6 * i;
             const auto weigh = [&](int feature) -> Vec<T>& { return by.own[feature * n + i]; };
             if (state < K) {
-                // Node `state` moved all later positions.
+                // The heading and speed at `state` affect all later positions, whose derivatives have been summed so far.
                 const Vec<T> c = p.cosine[state], si = p.sine[state], v = p.speed[state];
                 const Vec<T> along0 = c * s[0] + si * s[1], across0 = c * s[1] - si * s[0];
                 const Vec<T> along1 = c * s[2] + si * s[3], across1 = c * s[3] - si * s[2];
@@ -294,7 +298,8 @@ void differentiate(
             if (g.has(VELB)) speed.add_bounded(g.own(VELB, i), p.speed[state], g.game.bounds[BOUND_VEL], weigh(VELB));
             nodes[2 * i + 1] += speed.cotangent;
             const auto pull_to = [&](int feature, Vec<T> x, Vec<T> y, Vec<T> tangent_x, Vec<T> tangent_y) {
-                // The nearest point of a lane moves along it with the position: the residual has no derivative in that direction.
+                // The nearest point of a reference line moves along the line with the agent. Along the line, the residual therefore
+                // has the derivative zero.
                 const Vec<T> w = g.own(feature, i), squared = w * w;
                 const Vec<T> gap_x = p.x[state] - x + t2.x[state], gap_y = p.y[state] - y + t2.y[state];
                 const Vec<T> along_line = t1.x[state] * tangent_x + t1.y[state] * tangent_y;
@@ -355,7 +360,7 @@ void differentiate(
                 return -squared * (s1_moves * value + s1 * (by_self + s2_moves));
             };
             bar_turn[i * K + k] += slope(steer.by_turn, steer.turn_turn, steer.turn_speed);
-            // The speed before this step is summed up by the next iteration of the loop; the first speed is given.
+            // The next iteration of the loop backpropagates the derivative by the speed before this step. The first speed is given.
             if (k > 0) nodes[2 * i + 1] += slope(steer.by_speed, steer.turn_speed, steer.speed_speed);
             weigh(STEER) -= T(2) * w * s1 * value;
         }
