@@ -287,9 +287,9 @@ def _config(arguments: Arguments) -> None:
         print(yaml.safe_dump(mask(config), sort_keys=False, default_flow_style=None, width=120), end="")
         return
     if verb != "train":
-        from epo_lightning.experiment.verbs import check
+        from epo_lightning.experiment.verbs import check_settings
 
-        check(verb, config)
+        check_settings(verb, config)
         print(f"{verb}: the configuration is valid")
         return
     from epo_lightning.experiment import assembly, train
@@ -297,7 +297,7 @@ def _config(arguments: Arguments) -> None:
     from epo_lightning.schema import read
 
     settings = read(Settings, config)
-    data, model = assembly.check(settings)
+    data, model = assembly.check_buildable(settings)
     run = train.folder_for(settings)
     print(f"{settings.title}: the configuration is valid")
     print(f"  parameters  {assembly.parameters(model)}")
@@ -348,7 +348,7 @@ def _multirun(arguments: Arguments) -> None:
 
         for job in listed:
             settings = read(Settings, compose.compose("train", job, arguments.extra))
-            assembly.check(settings)
+            assembly.check_buildable(settings)
             train.refuse_occupied(settings, train.folder_for(settings))
         print(f"{len(listed)} runs")
         for done in compose.launch("train", arguments.overrides, listed, job_of_sweep, arguments.extra):

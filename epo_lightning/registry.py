@@ -94,7 +94,7 @@ def lookup(kind: str, name: str) -> Callable[..., Any]:
     return parts[name]
 
 
-def check(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:
+def check_keys(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:
     """Compare a part's configuration with its constructor's signature, without building it.
 
     Args:
@@ -127,9 +127,9 @@ def build(kind: str, config: Mapping[str, Any], **supplied: Any) -> Any:
         supplied: further arguments; the constructor gets those that are in its signature.
 
     Raises:
-        ConfigError: as :func:`check`, or a value that the part refuses.
+        ConfigError: as :func:`check_keys`, or a value that the part refuses.
     """
-    check(kind, config, supplied)
+    check_keys(kind, config, supplied)
     part = lookup(kind, config["name"])
     arguments = {key: value for key, value in config.items() if key != "name"}
     arguments |= {key: value for key, value in supplied.items() if key in inspect.signature(part).parameters}

@@ -8,7 +8,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from epo_lightning.registry import ConfigError, check, lookup, nearest
+from epo_lightning.registry import ConfigError, check_keys, lookup, nearest
 
 Section = typing.TypeVar("Section")
 
@@ -86,14 +86,14 @@ def describe(hint: Any) -> str:
 
 
 def check_part(kind: str, values: Any, supplied: Sequence[str] = ()) -> None:
-    """Check the section of a part: its keys (:func:`registry.check`), and its values against the constructor's annotations.
+    """Check the section of a part: its keys (:func:`registry.check_keys`), and the types of its values by the constructor.
 
     Raises:
-        ConfigError: as :func:`registry.check`, or a value of another type.
+        ConfigError: as :func:`registry.check_keys`, or a value of another type.
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{kind} must be a mapping with a name, not {values!r}")
-    check(kind, values, supplied)
+    check_keys(kind, values, supplied)
     part = lookup(kind, values["name"])
     function = part.__init__ if isinstance(part, type) else part  # type: ignore[misc]
     try:

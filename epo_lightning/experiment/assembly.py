@@ -65,7 +65,7 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
         ConfigError: a part, key or value that cannot work, or sizes that do not fit together, in one sentence.
     """
     if settings.logger.mlflow is not None:
-        mlflow.check(settings.logger.mlflow)
+        mlflow.check_settings(settings.logger.mlflow)
     data = build_data(settings.data)
     data.order_seed = settings.seed
     check_divisible(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)
@@ -112,7 +112,7 @@ def parameters(model: torch.nn.Module) -> int:
     return sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
 
 
-def check(settings: Settings) -> tuple[Any, LightningModule]:
+def check_buildable(settings: Settings) -> tuple[Any, LightningModule]:
     """Check that data module and forecaster can be built, without an effect on random states and without warnings.
 
     Raises:
@@ -203,7 +203,7 @@ def build_trainer(
             limit_val_batches=settings.limit_val_batches,
             log_every_n_steps=settings.log_every,
             deterministic=settings.deterministic,
-            callbacks=[*callbacks, *debugging.watchers(settings, run)],
+            callbacks=[*callbacks, *debugging.debug_callbacks(settings, run)],
             logger=list(loggers),
             enable_progress_bar=any(isinstance(callback, TQDMProgressBar) for callback in callbacks),
             enable_model_summary=False,

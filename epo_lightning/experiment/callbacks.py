@@ -178,7 +178,7 @@ class Progress(Callback):
             write_json(self._run.progress_file, content)
 
 
-def watchers(settings: CallbackSettings, run: RunFolder, title: str) -> list[Callback]:
+def run_callbacks(settings: CallbackSettings, run: RunFolder, title: str) -> list[Callback]:
     """The callbacks of a run.
 
     The checkpoint ``best`` is written when a validation ends. The checkpoint ``last`` is written at the end of the epoch,

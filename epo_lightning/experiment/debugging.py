@@ -33,7 +33,7 @@ MOST_SCENES = 16
 """Largest number of scenes that a message names."""
 
 
-def watchers(settings: TrainerSettings, run: RunFolder) -> list[Callback]:
+def debug_callbacks(settings: TrainerSettings, run: RunFolder) -> list[Callback]:
     """Debugging callbacks that a configuration asks for."""
     found: list[Callback] = []
     if settings.profiler:

@@ -52,7 +52,7 @@ def follow(place: Place, run: RunFolder | None = None) -> None:
     assembly.quiet()
     seed_everything(settings.seed, workers=True, verbose=False)
     data, model = assembly.build(settings)
-    watchers = callbacks.watchers(settings.callbacks, run, settings.title)
+    watchers = callbacks.run_callbacks(settings.callbacks, run, settings.title)
     # Callbacks that decide when to stop or have a state in the checkpoint. Only the leader writes files and prints.
     deciding = [w for w in watchers if isinstance(w, Checkpoint | EarlyStopping | callbacks.RandomStates)]
     trainer = assembly.build_trainer(

@@ -129,7 +129,7 @@ def fit(
     learned = assembly.parameters(forecaster)
     learns = learned > 0 and settings.trainer.max_steps != 0
     timer = Timer()  # its state is part of the checkpoint, so the time before a kill is counted as well
-    watchers = [*callbacks.watchers(settings.callbacks, run, f"{settings.title}, seed {settings.seed}"), timer]
+    watchers = [*callbacks.run_callbacks(settings.callbacks, run, f"{settings.title}, seed {settings.seed}"), timer]
     strategy = None
     if settings.trainer.devices > 1:
         strategy = distributed.strategy(settings.trainer.devices, run, config, last) if learns else None

@@ -28,7 +28,7 @@ SCHEMAS: dict[str, type] = {
 HEADLINE = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp")
 
 
-def check(verb: str, config: dict[str, Any]) -> Any:
+def check_settings(verb: str, config: dict[str, Any]) -> Any:
     """The settings of a verb other than train.
 
     Raises:
@@ -42,7 +42,7 @@ def check(verb: str, config: dict[str, Any]) -> Any:
 
 def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Make the data set unless it exists, and print its report."""
-    settings = check("generate", config)
+    settings = check_settings("generate", config)
     from epo_lightning.experiment import assembly
     from epo_lightning.experiment.config.compose import tree
     from epo_lightning.experiment.config.sources import HIGHWAYS
@@ -90,7 +90,7 @@ def _print_trained(run: RunFolder) -> float | None:
 
 def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Score runs, and print the headline metrics."""
-    settings = check("evaluate", config)
+    settings = check_settings("evaluate", config)
     from epo_lightning.experiment.evaluate import evaluate
 
     for run, file, metrics in evaluate(config):
@@ -106,7 +106,7 @@ def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
 
 def predict_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Write forecasts and figures, and print their paths."""
-    settings = check("predict", config)
+    settings = check_settings("predict", config)
     from epo_lightning.experiment.predict import predict
 
     written = predict(settings)
@@ -115,7 +115,7 @@ def predict_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
 
 def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Write tables and figures of all evaluated runs below a folder, and print the path of the page."""
-    settings = check("report", config)
+    settings = check_settings("report", config)
     from epo_lightning.experiment.report import report
 
     print(f"wrote {report(settings) / 'index.html'}")

@@ -10,7 +10,7 @@ from typing import Any
 from epo_lightning import pretrained
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.checkpoint import read_checkpoint
-from epo_lightning.registry import ConfigError, build, check, lookup, nearest
+from epo_lightning.registry import ConfigError, build, check_keys, lookup, nearest
 from epo_lightning.task import TASK_KEYS, Task
 
 __all__ = ["Forecaster", "Task", "build_forecaster", "check_model", "load"]
@@ -52,7 +52,7 @@ def check_model(model: Mapping[str, Any]) -> None:
             f"{model['candidates']} candidates per agent: use goal=energy, and the forecaster chooses among the candidates"
         )
     for kind, supplied in SUPPLIED.items():
-        check(kind, model[kind], supplied)
+        check_keys(kind, model[kind], supplied)
 
 
 def build_forecaster(model: Mapping[str, Any]) -> Forecaster:

@@ -64,13 +64,13 @@ def changed(key: str, value: Any) -> dict[str, Any]:
 
 
 def test_the_default_configuration_is_accepted() -> None:
-    assembly.check(read(Settings, CONFIG))
+    assembly.check_buildable(read(Settings, CONFIG))
 
 
 @pytest.mark.parametrize(("key", "value"), CASES, ids=lambda case: str(case))
 def test_invalid_numbers_are_refused(key: str, value: Any) -> None:
     with pytest.raises(ConfigError) as error:
-        assembly.check(read(Settings, changed(key, value)))
+        assembly.check_buildable(read(Settings, changed(key, value)))
     assert key.rpartition(".")[2] in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -101,11 +101,11 @@ def test_invalid_numbers_of_other_verbs_are_refused(schema: type, values: dict[s
 @pytest.mark.parametrize("monitor", ["val/foo", "foo", "", "val/minSADE/executed"])
 def test_an_unknown_score_cannot_be_monitored(monitor: str) -> None:
     with pytest.raises(ConfigError, match=r"unknown callbacks\.monitor .*known: .*val/minSADE"):
-        assembly.check(read(Settings, changed("callbacks.monitor", monitor)))
+        assembly.check_buildable(read(Settings, changed("callbacks.monitor", monitor)))
 
 
 def test_scores_of_subsets_can_be_monitored() -> None:
-    assembly.check(read(Settings, changed("callbacks.monitor", "val/executed/minADE")))
+    assembly.check_buildable(read(Settings, changed("callbacks.monitor", "val/executed/minADE")))
 
 
 @pytest.mark.parametrize("words", ["seed=1 seed=2", "seed=1 +seed=1", "data=rpi data=exid", "a.b=1 c=2 ++a.b=3"])

@@ -21,7 +21,7 @@ KIND = {"mlflow.experimentKind": "custom_model_development"}
 """Without it, MLflow's page guesses, and may show runs as it shows the traces of a language model."""
 
 
-def check(settings: MLflowSettings) -> None:
+def check_settings(settings: MLflowSettings) -> None:
     """Check that MLflow is installed and its address complete.
 
     Raises:

@@ -79,10 +79,10 @@ class Job:
         """The job of a resolved configuration, after a check of the configuration; writes no file.
 
         Raises:
-            ConfigError: as :func:`assembly.check`.
+            ConfigError: as :func:`assembly.check_buildable`.
         """
         settings = read(Settings, config)
-        data, _ = assembly.check(settings)
+        data, _ = assembly.check_buildable(settings)
         run = training.folder_for(settings)
         name = identity(config, data.digest)
         return cls(
