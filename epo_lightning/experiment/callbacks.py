@@ -121,6 +121,9 @@ class EpochLines(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._started = time.monotonic()
+        for kept in trainer.checkpoint_callbacks:  # of a resumed run, they hold the best score so far
+            if isinstance(kept, ModelCheckpoint) and kept.monitor and kept.best_model_score is not None:
+                self._best = float(kept.best_model_score)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._validated = True

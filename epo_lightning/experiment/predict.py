@@ -108,11 +108,12 @@ def _scenes_of(
     """
     try:
         return choose(open_data(run, of_run), settings.split, settings.scenes)
-    except ConfigError as error:
+    except ConfigError as missing:
         if not pretrained.ships(run.path):
             raise
         scenes = pretrained.examples(run.path)
-        print(f"{error}\nForecasting the {len(scenes.history)} example scenes that ship with {run.path.name} instead.")
+        count, name = len(scenes.history), run.path.name
+        print(f"{count} example scenes that ship with {name} are forecast instead of its test split: {missing}")
         return spread(scenes, settings.scenes), None
 
 

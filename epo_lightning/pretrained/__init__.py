@@ -31,12 +31,13 @@ def ships(folder: Path) -> bool:
     return folder.absolute().parent == HOME
 
 
-def examples(folder: Path) -> Scene:
-    """Scenes of the test split that ship with a run, for forecasts where there is no data set."""
+def examples(run: str | Path) -> Scene:
+    """Scenes of the test split that ship with a run, given by name or folder, for forecasts without its data set."""
     import safetensors
 
     from epo_lightning.scene import Scene
 
+    folder = folder_of(run) or Path(run)
     with safetensors.safe_open(folder / "scenes.safetensors", framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         return Scene(**tensors, dt=float((file.metadata() or {})["dt"]))

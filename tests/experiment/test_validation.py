@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import torch
 from experiment.conftest import TINY, Epo
 
-from epo_lightning.experiment import assembly
+from epo_lightning.experiment import assembly, callbacks
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS
@@ -76,3 +79,21 @@ def test_runs_of_different_seeds_see_the_same_scenes_in_different_orders() -> No
         orders.append([number for scene in data.train_dataloader() for number in scene.id.tolist()])
     assert orders[0] == orders[1] != orders[2]
     assert sorted(orders[0]) == sorted(orders[2])
+
+
+def test_progress_lines_of_a_resumed_run_know_its_best_score(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = callbacks.ModelCheckpoint(tmp_path, monitor="val/minSADE")
+    kept.best_model_score = torch.tensor(0.1)
+    trainer: Any = SimpleNamespace(
+        checkpoint_callbacks=[kept],
+        callback_metrics={"val/minSADE": torch.tensor(0.3), "train/loss": torch.tensor(1.0)},
+        current_epoch=4,
+        max_epochs=9,
+        global_step=50,
+    )
+    lines = callbacks.EpochLines("a run", "val/minSADE")
+    for hook in (lines.on_train_start, lines.on_validation_end, lines.on_train_epoch_end):
+        hook(trainer, torch.nn.Identity())  # type: ignore[arg-type]
+    assert "epoch 5/9, step 50, loss 1.0000, val/minSADE 0.3000 (best 0.1000)" in capsys.readouterr().out
