@@ -240,7 +240,8 @@ def _one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Itera
         yield
     except OverrideParseException as error:
         raise ConfigError(
-            f"cannot read the override {error.override!r}: write key=value, for example seed=1"
+            f"cannot read the override {error.override!r}: write key=value, for example seed=1; "
+            "a value with other than plain letters, digits and ._-/ needs quotes, \"key='value'\""
         ) from error
     except MissingConfigException as error:
         raise ConfigError(_missing_option(instance, error.missing_cfg_file or "", str(error))) from error
