@@ -228,9 +228,9 @@ class _Parts:
         """
         width, count = 2 * self.size, end - start
         batch = len(matrix)
-        # Over nodes start - 1 .. end: diagonals 0, 1 and 2 of a banded matrix [C, T + 2, F]. A control is a difference of two
-        # nodes: c (z' - z)^2 adds c, c to the diagonal and -c beside it. A rate is one of three: r (z'' - 2 z' + z)^2 adds
-        # r, 4 r, r to the diagonal, -2 r, -2 r beside it and r two nodes away.
+        # Over nodes start - 1 .. end: diagonals 0, 1 and 2 of a banded matrix [C, T + 2, F]. A control is a difference of
+        # two nodes: c (z' - z)^2 adds c, c to the diagonal and -c beside it. A rate is one of three nodes:
+        # r (z'' - 2 z' + z)^2 adds r, 4 r, r to the diagonal, -2 r, -2 r beside it and r two nodes away.
         diagonal = matrix.new_zeros(batch, count + 2, 2, self.size)
         first, second = torch.zeros_like(diagonal), torch.zeros_like(diagonal)
         control = self.control[:, start:end]

@@ -138,7 +138,7 @@ class _Call:
         self._reserve(step_size, damping)
 
     def _describe(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> None:
-        """Fill the kernel's description of the games: sizes, bounds, and addresses and strides of scenes, weights and goals."""
+        """Fill the kernel's description of the games: sizes, bounds, addresses and strides of scenes, weights and goals."""
         batch, modes, agents, horizon, _ = self.controls.shape
         like = self.controls.dtype
         kept: list[Tensor] = []
@@ -182,7 +182,7 @@ class _Call:
         self.kept = kept
 
     def _reserve(self, step_size: float, damping: Tensor) -> None:
-        """Allocate what the kernel writes: iterates and directions of all steps if recorded, else the last ones, and results."""
+        """Allocate what the kernel writes: results, and iterates and directions of all steps if they are recorded."""
         controls, shape = self.controls, self.controls.shape
         stacked = self.record or self.keep_iterates
         self.iterates = controls.new_empty((self.steps + 1 if stacked else 1, *shape))
