@@ -205,10 +205,16 @@ def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:
 
     Raises:
         Diverged: no validation score is finite.
+        ConfigError: the training ended before its first validation.
     """
     watchers = [w for w in trainer.checkpoint_callbacks if isinstance(w, callbacks.ModelCheckpoint) and w.monitor]
     best = [w.best_model_score for w in watchers]
     score = next((float(value) for value in best if value is not None), None)
+    if score is None and monitor not in trainer.callback_metrics:
+        raise ConfigError(
+            f"{run.path}: the training ended after {trainer.global_step} steps, before its first validation: validate more "
+            "often (trainer.validate_every, trainer.validate_steps) or take more steps (trainer.max_steps)"
+        )
     score = float(trainer.callback_metrics.get(monitor, math.nan)) if score is None else score
     if not math.isfinite(score):
         raise Diverged(

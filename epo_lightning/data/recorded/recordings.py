@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shlex
 import shutil
+import warnings
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -195,7 +196,13 @@ class RecordedData(SceneDataModule):
                 f"settings; choose one of {names}"
             )
         if extracted:
-            return extracted[0][1]
+            made, config = extracted[0]
+            warnings.warn(
+                f"there is no folder {home}: the data set {made} is used, which was extracted with these settings from "
+                f"{len(config['recordings'])} recordings",
+                stacklevel=2,
+            )
+            return config
         sources = self.sources()
         return self._config_of(sources, self.identity(sources))
 
