@@ -59,7 +59,7 @@ def composes(words: list[str]) -> None:
     if verb == "report" and overrides and "=" not in overrides[0]:
         assert overrides.pop(0) in sweeping.known(arguments.extra)
     if verb != "train":
-        verbs.check(verb, compose.compose(verb, overrides, arguments.extra))
+        verbs.check_settings(verb, compose.compose(verb, overrides, arguments.extra))
         return
     if overrides and overrides[0].startswith("resume="):
         assert overrides[1:] == []
