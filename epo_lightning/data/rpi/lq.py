@@ -18,28 +18,15 @@ from epo_lightning.data.rpi.game import Array
 
 STATES, CONTROLS = 8, 4
 """Sizes n and m of the joint states and controls of two unicycles."""
-# error_model="numpy": no check for a division by zero, which cannot happen after the check of the pivots.
 
 
 @njit(cache=True)
-def transposed_product(a: Array, b: Array, out: Array) -> None:
-    """out = a' b, row by row and without zeros: three quarters of the entries of a unicycle's matrices are zero."""
-    out[:] = 0.0
-    for k in range(a.shape[0]):
-        for i in range(a.shape[1]):
-            factor = a[k, i]
-            if factor != 0.0:
-                for j in range(b.shape[1]):
-                    out[i, j] += factor * b[k, j]
-
-
-@njit(cache=True, error_model="numpy")
-def fixed_transposed_product(a: Array, b: Array, out: Array, columns: int, width: int) -> None:
-    """out = a' b as above, for ``a`` [STATES, columns] and ``b`` [STATES, width] of sizes that the compiler knows."""
+def transposed_product(a: Array, b: Array, out: Array, rows: int, columns: int, width: int) -> None:
+    """out = a' b for ``a`` [rows, columns] and ``b`` [rows, width], without zeros: most entries of a unicycle's are zero."""
     for i in range(columns):
         for j in range(width):
             out[i, j] = 0.0
-    for k in range(STATES):
+    for k in range(rows):
         for i in range(columns):
             factor = a[k, i]
             if factor != 0.0:
@@ -55,6 +42,7 @@ def transpose(a: Array, out: Array) -> None:
             out[j, i] = a[i, j]
 
 
+# Pivots are checked, so that no division by zero can happen: error_model="numpy" leaves out the check of each division.
 @njit(cache=True, error_model="numpy")
 def solve_positive(a: Array, b: Array) -> bool:
     """Overwrite ``b`` with a^-1 b by Cholesky, ``a`` with its factor; False if ``a`` is not positive definite."""
@@ -141,13 +129,13 @@ def lq_minimum(
     right = np.empty((CONTROLS, STATES + 1))
     promised = 0.0
     for k in range(steps - 1, -1, -1):
-        fixed_transposed_product(A[k], value, av, STATES, STATES)
+        transposed_product(A[k], value, av, STATES, STATES, STATES)
         transpose(av, va)
-        fixed_transposed_product(A[k], va, axx, STATES, STATES)
-        fixed_transposed_product(B[k], value, bv, CONTROLS, STATES)
+        transposed_product(A[k], va, axx, STATES, STATES, STATES)
+        transposed_product(B[k], value, bv, STATES, CONTROLS, STATES)
         transpose(bv, vb)
-        fixed_transposed_product(B[k], va, qux, CONTROLS, STATES)
-        fixed_transposed_product(B[k], vb, quu, CONTROLS, CONTROLS)
+        transposed_product(B[k], va, qux, STATES, CONTROLS, STATES)
+        transposed_product(B[k], vb, quu, STATES, CONTROLS, CONTROLS)
         for i in range(CONTROLS):
             entry = r[k, i]
             for j in range(STATES):
@@ -227,10 +215,10 @@ def lq_game(A: Array, B: Array, Q: Array, q: Array, R: Array, r: Array, owner: A
     drift, moved = np.empty(n), np.empty(n)
     for k in range(steps - 1, -1, -1):
         for player in range(players):
-            transposed_product(B[k], value[player], bv)
+            transposed_product(B[k], value[player], bv, n, m, n)
             transpose(bv, vb)
-            transposed_product(B[k], vb, square)
-            transposed_product(vb, A[k], mixed)
+            transposed_product(B[k], vb, square, n, m, m)
+            transposed_product(vb, A[k], mixed, n, m, n)
             for row in range(m):
                 if owner[row] == player:
                     for column in range(m):
@@ -261,9 +249,9 @@ def lq_game(A: Array, B: Array, Q: Array, q: Array, R: Array, r: Array, owner: A
                 moved[i] = slope[player, i]
                 for j in range(n):
                     moved[i] += value[player, i, j] * drift[j]
-            transposed_product(closed, value[player], product)
+            transposed_product(closed, value[player], product, n, n, n)
             transpose(product, va)
-            transposed_product(closed, va, inner)
+            transposed_product(closed, va, inner, n, n, n)
             for i in range(n):
                 slope[player, i] = q[player, k, i]
                 for j in range(n):

@@ -218,20 +218,18 @@ def solve(
 ) -> Solutions:
     """Solutions of the game with the start state ``start`` [8] from start strategies [S, K, 4].
 
-    The loop over the starts is plain Python: compiled, it would compile both solvers anew, half a minute for nothing.
+    The loop over the starts is not compiled, because compiling it would compile both solvers again.
     """
+    feedback = solver == "feedback"
+    settings, both = (FeedbackSettings() if feedback else PotentialSettings()).array(), np.ones(2)
     count, steps = starts.shape[:2]
     states, controls = np.empty((count, steps + 1, 8)), np.empty((count, steps, 4))
     converged, facts = np.empty(count, dtype=np.bool_), np.empty((count, 7))
     for s, strategy in enumerate(np.ascontiguousarray(starts)):
-        if solver == "feedback":
-            x, u, done, iterations = solve_feedback(
-                start, strategy, constants, goals, weight, FeedbackSettings().array()
-            )
+        if feedback:
+            x, u, done, iterations = solve_feedback(start, strategy, constants, goals, weight, settings)
         else:
-            x, u, done, iterations = solve_potential(
-                start, strategy, constants, goals, weight, np.ones(2), PotentialSettings().array()
-            )
+            x, u, done, iterations = solve_potential(start, strategy, constants, goals, weight, both, settings)
         states[s], controls[s], converged[s] = x, u, done
         robot, pedestrian, pair = game.costs(x, u, constants, goals, weight)
         smallest, _, rotation, slowest = game.passage(x)
