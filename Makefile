@@ -32,24 +32,30 @@ KERNEL_FOLDER := epo_lightning/solvers/gauss_newton/kernel
 KERNEL := $(wildcard $(KERNEL_FOLDER)/*.?pp)
 SOURCES := pyproject.toml constraints.txt $(KERNEL)
 
-define virtual_environment
-@echo "installing into $(VENV) ($(1)) ..."
-$(PYTHON) -m venv $(VENV)
-$(if $(TORCH_INDEX),$(BIN)/pip install -q --no-compile --index-url $(TORCH_INDEX) -c constraints.txt torch)
+define LIST_REQUIREMENTS
+import tomllib
+project = tomllib.load(open("pyproject.toml", "rb"))["project"]
+print(*project["dependencies"], *project["optional-dependencies"]["local"], sep="\n")
 endef
+export LIST_REQUIREMENTS
 
-# The compiled layer is built beside the download of the packages; the installation waits for it, or builds it if this failed.
-kernel = $(PYTHON) $(KERNEL_FOLDER)/build.py > /dev/null 2>&1 &
+# The layer is compiled on one core while packages are downloaded and unpacked on another: half a minute less than one after the other.
+# Without a compiler its build fails, and the last line says so.
 # --no-compile: Python compiles the modules that are used, when they are used, instead of twelve thousand at once.
 $(INSTALLED): $(SOURCES)
-	$(call virtual_environment,a minute or two and the download)
-	$(kernel) $(BIN)/pip install -q --no-compile -c constraints.txt -e '.[local]'
+	@echo "installing into $(VENV) (a minute or two and the download) ..."
+	$(PYTHON) -m venv $(VENV)
+	$(if $(TORCH_INDEX),$(BIN)/pip install -q --no-compile --index-url $(TORCH_INDEX) -c constraints.txt torch)
+	@$(BIN)/python -c "$$LIST_REQUIREMENTS" > $(VENV)/requirements.txt
+	$(BIN)/python $(KERNEL_FOLDER)/build.py > /dev/null 2>&1 & \
+	$(BIN)/pip install -q --no-compile -c constraints.txt -r $(VENV)/requirements.txt && wait
+	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[local]'
 	touch $@
 
-$(TESTABLE): $(SOURCES)
-	$(call virtual_environment,with everything that tests need: a few minutes and the download)
-	$(kernel) $(BIN)/pip install -q --no-compile -c constraints.txt -e '.[dev,docs]'
-	touch $(INSTALLED) $(DOCUMENTABLE) $@
+$(TESTABLE): $(INSTALLED)
+	@echo "installing into $(VENV) what tests need as well (a few minutes and the download) ..."
+	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[dev,docs]'
+	touch $(DOCUMENTABLE) $@
 
 $(DOCUMENTABLE): $(INSTALLED)
 	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[docs]'

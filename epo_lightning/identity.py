@@ -2,6 +2,14 @@
 
 Settings that only say how a run is named, where its files lie, where it is logged and on what it is computed (threads,
 devices, processes) are left out. The digest of the data replaces its path.
+
+Four hashes are recorded with a run:
+
+- ``data_digest``: the contents of its data set, from the data set's manifest.
+- ``identity``: the settings that decide on its result, and ``data_digest``.
+- ``row``: the same without the seed; runs of one row of a table share it.
+- ``variant``: the settings without the seed, empty if they are those of the files of experiment and budget. It ends the
+  name of the run folder (:mod:`.experiment.config.compose`).
 """
 
 from __future__ import annotations

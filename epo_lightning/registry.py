@@ -37,13 +37,13 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return (f"did you mean {close[0]!r}? " if close else "") + "known: " + (", ".join(known) or "none")
 
 
-def register(kind: str, name: str) -> Callable[[Part], Part]:
-    """Make a class or function available as the part ``name`` of a ``kind`` (``"backbone"``, ``"solver"``, ...)."""
+def register(group: str, name: str) -> Callable[[Part], Part]:
+    """Make a class or function available as the part ``name`` of a ``group`` (``"backbone"``, ``"solver"``, ...)."""
 
     def add(part: Part) -> Part:
-        taken = _PARTS.setdefault(kind, {}).setdefault(name, part)
+        taken = _PARTS.setdefault(group, {}).setdefault(name, part)
         if taken is not part:
-            raise ValueError(f"two {kind} parts are called {name!r}: {taken!r} and {part!r}")
+            raise ValueError(f"two {group} parts are called {name!r}: {taken!r} and {part!r}")
         return part
 
     return add
@@ -61,44 +61,44 @@ _HOMES = {
     "optimizer": "optimizers",
     "solver": "solvers",
 }
-"""Module or folder of this package that holds the parts of each kind. New files in a folder are found automatically."""
+"""Module or folder of this package that holds the parts of each group. New files in a folder are found automatically."""
 
 
 @cache
-def _load(kind: str) -> None:
-    """Import all modules that may register parts of a kind; called before the first look-up of a part of this kind."""
-    if kind in _HOMES:
-        home = import_module(f"epo_lightning.{_HOMES[kind]}")
+def _load(group: str) -> None:
+    """Import all modules that may register parts of a group; called before the first look-up of a part of this group."""
+    if group in _HOMES:
+        home = import_module(f"epo_lightning.{_HOMES[group]}")
         for module in pkgutil.walk_packages(getattr(home, "__path__", []), f"{home.__name__}."):
             import_module(module.name)
     for entry in entry_points(group="epo_lightning.parts"):
         entry.load()
 
 
-def parts(kind: str) -> Mapping[str, Callable[..., Any]]:
-    """All parts of a kind, by name."""
-    _load(kind)
-    return dict(sorted(_PARTS.get(kind, {}).items()))
+def parts(group: str) -> Mapping[str, Callable[..., Any]]:
+    """All parts of a group, by name."""
+    _load(group)
+    return dict(sorted(_PARTS.get(group, {}).items()))
 
 
-def lookup(kind: str, name: str) -> Callable[..., Any]:
+def lookup(group: str, name: str) -> Callable[..., Any]:
     """The part registered as ``name``.
 
     Raises:
         ConfigError: no such part; the message names the nearest one.
     """
-    _load(kind)
-    parts = _PARTS.get(kind, {})
+    _load(group)
+    parts = _PARTS.get(group, {})
     if name not in parts:
-        raise ConfigError(f"unknown {kind} {name!r}: {nearest(str(name), parts)}")
+        raise ConfigError(f"unknown {group} {name!r}: {nearest(str(name), parts)}")
     return parts[name]
 
 
-def check_keys(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:
+def check_keys(group: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:
     """Compare a part's configuration with its constructor's signature, without building it.
 
     Args:
-        kind: the kind of part, which is also the name of its configuration group.
+        group: the group of part, which is also the name of its configuration group.
         config: ``name`` and the part's keyword arguments.
         supplied: arguments that the caller hands over in code and a configuration must not set.
 
@@ -106,31 +106,31 @@ def check_keys(kind: str, config: Mapping[str, Any], supplied: Iterable[str] = (
         ConfigError: a missing ``name``, an unknown part, an unknown key (with the nearest known one) or a missing key.
     """
     if not config.get("name"):
-        _load(kind)
-        raise ConfigError(f"{kind}.name is missing: {nearest('', _PARTS.get(kind, {}))}")
-    schema = inspect.signature(lookup(kind, config["name"])).parameters
+        _load(group)
+        raise ConfigError(f"{group}.name is missing: {nearest('', _PARTS.get(group, {}))}")
+    schema = inspect.signature(lookup(group, config["name"])).parameters
     keys = set(config) - {"name"}
     known = set(schema) - set(supplied)
     for key in sorted(keys - known):
-        raise ConfigError(f"unknown key {kind}.{key} for {kind} {config['name']!r}: {nearest(key, known)}")
+        raise ConfigError(f"unknown key {group}.{key} for {group} {config['name']!r}: {nearest(key, known)}")
     required = {key for key, argument in schema.items() if argument.default is argument.empty}
     for key in sorted(required - keys - set(supplied)):
-        raise ConfigError(f"missing key {kind}.{key} for {kind} {config['name']!r}")
+        raise ConfigError(f"missing key {group}.{key} for {group} {config['name']!r}")
 
 
-def build(kind: str, config: Mapping[str, Any], **supplied: Any) -> Any:
+def build(group: str, config: Mapping[str, Any], **supplied: Any) -> Any:
     """Build the part that ``config["name"]`` selects.
 
     Args:
-        kind: the kind of part.
+        group: the group of part.
         config: ``name`` and the part's keyword arguments.
         supplied: further arguments; the constructor gets those that are in its signature.
 
     Raises:
         ConfigError: as :func:`check_keys`, or a value that the part refuses.
     """
-    check_keys(kind, config, supplied)
-    part = lookup(kind, config["name"])
+    check_keys(group, config, supplied)
+    part = lookup(group, config["name"])
     arguments = {key: value for key, value in config.items() if key != "name"}
     arguments |= {key: value for key, value in supplied.items() if key in inspect.signature(part).parameters}
     try:
@@ -138,4 +138,4 @@ def build(kind: str, config: Mapping[str, Any], **supplied: Any) -> Any:
     except ConfigError:
         raise
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"{kind} {config['name']!r}: {error}") from error
+        raise ConfigError(f"{group} {config['name']!r}: {error}") from error

@@ -92,7 +92,7 @@ _FIELDS: Mapping[str, tuple[str, tuple[str | int, ...], str | None]] = {
     "subset": (_INTEGER, ("B",), None),
     "id": (_INTEGER, ("B",), None),
 }
-"""For every tensor of a :class:`Scene`: kind of number, shape, and the field that it belongs to, which must be given too."""
+"""For every tensor of a :class:`Scene`: number type, shape, and the field that it belongs to, which must be given too."""
 
 _LEAST = {"H": (1, "step; the last one is the current state, t0"), "K": (1, "step"), "Q": (2, "points of each line")}
 """Smallest sizes of some dimensions, with the unit that error messages name."""
@@ -237,8 +237,8 @@ def _check_tensor(name: str, value: Any, numbers: str, shape: tuple[str | int, .
         ValueError: another type of number or another shape.
     """
     if not isinstance(value, Tensor):
-        kind = type(value)
-        raise TypeError(f"scene.{name} is a {kind.__module__}.{kind.__qualname__}; convert it with torch.as_tensor")
+        given = type(value)
+        raise TypeError(f"scene.{name} is a {given.__module__}.{given.__qualname__}; convert it with torch.as_tensor")
     given = "boolean" if value.dtype == torch.bool else "floating-point" if value.is_floating_point() else "integer"
     if given != numbers:
         hint = "; masks are torch.bool, True where an entry is real" if numbers == _MASK else ""

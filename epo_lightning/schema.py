@@ -57,11 +57,11 @@ def fits(value: Any, hint: Any) -> bool:
         return isinstance(value, int | float) and not isinstance(value, bool) and value == value  # not nan
     if hint is str:
         return isinstance(value, str)
-    kind = origin or hint
-    if isinstance(kind, type) and issubclass(kind, Mapping):
+    base = origin or hint
+    if isinstance(base, type) and issubclass(base, Mapping):
         entry = arguments[1] if len(arguments) == 2 else Any
         return isinstance(value, Mapping) and all(fits(item, entry) for item in value.values())
-    if isinstance(kind, type) and issubclass(kind, Sequence):
+    if isinstance(base, type) and issubclass(base, Sequence):
         entry = arguments[0] if arguments else Any
         return isinstance(value, Sequence) and not isinstance(value, str) and all(fits(item, entry) for item in value)
     return True
@@ -77,24 +77,24 @@ def describe(hint: Any) -> str:
     names = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"}
     if hint in names:
         return names[hint]
-    kind = origin or hint
-    if isinstance(kind, type) and issubclass(kind, Mapping):
+    base = origin or hint
+    if isinstance(base, type) and issubclass(base, Mapping):
         return "a mapping"
-    if isinstance(kind, type) and issubclass(kind, Sequence):
+    if isinstance(base, type) and issubclass(base, Sequence):
         return "a list" + (f" of {describe(arguments[0])}" if arguments else "")
-    return str(getattr(kind, "__name__", kind))
+    return str(getattr(base, "__name__", base))
 
 
-def check_part(kind: str, values: Any, supplied: Sequence[str] = ()) -> None:
+def check_part(group: str, values: Any, supplied: Sequence[str] = ()) -> None:
     """Check the section of a part: its keys (:func:`registry.check_keys`), and the types of its values by the constructor.
 
     Raises:
         ConfigError: as :func:`registry.check_keys`, or a value of another type.
     """
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{kind} must be a mapping with a name, not {values!r}")
-    check_keys(kind, values, supplied)
-    part = lookup(kind, values["name"])
+        raise ConfigError(f"{group} must be a mapping with a name, not {values!r}")
+    check_keys(group, values, supplied)
+    part = lookup(group, values["name"])
     function = part.__init__ if isinstance(part, type) else part  # type: ignore[misc]
     try:
         hints = typing.get_type_hints(function)
@@ -102,4 +102,4 @@ def check_part(kind: str, values: Any, supplied: Sequence[str] = ()) -> None:
         return
     for key, value in values.items():
         if key in hints and not fits(value, hints[key]):
-            raise ConfigError(f"{kind}.{key} must be {describe(hints[key])}, not {value!r}")
+            raise ConfigError(f"{group}.{key} must be {describe(hints[key])}, not {value!r}")

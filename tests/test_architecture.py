@@ -14,6 +14,7 @@ FLOORS = {
     "scene": set(),
     "registry": set(),
     "checks": {"registry"},
+    "arguments": {"registry"},
     "schema": {"registry"},
     "task": {"registry"},
     "identity": set(),

@@ -33,11 +33,10 @@ class SceneDataset(Protocol):
         """Prepare the samples of an epoch, for data sets in which they differ between epochs."""
 
 
-class Subset:
+class Share:
     """A random share of the scenes of a data set, in their original order (``data.share``).
 
-    The draw does not depend on the run's seed, so that every run of a table sees the same scenes. (``Scene.subset`` is not
-    related: it numbers the named subsets for which metrics are reported.)
+    The draw does not depend on the run's seed, so that every run of a table sees the same scenes.
 
     Args:
         whole: the data set.
@@ -169,7 +168,7 @@ class SceneDataModule(LightningDataModule):
         for name in names.get(stage or "fit", ("train", "val")):
             if name not in self._opened:
                 whole = self.open(name)
-                self._opened[name] = whole if self.share == 1 else Subset(whole, self.share)
+                self._opened[name] = whole if self.share == 1 else Share(whole, self.share)
 
     def dataset(self, split: str) -> SceneDataset:
         """The opened data set of a split.

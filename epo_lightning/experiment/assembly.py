@@ -54,7 +54,7 @@ def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
 
     It is the argument of :func:`~epo_lightning.forecasters.build_forecaster`.
     """
-    sections = {kind: dict(getattr(settings, kind)) for kind in PARTS if kind != "data"}
+    sections = {group: dict(getattr(settings, group)) for group in PARTS if group != "data"}
     return {**sections, "goal": settings.goal, **data.task.to_config()}
 
 
@@ -67,7 +67,9 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
     if settings.logger.mlflow is not None:
         mlflow.check_settings(settings.logger.mlflow)
     data = build_data(settings.data)
-    data.order_seed = settings.seed
+    data.order_seed = (
+        settings.seed
+    )  # the order of the batches belongs to the run; data.seed draws the scenes and splits
     check_divisible(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)
     forecaster = build_model(settings, data)
     check_monitor(settings.callbacks.monitor, data.task)
@@ -93,8 +95,8 @@ def check_monitor(monitor: str, task: Task) -> None:
 def build_model(settings: Settings, data: Any) -> LightningModule:
     """The forecaster of a configuration for the task of ``data``, see :func:`build`."""
     model = describe_model(settings, data)
-    for kind in PARTS[1:]:  # all but "data", which was checked when it was built
-        check_part(kind, model[kind], SUPPLIED[kind])
+    for group in PARTS[1:]:  # all but "data", which was checked when it was built
+        check_part(group, model[group], SUPPLIED[group])
     try:
         forecaster = build_forecaster(model)
     except ConfigError:
@@ -124,10 +126,10 @@ def check_buildable(settings: Settings) -> tuple[Any, LightningModule]:
 
 def _suspects(model: Mapping[str, Any]) -> str:
     """Whole numbers below 1 in the model's configuration: a likely cause of an error whose message names no setting."""
-    sections = ((kind, model[kind]) for kind in PARTS[1:])
+    sections = ((group, model[group]) for group in PARTS[1:])
     small = [
-        f"{kind}.{key}={value}"
-        for kind, section in sections
+        f"{group}.{key}={value}"
+        for group, section in sections
         for key, value in section.items()
         if isinstance(value, int) and not isinstance(value, bool) and value < 1
     ]

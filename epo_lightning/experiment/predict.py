@@ -125,6 +125,6 @@ def _tensors(scenes: Scene, forecast: JointForecast) -> Iterable[tuple[str, Tens
             if (value := getattr(owner, name, None)) is not None:
                 yield name, value.contiguous()
     if game is not None:
-        for kind in ("own_weights", "pair_weights"):
-            for name, value in getattr(game, kind).items():
-                yield f"{kind}/{name}", value.contiguous()
+        for part in ("own_weights", "pair_weights"):
+            for name, value in getattr(game, part).items():
+                yield f"{part}/{name}", value.contiguous()

@@ -356,14 +356,14 @@ class ConvexEnergy(Energy):
         count = agents * (agents - 1) // 2
         own, pair = self.weighted
         given: list[tuple[str, Tensor | None, list[int]]] = []
-        for kind, names, weights, entries in (
+        for part, names, weights, entries in (
             ("own_weights", own, parameters.own_weights, agents),
             ("pair_weights", pair, parameters.pair_weights, count),
         ):
             for name in names:
                 if name not in weights:
-                    raise ValueError(f"{kind} lacks the term {name!r}; it has {sorted(weights)}")
-                given.append((f"{kind}[{name!r}]", weights[name], [entries]))
+                    raise ValueError(f"{part} lacks the term {name!r}; it has {sorted(weights)}")
+                given.append((f"{part}[{name!r}]", weights[name], [entries]))
         if "goals" in self.needs:
             given.append(("parameters.goals", parameters.goals, [agents, 2]))
         if self.pair:

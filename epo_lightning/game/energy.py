@@ -32,23 +32,23 @@ _TABLE_ENTRIES = 2_000_000
 """Largest number of (pair of candidates, step) entries that are evaluated together, which bounds the memory."""
 
 
-def check_names(kind: str, names: Any, known: Collection[str], what: str) -> None:
+def check_names(key: str, names: Any, known: Collection[str], what: str) -> None:
     """Check a list of names of terms: all are known, and no name is repeated.
 
     Raises:
         ConfigError: an unknown name (the message suggests the nearest known one), a repeated name, or no list.
     """
     if isinstance(names, str) or not isinstance(names, Sequence):
-        raise ConfigError(f"energy.{kind} must be a list of names, not {names!r}")
+        raise ConfigError(f"energy.{key} must be a list of names, not {names!r}")
     if not all(isinstance(name, str) for name in names):
-        raise ConfigError(f"energy.{kind} must be a list of names, not {list(names)}")
+        raise ConfigError(f"energy.{key} must be a list of names, not {list(names)}")
     if not set(names) <= set(known):
         parts("energy")  # loads third-party packages, which may register the missing names
     for name in names:
         if name not in known:
-            raise ConfigError(f"unknown {kind} {what} {name!r} in energy.{kind}: {nearest(name, known)}")
+            raise ConfigError(f"unknown {key} {what} {name!r} in energy.{key}: {nearest(name, known)}")
     if len(set(names)) < len(names):
-        raise ConfigError(f"energy.{kind} names a {what} twice: {list(names)}")
+        raise ConfigError(f"energy.{key} names a {what} twice: {list(names)}")
 
 
 class Energy(ABC):

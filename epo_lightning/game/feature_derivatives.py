@@ -128,26 +128,26 @@ def linear_signal(
     return control if feature.source is Source.CONTROL else control.diff(dim=-1) / dt
 
 
-def add_linear_force(
+def add_linear_gradient(
     feature: OwnFeature,
-    force: Float[Tensor, "*batch R"],
+    gradient: Float[Tensor, "*batch R"],
     control: Float[Tensor, "*batch 2 K"],
     node: Float[Tensor, "*batch 2 K"],
     dt: float,
 ) -> None:
-    """Backpropagate the gradient by a linear signal (``force``); the adjoint of :func:`linear_signal`.
+    """Backpropagate the gradient by a linear signal (``gradient``); the adjoint of :func:`linear_signal`.
 
     Adds to the gradient by the controls (``control``) or, for speeds, to that by speed and heading (``node``), in place.
     """
     match feature.source:
         case Source.CONTROL:
-            control[..., feature.channel, :] += force
+            control[..., feature.channel, :] += gradient
         case Source.RATE:
-            force = force / dt
-            control[..., feature.channel, 1:] += force
-            control[..., feature.channel, :-1] -= force
+            gradient = gradient / dt
+            control[..., feature.channel, 1:] += gradient
+            control[..., feature.channel, :-1] -= gradient
         case _:
-            node[..., 0, :] += force
+            node[..., 0, :] += gradient
 
 
 def signal_and_change(

@@ -291,16 +291,16 @@ class FeatureEnergy(Energy):
         batch, agents = scene.agent_mask.shape
         modes, steps = controls.shape[1], controls.shape[3]
         self.check_horizon(steps)
-        for kind, names, given, count in (
+        for part, names, given, count in (
             ("own_weights", self.own, parameters.own_weights, agents),
             ("pair_weights", self.pair, parameters.pair_weights, agents * (agents - 1) // 2),
         ):
             for name in names:
                 if name not in given:
-                    raise ValueError(f"{kind} lacks the feature {name!r}; it has {sorted(given)}")
+                    raise ValueError(f"{part} lacks the feature {name!r}; it has {sorted(given)}")
                 shape = list(given[name].shape) if isinstance(given[name], Tensor) else given[name]
                 if shape not in ([batch, modes, count], [batch, 1, count]):
-                    raise ValueError(f"{kind}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}")
+                    raise ValueError(f"{part}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}")
         needed: dict[str, tuple[tuple[str, Tensor | None], ...]] = {
             "goals": (("parameters.goals", parameters.goals),),
             "reference": (("scene.references", scene.references), ("parameters.reference", parameters.reference)),

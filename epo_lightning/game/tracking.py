@@ -22,7 +22,7 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.scene import HEADING, SPEED, Scene
 
 _SMOOTHNESS = 1e-2
-"""mu relative to the mean of a channel's stiffness, the diagonal of J^T J, so that it has no unit."""
+"""mu relative to the mean of a channel's diagonal entries of J^T J, so that it has no unit."""
 
 
 @runtime_checkable
@@ -144,21 +144,21 @@ def _step(
     batch, agents, steps = seen.shape
     jacobian = torch.where(seen[..., None], moved, 0.0).flatten(3).permute(1, 2, 0, 3)  # [B, N, 2 K, 2 K]
     matrix = jacobian @ jacobian.mT
-    stiffness = matrix.diagonal(dim1=-2, dim2=-1).unflatten(-1, (steps, 2))
-    mean = stiffness.sum(-2) / told.sum(-1, keepdim=True).clamp_min(1)  # [B, N, 2]
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1).unflatten(-1, (steps, 2))
+    mean = diagonal.sum(-2) / told.sum(-1, keepdim=True).clamp_min(1)  # [B, N, 2]
     # The smoothness term couples neighbouring controls that are both determined.
     link = told[..., 1:].to(missed)
     difference = torch.eye(steps, dtype=missed.dtype, device=missed.device).diff(dim=0)
     smooth = difference.mT @ (link[..., None] * difference)  # [B, N, K, K]
     block = matrix.view(batch, agents, steps, 2, steps, 2)
-    force = (jacobian @ missed.flatten(2)[..., None]).view(batch, agents, steps, 2)
+    right = (jacobian @ missed.flatten(2)[..., None]).view(batch, agents, steps, 2)
     for channel in range(2):
-        bond = _SMOOTHNESS * mean[..., channel, None, None] * smooth
-        block[..., channel, :, channel] += bond
-        force[..., channel] -= (bond @ corrected[..., channel, None])[..., 0]
+        coupling = _SMOOTHNESS * mean[..., channel, None, None] * smooth
+        block[..., channel, :, channel] += coupling
+        right[..., channel] -= (coupling @ corrected[..., channel, None])[..., 0]
     # Controls without effect on any position (the turn rate of a standing agent) keep their value.
     most = mean.amax(-1)
     least = 10.0 * torch.finfo(most.dtype).eps * most + (most == 0)
     matrix.diagonal(dim1=-2, dim2=-1).add_(least[..., None])
     factor, _ = torch.linalg.cholesky_ex(matrix)
-    return torch.cholesky_solve(force.flatten(2)[..., None], factor).view(batch, agents, steps, 2)
+    return torch.cholesky_solve(right.flatten(2)[..., None], factor).view(batch, agents, steps, 2)

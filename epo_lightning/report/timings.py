@@ -103,8 +103,8 @@ def _method(config: Mapping[str, Any]) -> str:
     if config["forecaster"]["name"] != "epo":
         return ""
     known = essence(config)
-    parts = {kind: known.get(kind) or {} for kind in METHOD}
-    return canonical({kind: {k: v for k, v in part.items() if k not in SIZES} for kind, part in parts.items()})
+    parts = {group: known.get(group) or {} for group in METHOD}
+    return canonical({group: {k: v for k, v in part.items() if k not in SIZES} for group, part in parts.items()})
 
 
 def places(timings: Sequence[Timing]) -> dict[str, list[Timing]]:

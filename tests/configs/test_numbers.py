@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from epo_lightning.cli import parse
+from epo_lightning.arguments import parse
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import EvaluateSettings, GenerateSettings, PredictSettings, Settings

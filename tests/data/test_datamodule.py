@@ -8,7 +8,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from epo_lightning.data import cache
-from epo_lightning.data.datamodule import BatchSampler, Subset
+from epo_lightning.data.datamodule import BatchSampler, Share
 from epo_lightning.data.drawn import DrawnData
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.registry import ConfigError, build
@@ -247,13 +247,13 @@ def test_a_share_of_every_split_is_the_same_whatever_the_seed(tmp_path):
     whole, part, other = (DrawnData("rpi", scenes=64, **words) for words in ({}, {}, {}))
     for module in (whole, part, other):
         module.setup("fit")
-    some = Subset(whole.dataset("train"), 0.25)
+    some = Share(whole.dataset("train"), 0.25)
     assert len(some) == 16
     ids = some[torch.arange(16)].id
-    assert torch.equal(ids, Subset(part.dataset("train"), 0.25)[torch.arange(16)].id)
+    assert torch.equal(ids, Share(part.dataset("train"), 0.25)[torch.arange(16)].id)
     assert len(set(ids.tolist())) > 8
     assert torch.equal(some[torch.tensor([3])].history, whole.dataset("train")[some.chosen[[3]]].history)
-    assert len(Subset(whole.dataset("train"), 1e-9)) == 1
+    assert len(Share(whole.dataset("train"), 1e-9)) == 1
 
 
 @pytest.mark.parametrize("share", [0.0, -0.5, 1.5])

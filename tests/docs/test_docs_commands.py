@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from docs.pages import PAGES, ROOT, commands, unknown
 
-from epo_lightning import cli
+from epo_lightning.arguments import parse
 from epo_lightning.experiment import assembly, verbs
 from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.config.settings import Settings
@@ -41,7 +41,7 @@ def test_shell_blocks_hold_nothing_but_known_programs() -> None:
 
 def composes(words: list[str]) -> None:
     """Compose and check what `epo <words>` would do, without data; of a table, its first run."""
-    arguments = cli.parse(words)
+    arguments = parse(words)
     verb, overrides = arguments.verb, list(arguments.overrides)
     if verb == "config":
         verb = "train"

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.game.feature_derivatives import (
-    add_linear_force,
+    add_linear_gradient,
     linear_signal,
     nearest_point,
     own_derivatives,
@@ -80,21 +80,21 @@ def expand(
             linked |= _add_pairs(sums, edges, separation, pair)
     if exact:
         _set_undeclared_hessian(sums, edges)
-    force = at.to_velocities(sums.pull[:, :, :2])
+    by_velocity = at.to_velocities(sums.positions[:, :, :2])
     if exact:
         # The unit vector of a heading has the second derivative e'' = -e.
-        sums.node[:, :, 1] -= at.speed * (at.unit * force).sum(2)
-        sums.crossed()[:, :, 0] += (at.left * force).sum(2)
-    sums.node_force += (at.moves * force[:, :, None]).sum(3)
+        sums.node[:, :, 1] -= at.speed * (at.unit * by_velocity).sum(2)
+        sums.crossed()[:, :, 0] += (at.left * by_velocity).sum(2)
+    sums.node_gradient += (at.moves * by_velocity[:, :, None]).sum(3)
     return QuadraticModel(
         at=at,
         value=sums.agent_value.cumsum(1)[:, -1],  # agent by agent, so that absent agents add an exact zero
-        gradient=sums.control_force + at.dt * suffix_sums(sums.node_force),
+        gradient=sums.control_gradient + at.dt * suffix_sums(sums.node_gradient),
         control=sums.control,
         rate=sums.rate,
         node=sums.node,
         cross=sums.cross,
-        position=sums.pull[:, :, 2:],
+        position=sums.positions[:, :, 2:],
         blocks=sums.blocks,
         edges=edges,
         linked=linked,
@@ -110,24 +110,21 @@ def expand(
 class _Sums:
     """Running sums over features, to which the functions below add.
 
-    A *force* is a first derivative of the energy by a quantity, a *stiffness* a second derivative, and a *pull* holds both
-    for positions.
-
     Attributes:
         at, exact: as for :func:`expand`.
         agent_value: own energy of each agent. The energy of all pairs of a sample is added to the sample's first agent.
-        control_force, node_force: gradients by controls and by nodes, without the part that acts through positions
-            (``pull``).
-        pull: gradient x, y and stiffness xx, xy, yy at positions.
+        control_gradient, node_gradient: gradients by controls and by nodes, without the part that acts through positions
+            (``positions``).
+        positions: gradient by positions (x, y), then their second derivatives (xx, xy, yy).
         control, rate, node, cross, blocks, pair_position, pair_blocks: see :class:`QuadraticModel`.
     """
 
     at: Iterate
     exact: bool
     agent_value: Tensor
-    control_force: Tensor
-    node_force: Tensor
-    pull: Tensor
+    control_gradient: Tensor
+    node_gradient: Tensor
+    positions: Tensor
     control: Tensor
     node: Tensor
     rate: Tensor | None = None
@@ -151,9 +148,9 @@ class _Sums:
             self.cross = torch.zeros_like(self.node)
         return self.cross
 
-    def add_value(self, force: Tensor, value: Tensor) -> None:
-        """Add the energy of a feature, 1/2 w^2 c^2, with ``force`` = w^2 c."""
-        self.agent_value += 0.5 * (force * value).flatten(2).sum(-1)
+    def add_value(self, scaled: Tensor, value: Tensor) -> None:
+        """Add the energy of a feature, 1/2 w^2 c^2, with ``scaled`` = w^2 c."""
+        self.agent_value += 0.5 * (scaled * value).flatten(2).sum(-1)
 
 
 def _add_own(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> OwnTerm:
@@ -175,39 +172,41 @@ def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]
     if feature.needs:
         signal = signal - at.by_sample(at.around.reference_speed)
     c = own_derivatives(feature, signal, at.energy.bounds, second=True)
-    force = square * c.value
-    sums.add_value(force, c.value)
-    stiffness = square if c.first is None else square * c.first.square()
+    scaled = square * c.value
+    sums.add_value(scaled, c.value)
+    curvature = square if c.first is None else square * c.first.square()
     if sums.exact and c.second is not None:
-        stiffness = stiffness + force * c.second
-    add_linear_force(feature, force if c.first is None else force * c.first, sums.control_force, sums.node_force, at.dt)
+        curvature = curvature + scaled * c.second
+    add_linear_gradient(
+        feature, scaled if c.first is None else scaled * c.first, sums.control_gradient, sums.node_gradient, at.dt
+    )
     match feature.source:
         case Source.CONTROL:
-            sums.control[:, :, feature.channel] += stiffness
+            sums.control[:, :, feature.channel] += curvature
         case Source.RATE:
             if sums.rate is None:
                 sums.rate = torch.zeros_like(sums.control)
-            sums.rate[:, :, feature.channel, :-1] += stiffness
+            sums.rate[:, :, feature.channel, :-1] += curvature
         case _:
-            sums.node[:, :, 0] += stiffness
+            sums.node[:, :, 0] += curvature
     return SignalTerm(feature, weight, c)
 
 
 def _add_steering(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
     at, square = sums.at, weight.square()
     angle, by_turn_rate, by_speed = steering(*at.steered())
-    force = square * angle
-    sums.add_value(force, angle)
-    stiffness = [square * by_turn_rate.square(), square * by_turn_rate * by_speed, square * by_speed.square()]
+    scaled = square * angle
+    sums.add_value(scaled, angle)
+    curvature = [square * by_turn_rate.square(), square * by_turn_rate * by_speed, square * by_speed.square()]
     if sums.exact:
         second = steering_second_derivatives(*at.steered())
-        stiffness = [part + force * by for part, by in zip(stiffness, second, strict=True)]
-    sums.control_force[:, :, TURN_RATE] += force * by_turn_rate
-    sums.control[:, :, TURN_RATE] += stiffness[0]
+        curvature = [part + scaled * by for part, by in zip(curvature, second, strict=True)]
+    sums.control_gradient[:, :, TURN_RATE] += scaled * by_turn_rate
+    sums.control[:, :, TURN_RATE] += curvature[0]
     # The steering angle of a step depends on the speed at the node before the step. The initial speed is not an unknown.
-    sums.node_force[:, :, 0, :-1] += (force * by_speed)[..., 1:]
-    sums.node[:, :, 0, :-1] += stiffness[2][..., 1:]
-    cross = stiffness[1][..., 1:] / at.dt
+    sums.node_gradient[:, :, 0, :-1] += (scaled * by_speed)[..., 1:]
+    sums.node[:, :, 0, :-1] += curvature[2][..., 1:]
+    cross = curvature[1][..., 1:] / at.dt
     sums.crossed()[:, :, 0, :-1] -= cross
     sums.crossed()[:, :, 1, :-1] += cross
     return SteeringTerm(weight, angle, by_turn_rate, by_speed)
@@ -220,12 +219,12 @@ def _add_lane(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
     nearest, tangent = nearest_point(position, at.around.line)
     offset, tangent = (rows.flatten(0, 1).transpose(-1, -2).contiguous() for rows in (position - nearest, tangent))
     square = weight.square()[..., None]
-    force = square * offset
-    sums.pull[:, :, :2] += force
-    sums.pull[:, :, 2::2] += square
+    scaled = square * offset
+    sums.positions[:, :, :2] += scaled
+    sums.positions[:, :, 2::2] += square
     if sums.exact:
-        sums.pull[:, :, 2:] -= square * _outer(tangent, 2)
-    sums.add_value(force, offset)
+        sums.positions[:, :, 2:] -= square * _outer(tangent, 2)
+    sums.add_value(scaled, offset)
     return LaneTerm(weight, offset, tangent)
 
 
@@ -233,10 +232,10 @@ def _add_goal(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
     at, square = sums.at, weight.square()
     assert at.around.goals is not None
     offset = at.x[:, :, :2, -1] - at.around.goals.flatten(0, 1)
-    force = square * offset
-    sums.pull[:, :, :2, -1] += force
-    sums.pull[:, :, 2::2, -1] += square
-    sums.add_value(force, offset)
+    scaled = square * offset
+    sums.positions[:, :, :2, -1] += scaled
+    sums.positions[:, :, 2::2, -1] += square
+    sums.add_value(scaled, offset)
     return GoalTerm(weight, offset)
 
 
@@ -249,7 +248,7 @@ def _add_undeclared(sums: _Sums, name: str) -> None:
     )  # [B, M, N, R], [2 K, B, M, N, R]
     value, jacobian = value.flatten(0, 1), change.flatten(1, 2).permute(1, 2, 0, 3)
     sums.add_value(value, value)
-    sums.node_force += (jacobian @ value[..., None]).view_as(sums.node_force)
+    sums.node_gradient += (jacobian @ value[..., None]).view_as(sums.node_gradient)
     if not sums.exact:
         block = jacobian @ jacobian.mT
         sums.blocks = block if sums.blocks is None else sums.blocks + block
@@ -273,29 +272,29 @@ def _pair_terms(at: Iterate, edges: Edges, separation: Separation) -> dict[str, 
 def _add_pairs(sums: _Sums, edges: Edges, separation: Separation, terms: dict[str, PairTerm]) -> Bool[Tensor, " E"]:
     """Add the declared pair features; returns the edges that couple their agents."""
     at, normal = sums.at, separation.normal
-    force = torch.zeros_like(separation.distance)
-    stiffness, value = torch.zeros_like(force), torch.zeros_like(force)
+    by_distance = torch.zeros_like(separation.distance)
+    curvature, value = torch.zeros_like(by_distance), torch.zeros_like(by_distance)
     for term in terms.values():
         d = term.d
         assert d.first is not None
         square = term.weight.square()
-        pull = square * d.value
-        value += pull * d.value
+        scaled = square * d.value
+        value += scaled * d.value
         if sums.exact and d.second is not None:
-            stiffness += pull * d.second
-        force += pull * d.first
-        stiffness += square * d.first.square()
-    pulled = force[:, None] * normal
-    position = stiffness[:, None] * _outer(normal, 1)
+            curvature += scaled * d.second
+        by_distance += scaled * d.first
+        curvature += square * d.first.square()
+    gradient = by_distance[:, None] * normal
+    position = curvature[:, None] * _outer(normal, 1)
     if sums.exact:
-        turning = force * separation.inverse
+        turning = by_distance * separation.inverse
         position -= turning[:, None] * _outer(normal, 1)
         position[:, ::2] += turning[:, None]
-    pulled, position = at.at_every_step(pulled), at.at_every_step(position)
-    edges.spread_(sums.pull, torch.cat((pulled, position), 1), torch.cat((-pulled, position), 1))
+    gradient, position = at.at_every_step(gradient), at.at_every_step(position)
+    edges.spread_(sums.positions, torch.cat((gradient, position), 1), torch.cat((-gradient, position), 1))
     sums.pair_position = position
     _add_pair_value(sums, edges, value)
-    return (stiffness != 0).any(1)
+    return (curvature != 0).any(1)
 
 
 def _add_undeclared_pair(
@@ -314,8 +313,8 @@ def _add_undeclared_pair(
     found = undeclared_change_by_agent(feature, both, (first, second), *sizes)
     value, by_first, by_second = (weight * torch.where(exists, part, 0.0) for part in found)
     jacobians = by_first.permute(1, 0, 2), by_second.permute(1, 0, 2)  # [E, 2 K, R]
-    forces = (side @ value[..., None] for side in jacobians)
-    edges.spread_(sums.node_force, *(force.view(-1, 2, at.steps) for force in forces))
+    gradients = (side @ value[..., None] for side in jacobians)
+    edges.spread_(sums.node_gradient, *(part.view(-1, 2, at.steps) for part in gradients))
     _add_pair_value(sums, edges, value.square())
     if not sums.exact:
         if sums.blocks is None:

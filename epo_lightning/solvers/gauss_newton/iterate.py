@@ -136,12 +136,12 @@ class Iterate:
         before = torch.nn.functional.pad(sums[..., :-1], (1, 0))
         return self.dt * (before if self.beta == 1.0 else self.beta * before + (1.0 - self.beta) * sums)
 
-    def to_velocities(self, force: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
+    def to_velocities(self, gradient: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
         """The gradient by the velocities at the nodes that follows from a gradient by positions.
 
         This is the adjoint of :meth:`to_positions`.
         """
-        sums = suffix_sums(force)
+        sums = suffix_sums(gradient)
         if self.beta == 1.0:
             return self.dt * following(sums)
         return self.dt * (self.beta * following(sums) + (1.0 - self.beta) * sums)

@@ -5,8 +5,8 @@ For constant changes mu (``adjoint``) and d (``step``) of the controls, the grad
     phi(u, p) = -<J mu, r + J d>
 
 by the controls u and by the weights and goals p. The quadratic model holds the first and second derivatives of every
-residual r = w c(z(u)). The derivatives of phi by controls, nodes and positions (called *forces*) are summed over the
-features, and at the end they are backpropagated to the controls, as for the gradient of an energy.
+residual r = w c(z(u)). The derivatives of phi by controls, nodes and positions are summed over the features, and at the end
+they are backpropagated to the controls, as for the gradient of an energy.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.game.feature_derivatives import add_linear_force, linear_signal, steering_second_derivatives
+from epo_lightning.game.feature_derivatives import add_linear_gradient, linear_signal, steering_second_derivatives
 from epo_lightning.scene import TURN_RATE
 from epo_lightning.solvers.gauss_newton.iterate import following, suffix_sums
 from epo_lightning.solvers.gauss_newton.quadratic_model import (
@@ -55,8 +55,8 @@ class _Changes:
 
 
 @dataclass(frozen=True)
-class _Forces:
-    """Derivatives of phi (forces), to which the functions below add in place.
+class _Sums:
+    """Derivatives of phi by controls, nodes and positions, to which the functions below add in place.
 
     Attributes:
         controls, nodes: derivatives by controls and nodes.
@@ -75,34 +75,34 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
     controls = torch.stack((adjoint, step))
     nodes = dt * controls.cumsum(-1)
     changes = _Changes(controls, nodes, at.to_positions((at.moves * nodes[:, :, :, :, None]).sum(3)))
-    forces = _forces_along_mu(model, changes)
+    sums = _gradients_along_mu(model, changes)
     own: dict[str, Tensor] = {}
     goals = None
     for name, term in model.own.items():
         match term:
             case SignalTerm():
-                along_mu, ahead = _pull_signal(term, changes, forces, dt)
+                along_mu, ahead = _pull_signal(term, changes, sums, dt)
             case SteeringTerm():
-                along_mu, ahead = _pull_steering(model, term, changes, forces)
+                along_mu, ahead = _pull_steering(model, term, changes, sums)
             case LaneTerm():
-                along_mu, ahead = _pull_lane(term, changes, forces)
+                along_mu, ahead = _pull_lane(term, changes, sums)
             case GoalTerm():
-                along_mu, ahead = _pull_goal(term, changes, forces)
+                along_mu, ahead = _pull_goal(term, changes, sums)
                 goals = term.weight.square() * along_mu
         own[name] = -2.0 * term.weight[..., 0] * (along_mu * ahead).flatten(2).sum(-1)
-    pair = _pull_pairs(model, changes, forces)
-    after = at.to_velocities(forces.positions)
+    pair = _pull_pairs(model, changes, sums)
+    after = at.to_velocities(sums.positions)
     along_e, along_left = ((direction[:, :, None] * after).sum(3) for direction in (at.unit, at.left))  # [S, N, 3, K]
     faster, turned = nodes.movedim(0, 2).unbind(3)  # [S, N, 2, K]
-    node = forces.nodes
+    node = sums.nodes
     node[:, :, 0] += along_e[:, :, 0] + (turned * along_left[:, :, 1:]).sum(2)
     node[:, :, 1] += at.speed * (along_left[:, :, 0] - (turned * along_e[:, :, 1:]).sum(2))
     node[:, :, 1] += (faster * along_left[:, :, 1:]).sum(2)
-    return Gradients(forces.controls + dt * suffix_sums(node), own, pair, goals)
+    return Gradients(sums.controls + dt * suffix_sums(node), own, pair, goals)
 
 
-def _forces_along_mu(model: QuadraticModel, changes: _Changes) -> _Forces:
-    """Initial values of the forces: minus the diagonal stiffness times mu for controls and nodes, zero for positions."""
+def _gradients_along_mu(model: QuadraticModel, changes: _Changes) -> _Sums:
+    """Initial values: minus the diagonal second derivatives times mu for controls and nodes, zero for positions."""
     mu = changes.controls[0]
     control = -model.control * mu
     node = -model.node * changes.nodes[0]
@@ -110,28 +110,26 @@ def _forces_along_mu(model: QuadraticModel, changes: _Changes) -> _Forces:
         rate = -model.rate * (following(mu) - mu) / model.at.dt**2
         control -= rate - torch.nn.functional.pad(rate[..., :-1], (1, 0))
     samples, agents, _, steps = mu.shape
-    return _Forces(control, node, mu.new_zeros(samples, agents, 3, 2, steps))
+    return _Sums(control, node, mu.new_zeros(samples, agents, 3, 2, steps))
 
 
-# Each of the following four functions adds the forces of one feature, as far as the diagonal stiffness does not contain them
-# (:func:`_forces_along_mu`). It returns J mu (``along_mu``) and r + J d (``ahead``), both without the feature's weight.
+# Each of the following four functions adds the derivatives of one feature that are not in :func:`_gradients_along_mu`. It
+# returns J mu (``along_mu``) and r + J d (``ahead``), both without the feature's weight.
 
 
-def _pull_signal(term: SignalTerm, changes: _Changes, forces: _Forces, dt: float) -> tuple[Tensor, Tensor]:
+def _pull_signal(term: SignalTerm, changes: _Changes, sums: _Sums, dt: float) -> tuple[Tensor, Tensor]:
     along_mu, along_d = linear_signal(term.feature, changes.controls, changes.nodes[:, :, :, 0], dt, channels=-2)
     value, first, second = term.c
     if first is None:
         return along_mu, value + along_d
     ahead = value + first * along_d
     if second is not None:
-        force = -term.weight.square() * second * (along_mu * ahead + first * along_mu * along_d)
-        add_linear_force(term.feature, force, forces.controls, forces.nodes, dt)
+        gradient = -term.weight.square() * second * (along_mu * ahead + first * along_mu * along_d)
+        add_linear_gradient(term.feature, gradient, sums.controls, sums.nodes, dt)
     return first * along_mu, ahead
 
 
-def _pull_steering(
-    model: QuadraticModel, term: SteeringTerm, changes: _Changes, forces: _Forces
-) -> tuple[Tensor, Tensor]:
+def _pull_steering(model: QuadraticModel, term: SteeringTerm, changes: _Changes, sums: _Sums) -> tuple[Tensor, Tensor]:
     square = term.weight.square()
     turned = changes.controls[:, :, :, TURN_RATE]
     faster = torch.nn.functional.pad(changes.nodes[:, :, :, 0, :-1], (1, 0))
@@ -141,38 +139,38 @@ def _pull_steering(
     by_turn_rate = twice * turned + mixed * faster
     by_speed = mixed * turned + by_speeds * faster
     cross = square * term.by_turn_rate * term.by_speed
-    forces.controls[:, :, TURN_RATE] -= (
+    sums.controls[:, :, TURN_RATE] -= (
         square * (ahead * by_turn_rate[0] + along_mu * by_turn_rate[1]) + cross * faster[0]
     )
     by_node = square * (ahead * by_speed[0] + along_mu * by_speed[1]) + cross * turned[0]
-    forces.nodes[:, :, 0, :-1] -= by_node[..., 1:]
+    sums.nodes[:, :, 0, :-1] -= by_node[..., 1:]
     return along_mu, ahead
 
 
-def _pull_lane(term: LaneTerm, changes: _Changes, forces: _Forces) -> tuple[Tensor, Tensor]:
+def _pull_lane(term: LaneTerm, changes: _Changes, sums: _Sums) -> tuple[Tensor, Tensor]:
     square = term.weight.square()[..., None]
     along_mu, along_d = changes.positions
     ahead = term.offset + along_d
     across = along_mu - term.tangent * (term.tangent * along_mu).sum(2, keepdim=True)
-    forces.positions[:, :, 0] -= square * across
-    forces.positions[:, :, 1] -= square * ahead
-    forces.positions[:, :, 2] -= square * along_mu
+    sums.positions[:, :, 0] -= square * across
+    sums.positions[:, :, 1] -= square * ahead
+    sums.positions[:, :, 2] -= square * along_mu
     return along_mu, ahead
 
 
-def _pull_goal(term: GoalTerm, changes: _Changes, forces: _Forces) -> tuple[Tensor, Tensor]:
+def _pull_goal(term: GoalTerm, changes: _Changes, sums: _Sums) -> tuple[Tensor, Tensor]:
     square = term.weight.square()
     along_mu, along_d = changes.positions[..., -1]
     ahead = term.offset + along_d
-    pull = square * along_mu
-    forces.positions[:, :, 0, :, -1] -= pull
-    forces.positions[:, :, 1, :, -1] -= square * ahead
-    forces.positions[:, :, 2, :, -1] -= pull
+    scaled = square * along_mu
+    sums.positions[:, :, 0, :, -1] -= scaled
+    sums.positions[:, :, 1, :, -1] -= square * ahead
+    sums.positions[:, :, 2, :, -1] -= scaled
     return along_mu, ahead
 
 
-def _pull_pairs(model: QuadraticModel, changes: _Changes, forces: _Forces) -> dict[str, Float[Tensor, "S P"]]:
-    """Adds the forces of the declared pair features; returns the gradient by their weights."""
+def _pull_pairs(model: QuadraticModel, changes: _Changes, sums: _Sums) -> dict[str, Float[Tensor, "S P"]]:
+    """Adds the derivatives of the declared pair features; returns the gradient by their weights."""
     by_weight: dict[str, Tensor] = {}
     if not model.pair:
         return by_weight
@@ -202,8 +200,8 @@ def _pull_pairs(model: QuadraticModel, changes: _Changes, forces: _Forces) -> di
             weighed = rows.index_copy_(0, edges.pair, weighed)
         by_weight[name] = weighed.view(at.samples, -1)
     turning = (apart - closing[:, :, None] * normal[:, None]) * separation.inverse[:, None, None]
-    force = outward[:, None] * normal + with_mu[:, None] * turning[:, 0] + with_d[:, None] * turning[:, 1]
-    force = torch.stack((force, with_mu[:, None] * normal, with_d[:, None] * normal), 1)
-    force = at.at_every_step(force.flatten(1, 2)).view(-1, 3, 2, at.steps)
-    edges.spread_(forces.positions, force, -force)
+    gradient = outward[:, None] * normal + with_mu[:, None] * turning[:, 0] + with_d[:, None] * turning[:, 1]
+    gradient = torch.stack((gradient, with_mu[:, None] * normal, with_d[:, None] * normal), 1)
+    gradient = at.at_every_step(gradient.flatten(1, 2)).view(-1, 3, 2, at.steps)
+    edges.spread_(sums.positions, gradient, -gradient)
     return by_weight

@@ -7,7 +7,7 @@ l >= l'
 
 so one matrix product with few columns gives the whole lower triangle. All other contributions are banded matrices: controls
 are first differences of z, their rates second differences, speeds contribute to the diagonal, and a steering angle couples a
-turn rate with the speed before it. The model holds the second derivatives by these quantities, called "stiffness" below;
+turn rate with the speed before it. The model holds the second derivatives by these quantities;
 :mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and factorises the matrix.
 
 Pairs are a list of E edges between agents. Agent i of sample s has the number s N + i.
@@ -108,17 +108,17 @@ class QuadraticModel:
         at: the iterate.
         value: E(u), by sample.
         gradient: dE/du.
-        control, node: diagonal stiffness of the controls and of the nodes.
-        rate: diagonal stiffness of the controls' rates, zero at the last entry (there are K - 1 rates); None if no feature
-            uses a rate.
-        cross: stiffness between the speed of a node and two headings, that of the same node and that of the next; None if it
+        control, node: second derivatives by single controls and by single nodes.
+        rate: second derivatives by single rates of controls, zero at the last entry (there are K - 1 rates); None if no
+            feature uses a rate.
+        cross: second derivatives by the speed of a node and a heading, that of the same node or of the next; None if it
             is zero.
-        position: stiffness xx, xy and yy of the positions.
-        blocks: dense stiffness of the nodes by undeclared own features; None without.
+        position: second derivatives by the positions: xx, xy and yy.
+        blocks: all second derivatives of undeclared own features by the nodes; None without.
         edges: the pairs that were evaluated.
         linked: the edges whose two agents are coupled.
-        pair_position: stiffness xx, xy and yy that an edge adds to both agents, and subtracts between them; None without.
-        pair_blocks: dense stiffness between the nodes of both agents by undeclared pair features; None without.
+        pair_position: xx, xy and yy that an edge adds to both agents, and subtracts between them; None without.
+        pair_blocks: all those of undeclared pair features by the nodes of both agents; None without.
         own: declared own features by name.
         pair: declared pair features by name.
         separation: distances of the edges; None without edges.

@@ -173,17 +173,6 @@ def sources_in(folder):
             shutil.copy(path, folder)
 
 
-def test_one_process_builds_at_a_time(tmp_path):
-    sources_in(tmp_path)
-    with build._alone(tmp_path / "epo_kernel.so.1"):
-        other = subprocess.Popen(
-            [sys.executable, tmp_path / "build.py"], env={"CXX": "no-such-compiler"}, stderr=subprocess.PIPE, text=True
-        )
-        with pytest.raises(subprocess.TimeoutExpired):
-            other.wait(timeout=1.0)
-    assert "no-such-compiler" in other.communicate()[1]
-
-
 def test_a_missing_compiler_is_named(tmp_path):
     """The installation prints a note and continues."""
     sources_in(tmp_path)

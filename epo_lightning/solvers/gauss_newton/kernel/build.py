@@ -19,8 +19,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -91,25 +89,6 @@ def _run(commands: list[list[str]]) -> None:
             raise OSError(f"{shlex.join(command)} ended with {process.returncode}\n{words[-2000:]}")
 
 
-@contextmanager
-def _alone(target: Path) -> Iterator[None]:
-    """Context in which no other process builds the same library: the second of two waits, and finds it up to date.
-
-    The folder itself is locked, so that no file is left. On Windows there is no lock.
-    """
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    folder = os.open(target.parent, os.O_RDONLY)
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(folder)
-
-
 def build(target: Path = LIBRARY) -> None:
     """Compile and link, unless the library is up to date.
 
@@ -119,18 +98,13 @@ def build(target: Path = LIBRARY) -> None:
     Raises:
         OSError: there is no compiler, or it fails; the message holds its output.
     """
-    with _alone(target):
-        if target != SANITIZED:
-            try:
-                load(target)
-                return
-            except OSError:
-                pass  # missing or stale: it is replaced once the new one has been built
-        _build(target)
-
-
-def _build(target: Path) -> None:
     sanitized = target == SANITIZED
+    if not sanitized:
+        try:
+            load(target)
+            return
+        except OSError:
+            pass  # missing or stale: it is replaced once the new one has been built
     compiler = [_found("clang++")] if sanitized else _compiler()
     x86 = platform.machine().lower() in ("x86_64", "amd64") and not sanitized
     # A sanitized library runs where it was built: one level of instructions, the machine's own.
