@@ -91,6 +91,8 @@ _FIELDS: Mapping[str, tuple[str, tuple[str | int, ...], str | None]] = {
     "frame": (_FLOAT, ("B", 3), None),
     "subset": (_INTEGER, ("B",), None),
     "id": (_INTEGER, ("B",), None),
+    "goal_headings": (_FLOAT, ("B", "N", "G"), "goal_candidates"),
+    "game_steps": (_INTEGER, ("B",), None),
 }
 """For every tensor of a :class:`Scene`: number type, shape, and the field that it belongs to, which must be given too."""
 
@@ -127,6 +129,10 @@ class Scene(_Batch):
             world = R(rotation) position + origin.
         subset: index of the named subset of the data that the future belongs to (RPI: executed 0, alternative 1).
         id: index of the scene's record in its data set.
+        goal_headings: heading [rad] that an agent wants at each goal candidate, continuous with the agent's heading: it is
+            not wrapped to (-pi, pi], so a difference of 2 pi is a full turn.
+        game_steps: number of steps from t0 to the end of each scene's game, 1 .. K of the controls. Controls after the end
+            have no cost and no effect. None if all games end with the last control.
 
     Raises:
         TypeError: a field that is not a tensor (numpy arrays included), or a time step that is not a number.
@@ -152,6 +158,8 @@ class Scene(_Batch):
     frame: Float[Tensor, "B 3"] | None = None
     subset: Int[Tensor, " B"] | None = None
     id: Int[Tensor, " B"] | None = None
+    goal_headings: Float[Tensor, "B N G"] | None = None
+    game_steps: Int[Tensor, " B"] | None = None
 
     def __post_init__(self) -> None:
         # Only shapes and types are checked here; checking values would make the host wait for a GPU (`validate_values`).
@@ -211,10 +219,12 @@ class Scene(_Batch):
         result = torch.ones(len(self.history), dtype=torch.bool, device=self.history.device)
         references = None if self.references is None else self.references.flatten(3)
         speed = None if self.reference_speed is None else self.reference_speed[..., None]
+        headings = None if self.goal_headings is None else self.goal_headings[..., None]
         for values, mask in (
             (self.history, self.history_mask),
             (self.future, self.future_mask),
             (self.goal_candidates, self.goal_mask),
+            (headings, self.goal_mask),
             (self.size, None),
             (references, self.reference_mask),
             (speed, None),
@@ -273,6 +283,9 @@ class GameParameters(_Batch):
         context: features z of the agents, for energies that are networks.
         order: +1 or -1 for every pair i < j: the side on which they pass, or the agent that goes first
             (:mod:`~epo_lightning.game.pair_order`). None for energies without orders.
+        goal_headings: heading [rad] wanted at the goal, continuous with the agent's heading (not wrapped); None for energies
+            without a feature of it.
+        margins: additional distance [m] that a pair keeps, >= 0, by name of the pair feature.
     """
 
     own_weights: Mapping[str, Float[Tensor, "B M N"]]
@@ -282,6 +295,8 @@ class GameParameters(_Batch):
     reference: Int[Tensor, "B M N"] | None = None
     context: Float[Tensor, "B N D"] | None = None
     order: Float[Tensor, "B M P"] | None = None
+    goal_headings: Float[Tensor, "B M N"] | None = None
+    margins: Mapping[str, Float[Tensor, "B M P"]] = dataclasses.field(default_factory=dict)
 
     def for_modes(self, modes: int) -> GameParameters:
         """The same games for M modes: a single game is repeated for all of them. Initial strategies stay unchanged."""
@@ -296,6 +311,8 @@ class GameParameters(_Batch):
             goals=widen(self.goals),
             reference=widen(self.reference),
             order=widen(self.order),
+            goal_headings=widen(self.goal_headings),
+            margins={name: margin.expand(-1, modes, -1) for name, margin in self.margins.items()},
         )
 
 

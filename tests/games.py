@@ -106,7 +106,7 @@ def highway_scene(scenes: int = 3, agents: int = 4, *, candidates: int = 6, hori
 def reordered(scene: Scene, order: list[int]) -> Scene:
     """Scene with its agents in another order."""
     whose = ("history", "history_mask", "agent_mask", "future", "future_mask", "goal_candidates", "goal_mask")
-    whose += ("goal_reference", "size", "kind", "references", "reference_mask", "reference_speed")
+    whose += ("goal_reference", "goal_headings", "size", "kind", "references", "reference_mask", "reference_speed")
     fields = dict(vars(scene))
     return Scene(**{**fields, **{name: fields[name][:, order] for name in whose if fields[name] is not None}})
 
@@ -155,6 +155,8 @@ def widen(parameters: GameParameters, agents: int = 2, filling: float = float("n
         initial_controls=grow(parameters.initial_controls),
         goals=None if parameters.goals is None else grow(parameters.goals),
         reference=None if parameters.reference is None else grow(parameters.reference),
+        goal_headings=None if parameters.goal_headings is None else grow(parameters.goal_headings),
+        margins={name: grow_pairs(margin) for name, margin in parameters.margins.items()},
     )
 
 
@@ -192,6 +194,8 @@ def pad(
         future_mask=grow(scene.future_mask, 1, agents, False),
         goal_candidates=grow(grow(scene.goal_candidates, 1, agents, filling), 2, candidates, filling),
         goal_mask=grow(grow(scene.goal_mask, 1, agents, False), 2, candidates, False),
+        goal_headings=grow(grow(scene.goal_headings, 1, agents, filling), 2, candidates, filling),
+        game_steps=scene.game_steps,
         goal_reference=grow(grow(scene.goal_reference, 1, agents, -99), 2, candidates, -99),
         size=grow(scene.size, 1, agents, filling),
         kind=grow(scene.kind, 1, agents, -99),

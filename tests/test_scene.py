@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jaxtyping
 import pytest
 import torch
@@ -64,6 +66,13 @@ def a_mask(*shape: int) -> torch.Tensor:
         ({"reference_speed": torch.ones(2)}, r"scene\.reference_speed has shape \[2\]; this scene takes \[2, 3\]"),
         ({"frame": torch.zeros(2, 2)}, r"scene\.frame has shape \[2, 2\]; this scene takes \[2, 3\]"),
         ({"subset": torch.zeros(3, dtype=torch.long)}, r"scene\.subset has shape \[3\]; this scene takes \[2\]"),
+        ({"goal_headings": torch.zeros(2, 3, 5)}, r"scene\.goal_headings has shape .* takes \[2, 3, 6\]"),
+        (
+            {"goal_candidates": None, "goal_headings": torch.zeros(2, 3, 6)},
+            r"scene\.goal_headings describes scene\.goal_candidates, which is None",
+        ),
+        ({"game_steps": torch.ones(3, dtype=torch.long)}, r"scene\.game_steps has shape \[3\]; this scene takes \[2\]"),
+        ({"game_steps": torch.ones(2)}, r"scene\.game_steps is of type torch\.float32, expected integer"),
         ({"id": torch.zeros(2)}, r"scene\.id is of type torch\.float32, expected integer"),
         ({"agent_mask": torch.ones(2, 3)}, r"scene\.agent_mask is of type torch\.float32, .* masks are torch\.bool"),
         ({"history_mask": torch.ones(2, 3, 5)}, r"scene\.history_mask is of type torch\.float32"),
@@ -142,11 +151,18 @@ def test_only_unmasked_values_must_be_finite():
     scene.reference_mask[2, 1, 1] = False
     scene.agent_mask[0, 0] = False
     assert scene.finite.all()
+    headed = dataclasses.replace(scene, goal_headings=torch.zeros(3, 2, 1))
+    headed.goal_headings[1, 1] = torch.nan
+    assert headed.finite.tolist() == [True, False, True]
+    headed.goal_mask[1, 1] = False
+    assert headed.finite.all()
 
 
 def test_nested_data_classes_are_indexed_with_the_batch():
     goals = torch.arange(3.0).view(3, 1, 1, 1).expand(3, 1, 1, 2)
-    game = GameParameters({"goal": goals[..., 0]}, {}, torch.zeros(3, 1, 1, 2, 2), goals)
+    margins = {"clearance": goals[..., 0]}
+    game = GameParameters({"goal": goals[..., 0]}, {}, torch.zeros(3, 1, 1, 2, 2), goals, margins=margins)
     forecast = JointForecast(torch.zeros(3, 1, 1, 2, 4), torch.ones(3, 1), parameters=game)
     assert torch.equal(forecast[2].parameters.goals, goals[2:])
     assert torch.equal(forecast[2].parameters.own_weights["goal"], goals[2:, ..., 0])
+    assert torch.equal(forecast[2].parameters.margins["clearance"], goals[2:, ..., 0])

@@ -26,6 +26,7 @@ class Goals:
         reference: index of the reference line on which each goal lies; None for scenes without reference lines.
         logits: logits of the candidates, ``NO_CANDIDATE`` for absent ones; None where goals are not chosen.
         chosen: index of the candidate chosen in each mode; None where goals are not chosen.
+        headings: headings [rad] wanted at the goals, zero for agents without a goal; None for scenes without goal headings.
     """
 
     exist: Bool[Tensor, "B N"]
@@ -33,6 +34,7 @@ class Goals:
     reference: Int[Tensor, "B M N"] | None = None
     logits: Float[Tensor, "B N G"] | None = None
     chosen: Int[Tensor, "B M N"] | None = None
+    headings: Float[Tensor, "B M N"] | None = None
 
     @property
     def probabilities(self) -> Float[Tensor, "B N G"] | None:
@@ -93,7 +95,10 @@ class GivenGoals(nn.Module):
             ValueError: the scene gives no goal, or several candidates per agent.
         """
         positions = given_goals(scene)[:, None].expand(-1, self.modes, -1, -1)
-        return Goals(_exist(scene)[:, :, 0], positions)
+        exist, headings = _exist(scene)[:, :, 0], None
+        if scene.goal_headings is not None:
+            headings = scene.goal_headings[:, :, 0].where(exist, 0.0)[:, None].expand(-1, self.modes, -1)
+        return Goals(exist, positions, headings=headings)
 
 
 class GoalDecoder(nn.Module):
@@ -121,7 +126,7 @@ class GoalDecoder(nn.Module):
         """
         logits = self.logits(z, scene)
         chosen = most_likely(logits, self.modes)
-        return Goals(_exist(scene).any(-1), *choose(scene, chosen), logits, chosen)
+        return Goals(_exist(scene).any(-1), *choose(scene, chosen), logits, chosen, chosen_headings(scene, chosen))
 
     def logits(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B N G"]:
         """Logits of the candidates, ``NO_CANDIDATE`` for absent ones.
@@ -177,3 +182,11 @@ def choose(scene: Scene, chosen: Int[Tensor, "B M N"]) -> tuple[Float[Tensor, "B
     if scene.goal_reference is None:
         return goals, None
     return goals, torch.where(exists[index], scene.goal_reference[index], 0)
+
+
+def chosen_headings(scene: Scene, chosen: Int[Tensor, "B M N"]) -> Float[Tensor, "B M N"] | None:
+    """Headings [rad] of the chosen candidates, zero for agents without candidates; None for scenes without goal headings."""
+    if scene.goal_headings is None:
+        return None
+    take = chosen.transpose(1, 2)
+    return scene.goal_headings.where(_exist(scene), 0.0).gather(-1, take).transpose(1, 2)

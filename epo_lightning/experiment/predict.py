@@ -38,6 +38,7 @@ MEANING = {
     "future_mask": "[B, N, K] which of its steps were observed",
     "goal_candidates": "[B, N, G, 2] where an agent may be heading for [m]",
     "goal_mask": "[B, N, G] which candidates exist",
+    "goal_headings": "[B, N, G] heading that an agent wants at each candidate [rad]",
     "goal_reference": "[B, N, G] index of the line in references on which a candidate lies",
     "size": "[B, N, 2] length and width [m]",
     "kind": "[B, N] index into kinds",
@@ -49,6 +50,7 @@ MEANING = {
     "frame": "[B, 3] origin x, y [m] and rotation [rad]: in the recording a position is R(rotation) position + origin",
     "id": "[B] record of the data set",
     "subset": "[B] index into subsets",
+    "game_steps": "[B] number of steps from t0 to the end of each game",
 }
 
 
@@ -125,6 +127,6 @@ def _tensors(scenes: Scene, forecast: JointForecast) -> Iterable[tuple[str, Tens
             if (value := getattr(owner, name, None)) is not None:
                 yield name, value.contiguous()
     if game is not None:
-        for part in ("own_weights", "pair_weights"):
+        for part in ("own_weights", "pair_weights", "margins"):
             for name, value in getattr(game, part).items():
                 yield f"{part}/{name}", value.contiguous()

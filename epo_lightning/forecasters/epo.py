@@ -195,6 +195,7 @@ class EPO(Forecaster):
             reference=goals.reference,
             context=z if "context" in self.energy.needs else None,
             order=None if orders is None else orders.order,
+            goal_headings=goals.headings,
         )
 
     @property

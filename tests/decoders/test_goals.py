@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
-from games import highway_scene, pad
+from games import highway_scene, pad, random_scene
 from hypothesis import given
 from hypothesis import strategies as st
 
-from epo_lightning.decoders.goals import NO_CANDIDATE, GoalDecoder, choose, most_likely
+from epo_lightning.decoders.goals import NO_CANDIDATE, GivenGoals, GoalDecoder, choose, most_likely
 from epo_lightning.decoders.mlp import MLP
 from epo_lightning.scene import Scene
 
@@ -101,3 +103,25 @@ def test_a_scene_without_candidates_is_refused():
     bare = Scene(scene.history, scene.dt)
     with pytest.raises(ValueError, match=r"goal_candidates .* is None"):
         GoalDecoder(8)(torch.randn(2, 3, 8), bare)
+
+
+def test_goal_headings_are_chosen_with_the_goals():
+    scene, modes = highway_scene(3, 2), 4
+    headings = torch.where(scene.goal_mask, torch.randn(3, 2, 6), torch.nan)
+    scene = dataclasses.replace(scene, goal_headings=headings)
+    scene.agent_mask[2, 1] = False
+    goals = GoalDecoder(8, modes=modes)(torch.randn(3, 2, 8), scene)
+    for b, m, i in torch.cartesian_prod(torch.arange(3), torch.arange(modes), torch.arange(2)).tolist():
+        expected = headings[b, i, goals.chosen[b, m, i]] if scene.agent_mask[b, i] else torch.tensor(0.0)
+        assert goals.headings[b, m, i] == expected
+    assert GoalDecoder(8)(torch.randn(3, 2, 8), dataclasses.replace(scene, goal_headings=None)).headings is None
+
+
+def test_given_goal_headings_are_the_same_in_every_mode():
+    one = dataclasses.replace(
+        random_scene(3, 2), goal_headings=torch.tensor([[[1.0], [2.0]], [[3.0], [torch.nan]], [[5.0], [6.0]]])
+    )
+    one.goal_mask[1, 1] = False
+    headings = GivenGoals(2)(torch.zeros(3, 2, 4), one).headings
+    assert headings.tolist() == [[[1.0, 2.0]] * 2, [[3.0, 0.0]] * 2, [[5.0, 6.0]] * 2]
+    assert GivenGoals(2)(torch.zeros(3, 2, 4), random_scene(3, 2)).headings is None

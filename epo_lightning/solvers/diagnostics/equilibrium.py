@@ -310,6 +310,7 @@ def _relevant(scene: Scene) -> Scene:
         references=scene.references,
         reference_mask=scene.reference_mask,
         reference_speed=scene.reference_speed,
+        game_steps=scene.game_steps,
     )
 
 
