@@ -1,6 +1,6 @@
 """Data classes of the project: the observed scene, the inferred game, its solution and the forecast.
 
-The letters in shapes mean the same everywhere:
+The letters in shapes mean the same everywhere but in ``solvers/gauss_newton``, which states its own:
 
 ====  ==========================  ======  ================================================================
 B     scenes in a batch           P       pairs of agents i < j, P = N (N - 1) / 2
@@ -403,8 +403,8 @@ class Equilibrium(_Batch):
 class JointForecast(_Batch):
     """M joint futures of all agents of a scene and their probabilities.
 
-    Losses read the logits, because their gradient does not vanish for very small probabilities. If a forecaster gives no
-    logits, losses take the logarithms of its probabilities.
+    Losses use ``log_probabilities``, computed from the logits where there are any: the gradient of a log-softmax does not
+    vanish for very small probabilities.
 
     Attributes:
         states: futures; the agents of one mode belong together.

@@ -26,6 +26,6 @@ class VLSTM(PolylineBackbone):
     def forward(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
         """Features z_i of all agents."""
         agents = self.agent_features(scene)
-        lanes, drawn = self.lane_features(scene)
-        sources, exist = torch.cat((agents, lanes), 1), torch.cat((scene.agent_mask, drawn), 1)
+        lanes, lane_exists = self.lane_features(scene)
+        sources, exist = torch.cat((agents, lanes), 1), torch.cat((scene.agent_mask, lane_exists), 1)
         return self.interaction(agents, sources, exist)

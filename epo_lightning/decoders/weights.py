@@ -18,7 +18,7 @@ def _by_name(weights: Float[Tensor, "B R out"], names: Sequence[str], modes: int
 
 
 class OwnWeights(nn.Module):
-    """phi_own: weights W_i of an agent's own features from its feature z_i alone, one network for all agents.
+    """phi_own: weights W_i of the energy's own features, decoded from z_i alone, by one network for all agents.
 
     Args:
         width: size of the agent features.

@@ -50,7 +50,8 @@ def build_data(section: Mapping[str, Any]) -> Any:
 
 
 def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
-    """The model's configuration as plain values, which checkpoints store: all parts except ``data``, ``goal`` and the task.
+    """The model's configuration as plain values, which checkpoints store: all parts but ``data``, and also
+    ``goal`` and the fields of the task.
 
     It is the argument of :func:`~epo_lightning.forecasters.build_forecaster`.
     """
@@ -94,16 +95,16 @@ def check_monitor(monitor: str, task: Task) -> None:
 
 def build_model(settings: Settings, data: Any) -> LightningModule:
     """The forecaster of a configuration for the task of ``data``, see :func:`build`."""
-    model = describe_model(settings, data)
+    configuration = describe_model(settings, data)
     for group in PARTS[1:]:  # all but "data", which was checked when it was built
-        check_part(group, model[group], SUPPLIED[group])
+        check_part(group, configuration[group], SUPPLIED[group])
     try:
-        forecaster = build_forecaster(model)
+        forecaster = build_forecaster(configuration)
     except ConfigError:
         raise
     except (TypeError, ValueError, RuntimeError, ArithmeticError) as error:
         raise ConfigError(
-            f"the forecaster cannot be built{_suspects(model)}: {' '.join(str(error).split())}"
+            f"the forecaster cannot be built{_suspects(configuration)}: {' '.join(str(error).split())}"
         ) from error
     # Lightning converts the model as well, but only after it has loaded a checkpoint into the model.
     return forecaster.double() if settings.trainer.precision == "64-true" else forecaster

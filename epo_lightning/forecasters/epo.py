@@ -117,9 +117,10 @@ class EPO(Forecaster):
             raise ConfigError(f"forecaster.control_scale must be positive and finite, not {control_scale}")
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
-        self.differentiate, self.objective = backward, objective  # `backward` is a method of LightningModule
+        # `solve` runs the minimiser, with the derivative of its solution that the part `backward` defines.
+        self.solve, self.objective = backward, objective
         # M games with one initial strategy each; for solvers that choose, one game with C candidates.
-        games, starts = solver.games(modes), solver.starts(modes)
+        games, strategies = solver.games(modes), solver.strategies(modes)
         width, scale, horizon = backbone.width, task.scale, task.horizon
         own, pair = energy.weighted
         start = _check_start(own_start, own, energy.own)
@@ -129,11 +130,11 @@ class EPO(Forecaster):
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs)
         self.strategies: InitialStrategies | ZeroStrategies | Motions
         if initial == "decoded":
-            self.strategies = InitialStrategies(width, starts, horizon, control_scale)
+            self.strategies = InitialStrategies(width, strategies, horizon, control_scale)
         elif initial == "zero":
-            self.strategies = ZeroStrategies(starts, horizon)
+            self.strategies = ZeroStrategies(strategies, horizon)
         else:
-            self.strategies = Motions(horizon, starts, **ranges)
+            self.strategies = Motions(horizon, strategies, **ranges)
         self.goals: GoalDecoder | GivenGoals | NoGoals
         if task.candidates > 1 and energy.needs & {"goals", "reference"}:
             self.goals = GoalDecoder(width, scale, games)
@@ -153,13 +154,13 @@ class EPO(Forecaster):
         goals = self.goals(z, scene)
         orders = self._decode_orders(z, scene)
         parameters = self._infer_game(z, scene, goals, orders)
-        solution = self.differentiate(self._minimiser, self.energy, scene, parameters)
+        solution = self.solve(self._minimiser, self.energy, scene, parameters)
         logits = self._mode_logits(z, scene, goals, orders, solution)
         return JointForecast(
             states=solution.states,
             probabilities=logits.softmax(1),
             controls=solution.controls,
-            initial_states=self._initial_states(scene, parameters),
+            initial_states=self._states_of_initial_strategies(scene, parameters),
             parameters=parameters,
             solution=solution,
             goal_probabilities=goals.probabilities,
@@ -220,15 +221,15 @@ class EPO(Forecaster):
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
         return self.probabilities(z, solution.states[..., :2], current[..., :2], scene.agent_mask)
 
-    def _initial_states(self, scene: Scene, parameters: GameParameters) -> Tensor | None:
+    def _states_of_initial_strategies(self, scene: Scene, parameters: GameParameters) -> Tensor | None:
         """The states of the initial strategies, [B, M, N, K, 4]; None for solvers that choose among candidates."""
         if TABLES in self.solver.provides:
             return None
-        starts = parameters.initial_controls
-        # With backward=unrolled, a gradient reaches the initial strategies through the solution. Their states, which the
-        # loss term `initial` uses otherwise, then need no gradient.
-        starts = starts.detach() if self.differentiate.teaches_start else starts
-        return self.energy.dynamics.rollout(self.energy.initial(scene), starts, scene.dt)
+        controls = parameters.initial_controls
+        # If gradients reach the initial strategies through the solution (backward=unrolled), the loss term `initial` is not
+        # used, so their states are computed without a gradient.
+        controls = controls.detach() if self.solve.teaches_start else controls
+        return self.energy.dynamics.rollout(self.energy.initial(scene), controls, scene.dt)
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
         assert forecast.parameters is not None

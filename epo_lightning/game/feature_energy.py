@@ -150,7 +150,8 @@ class FeatureEnergy(Energy):
     ) -> tuple[Float[Tensor, "B M R"], Float[Tensor, "D B M R"]]:
         """The vector r of all residuals, and its directional derivatives J v along D directions v of the controls.
 
-        Both are differentiable with respect to controls and parameters; the set of active hinges is held constant.
+        Both are differentiable with respect to controls and parameters. Which bounds are violated and which agents overlap
+        is held constant.
         """
         _, residuals, changes = zip(*self._features(scene, parameters, controls, directions), strict=True)
         return torch.cat([r.flatten(2) for r in residuals], -1), torch.cat([c.flatten(3) for c in changes], -1)
@@ -198,7 +199,7 @@ class FeatureEnergy(Energy):
             scene, parameters, around: the game.
             at: states and controls.
             moved: their changes along D directions, in the first dimension.
-            slide: see :func:`~epo_lightning.game.feature_derivatives.signal_and_change`.
+            slide: whether the nearest point of a line moves with the agent
         """
         feature = self.own_features[name]
         if feature.declared:

@@ -47,12 +47,12 @@ class Minimiser(ABC):
         """The minimiser to use outside training."""
         return self
 
-    def starts(self, modes: int) -> int:
+    def strategies(self, modes: int) -> int:
         """Number of initial strategies per agent for M modes."""
         return modes
 
     def for_modes(self, modes: int) -> Minimiser:
-        """The minimiser for M joint modes."""
+        """This minimiser, set up to return M joint modes; only minimisers that choose among candidates differ."""
         return self
 
     def games(self, modes: int) -> int:

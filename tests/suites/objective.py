@@ -40,7 +40,7 @@ class ObjectiveSuite:
 
     def game(self, energy: Energy) -> tuple[Scene, GameParameters]:
         minimiser = build("solver", self.solver)
-        scene, game = game_of(energy, starts=minimiser.starts(MODES))
+        scene, game = game_of(energy, starts=minimiser.strategies(MODES))
         starts, games = game.initial_controls, minimiser.games(MODES)
         one = game.map(lambda tensor: tensor[:, :games] if tensor.shape[1] == MODES else tensor)
         scene.future_mask[0, 1, 3:] = False

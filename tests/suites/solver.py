@@ -50,7 +50,7 @@ class SolverSuite:
     def game(self, energy: Energy) -> tuple[Scene, GameParameters]:
         """A game for as many modes, and with as many starts, as the minimiser takes."""
         minimiser = self.minimiser()
-        scene, game = game_of(energy, starts=max(MODES, minimiser.starts(MODES)))
+        scene, game = game_of(energy, starts=max(MODES, minimiser.strategies(MODES)))
         games = minimiser.games(MODES)
         starts = game.initial_controls
         one = game.map(lambda tensor: tensor[:, :games] if tensor.shape[1] == MODES else tensor)

@@ -33,7 +33,8 @@ class RPIDataset:
     ``sampled`` (one of the record's modes, drawn in every epoch from (seed, epoch, index)).
 
     Args:
-        records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``states`` [R, 2 modes, 2, 40, 4] and ``modes`` [R].
+        records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``states`` [R, 2 modes, 2, 40, 4] and ``modes`` [R],
+            the number of modes of each record.
         targets: ``executed``, ``both`` or ``sampled``.
         seed: seed of the random modes of ``sampled``.
     """

@@ -92,9 +92,9 @@ def compose(name: str, overrides: Sequence[str] = (), extra: Sequence[str] = ())
 def resolve(config: DictConfig) -> dict[str, Any]:
     """A configuration as plain Python values, with every interpolation replaced and without the section ``hydra``.
 
-    Adds ``experiment`` and ``variant``. ``variant`` is empty if all settings that decide on the result have the values
-    of the experiment's file and the budget's file. Otherwise it is six digits of a hash of those settings, without the
-    seed.
+    Adds ``experiment`` and, for `epo train`, ``variant``. ``variant`` is empty if all settings that decide on the result
+    have the values of the experiment's file and the budget's file. Otherwise it is six digits of a hash of those settings,
+    without the seed.
 
     Raises:
         ConfigError: an interpolation of a key that does not exist, or a value that is still missing.

@@ -188,9 +188,9 @@ class Settings:
     run_dir: str | None = None
     existing: Literal["error", "continue"] = "error"
     resume: str | None = None
-    score: Measured | Sequence[Measured] | None = None
+    score: Measured | Sequence[Measured] | None = None  # see `measures`
     sweep: str | None = None
-    experiment: str | None = None
+    experiment: str | None = None  # this and `variant` are added by `compose.resolve`
     variant: str = ""
 
     def __post_init__(self) -> None:

@@ -35,7 +35,7 @@ class ParsedOnce(FileConfigSource):
 
 
 class TreeSource(ParsedOnce):
-    """A folder in which ``rpi/v_lstm`` is an option of ``experiment``, so that ``glob('rpi/*')`` finds it.
+    """A folder whose subfolders' files are options of a group: Hydra's ``glob('rpi/*')`` then finds ``rpi/v_lstm``.
 
     ``experiment=us101/vibes`` means ``experiment=highway/vibes data=us101``; there is no file with the first name.
     """

@@ -54,7 +54,7 @@ class Candidates(Minimiser):
         """This minimiser for M joint modes."""
         return dataclasses.replace(self, modes=modes)
 
-    def starts(self, modes: int) -> int:
+    def strategies(self, modes: int) -> int:
         """Number C of candidates, for any number of modes."""
         return self.candidates
 

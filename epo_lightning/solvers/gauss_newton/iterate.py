@@ -1,8 +1,9 @@
 """An iterate of a Gauss-Newton solver: joint strategies, their trajectories, and the maps between controls and nodes.
 
 The solver's unknowns are not the controls u but the speeds and headings z_l = z_0 + dt sum_{j<l} u_j after every step,
-called nodes l = 1 .. K, because the second derivatives by z have a simple structure (:mod:`.quadratic_model`). With e_l the
-unit vector of the heading and e'_l the unit vector to its left, a position changes as
+called nodes l = 1 .. K, because the second derivatives by z have a simple structure (:mod:`.quadratic_model`). (The
+features z of the backbone are something else.) With e_l the unit vector of the heading and e'_l the unit vector to its
+left, a position changes as
 
     dp_k = dt sum_{l<k} M_l dz_l,   M_l = [e_l, v_l e'_l]     (explicit Euler; other integrators include l = k).
 

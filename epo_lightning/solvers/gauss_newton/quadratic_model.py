@@ -118,7 +118,7 @@ class QuadraticModel:
         edges: the pairs that were evaluated.
         linked: the edges whose two agents are coupled.
         pair_position: xx, xy and yy that an edge adds to both agents, and subtracts between them; None without.
-        pair_blocks: all those of undeclared pair features by the nodes of both agents; None without.
+        pair_blocks: second derivatives of undeclared pair features by the nodes of both agents; None without.
         own: declared own features by name.
         pair: declared pair features by name.
         separation: distances of the edges; None without edges.

@@ -169,14 +169,14 @@ class _Step(torch.autograd.Function):
         status = factors.status.view(controls.shape[:2])
         moved = controls + game.step_size * step
         solved = game.finite & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
-        keep = solved[..., None, None, None]
+        moves = solved[..., None, None, None]
         status = torch.where(solved, status, Status.STOPPED)
         value = model.value.view(controls.shape[:2])
         if any(ctx.needs_input_grad):
             ctx.game, ctx.factors = game, factors
-            ctx.save_for_backward(torch.where(keep, step, 0.0), solved, *tensors)
+            ctx.save_for_backward(torch.where(moves, step, 0.0), solved, *tensors)
         ctx.mark_non_differentiable(status, value)
-        return torch.where(keep, moved, controls), status, value
+        return torch.where(moves, moved, controls), status, value
 
     @staticmethod
     @once_differentiable

@@ -246,7 +246,7 @@ def test_a_scene_in_another_precision_and_one_without_agents():
 def test_solvers_declare_numbers_of_candidates_games_and_modes():
     for kind in KINDS:
         solver = kind(candidates=5)
-        assert (solver.starts(3), solver.games(3), solver.for_modes(3).modes, solver.modes) == (5, 1, 3, 1)
+        assert (solver.strategies(3), solver.games(3), solver.for_modes(3).modes, solver.modes) == (5, 1, 3, 1)
         assert solver.for_test() is solver
 
 
