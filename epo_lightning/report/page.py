@@ -31,8 +31,8 @@ class Content:
     Attributes:
         title: title of the page.
         command: command that writes the page again.
-        preface, legend, comparison_legend: Markdown; only bold, underline and code are rendered.
-        tables, costs, comparisons, settings: shown in this order; the latter three are text in columns.
+        preface, legend, worth_legend, comparison_legend: Markdown; only bold, underline and code are rendered.
+        tables, costs, worth, comparisons, settings: shown on the page; all but ``tables`` are text in columns.
         charts: figures, grouped by their section.
         pictures: PNG files.
         made: provenance of every row.
@@ -45,9 +45,11 @@ class Content:
     command: str
     preface: str
     legend: str
+    worth_legend: str
     comparison_legend: str
     tables: Sequence[Table]
     costs: Sequence[Sheet]
+    worth: Sequence[Sheet]
     comparisons: Sequence[Sheet]
     settings: Sequence[Sheet]
     charts: Sequence[Chart]

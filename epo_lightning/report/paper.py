@@ -84,6 +84,11 @@ def is_papers(forecaster: str, config: Mapping[str, Any]) -> bool:
     return all((config.get(kind) or {}).get("name", name) == name for kind, name in PARTS.items())
 
 
+def interacts(config: Mapping[str, Any]) -> bool:
+    """Whether the energy of a row has pair terms; False for the ablation without any, which the paper does not have."""
+    return (config.get("energy") or {}).get("pair") != []
+
+
 def paper_values(
     data: str,
     backbone: str,

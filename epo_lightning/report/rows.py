@@ -15,7 +15,7 @@ from epo_lightning.identity import differences
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import GAME
 from epo_lightning.report.labels import labels, value_text, varying
-from epo_lightning.report.paper import is_papers, paper_values
+from epo_lightning.report.paper import interacts, is_papers, paper_values
 from epo_lightning.report.runs import EvaluatedRun
 
 CONDITIONS = ("data", "trainer", "callbacks")
@@ -199,7 +199,8 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
             )
     steps = _setting(first.config, "solver.steps") if first.forecaster == "epo" else None
     known = (first.data, first.backbone, first.forecaster, first.goal, first.experiment, first.split, steps)
-    paper = paper_values(*known) if is_papers(first.forecaster, first.config) else {}
+    in_paper = is_papers(first.forecaster, first.config) and (first.forecaster != "epo" or interacts(first.config))
+    paper = paper_values(*known) if in_paper else {}
     cells = {}
     for metric in dict.fromkeys(metric for run in runs for metric in run.metrics):
         values = [run.metrics.get(metric, math.nan) for run in runs]

@@ -16,6 +16,8 @@ from epo_lightning.report.paper import PAPER
 from epo_lightning.report.rows import Row, plain_rows, require_comparable
 from epo_lightning.report.runs import EvaluatedRun
 
+INTERACTIVE = "interactive"
+"""Name of the subset that has a table with all columns of the main table."""
 BACKBONES = tuple(dict.fromkeys(backbone for _, backbone, _ in PAPER))
 FORECASTERS = ("marginal", "scene_consistent", "epo")
 """The paper's order of groups, and of rows within a group; others follow in the order of the runs."""
@@ -60,12 +62,12 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
         rows = build_rows(members)
         where = f"{data}, {split} split"
         tables.append(Table(where, MAIN, rows))
-        names = dict.fromkeys(metric.split("/")[0] for row in rows for metric in row.cells if "/" in metric)
-        # The executed mode comes first, although "alternative" precedes "executed" in the files.
-        subsets = sorted(names.keys() - {"initial"}, key=lambda name: (name != "executed", name))
-        short = (Column("minSADE", "SADE"), Column("minSFDE", "SFDE"))
-        columns = tuple(Column(f"{name}/{c.metric}", f"{name} {c.label}") for name in subsets for c in short)
+        columns = subset_columns(rows, (Column("minSADE", "SADE"), Column("minSFDE", "SFDE")))
+        subsets = dict.fromkeys(column.metric.split("/")[0] for column in columns)
         tables += _shown(f"{where}: {' and '.join(subsets)} apart", columns, rows)
+        if INTERACTIVE in subsets:
+            columns = tuple(Column(f"{INTERACTIVE}/{column.metric}", column.label) for column in MAIN)
+            tables += _shown(f"{where}: {INTERACTIVE} scenes", columns, rows)
         found = (OF_MODES.fullmatch(metric) for row in rows for metric in row.cells)
         most = max((int(match[1]) for match in found if match), default=0)
         if most > 1:  # k = 1 alone would repeat the main table
@@ -79,6 +81,14 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
         tables += _shown(f"{where}: initial and solved strategies", initial, rows)
         tables += _partly_shown(f"{where}: equilibrium", EQUILIBRIUM, [row for row in rows if "nash_gap" in row.cells])
     return tables
+
+
+def subset_columns(rows: Iterable[Row], columns: Sequence[Column]) -> tuple[Column, ...]:
+    """The columns for every named subset of the data of which a row has scores, subset by subset."""
+    names = {metric.split("/")[0] for row in rows for metric in row.cells if "/" in metric}
+    # The executed mode comes first, although "alternative" precedes "executed" in the files.
+    subsets = sorted(names - {"initial"}, key=lambda name: (name != "executed", name))
+    return tuple(Column(f"{name}/{c.metric}", f"{name} {c.label}") for name in subsets for c in columns)
 
 
 def distinct(tables: Iterable[Table]) -> list[Row]:

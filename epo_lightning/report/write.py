@@ -32,6 +32,8 @@ from epo_lightning.report.selection import BestSetting, best_settings
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import Table, build_tables
 from epo_lightning.report.timings import places, read_timings, timing_sheet
+from epo_lightning.report.worth import LEGEND as WORTH_LEGEND
+from epo_lightning.report.worth import build_worth
 from epo_lightning.run_folder import RunFolder, write_file
 
 
@@ -118,8 +120,8 @@ def write_report(
     out = Path(out).expanduser()
     tables = build_tables(report.evaluated)
     timings, damaged = read_timings(report.runs)
-    comparisons = build_comparisons(tables)
-    compared = [comparison_sheet(entry) for entry in comparisons]
+    of_game, comparisons = build_worth(tables), build_comparisons(tables)
+    worth, compared = ([comparison_sheet(entry) for entry in entries] for entries in (of_game, comparisons))
     best, hint = _best(report.evaluated)
     settings = [settings_sheet(best)] if best else []
     notes = [*notes, *damaged, *([hint] if hint else [])]
@@ -127,7 +129,7 @@ def write_report(
     costs = cost_sheets(tables, timings)
     others = [timing for timing in timings if timing not in timings_of(tables, timings)]  # a cost is said once
     timed = [timing_sheet(where, same) for where, same in places(others).items()]
-    shown: list[Sheet] = [*settings, *compared, *timed]
+    shown: list[Sheet] = [*settings, *worth, *compared, *timed]
     links = [f"figures/{chart.name}.png" for chart in charts] + [os.path.relpath(figure, out) for figure in figures]
     markdown = "\n".join(
         part
@@ -140,7 +142,8 @@ def write_report(
             legend(tables) + "\n" if tables else "",
             *(to_markdown(sheet) for sheet in costs),
             *(to_markdown(sheet) for sheet in shown),
-            COMPARISON_LEGEND + "\n" if compared else "",
+            WORTH_LEGEND + "\n" if worth else "",
+            COMPARISON_LEGEND + "\n" if worth or compared else "",
             _how_made(made, report),
             *(f"![{Path(link).stem}]({link})\n" for link in links),
         )
@@ -151,9 +154,11 @@ def write_report(
         command=report.command,
         preface=preface,
         legend=legend(tables, "below"),
+        worth_legend=WORTH_LEGEND,
         comparison_legend=COMPARISON_LEGEND,
         tables=tables,
         costs=costs,
+        worth=worth,
         comparisons=compared,
         settings=settings,
         charts=charts,
@@ -169,11 +174,11 @@ def write_report(
         caveat = _caveat(tables) if preface.strip() else ""
         latex = [to_latex(table, caveat=caveat) for table in tables]
         latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in costs]
-        latex += [comparisons_to_latex(entry, caveat=caveat) for entry in comparisons]
+        latex += [comparisons_to_latex(entry, caveat=caveat) for entry in (*of_game, *comparisons)]
         latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in settings]
         files["results.tex"] = "\n".join(latex)
-    if comparisons:
-        files["comparisons.csv"] = comparisons_to_csv(comparisons)
+    if of_game or comparisons:
+        files["comparisons.csv"] = comparisons_to_csv([*of_game, *comparisons])
 
     for chart in charts:
         save(chart.draw(chart.wide, True), out / "figures" / f"{chart.name}.png")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 from experiment.conftest import Epo
@@ -16,6 +17,7 @@ from epo_lightning.experiment.config.compose import compose, hydra, jobs, option
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.config.sources import HIGHWAYS
 from epo_lightning.experiment.train import folder_for
+from epo_lightning.identity import differences
 from epo_lightning.schema import read
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "exid_sim"
@@ -27,7 +29,8 @@ SHARED = Path(os.environ.get("EPO_SHARED", Path(__file__).parents[2].parent / "s
 def test_the_rows_are_the_papers() -> None:
     backbones = ("v_lstm", "vibes", "hivt_m")
     main = {f"{backbone}{suffix}" for backbone in backbones for suffix in ("", "_sc", "_epo")}
-    assert set(ROWS) == main | {"const_vel", "v_lstm_epo_no_init", "v_lstm_epo_no_goal"}
+    no_pair = {f"{backbone}_epo_no_pair" for backbone in backbones}
+    assert set(ROWS) == main | no_pair | {"const_vel", "v_lstm_epo_no_init", "v_lstm_epo_no_goal"}
     with hydra() as instance:
         options = options_of(instance, "experiment")
     for data in HIGHWAYS:
@@ -50,6 +53,23 @@ def test_other_data_and_other_settings_get_folders_of_their_own() -> None:
     configs = [compose("train", ["experiment=highway/vibes", *more]) for more in words]
     assert len({folder_for(read(Settings, config)).path for config in configs}) == len(words)
     assert [config["experiment"] for config in configs][2] == "highway/vibes"  # not one of the highway data sets
+
+
+@pytest.mark.parametrize(
+    ("sweep", "count"), [("interaction", 2), ("interaction_highway_sim", 3), ("interaction_us101", 3)]
+)
+def test_every_row_of_an_interaction_sweep_has_a_twin_without_pair_terms(sweep: str, count: int) -> None:
+    configs = {(config["experiment"], config["seed"]): config for config in _of_sweep(sweep)}
+    twins = [name for name in configs if name[0].endswith("_no_pair")]
+    assert len(twins) == 3 * count
+    for experiment, seed in twins:
+        game, twin = configs[experiment.removesuffix("_no_pair"), seed], configs[experiment, seed]
+        assert differences(game, twin) == [("energy.pair", ["proximity"], [])]
+        assert (experiment.removesuffix("_no_pair").replace("_epo", "_sc"), seed) in configs
+
+
+def _of_sweep(name: str) -> list[dict[str, Any]]:
+    return [compose("train", job) for job in jobs("train", [f"sweeps={name}"])]
 
 
 def test_old_names_work_in_globs_and_sweeps() -> None:

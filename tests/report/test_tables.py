@@ -134,6 +134,21 @@ def test_subsets_and_initial_strategies_have_tables_of_their_own(tmp_path: Path)
     assert main.rows[1].cells["initial/minSADE"].rank is None
 
 
+def test_interactive_scenes_have_a_table_with_all_columns(tmp_path: Path) -> None:
+    calm, interactive = (
+        {f"{name}/{metric}": score for metric, score in scores(*values).items()}
+        for name, values in (("calm", (0.2, 0.0)), ("interactive", (0.4, 0.1)))
+    )
+    make_run(tmp_path / "m", "V-LSTM", "marginal", scores(0.3) | calm | interactive)
+    make_run(tmp_path / "old", "older", "marginal", scores(0.3))  # evaluated before there were subsets
+    main, apart, table = build_tables(collect(tmp_path))
+    assert apart.title == "rpi, test split: calm and interactive apart"
+    assert table.title == "rpi, test split: interactive scenes"
+    assert [column.label for column in table.columns] == [column.label for column in main.columns]
+    (row,) = table.rows
+    assert [row.cells[column.metric].mean for column in table.columns] == [0.4, 0.4, 0.4, 0.4, 0.1, 0.1]
+
+
 def test_splits_are_tables_apart(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3), digest="abc")
     make_run(tmp_path / "b", "V-LSTM", "marginal", scores(0.2), digest="xyz", split="val")
