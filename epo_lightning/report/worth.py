@@ -19,10 +19,10 @@ WORTH = (Column("minSADE", "SADE"), Column("minSFDE", "SFDE"), Column("overlap_j
 """Scores of joint forecasts, which the interaction of agents can change; they are compared on every subset as well."""
 
 LEGEND = (
-    "What the game is worth: a row minus its twin, which was trained with the same settings except that its energy has fewer "
-    "pair terms (`energy.pair`). Negative differences are in favour of the pair terms. They are paired by seed like the "
-    "other tests. A run records means over scenes, not the scores of single scenes: the interval is over trainings with "
-    "different seeds, not over scenes."
+    "What the game is worth: a row minus its twin, which was trained with the same settings except that its energy has "
+    "fewer pair terms (`energy.pair`). Negative differences are in favour of the pair terms. They are paired by seed like "
+    "the other tests. A run records means over scenes, not the scores of single scenes: the interval is over trainings "
+    "with different seeds, not over scenes."
 )
 
 
