@@ -25,10 +25,14 @@ CHECKED = (
 )
 install_import_hook([f"epo_lightning.{name}" for name in CHECKED], "typechecker.check")
 
+import hypothesis
 import pytest
 import torch
 
 torch.set_num_threads(1)
+# No test asserts a time: on a busy machine, any example can take long.
+hypothesis.settings.register_profile("epo", deadline=None)
+hypothesis.settings.load_profile("epo")
 
 
 @pytest.fixture(autouse=True)

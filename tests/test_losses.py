@@ -7,7 +7,7 @@ import math
 import jaxtyping
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from epo_lightning import losses
@@ -121,7 +121,6 @@ def test_a_future_of_another_length_is_refused(monkeypatch):
             losses.distances(positions, *wrong)
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.lists(

@@ -63,7 +63,7 @@ def test_motions_are_drawn_from_the_mixture_of_the_paper():
         assert values.amax() > 0.5 * largest
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.floats(0.0, 40.0),
     st.floats(0.05, 9.0),

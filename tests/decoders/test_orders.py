@@ -16,7 +16,7 @@ from epo_lightning.game.convex_energy import ConvexEnergy
 from epo_lightning.scene import Scene
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(count=st.integers(0, 7), modes=st.integers(1, 12), ties=st.booleans(), seed=st.integers(0, 1000))
 def test_the_most_likely_orders_equal_those_of_full_enumeration(count, modes, ties, seed):
     torch.manual_seed(seed)
@@ -118,7 +118,7 @@ def test_a_single_agent_has_one_empty_order():
     assert repeated(order).tolist() == [[False, True, True]] * 2
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(modes=st.integers(1, 6), width=st.integers(0, 3), seed=st.integers(0, 1000))
 def test_surplus_modes_repeat_earlier_orders(modes, width, seed):
     torch.manual_seed(seed)

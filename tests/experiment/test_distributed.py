@@ -104,7 +104,10 @@ def steps(count: int) -> tuple[str, ...]:
     return ("trainer.max_epochs=2", f"trainer.limit_train_batches={count}")
 
 
-@pytest.mark.parametrize("row", ["rpi/v_lstm_sc", "rpi/v_lstm_epo", "exid/v_lstm_epo"])
+@pytest.mark.parametrize(
+    "row",
+    [*(pytest.param(row, marks=pytest.mark.slow) for row in ("rpi/v_lstm_sc", "rpi/v_lstm_epo")), "exid/v_lstm_epo"],
+)
 def test_two_processes_give_the_numbers_of_one(epo: Epo, row: str) -> None:
     data = RPI if row.startswith("rpi") else HIGHWAY
     words = ("train", f"experiment={row}", *QUIET, *data, DOUBLE, *steps(3))
@@ -148,6 +151,7 @@ def sweep(epo: Epo, *more: str) -> None:
         same("two-0", "two-1", 1e-10)
 
 
+@pytest.mark.slow
 def test_the_jobs_of_a_sweep_train_one_after_the_other(epo: Epo) -> None:
     sweep(epo)
 
@@ -160,6 +164,7 @@ def test_the_jobs_of_a_sweep_train_in_workers(epo: Epo) -> None:
 LONG = ("train", "experiment=rpi/v_lstm_sc", *QUIET, *RPI, DOUBLE, "optimizer.lr=5e-5")
 
 
+@pytest.mark.slow
 def test_a_run_on_one_device_continues_on_two(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
     words = (*LONG, "trainer.max_epochs=4")
     assert epo(*words, "run_dir=whole") == 0

@@ -34,6 +34,11 @@ ROW = "experiment=rpi/v_lstm_sc"
 STEP = "trainer/global_step"
 
 
+WANDB = ("logger=[wandb]", "logger.wandb.patience=120")
+MLFLOW = ("logger=[mlflow]", "logger.mlflow.patience=120")
+"""Dashboards that a busy machine does not switch off."""
+
+
 @pytest.fixture(autouse=True)
 def no_account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Environment without the user's keys, servers and databases."""
@@ -169,15 +174,15 @@ def test_scores_on_the_test_split_reach_the_dashboard(epo: Epo) -> None:
 
 
 def test_every_run_of_a_sweep_has_its_own_id_name_configuration_and_summary_in_wandb(epo: Epo) -> None:
-    assert epo("train", "-m", ROW, *TINY, "logger=[wandb]", "seed=0,1,2") == 0
+    assert epo("train", "-m", ROW, *TINY, *WANDB, "seed=0,1") == 0
     runs = [str(run.path) for run in discover("runs")]
     folders = [wandb_folders(run) for run in runs]
-    assert [len(found) for found in folders] == [1, 1, 1]
+    assert [len(found) for found in folders] == [1, 1]
     shown = [found[0] for found in folders]
-    assert len({run["run_id"] for run in shown}) == 3
+    assert len({run["run_id"] for run in shown}) == 2
     assert [run["run_id"].split("-")[0] for run in shown] == [RunFolder(Path(run)).record["identity"] for run in runs]
-    assert [run["name"] for run in shown] == [f"V-LSTM + SC (seed {seed})" for seed in range(3)]
-    assert [run["config"]["seed"] for run in shown] == [0, 1, 2]
+    assert [run["name"] for run in shown] == [f"V-LSTM + SC (seed {seed})" for seed in range(2)]
+    assert [run["config"]["seed"] for run in shown] == [0, 1]
     assert {run["config"]["data_digest"] for run in shown} == {"tiny-64-0"}
     for run, found in zip(runs, shown, strict=True):
         assert found["summary"]["best/minSADE"] == pytest.approx(best_in_file(run))
@@ -197,7 +202,7 @@ def group_of(run: str) -> tuple[str, str]:
 
 
 def test_a_stopped_run_continues_in_the_same_wandb_run(epo: Epo, stopped: Callable[..., None]) -> None:
-    stopped("run_dir=run", "logger=[wandb]")
+    stopped("run_dir=run", *WANDB)
     assert [folder["exit_code"] for folder in wandb_folders("run")] == [1]
     assert epo("train", "resume=run") == 0
     assert [folder["exit_code"] for folder in wandb_folders("run")] == [1, 0]
@@ -207,7 +212,7 @@ def test_a_stopped_run_continues_in_the_same_wandb_run(epo: Epo, stopped: Callab
 
 def test_pictures_and_the_checkpoint_can_be_uploaded(epo: Epo) -> None:
     options = ("logger.wandb.pictures=2", "logger.wandb.artifacts=true")
-    assert epo("train", ROW, *TINY, "run_dir=run", "logger=[wandb]", *options) == 0
+    assert epo("train", ROW, *TINY, "run_dir=run", *WANDB, *options) == 0
     assert list(Path("run/logs/figures").glob("*.png"))
     (folder,) = wandb_folders("run")
     assert (
@@ -229,7 +234,7 @@ def client(database: str = "runs/mlflow.db") -> Any:
 
 def test_mlflow_keeps_name_parameters_tags_and_scores_through_a_stop(epo: Epo, stopped: Callable[..., None]) -> None:
     pytest.importorskip("mlflow")
-    stopped("run_dir=runs/one", "logger=[mlflow]")
+    stopped("run_dir=runs/one", *MLFLOW)
     there = client()
     experiment = there.get_experiment_by_name("epo_lightning")
     (run,) = there.search_runs([experiment.experiment_id])
@@ -258,7 +263,7 @@ def test_a_missing_mlflow_is_named_before_the_run(refused: Callable[..., str], m
 def test_several_processes_share_one_database(tmp_path: Path) -> None:
     pytest.importorskip("mlflow")
     program = [sys.executable, str(Path(tiny.__file__).resolve())]
-    words = ["train", ROW, *TINY, "logger=[mlflow]", "logger.mlflow.patience=60"]
+    words = ["train", ROW, *TINY, *MLFLOW]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     processes = [
         subprocess.Popen(
@@ -411,7 +416,7 @@ def test_a_full_disk_under_wandb_does_not_stop_the_run(
 ) -> None:
     stopped("run_dir=run", "logger=[csv]")
     config = Path("run/config.yaml")
-    config.write_text(config.read_text().replace("logger:", "logger:\n  wandb: {mode: offline, patience: 5}\n ", 1))
+    config.write_text(config.read_text().replace("logger:", "logger:\n  wandb: {mode: offline, patience: 15}\n ", 1))
     folder = Path("run/logs/wandb")
     folder.mkdir()
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", folder], capture_output=True)

@@ -54,7 +54,7 @@ def close(found: np.ndarray, expected: np.ndarray) -> None:
 @pytest.mark.parametrize("backbone", ["v_lstm", "vibes", "hivt_m"])
 @pytest.mark.parametrize("name", CONFIGS)
 @given(st.floats(-3.1, 3.1), st.floats(-5e3, 5e3))
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3)
 def test_aligned_forecasts_turn_with_the_world(name, backbone, turn, shift):
     still, likely = forecasts(name, backbone, curve(900.0), "aligned")
     moved, as_likely = forecasts(name, backbone, curve(900.0, turn, (shift, -shift)), "aligned")
@@ -65,7 +65,7 @@ def test_aligned_forecasts_turn_with_the_world(name, backbone, turn, shift):
 
 @pytest.mark.parametrize("name", CONFIGS)
 @given(st.floats(-5e3, 5e3), st.floats(-5e3, 5e3))
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3)
 def test_fixed_forecasts_move_with_the_world(name, x, y):
     still, likely = forecasts(name, "v_lstm", curve(900.0), "fixed")
     moved, as_likely = forecasts(name, "v_lstm", curve(900.0, 0.0, (x, y)), "fixed")

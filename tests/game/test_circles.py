@@ -141,7 +141,7 @@ def test_cars_in_adjacent_lanes_do_not_overlap_and_cars_in_a_row_do():
     assert of_discs < 0.0 < behind
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), turn=st.floats(-7.0, 7.0), x=st.floats(-50.0, 50.0), y=st.floats(-50.0, 50.0))
 def test_residuals_are_symmetric_and_invariant_to_rigid_motion(seed, turn, x, y):
     torch.manual_seed(seed)

@@ -51,7 +51,7 @@ def collide(first, second, first_size, second_size, shape):
     return False
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(shape=st.sampled_from(["disc", "box"]), seed=st.integers(0, 1000))
 def test_collisions_equal_a_loop_over_circles(shape, seed):
     torch.manual_seed(seed)

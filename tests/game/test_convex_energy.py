@@ -100,7 +100,7 @@ def test_energy_equals_loops_over_agents_and_steps(direction):
     torch.testing.assert_close(halves, values, rtol=1e-12, atol=0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     direction=st.sampled_from(DIRECTIONS),
     agents=st.integers(1, 4),
@@ -163,7 +163,7 @@ def test_absent_agents_do_not_change_the_energy(direction):
     assert matrix.isfinite().all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     direction=st.sampled_from(DIRECTIONS),
     agents=st.integers(1, 4),

@@ -108,7 +108,7 @@ def test_energy_equals_plain_arithmetic(stride):
     assert all((residuals[name] != 0).any() for name in (*ALL, "proximity")), "every hinge should be active somewhere"
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     agents=st.integers(1, 4),
     modes=st.integers(1, 3),

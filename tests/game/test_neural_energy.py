@@ -83,7 +83,7 @@ def slow_energy(energy, scene, game, b, m):
     return total
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(agents=st.integers(1, 4), seed=st.integers(0, 1000))
 def test_the_energy_equals_plain_arithmetic(agents, seed):
     torch.manual_seed(seed)

@@ -262,7 +262,7 @@ def test_runs_of_one_row_must_have_the_same_metrics(tmp_path: Path) -> None:
         build_tables(collect(tmp_path))
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.floats(0, 1e3), min_size=1, max_size=5))
 def test_means_and_deviations_equal_those_of_numpy(tmp_path: Path, values: list[float]) -> None:
     folder = tmp_path / "runs"

@@ -135,7 +135,7 @@ rows_of = st.lists(
 
 
 @given(rows_of)
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_twins_equal_those_of_the_definition(
     tmp_path_factory: pytest.TempPathFactory, drawn: list[tuple[list[str] | None, str, str, int]]
 ) -> None:

@@ -90,7 +90,7 @@ def obvious(of, config: WindowConfig) -> set[tuple[int, frozenset[int]]]:
         ]
     ),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_windows_equal_those_of_a_plain_loop(seed, config):
     of = recording(vehicles=crowd(seed))
     scenes, counts = extract(of, config)
@@ -155,7 +155,7 @@ def test_goals_lie_on_the_lanes_that_an_agent_may_take():
 
 
 @given(st.integers(0, 10_000), st.floats(-3.1, 3.1))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_moving_the_world_moves_the_frame_and_nothing_else(seed, turn):
     vehicles = crowd(seed, 6)
     config = WindowConfig(radius=None, lane_change=False)
@@ -287,7 +287,7 @@ def test_a_vehicle_on_no_lane_is_counted_and_left_out():
 
 @pytest.mark.parametrize("smoothing", [None, 1.0])
 @given(st.integers(0, 10_000))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_inputs_do_not_depend_on_the_future(smoothing, seed):
     config = WindowConfig(radius=None, lane_change=False, smoothing=smoothing)
     of, frame = recording(vehicles=crowd(seed, 6)), 100

@@ -66,7 +66,7 @@ def test_shapes_that_would_be_broadcast_are_refused(metric, wrong: str, monkeypa
         metric(*arguments[wrong])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(case=cases)
 def test_equals_loops(case: Case) -> None:
     expected = reference.displacements(case.states, case.future, case.mask)

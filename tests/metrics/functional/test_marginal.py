@@ -24,7 +24,7 @@ def test_equally_likely_modes_keep_their_order() -> None:
     assert torch.equal(marginal_to_joint(states, torch.ones(1, 40, 1))[0], states)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(case=cases)
 def test_equals_loops_and_leaves_marginal_metrics_alone(case: Case) -> None:
     states, probabilities = marginal_to_joint(case.states, case.agent_probabilities)

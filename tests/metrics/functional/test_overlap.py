@@ -73,7 +73,7 @@ def test_only_the_most_likely_mode_counts_at_any_step() -> None:
     assert overlap_rate(states, torch.tensor([[0.4, 0.6]]), sizes, everyone).item() == 1.0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(case=cases, shape=st.sampled_from(["disc", "box"]), definition=st.sampled_from(["jfp", "authors"]))
 def test_equals_polygons(case: Case, shape: str, definition: str) -> None:
     expected = reference.overlaps(case.states, case.probabilities, case.size, case.agent_mask, shape)[definition]

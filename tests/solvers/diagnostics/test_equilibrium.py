@@ -27,7 +27,7 @@ from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarq
 
 OWN = ("goal", "acc", "turnr")
 STEPS = 7
-SLOW = settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
+SLOW = settings(max_examples=12, suppress_health_check=[HealthCheck.differing_executors])
 
 
 class Opaque(Energy):

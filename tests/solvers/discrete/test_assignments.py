@@ -210,7 +210,7 @@ def test_absent_agents_take_their_first_candidate(find):
     torch.testing.assert_close(energy, lowest)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10_000), st.integers(1, 4), st.integers(1, 4), st.integers(1, 12))
 def test_the_best_assignments_equal_those_of_a_sorted_list(seed, agents, count, modes):
     torch.manual_seed(seed)

@@ -69,7 +69,7 @@ def sizes(draw):
     return agents, draw(st.integers(3, max(3, min(40, 72 // agents))))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     size=sizes(),
     absent=st.integers(0, 2),

@@ -71,7 +71,7 @@ def test_two_agents_on_a_line_have_a_closed_form(minimise):
 
 
 @both
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3)
 @given(direction=st.sampled_from(["along", "across"]), agents=st.integers(2, 3), seed=st.integers(0, 1000))
 def test_one_minimiser_for_every_order_whatever_the_start(minimise, direction, agents, seed):
     torch.manual_seed(seed)
