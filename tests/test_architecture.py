@@ -27,7 +27,7 @@ FLOORS = {
     "solvers": {"game", "scene", "registry", "checks"},
     "encoders": {"scene"},
     "metrics": {"scene", "registry"},
-    "decoders": {"scene", "game"},
+    "decoders": {"scene", "registry", "game"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
     "data": {"scene", "registry", "schema", "checks", "task"},
     "objectives": {"scene", "registry", "game", "solvers", "decoders", "losses"},

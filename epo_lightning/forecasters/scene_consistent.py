@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
-from epo_lightning.decoders.probabilities import SceneProbabilities
+from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.strategies import InitialStrategies
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.dynamics import Unicycle
@@ -29,6 +29,8 @@ class SceneConsistent(Forecaster):
         loss_weights: lambda of ``imitation`` and ``probability``.
         control_scale: control at a network output of one.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
+        probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
+            (:mod:`~epo_lightning.decoders.probabilities`).
     """
 
     def __init__(
@@ -42,21 +44,23 @@ class SceneConsistent(Forecaster):
         control_scale: float = 0.3,
         relaxation: float = 0.0,
         relaxation_steps: int = 1000,
+        probabilities: str = "linear",
     ) -> None:
+        check_probabilities(probabilities)
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.dynamics = dynamics
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
-        self.probabilities = SceneProbabilities(backbone.width, modes, task.horizon, task.scale)
+        self.probabilities = PROBABILITIES[probabilities](backbone.width, modes, task.horizon, task.scale)
 
     def forward(self, scene: Scene) -> JointForecast:
         z = self.backbone(scene)
         controls = self.strategies(z, scene)
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
         states = self.dynamics.rollout(current[:, None], controls, scene.dt)
-        logits = self.probabilities(z, states[..., :2], current[..., :2], scene.agent_mask)
+        logits = self.probabilities(z, states[..., :2], current, scene.agent_mask)
         return JointForecast(states, logits.softmax(1), controls=controls, logits=logits)
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:

@@ -109,6 +109,10 @@ class TestEPO(ForecasterSuite):
         assert (forecasts[0].parameters.own_weights["goal"][0, :, 1] == 0).all()
 
 
+class TestPairwiseSceneConsistent(ForecasterSuite):
+    config = {**TestSceneConsistent.config, "probabilities": "pairwise"}
+
+
 EPO = TestEPO.config
 
 
