@@ -93,6 +93,8 @@ def _rpi(scenes: int, agents: int, preset: Preset, draw: torch.Generator) -> dic
     return {
         "history": history.float(),
         "goals": futures[:, 0, :, -1, :2].float(),
+        "goal_headings": futures[:, 0, :, -1, 2].float(),
+        "game_steps": torch.full((scenes,), preset.task.horizon),
         "states": futures.float(),
         "modes": torch.full((scenes,), 2),
     }

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from epo_lightning.backbones.base import Backbone
@@ -71,6 +72,9 @@ class EPO(Forecaster):
         initial: ``decoded``, ``zero`` or ``motions``.
         control_scale: initial control at a network output of one.
         motions: largest ``acceleration`` [m/s^2] and ``curvature`` [1/m] of initial motions.
+        game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
+            the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
+            (``game_steps``). Initial controls after the first K steps are zero.
 
     Raises:
         ConfigError: parts that do not work together, with the changes that would work; or a value out of its range.
@@ -92,10 +96,16 @@ class EPO(Forecaster):
         initial: str = "decoded",
         control_scale: float = 0.3,
         motions: Mapping[str, float] | None = None,
+        game_horizon: int | None = None,
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         _check_needs(energy, task)
-        energy.check_horizon(task.horizon)
+        self.game_horizon = task.horizon if game_horizon is None else game_horizon
+        if self.game_horizon < task.horizon:
+            raise ConfigError(
+                f"forecaster.game_horizon must be {task.horizon} or more, the steps of the forecast, not {game_horizon}"
+            )
+        energy.check_horizon(self.game_horizon)
         chooses = TABLES in solver.provides
         if modes < 1:
             raise ConfigError(f"forecaster.modes must be 1 or more, not {modes}")
@@ -152,14 +162,15 @@ class EPO(Forecaster):
         """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 2."""
         z = self.backbone(scene)
         goals = self.goals(z, scene)
+        game = self._game_of(scene)
         orders = self._decode_orders(z, scene)
         parameters = self._infer_game(z, scene, goals, orders)
-        solution = self.solve(self._minimiser, self.energy, scene, parameters)
+        solution = self.solve(self._minimiser, self.energy, game, parameters)
         logits = self._mode_logits(z, scene, goals, orders, solution)
         return JointForecast(
-            states=solution.states,
+            states=solution.states[..., : self.task.horizon, :],
             probabilities=logits.softmax(1),
-            controls=solution.controls,
+            controls=solution.controls[..., : self.task.horizon, :],
             initial_states=self._states_of_initial_strategies(scene, parameters),
             parameters=parameters,
             solution=solution,
@@ -168,6 +179,14 @@ class EPO(Forecaster):
             logits=logits,
             goal_logits=goals.logits,
         )
+
+    def _game_of(self, scene: Scene) -> Scene:
+        """The scene with the end of its game, which is not after ``game_horizon``."""
+        steps = scene.game_steps
+        if steps is None:
+            return scene
+        longer = self.game_horizon > self.task.horizon
+        return dataclasses.replace(scene, game_steps=steps.clamp_max(self.game_horizon) if longer else None)
 
     def _decode_orders(self, z: Tensor, scene: Scene) -> DecodedOrders | None:
         """The most likely orders of the pairs; None for energies without orders."""
@@ -191,7 +210,7 @@ class EPO(Forecaster):
         return GameParameters(
             own_weights=own_weights,
             pair_weights=self.pair_weights(z),
-            initial_controls=self.strategies(z, scene),
+            initial_controls=F.pad(self.strategies(z, scene), (0, 0, 0, self.game_horizon - self.task.horizon)),
             goals=goals.positions,
             reference=goals.reference,
             context=z if "context" in self.energy.needs else None,
@@ -219,13 +238,14 @@ class EPO(Forecaster):
             return _without_repeats(orders.log_probability + goals.log_probability, choices)
         assert self.probabilities is not None
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
-        return self.probabilities(z, solution.states[..., :2], current[..., :2], scene.agent_mask)
+        positions = solution.states[..., : self.task.horizon, :2]
+        return self.probabilities(z, positions, current[..., :2], scene.agent_mask)
 
     def _states_of_initial_strategies(self, scene: Scene, parameters: GameParameters) -> Tensor | None:
         """The states of the initial strategies, [B, M, N, K, 4]; None for solvers that choose among candidates."""
         if TABLES in self.solver.provides:
             return None
-        controls = parameters.initial_controls
+        controls = parameters.initial_controls[..., : self.task.horizon, :]
         # If gradients reach the initial strategies through the solution (backward=unrolled), the loss term `initial` is not
         # used, so their states are computed without a gradient.
         controls = controls.detach() if self.solve.teaches_start else controls
@@ -233,8 +253,8 @@ class EPO(Forecaster):
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
         assert forecast.parameters is not None
-        assert forecast.controls is not None
-        terms = self.energy.terms(scene, forecast.parameters, forecast.controls)
+        assert forecast.solution is not None
+        terms = self.energy.terms(self._game_of(scene), forecast.parameters, forecast.solution.controls)
         return dataclasses.replace(
             forecast,
             own_energy={name: terms[name] for name in self.energy.own},
@@ -248,7 +268,7 @@ class EPO(Forecaster):
         scenes = len(scene.history)
         stride = 1 if cheap else max(1, self._batches * scenes // EXAMINED)
         chosen = torch.arange(0, scenes, stride, device=scene.history.device)
-        report = equilibrium(self.energy, scene[chosen], forecast[chosen])
+        report = equilibrium(self.energy, self._game_of(scene)[chosen], forecast[chosen])
         if report is None:
             return forecast
         if RESIDUALS not in self.energy.offers:

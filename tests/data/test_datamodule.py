@@ -16,12 +16,16 @@ from epo_lightning.registry import ConfigError, build
 
 def records(count=50):
     generator = torch.Generator().manual_seed(count)
-    return {
+    made = {
         "history": torch.rand(count, 2, 19, 4, generator=generator),
         "goals": torch.rand(count, 2, 2, generator=generator),
         "states": torch.rand(count, 2, 2, 40, 4, generator=generator),
         "modes": torch.randint(1, 3, (count,), generator=generator),
+        "phi": torch.rand(count, generator=generator),
+        "step": torch.randint(18, 61, (count,), generator=generator),
     }
+    headings = torch.stack((torch.zeros(count), made["phi"]), -1)
+    return {**made, "goal_headings": headings, "game_steps": 100 - made["step"]}
 
 
 @pytest.fixture
@@ -56,6 +60,8 @@ def test_scenes_have_the_documented_fields(data):
     rows = records(50)
     for i in range(8):
         assert torch.equal(scene.history[i], rows["history"][scene.id[i]])
+        assert scene.goal_headings[i, :, 0].tolist() == [0.0, rows["phi"][scene.id[i]].item()]
+        assert scene.game_steps[i] == 100 - rows["step"][scene.id[i]]
         assert torch.equal(scene.future[i], rows["states"][scene.id[i], scene.subset[i]])
 
 

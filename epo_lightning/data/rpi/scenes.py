@@ -13,6 +13,7 @@ from epo_lightning.checks import check_whole
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset, epoch_generator
+from epo_lightning.data.rpi.game import GameConstants
 from epo_lightning.data.rpi.splits import RULES
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import Scene
@@ -33,8 +34,8 @@ class RPIDataset:
     ``sampled`` (one of the record's modes, drawn in every epoch from (seed, epoch, index)).
 
     Args:
-        records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``states`` [R, 2 modes, 2, 40, 4] and ``modes`` [R],
-            the number of modes of each record.
+        records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``goal_headings`` [R, 2], ``states`` [R, 2 modes, 2, 40, 4],
+            ``modes`` [R], the number of modes of a record, and ``game_steps`` [R], the steps from t0 to the end of the game.
         targets: ``executed``, ``both`` or ``sampled``.
         seed: seed of the random modes of ``sampled``.
     """
@@ -42,6 +43,7 @@ class RPIDataset:
     def __init__(self, records: Mapping[str, Tensor], targets: str = "both", seed: int = 0) -> None:
         self.history, self.goals = records["history"].float(), records["goals"].float()
         self.futures, self.modes = records["states"].float(), records["modes"]
+        self.goal_headings, self.game_steps = records["goal_headings"].float(), records["game_steps"]
         self.targets, self.seed = targets, seed
         count = len(self.history)
         self.record, self.mode = torch.arange(count), torch.zeros(count, dtype=torch.long)
@@ -68,9 +70,11 @@ class RPIDataset:
             dt=RPIData.task.dt,
             future=self.futures[record, mode],
             goal_candidates=self.goals[record].unsqueeze(2),
+            goal_headings=self.goal_headings[record].unsqueeze(2),
             size=history.new_full((*history.shape[:2], 2), DISC_DIAMETER),
             subset=mode,
             id=record,
+            game_steps=self.game_steps[record],
         )
 
 
@@ -187,5 +191,17 @@ class RPIData(SceneDataModule):
             cache.CacheError: the data set is missing, broken, of another configuration, or holds numbers that are not
                 finite.
         """
-        records = cache.load(self.folder, split, ("history", "goals", "states", "modes"), self.command, self.config)
+        names = ("history", "goals", "states", "modes", "phi", "step")
+        records = cache.load(self.folder, split, names, self.command, self.config)
+        phi = records["phi"]
+        records["goal_headings"] = torch.stack((torch.zeros_like(phi), phi), -1)  # both cross the circle, see `game`
+        records["game_steps"] = GameConstants().steps - records["step"]
         return RPIDataset(records, self.targets, self.seed)
+
+    def true_weights(self, split: str) -> Tensor:
+        """The weight w of the game of every record [R] of a split; ``Scene.id`` holds indices of records.
+
+        Raises:
+            cache.CacheError: as :meth:`open`.
+        """
+        return cache.load(self.folder, split, ("weight",), self.command, self.config)["weight"]
