@@ -10,7 +10,19 @@ from jaxtyping import Float
 from torch import Tensor
 from torchmetrics import Metric
 
-from epo_lightning.metrics.functional import min_ade, min_fde, min_sade, min_sade_of_likely, min_sfde
+from epo_lightning.metrics.functional import (
+    brier_min_sade,
+    closest_mode,
+    expected_calibration_error,
+    min_ade,
+    min_fde,
+    min_sade,
+    min_sade_of_likely,
+    min_sfde,
+    missed,
+    reliability,
+)
+from epo_lightning.metrics.functional.calibration import BINS
 from epo_lightning.metrics.functional.overlap import Shape, check_choice, overlap_rates
 from epo_lightning.scene import JointForecast, Scene
 
@@ -30,8 +42,19 @@ EQUILIBRIUM_METRICS = (
 ``nash_gap`` is the largest gap of an agent, ``nash_gap_relative`` the largest gap divided by the agent's J_i."""
 MODE_METRICS = tuple(f"minSADE_{k}" for k in range(1, 17))
 """The minSADE among the k most likely joint modes, k = 1 .. 16, for forecasts with several modes."""
-COLUMNS = METRICS + INITIAL_METRICS + EQUILIBRIUM_METRICS + MODE_METRICS
-_OF_SUBSETS = len(METRICS + INITIAL_METRICS)
+PROBABILITY_METRICS = ("brier_minSADE",)
+"""Scores of displacements and probabilities together, for forecasts with several modes."""
+COLLAPSE_METRICS = ("missed",)
+"""Scores of the modes of a subset's scenes: the share of scenes without any mode near the future."""
+COLUMNS = METRICS + INITIAL_METRICS + EQUILIBRIUM_METRICS + MODE_METRICS + PROBABILITY_METRICS + COLLAPSE_METRICS
+"""Scores that are means over scenes."""
+SCORES = (*COLUMNS, "ECE")
+"""All scores; ``ECE`` is the calibration error of the probabilities of several modes
+(:mod:`~epo_lightning.metrics.functional.calibration`)."""
+_OF_SUBSETS = tuple(
+    name in (*METRICS, *INITIAL_METRICS, MODE_METRICS[0], *PROBABILITY_METRICS, *COLLAPSE_METRICS) for name in COLUMNS
+)
+_OF_ALL = tuple(name not in COLLAPSE_METRICS for name in COLUMNS)
 
 
 class ForecastMetrics(Metric):
@@ -40,6 +63,9 @@ class ForecastMetrics(Metric):
     Absent agents (``Scene.agent_mask``) and unobserved steps (``Scene.future_mask``) do not count. Sums are kept in double
     precision, so that the mean does not depend on sizes of batches or numbers of processes: a float32 sum over the 60 000
     scenes of a data set loses digits that tables print.
+
+    Forecasts with several modes have scores of their probabilities as well (``minSADE_1``, ``brier_minSADE``, ``ECE``), and
+    subsets the share of scenes without any mode near the future (``missed``).
 
     If a forecast has a measured equilibrium, its energies and Nash gaps are averaged as well, over all scenes but not by
     subset. Values that are not finite (a game that overflows) are left out, because one of them would make the mean
@@ -72,6 +98,7 @@ class ForecastMetrics(Metric):
 
     total: Tensor
     count: Tensor
+    bins: Tensor
 
     def __init__(self, subsets: Sequence[str] = (), shape: str = "disc", **options: Any) -> None:
         super().__init__(**options)
@@ -81,6 +108,8 @@ class ForecastMetrics(Metric):
         zeros = torch.zeros(1 + len(self.subsets), len(COLUMNS), dtype=torch.float64)
         self.add_state("total", zeros, dist_reduce_fx="sum")
         self.add_state("count", zeros.clone(), dist_reduce_fx="sum")
+        bins = torch.zeros(len(zeros), BINS, 3, dtype=torch.float64)
+        self.add_state("bins", bins, dist_reduce_fx="sum")
 
     def update(self, forecast: JointForecast, scene: Scene) -> None:
         """Count a batch of scenes.
@@ -95,22 +124,27 @@ class ForecastMetrics(Metric):
             subset = torch.full_like(numbers[:1], -1).expand(len(values)) if scene.subset is None else scene.subset
             groups = torch.cat([groups, subset[:, None] == numbers], dim=1)
         counted = groups[:, :, None] & ~values.isnan()[:, None]  # scene, group, metric
-        counted[:, 1:, _OF_SUBSETS:] = False
+        counted[:, :1] &= torch.tensor(_OF_ALL, device=values.device)
+        counted[:, 1:] &= torch.tensor(_OF_SUBSETS, device=values.device)
         self.total += torch.where(counted, values[:, None], 0.0).sum(0)
         self.count += counted.sum(0)
+        self.bins += torch.einsum("bg,bnx->gnx", groups.double(), calibration_values(forecast, scene))
 
     def compute(self) -> dict[str, Tensor]:
         """Scores by name.
 
         The six metrics over all scenes are always present, NaN before the first scene; the scores of a subset, of initial
-        strategies, of equilibria and of the most likely modes are present where there was a scene that has them.
+        strategies, of equilibria, of the most likely modes and of probabilities are present where there was a scene that has
+        them.
         """
-        mean = self.total / self.count
+        mean, calibration = self.total / self.count, expected_calibration_error(self.bins)
         scores = dict(zip(METRICS, mean[0], strict=False))
         for row, prefix in enumerate(("", *(f"{name}/" for name in self.subsets))):
             for column, metric in enumerate(COLUMNS):
                 if self.count[row, column] > 0:
                     scores[prefix + metric] = mean[row, column]
+            if self.bins[row].any():
+                scores[f"{prefix}ECE"] = calibration[row]
         return scores
 
 
@@ -137,7 +171,26 @@ def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> Float[
     modes = min(states.shape[1], len(MODE_METRICS)) if states.shape[1] > 1 else 0
     columns += min_sade_of_likely(states, forecast.probabilities, future, mask)[:, :modes].unbind(1)
     columns += [none] * (len(MODE_METRICS) - modes)
+    columns.append(brier_min_sade(states, forecast.probabilities, future, mask) if modes else none)
+    columns.append(missed(states, future, mask))
     return torch.stack([column.double() for column in columns], dim=1)
+
+
+def calibration_values(forecast: JointForecast, scene: Scene) -> Float[Tensor, "B bins 3"]:
+    """Sums of the bins of the calibration error of every scene, in float64.
+
+    All sums are zero for forecasts with a single mode, for scenes without observations, and for broken forecasts, of which
+    no mode is the closest or whose probabilities are not numbers.
+    """
+    assert scene.future is not None
+    assert scene.future_mask is not None
+    mask = scene.future_mask & scene.agent_mask[..., None]
+    probabilities = forecast.probabilities
+    known = min_sade(forecast.states, scene.future, mask).isfinite() & probabilities.isfinite().all(1)
+    if probabilities.shape[1] == 1:
+        known = torch.zeros_like(known)
+    closest = closest_mode(forecast.states, scene.future, mask)
+    return torch.where(known[:, None, None], reliability(probabilities.nan_to_num(0.0), closest), 0.0)
 
 
 def equilibrium_values(forecast: JointForecast) -> list[Float[Tensor, " B"]]:

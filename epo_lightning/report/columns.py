@@ -75,5 +75,16 @@ EQUILIBRIUM = (
     Column("nash_gap_relative", "Nash gap, relative"),
 )
 
+PROBABILITIES = (
+    Column("minSADE_1", "SADE, k=1"),
+    Column("brier_minSADE", "brier-SADE"),
+    Column("ECE", "ECE"),
+)
+
+ALTERNATIVES = ("executed", "alternative")
+"""Subsets that are known alternatives of the same scenes, of which a forecast should miss none."""
+
+OF_ALTERNATIVES = (Column("minSADE_1", "SADE, k=1"), Column("missed", "missed"))
+
 OF_MODES = re.compile(r"minSADE_(\d+)")
 """Names of the metrics minSADE among the k most likely joint modes."""

@@ -39,6 +39,15 @@ GAMES = (
     "their gradients and gaps are in different units; relative gaps compare, and lower is better."
 )
 
+CHANCES = (
+    "Brier-SADE is the SADE plus (1 - p)^2 of the closest mode with probability p. ECE is the calibration error: how far "
+    "the probabilities of modes are from the shares of scenes in which these modes are the closest."
+)
+
+MISSED = (
+    "Missed is the share of the scenes of that alternative whose future is more than 0.25 m (SADE) from every mode."
+)
+
 CSV_HEADER = (
     *("data", "split", "method", "backbone", "forecaster", "goal", "budget", "seeds", "n"),
     *("metric", "mean", "std", "paper", "difference"),
@@ -137,6 +146,8 @@ def legend(
         ranked if any(cell.rank for cell in cells) else "",
         rules if overlaps else "",
         GAMES if metrics & {*GAME} else "",
+        CHANCES if "ECE" in metrics else "",
+        MISSED if any(metric.endswith("/missed") for metric in metrics) else "",
     )
     return " ".join(part for part in parts if part)
 

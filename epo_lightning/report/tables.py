@@ -10,7 +10,15 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from epo_lightning.report.columns import EQUILIBRIUM, MAIN, OF_MODES, Column
+from epo_lightning.report.columns import (
+    ALTERNATIVES,
+    EQUILIBRIUM,
+    MAIN,
+    OF_ALTERNATIVES,
+    OF_MODES,
+    PROBABILITIES,
+    Column,
+)
 from epo_lightning.report.labels import natural
 from epo_lightning.report.paper import PAPER
 from epo_lightning.report.rows import Row, plain_rows, require_comparable
@@ -48,8 +56,9 @@ class Table:
 def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
     """Tables of every data set and split: the main table, and tables of subsets, modes and games.
 
-    The further tables show scores by subset, of the k most likely modes, of initial beside solved strategies, and the
-    distance of forecasts from an equilibrium of their game. They contain the rows that have such scores.
+    The further tables show scores by subset, of the k most likely modes, of probabilities and missed alternatives, of
+    initial beside solved strategies, and the distance of forecasts from an equilibrium of their game. They contain the rows
+    that have such scores.
 
     Raises:
         ConfigError: rows of one table that were trained under different conditions, or the same run twice.
@@ -73,6 +82,9 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
         if most > 1:  # k = 1 alone would repeat the main table
             modes = tuple(Column(f"minSADE_{k}", f"SADE, k={k}") for k in range(1, most + 1))
             tables += _partly_shown(f"{where}: accuracy of the k most likely modes", modes, rows)
+        scored = [row for row in rows if "brier_minSADE" in row.cells]
+        apart = (c for c in subset_columns(scored, OF_ALTERNATIVES) if c.metric.split("/")[0] in ALTERNATIVES)
+        tables += _partly_shown(f"{where}: probabilities of the modes", (*PROBABILITIES, *apart), scored)
         initial = tuple(
             Column(prefix + metric, f"{stage} {metric.removeprefix('min')}")
             for metric in ("minSADE", "minSFDE")

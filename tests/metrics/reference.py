@@ -9,6 +9,8 @@ from shapely.affinity import rotate, translate
 from shapely.geometry import Point, Polygon, box
 from torch import Tensor
 
+from .cases import Case
+
 
 def displacements(states: Tensor, future: Tensor, mask: Tensor) -> dict[str, list[float]]:
     """The four displacement metrics of every scene."""
@@ -81,3 +83,34 @@ def ordered(states: Tensor, agent_probabilities: Tensor) -> tuple[Tensor, Tensor
                 new_states[b, rank, i] = states[b, m, i]
                 new_probabilities[b, rank, i] = agent_probabilities[b, m, i]
     return new_states, new_probabilities
+
+
+def brier(case: Case) -> list[float]:
+    """The brier-minSADE of every scene."""
+    values = []
+    for b in range(len(case.states)):
+        joint = [
+            displacements(case.states[b : b + 1, [m]], case.future[b : b + 1], case.mask[b : b + 1])["minSADE"][0]
+            for m in range(case.states.shape[1])
+        ]
+        best = min(range(len(joint)), key=lambda m: joint[m])
+        values.append(joint[best] + (1 - case.probabilities[b, best].item()) ** 2)
+    return values
+
+
+def calibration_error(case: Case, chosen: list[int], bins: int = 10) -> float:
+    """The expected calibration error of the chosen scenes; NaN without any statement."""
+    statements = []
+    for b in chosen:
+        joint = [
+            displacements(case.states[b : b + 1, [m]], case.future[b : b + 1], case.mask[b : b + 1])["minSADE"][0]
+            for m in range(case.states.shape[1])
+        ]
+        if not math.isnan(joint[0]):
+            best = min(range(len(joint)), key=lambda m: joint[m])
+            statements += [(case.probabilities[b, m].item(), m == best) for m in range(len(joint))]
+    error = 0.0
+    for low in range(bins):
+        inside = [(p, true) for p, true in statements if low <= p * bins < low + 1 or (low == bins - 1 and p == 1)]
+        error += abs(sum(p - true for p, true in inside))
+    return error / len(statements) if statements else math.nan

@@ -7,7 +7,13 @@ from importlib import import_module
 
 import pytest
 
-MODULES = {"forecast": 1, "functional.displacement": 1, "functional.marginal": 1, "functional.overlap": 1}
+MODULES = {
+    "forecast": 1,
+    "functional.calibration": 1,
+    "functional.displacement": 1,
+    "functional.marginal": 1,
+    "functional.overlap": 1,
+}
 """Modules with examples, and how many docstrings of each have some at least."""
 
 

@@ -54,13 +54,31 @@ def likely_scores(case: Case) -> dict[str, float]:
     return {name: torch.tensor(values).double().nanmean().item() for name, values in scores.items()}
 
 
+def probability_scores(case: Case, chosen: Tensor) -> dict[str, float]:
+    """Scores of the probabilities of the chosen scenes, scene by scene."""
+    brier = torch.tensor(reference.brier(case)).double()[chosen].nanmean().item()
+    return {"brier_minSADE": brier, "ECE": reference.calibration_error(case, chosen.nonzero()[:, 0].tolist())}
+
+
+def collapse_scores(case: Case, chosen: Tensor) -> dict[str, float]:
+    """Share of the chosen scenes without a mode within 0.25 m, and the minSADE of the likeliest mode."""
+    parts = [
+        dataclasses.replace(case, **{k: v[[b]] for k, v in vars(case).items()}) for b in chosen.nonzero()[:, 0].tolist()
+    ]
+    best = [reference.displacements(part.states, part.future, part.mask)["minSADE"][0] for part in parts]
+    known = [value for value in best if not math.isnan(value)]
+    likeliest = torch.tensor([likely_scores(part)["minSADE_1"] for part in parts])
+    return {"missed": sum(value > 0.25 for value in known) / len(known), "minSADE_1": likeliest.nanmean().item()}
+
+
 @pytest.mark.parametrize("shape", ["disc", "box"])
 def test_scores_equal_the_reference_for_all_scenes_and_every_subset(shape: str) -> None:
     case, subset = big_case()
     scores = filled(case, subset, [slice(0, 8), slice(8, 9), slice(9, 23)], shape=shape)
-    expected = expected_scores(case, shape, subset >= 0) | likely_scores(case)
+    expected = expected_scores(case, shape, subset >= 0) | likely_scores(case) | probability_scores(case, subset >= 0)
     for number, name in enumerate(SUBSETS[:2]):
-        part = expected_scores(case, shape, subset == number)
+        chosen = subset == number
+        part = expected_scores(case, shape, chosen) | probability_scores(case, chosen) | collapse_scores(case, chosen)
         expected |= {f"{name}/{metric}": value for metric, value in part.items()}
     assert scores == pytest.approx(expected, abs=1e-6)
     assert scores["executed/minSADE"] != pytest.approx(scores["alternative/minSADE"], abs=1e-3)
@@ -74,7 +92,7 @@ def test_scores_do_not_depend_on_the_batch_size() -> None:
 
 def test_subsets_need_names_and_numbers() -> None:
     case, _ = big_case()
-    scores = {*METRICS, "initial/minSADE", "initial/minSFDE", *likely_scores(case)}
+    scores = {*METRICS, "initial/minSADE", "initial/minSFDE", *likely_scores(case), "brier_minSADE", "ECE"}
     assert set(filled(case, None, [slice(0, 23)])) == scores
     beyond = filled(case, torch.full((23,), 7), [slice(0, 23)])
     assert not any(name.startswith(SUBSETS) for name in beyond)
@@ -84,7 +102,7 @@ def test_initial_scores_exist_only_with_initial_strategies() -> None:
     case, _ = big_case()
     metrics = ForecastMetrics()
     metrics.update(case.forecast(), case.scene())
-    assert tuple(metrics.compute()) == (*METRICS, *likely_scores(case))
+    assert tuple(metrics.compute()) == (*METRICS, *likely_scores(case), "brier_minSADE", "ECE")
 
 
 @pytest.mark.filterwarnings("ignore:.*was called before the ``update``.*")

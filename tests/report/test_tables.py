@@ -18,6 +18,7 @@ from rich.console import Console
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, write_report
+from epo_lightning.report.render import legend
 from epo_lightning.report.rows import Cell, Row
 from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.tables import build_tables, distinct
@@ -132,6 +133,25 @@ def test_subsets_and_initial_strategies_have_tables_of_their_own(tmp_path: Path)
     assert {solved.rows[0].cells[column.metric].rank for column in solved.columns} == {None}  # alone there
     assert main.rows[1].cells["minSADE"].rank == 1
     assert main.rows[1].cells["initial/minSADE"].rank is None
+
+
+def test_probabilities_and_missed_alternatives_have_a_table_of_the_rows_that_were_scored(tmp_path: Path) -> None:
+    apart = {f"{name}/{metric}": 0.2 for name in ("executed", "alternative", "calm") for metric in scores(0.2)}
+    new = {"minSADE_1": 0.4, "minSADE_2": 0.1, "brier_minSADE": 0.35, "ECE": 0.05}
+    new |= {"executed/missed": 0.0, "alternative/missed": 0.125, "executed/minSADE_1": 0.2, "calm/missed": 0.9}
+    make_run(tmp_path / "old", "V-LSTM", "marginal", scores(0.3) | apart | {"minSADE_1": 0.5, "minSADE_2": 0.3})
+    make_run(tmp_path / "new", "V-LSTM + EPO", "epo", scores(0.1) | apart | new)
+    tables = {table.title.partition(": ")[2]: table for table in build_tables(collect(tmp_path))}
+    table = tables["probabilities of the modes"]
+    assert [row.name for row in table.rows] == ["V-LSTM + EPO"]
+    assert {column.label: table.rows[0].cells[column.metric].mean for column in table.columns} == {
+        **{"SADE, k=1": 0.4, "brier-SADE": 0.35, "ECE": 0.05},
+        **{"executed SADE, k=1": 0.2, "executed missed": 0.0, "alternative missed": 0.125},
+    }
+    text = legend([table])
+    assert "(1 - p)^2" in text
+    assert "0.25 m" in text
+    assert "(1 - p)^2" not in legend([tables["executed and alternative and calm apart"]])
 
 
 def test_interactive_scenes_have_a_table_with_all_columns(tmp_path: Path) -> None:

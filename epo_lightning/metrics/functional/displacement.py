@@ -10,7 +10,9 @@ minSADE   min_m mean_i mean_k e[m,i,k]        one mode for all agents of the sce
 minSFDE   min_m mean_i e[m,i,K]
 ========  ==================================  ==================================================
 
-The best mode is chosen for each metric separately: minSFDE and minSADE may be those of different modes.
+The best mode is chosen for each metric separately: minSFDE and minSADE may be those of different modes. With the probability
+p of the mode of the minSADE (the first one if several are equally close), brier-minSADE is minSADE + (1 - p)^2: it adds the
+probability's squared error to the displacement, as the brier-minFDE of Argoverse does.
 
 Agents without any observed step are left out of the mean over agents; final displacements also leave out agents whose last
 step was not observed. If no agent is left, the value of the scene is NaN. A prediction that is not finite at an observed
@@ -32,7 +34,7 @@ Example: two agents stand at the origin; mode 0 is right about the first one, mo
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -77,6 +79,40 @@ def min_sade_of_likely(
     order = probabilities.argsort(dim=1, descending=True, stable=True)
     joint = (error.sum(-1) / counted.sum(-1, keepdim=True)).gather(1, order)
     return joint.cummin(1).values
+
+
+def closest_mode(
+    states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
+) -> Int[Tensor, " B"]:
+    """Index of the joint mode of the minSADE, the first one if several are equally close; 0 for a scene without a value."""
+    return _average_errors(states, future, mask)[0].sum(-1).argmin(1)
+
+
+def brier_min_sade(
+    states: Float[Tensor, "B M N K X"],
+    probabilities: Float[Tensor, "B M"],
+    future: Float[Tensor, "B N K _"],
+    mask: Bool[Tensor, "B N K"],
+) -> Float[Tensor, " B"]:
+    """minSADE + (1 - p)^2 with the probability p of the closest joint mode [m]; infinite if p is not a number."""
+    best = closest_mode(states, future, mask)
+    wrong = (1.0 - probabilities.gather(1, best[:, None])[:, 0]).square()
+    return min_sade(states, future, mask) + wrong.nan_to_num(nan=torch.inf)
+
+
+def missed(
+    states: Float[Tensor, "B M N K X"],
+    future: Float[Tensor, "B N K _"],
+    mask: Bool[Tensor, "B N K"],
+    radius: float = 0.25,
+) -> Float[Tensor, " B"]:
+    """1 for scenes whose minSADE is above ``radius`` [m]: no joint mode is near the future; else 0.
+
+    On data with known alternatives (RPI), its mean over the scenes of one alternative is the share in which that alternative
+    is missing among the modes. NaN for a scene without a value.
+    """
+    distance = min_sade(states, future, mask)
+    return torch.where(distance.isnan(), distance, (distance > radius).to(distance.dtype))
 
 
 def min_sfde(
