@@ -40,7 +40,7 @@ class SceneProbabilities(nn.Module):
         self,
         z: Float[Tensor, "B N D"],
         positions: Float[Tensor, "B M N K 2"],
-        current: Float[Tensor, "B N X"],
+        current: Float[Tensor, "B N 4"],
         mask: Bool[Tensor, "B N"],
     ) -> Float[Tensor, "B M"]:
         """Logits of the joint futures; their softmax over the modes are the probabilities."""

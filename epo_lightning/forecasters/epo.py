@@ -18,7 +18,7 @@ from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.goals import GivenGoals, GoalDecoder, Goals, NoGoals
 from epo_lightning.decoders.motions import Motions
 from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
-from epo_lightning.decoders.probabilities import SceneProbabilities
+from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.strategies import InitialStrategies, ZeroStrategies
 from epo_lightning.decoders.weights import OwnWeights, PairWeights
 from epo_lightning.forecasters.base import Forecaster
@@ -75,6 +75,8 @@ class EPO(Forecaster):
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
             the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
             (``game_steps``). Initial controls after the first K steps are zero.
+        probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
+            (:mod:`~epo_lightning.decoders.probabilities`).
 
     Raises:
         ConfigError: parts that do not work together, with the changes that would work; or a value out of its range.
@@ -97,6 +99,7 @@ class EPO(Forecaster):
         control_scale: float = 0.3,
         motions: Mapping[str, float] | None = None,
         game_horizon: int | None = None,
+        probabilities: str = "linear",
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         _check_needs(energy, task)
@@ -120,6 +123,14 @@ class EPO(Forecaster):
             raise ConfigError(
                 f"forecaster.initial=motions needs dynamics=unicycle, not {type(energy.dynamics).__name__}: "
                 "the motions are those of a unicycle; choose decoded or zero"
+            )
+        check_probabilities(probabilities)
+        # The network decodes probabilities where neither energies of choices nor orders define them.
+        defined = chooses or energy.pair_order is not None
+        if defined and probabilities != "linear":
+            raise ConfigError(
+                f"forecaster.probabilities={probabilities} has no effect here, because the "
+                f"{'energies of choices' if chooses else 'orders of agents'} define the probabilities: leave it out"
             )
         if not math.isfinite(pair_start):
             raise ConfigError(f"forecaster.pair_start must be finite, not {pair_start}")
@@ -154,9 +165,7 @@ class EPO(Forecaster):
             self.goals = NoGoals()
         order = energy.pair_order
         self.orders = None if order is None else Orders(width, games, order.symmetric)
-        # The network decodes probabilities where neither energies of choices nor orders define them.
-        defined = chooses or order is not None
-        self.probabilities = None if defined else SceneProbabilities(width, modes, horizon, scale)
+        self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, horizon, scale)
 
     def forward(self, scene: Scene) -> JointForecast:
         """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 2."""
@@ -239,7 +248,7 @@ class EPO(Forecaster):
         assert self.probabilities is not None
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
         positions = solution.states[..., : self.task.horizon, :2]
-        return self.probabilities(z, positions, current[..., :2], scene.agent_mask)
+        return self.probabilities(z, positions, current, scene.agent_mask)
 
     def _states_of_initial_strategies(self, scene: Scene, parameters: GameParameters) -> Tensor | None:
         """The states of the initial strategies, [B, M, N, K, 4]; None for solvers that choose among candidates."""

@@ -160,7 +160,7 @@ def test_pairwise_probabilities_see_where_the_others_are() -> None:
     assert ((decoder()(z, positions, current, mask) - logits["pairwise"]).abs() > 1e-5).all()
 
 
-@pytest.mark.parametrize("name", ["scene_consistent"])
+@pytest.mark.parametrize("name", ["scene_consistent", "epo"])
 def test_highway_forecasts_with_pairwise_probabilities_are_equivariant_to_the_order_of_agents(name: str) -> None:
     torch.manual_seed(1)
     config = {"name": name, "modes": 3, "probabilities": "pairwise"}
@@ -199,7 +199,12 @@ def test_no_gradient_flows_to_the_futures_and_all_parameters_have_one(kind: str)
 
 def test_unknown_and_useless_choices_are_refused() -> None:
     baseline = {"name": "scene_consistent", "modes": 2, "loss_weights": LOSS_WEIGHTS}
-    with pytest.raises(ConfigError, match="did you mean 'pairwise'"):
-        build_forecaster(model({**baseline, "probabilities": "pairwse"}))
+    for forecaster in (baseline, {"name": "epo", "modes": 2}):
+        with pytest.raises(ConfigError, match="did you mean 'pairwise'"):
+            build_forecaster(model({**forecaster, "probabilities": "pairwse"}))
+    chosen = {"solver": {"name": "enumeration", "candidates": 4}, "backward": {"name": "unrolled"}}
+    objective = {"name": "conditional", "weights": {"density": 1.0, "marginal": 0.1, "regression": 0.1}}
+    with pytest.raises(ConfigError, match=r"probabilities=pairwise has no effect .* energies of choices"):
+        build_forecaster(model({"name": "epo", "modes": 2, "probabilities": "pairwise"}, **chosen, objective=objective))
     for made in (model(baseline), highway_model({"name": "epo", "modes": 3})):
         assert isinstance(build_forecaster(made).probabilities, SceneProbabilities), "the paper's is the default"

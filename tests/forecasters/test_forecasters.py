@@ -113,6 +113,10 @@ class TestPairwiseSceneConsistent(ForecasterSuite):
     config = {**TestSceneConsistent.config, "probabilities": "pairwise"}
 
 
+class TestPairwiseEPO(ForecasterSuite):
+    config = {**TestEPO.config, "probabilities": "pairwise"}
+
+
 EPO = TestEPO.config
 
 
