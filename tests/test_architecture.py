@@ -36,6 +36,7 @@ FLOORS = {
         "task",
         "objectives",
         "registry",
+        "checks",
         "game",
         "solvers",
         "backbones",

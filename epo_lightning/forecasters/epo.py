@@ -22,6 +22,7 @@ from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilit
 from epo_lightning.decoders.strategies import InitialStrategies, ZeroStrategies
 from epo_lightning.decoders.weights import OwnWeights, PairWeights
 from epo_lightning.forecasters.base import Forecaster
+from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
@@ -75,6 +76,8 @@ class EPO(Forecaster):
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
             the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
             (``game_steps``). Initial controls after the first K steps are zero.
+        calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which corrects the inferred
+            pair weights by the history outside training; None for no correction.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
             (:mod:`~epo_lightning.decoders.probabilities`).
 
@@ -99,10 +102,12 @@ class EPO(Forecaster):
         control_scale: float = 0.3,
         motions: Mapping[str, float] | None = None,
         game_horizon: int | None = None,
+        calibration: Mapping[str, float] | None = None,
         probabilities: str = "linear",
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         _check_needs(energy, task)
+        self.calibration = None if calibration is None else Calibration(**calibration)  # type: ignore[arg-type]
         self.game_horizon = task.horizon if game_horizon is None else game_horizon
         if self.game_horizon < task.horizon:
             raise ConfigError(
@@ -174,6 +179,8 @@ class EPO(Forecaster):
         game = self._game_of(scene)
         orders = self._decode_orders(z, scene)
         parameters = self._infer_game(z, scene, goals, orders)
+        if self.calibration is not None and not self.training:
+            parameters = self.calibration(self._minimiser, self.energy, game, parameters)
         solution = self.solve(self._minimiser, self.energy, game, parameters)
         logits = self._mode_logits(z, scene, goals, orders, solution)
         return JointForecast(

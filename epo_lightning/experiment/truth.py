@@ -1,0 +1,77 @@
+"""The truth test: how far inferred weights are from those of the games that made the data.
+
+Only ratios of weights mean something, because scaling all weights of a game by one factor changes no minimum. The unit of
+all costs is therefore the effort, the cost of squared controls, whose true weight is 10: the inferred cost of a term is
+
+    10 W^2 / (W_acc W_turnr),   and half of that for the pair term,
+
+averaged over both agents (geometrically), with the decoded weights W of the most likely mode. In these units the truth is
+w for the pair term, 300 for the goal and 30 for the speed (:class:`~epo_lightning.data.rpi.game.GameConstants`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from epo_lightning.data.rpi.game import GameConstants
+from epo_lightning.scene import GameParameters, JointForecast
+
+OWN = {"goal": "terminal", "vel": "slowness"}
+"""Own terms that are compared, with their true weight in :class:`GameConstants`."""
+NEEDED = frozenset({"acc", "turnr"})
+
+
+def inferred_costs(parameters: GameParameters, mode: Tensor) -> dict[str, Tensor]:
+    """Inferred costs [B] by term, in units of the true effort: ``pair``, and the terms of :data:`OWN` that the game has.
+
+    Args:
+        parameters: the inferred games.
+        mode: index of a mode for every scene [B].
+    """
+    rows = torch.arange(len(mode))
+    own = {name: weight.abs()[rows, mode].double() for name, weight in parameters.own_weights.items()}
+    pair = {name: weight.abs()[rows, mode].double() for name, weight in parameters.pair_weights.items()}
+    effort = (own["acc"] * own["turnr"]).log().mean(-1).exp() / GameConstants().effort
+    found = {name: own[name].square().log().mean(-1).exp() / effort for name in OWN if name in own}
+    if pair:
+        found["pair"] = 0.5 * torch.stack(list(pair.values())).square().sum(0)[:, 0] / effort
+    return found
+
+
+def collect(forecast: JointForecast, true_weight: Tensor) -> dict[str, Tensor]:
+    """True and inferred costs of a batch: ``true`` and the names of :func:`inferred_costs`, [B] each.
+
+    Args:
+        forecast: forecasts with an inferred game.
+        true_weight: w of every scene.
+    """
+    assert forecast.parameters is not None
+    return {"true": true_weight.double(), **inferred_costs(forecast.parameters, forecast.probabilities.argmax(1))}
+
+
+def compare(costs: dict[str, Tensor]) -> dict[str, float]:
+    """Scores of inferred costs.
+
+    Returns:
+        ``pair_rank``, the rank correlation of inferred and true w (Spearman's); ``pair_error``,
+        ``goal_error`` and ``vel_error``, medians of the relative error |inferred / true - 1|.
+    """
+    constants = GameConstants()
+    truths = {"pair": costs["true"], **{name: getattr(constants, key) for name, key in OWN.items()}}
+    scores = {
+        f"{name}_error": float((costs[name] / truth - 1.0).abs().median())
+        for name, truth in truths.items()
+        if name in costs
+    }
+    if "pair" in costs:
+        scores["pair_rank"] = float(stats.spearmanr(costs["pair"].numpy(), costs["true"].numpy()).statistic)
+    return scores
+
+
+def knows_truth(data: Any, parameters: GameParameters | None) -> bool:
+    """Whether the data knows its games' weights and the forecast has the terms to compare."""
+    return hasattr(data, "true_weights") and parameters is not None and parameters.own_weights.keys() >= NEEDED

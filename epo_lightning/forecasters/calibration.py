@@ -1,0 +1,126 @@
+"""Calibration of an inferred game on the observed history: the pair weights under which the game explains what was seen.
+
+The agents played the game before t0 as well. A game that is posed at the first observed state, with the inferred weights,
+therefore has to lead through the observed history. How much it misses tells how far the pair weights are off. This is an
+inverse game (Peters et al., "Inferring objectives in continuous dynamic games from noise-corrupted partial state
+observations", RSS 2021) with one unknown per joint mode: the logarithm s of a factor of all pair weights, which minimises
+
+    |x(s) - observed|^2 / noise^2 + s^2 / spread^2
+
+over the positions x of the history, so that weights without any effect on the history stay as the network decoded them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from epo_lightning.checks import check_number, check_whole
+from epo_lightning.game.energy import Energy
+from epo_lightning.scene import HEADING, SPEED, GameParameters, Scene
+from epo_lightning.solvers.base import Minimiser
+
+_DIFFERENCE = 0.05
+"""Change of s in the finite difference of the positions."""
+_LARGEST_STEP = 1.0
+"""Largest change of s in one step; a factor of e."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Gauss-Newton steps on the logarithm s of the factor, in float64 and without a gradient.
+
+    Attributes:
+        steps: number of steps; zero leaves the pair weights as they are.
+        noise: standard deviation [m] of the observed positions.
+        spread: standard deviation of s before the history is seen.
+    """
+
+    steps: int = 6
+    noise: float = 0.001
+    spread: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_whole("calibration.steps", self.steps, least=0)
+        check_number("calibration.noise", self.noise)
+        check_number("calibration.spread", self.spread)
+
+    @torch.no_grad()
+    def __call__(
+        self, minimiser: Minimiser, energy: Energy, scene: Scene, parameters: GameParameters
+    ) -> GameParameters:
+        """The game with calibrated pair weights. Scenes with gaps in the history of an agent keep their weights.
+
+        Args:
+            minimiser, energy: solver and energy of the forecast.
+            scene: the scene, whose game ends ``game_steps`` after t0.
+            parameters: the inferred game.
+        """
+        before = scene.history.shape[2] - 1
+        if self.steps == 0 or before == 0 or not parameters.pair_weights:
+            return parameters
+        past = _at_first_step(scene).to(torch.double)
+        game = parameters.map(lambda t: t.double() if t.is_floating_point() else t)
+        observed = past.future[:, None, :, :, :2]  # type: ignore[index]
+        present = scene.agent_mask[:, None, :, None, None]
+        controls = _with_history(past, game.initial_controls)
+
+        def misses(s: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+            """Weighted misses [B, M, R] of the history, and the strategies behind them."""
+            weights = {name: weight * s.exp()[..., None] for name, weight in game.pair_weights.items()}
+            found = minimiser(energy, past, dataclasses.replace(game, pair_weights=weights, initial_controls=start))
+            missed = found.states[..., :before, :2] - observed
+            return torch.where(present, missed, 0.0).flatten(2) / self.noise, found.controls
+
+        s = observed.new_zeros(controls.shape[:2])
+        damping = torch.ones_like(s)
+        missed, controls = misses(s, controls)
+        for _ in range(self.steps):
+            moved, _ = misses(s + _DIFFERENCE, controls)
+            change = (moved - missed) / _DIFFERENCE
+            slope = (change * missed).sum(-1) + s / self.spread**2
+            curvature = change.square().sum(-1) + 1.0 / self.spread**2
+            trial = s + (-slope / (damping * curvature)).clamp(-_LARGEST_STEP, _LARGEST_STEP)
+            after, strategies = misses(trial, controls)
+            better = self._cost(after, trial) < self._cost(missed, s)
+            damping = torch.where(better, (damping / 3.0).clamp_min(1.0), damping * 4.0)
+            s = torch.where(better, trial, s)
+            missed = torch.where(better[..., None], after, missed)
+            controls = torch.where(better[..., None, None, None], strategies, controls)
+        complete = (scene.history_mask | ~scene.agent_mask[..., None]).all(-1).all(-1)
+        factor = torch.where(complete[:, None] & s.isfinite(), s, 0.0).exp()[..., None]
+        weights = {name: weight * factor.to(weight.dtype) for name, weight in parameters.pair_weights.items()}
+        return dataclasses.replace(parameters, pair_weights=weights)
+
+    def _cost(self, missed: Tensor, s: Tensor) -> Float[Tensor, "B M"]:
+        cost = missed.square().sum(-1) + s.square() / self.spread**2
+        return torch.where(cost.isfinite(), cost, math.inf)
+
+
+def _at_first_step(scene: Scene) -> Scene:
+    """The scene at its first observed step: the rest of the history is its future, and its game ends as much later."""
+    before = scene.history.shape[2] - 1
+    steps = None if scene.game_steps is None else scene.game_steps + before
+    return dataclasses.replace(
+        scene,
+        history=scene.history[:, :, :1],
+        history_mask=scene.history_mask[:, :, :1],
+        future=scene.history[:, :, 1:],
+        future_mask=scene.history_mask[:, :, 1:],
+        game_steps=steps,
+    )
+
+
+def _with_history(past: Scene, initial: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "B M N T 2"]:
+    """The observed controls, followed by zeros: the start of the game at the first observed step."""
+    assert past.future is not None
+    seen = torch.cat((past.history, past.future), 2)
+    change = seen[..., [SPEED, HEADING]].diff(dim=2) / past.dt
+    change = torch.where(past.agent_mask[..., None, None], change, 0.0)
+    modes = initial.shape[1]
+    return torch.cat((change[:, None].expand(-1, modes, -1, -1, -1), torch.zeros_like(initial)), 3)

@@ -1,0 +1,59 @@
+"""Inferred costs in units of the true effort, and their scores against the true ones."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from epo_lightning.experiment import truth
+from epo_lightning.scene import GameParameters
+
+
+def games(weight: torch.Tensor, scale: torch.Tensor, sign: float = 1.0) -> GameParameters:
+    """The true RPI game in two modes, all weights of a scene multiplied by ``scale``; mode 0 has a wrong pair weight."""
+    batch = len(weight)
+
+    def own(value: float) -> torch.Tensor:
+        return sign * scale[:, None, None].expand(batch, 2, 2) * math.sqrt(value)
+
+    pair = scale[:, None] * torch.stack((weight, (2 * weight).sqrt()), 1)
+    return GameParameters(
+        own_weights={"acc": own(10.0), "turnr": own(10.0), "goal": own(300.0), "vel": own(30.0)},
+        pair_weights={"clearance": sign * pair[..., None]},
+        initial_controls=torch.zeros(batch, 2, 2, 4, 2),
+    )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_costs_of_the_true_game_are_the_true_ones_at_any_scale_and_sign(sign: float) -> None:
+    weight = torch.tensor([10.0, 40.0, 90.0], dtype=torch.double)
+    found = truth.inferred_costs(games(weight, torch.tensor([0.1, 1.0, 7.0]).double(), sign), torch.ones(3).long())
+    torch.testing.assert_close(found["pair"], weight)
+    torch.testing.assert_close(found["goal"], torch.full((3,), 300.0).double())
+    torch.testing.assert_close(found["vel"], torch.full((3,), 30.0).double())
+    assert truth.compare({"true": weight, **found}) == pytest.approx(
+        {"pair_error": 0.0, "goal_error": 0.0, "vel_error": 0.0, "pair_rank": 1.0}, abs=1e-12
+    )
+
+
+def test_scores_are_medians_of_relative_errors_and_a_rank_correlation() -> None:
+    true = torch.tensor([10.0, 20.0, 40.0, 80.0]).double()
+    wrong = {
+        "pair": torch.tensor([80.0, 40.0, 20.0, 10.0]).double(),
+        "goal": torch.tensor([150.0, 300, 600, 600]).double(),
+    }
+    scores = truth.compare({"true": true, **wrong})
+    assert scores["pair_rank"] == pytest.approx(-1.0)
+    assert scores["goal_error"] == pytest.approx(0.5)
+    assert scores["pair_error"] == pytest.approx(0.875)  # torch's median is the lower one of 0.5, 0.875, 1.0, 7.0
+    assert "vel_error" not in scores
+
+
+def test_games_without_a_pair_term_have_no_pair_cost() -> None:
+    game = games(torch.tensor([10.0]).double(), torch.ones(1).double())
+    alone = GameParameters(game.own_weights, {}, game.initial_controls)
+    costs = truth.inferred_costs(alone, torch.zeros(1).long())
+    assert set(costs) == {"goal", "vel"}
+    assert set(truth.compare({"true": torch.tensor([10.0]).double(), **costs})) == {"goal_error", "vel_error"}

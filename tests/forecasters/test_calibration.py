@@ -1,0 +1,92 @@
+"""Calibration on the history finds the pair weights of the game that was played, and leaves the others as they were."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from epo_lightning.forecasters.calibration import Calibration
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+
+ENERGY = FeatureEnergy(own=["goal", "vel", "acc", "turnr"], pair=["proximity"])
+SOLVER = LevenbergMarquardt(steps=60, step_size=1.0, damping=1.0, adaptive=True)
+BEFORE, AHEAD = 10, 20
+
+
+def parameters(weight: torch.Tensor, modes: int, steps: int, goals: torch.Tensor) -> GameParameters:
+    batch = len(weight)
+    own = {"goal": 10.0, "vel": 3.0, "acc": 3.0, "turnr": 3.0}
+    return GameParameters(
+        own_weights={name: torch.full((batch, modes, 2), value, dtype=torch.double) for name, value in own.items()},
+        pair_weights={"proximity": weight[:, None, None].expand(batch, modes, 1)},
+        initial_controls=torch.zeros(batch, modes, 2, steps, 2, dtype=torch.double),
+        goals=goals[:, None].expand(-1, modes, -1, -1),
+    )
+
+
+def played(weight: torch.Tensor, apart: float = 0.3) -> tuple[Scene, torch.Tensor]:
+    """Scenes in which two agents pass each other, after ``BEFORE`` steps of the game, and the goals."""
+    batch = len(weight)
+    start = torch.tensor([[[-2.0, 0.0, 0.0, 1.0], [2.0, apart, torch.pi, 1.0]]], dtype=torch.double)
+    start = start.expand(batch, 2, 4)
+    goals = torch.tensor([[[2.0, 0.0], [-2.0, apart]]], dtype=torch.double).expand(batch, 2, 2)
+    scene = Scene(history=start[:, :, None], dt=0.1, size=torch.full((batch, 2, 2), 1.2, dtype=torch.double))
+    states = SOLVER(ENERGY, scene, parameters(weight, 1, BEFORE + AHEAD, goals)).states[:, 0]
+    history = torch.cat((start[:, :, None], states[:, :, :BEFORE]), 2)
+    return Scene(history=history, dt=0.1, size=scene.size), goals
+
+
+def test_calibration_finds_the_weights_of_the_game_that_was_played() -> None:
+    true = torch.tensor([2.0, 5.0, 10.0], dtype=torch.double)
+    scene, goals = played(true)
+    for wrong in (0.5, 2.0):
+        inferred = parameters(wrong * true, 2, AHEAD, goals)
+        found = Calibration()(SOLVER, ENERGY, scene, inferred)
+        torch.testing.assert_close(
+            found.pair_weights["proximity"], true[:, None, None].expand(3, 2, 1), rtol=1e-2, atol=0
+        )
+        assert found.own_weights is inferred.own_weights
+
+
+def test_weights_without_an_effect_on_the_history_stay() -> None:
+    scene, goals = played(torch.tensor([4.0], dtype=torch.double), apart=9.0)
+    inferred = parameters(torch.tensor([8.0], dtype=torch.double), 1, AHEAD, goals)
+    found = Calibration()(SOLVER, ENERGY, scene, inferred)
+    torch.testing.assert_close(found.pair_weights["proximity"], inferred.pair_weights["proximity"])
+
+
+def test_scenes_with_gaps_in_the_history_keep_their_weights() -> None:
+    scene, goals = played(torch.tensor([4.0, 4.0], dtype=torch.double))
+    seen = torch.ones(2, 2, BEFORE + 1, dtype=torch.bool)
+    seen[0, 1, 3] = False
+    inferred = parameters(torch.tensor([8.0, 8.0], dtype=torch.double), 1, AHEAD, goals)
+    found = Calibration()(SOLVER, ENERGY, dataclasses.replace(scene, history_mask=seen), inferred)
+    assert found.pair_weights["proximity"].flatten()[0] == 8.0
+    assert abs(found.pair_weights["proximity"].flatten()[1] - 4.0) < 0.1
+
+
+def test_noise_moves_weights_less() -> None:
+    """The noisier the observations, the nearer the weights stay to what the network decoded."""
+    scene, goals = played(torch.tensor([4.0], dtype=torch.double))
+    inferred = parameters(torch.tensor([8.0], dtype=torch.double), 1, AHEAD, goals)
+    found = [
+        float(Calibration(noise=noise)(SOLVER, ENERGY, scene, inferred).pair_weights["proximity"])
+        for noise in (0.001, 0.1, 100.0)
+    ]
+    assert found == sorted(found)
+    assert found[0] == pytest.approx(4.0, rel=1e-2)
+    assert found[2] == pytest.approx(8.0, rel=1e-2)
+
+
+def test_no_steps_change_nothing_and_invalid_settings_are_refused() -> None:
+    scene, goals = played(torch.tensor([4.0], dtype=torch.double))
+    inferred = parameters(torch.tensor([8.0], dtype=torch.double), 1, AHEAD, goals)
+    assert Calibration(steps=0)(SOLVER, ENERGY, scene, inferred) is inferred
+    for settings in ({"steps": -1}, {"noise": 0.0}, {"spread": -1.0}):
+        with pytest.raises(ConfigError, match=f"calibration.{next(iter(settings))}"):
+            Calibration(**settings)
