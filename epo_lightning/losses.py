@@ -40,6 +40,56 @@ class Relaxation:
         return self.share * max(0.0, 1.0 - step / self.steps)
 
 
+HARDEST = 0.01
+"""Temperature [m] at which annealing ends and the hard minimum begins: modes 5 cm apart are told apart by then."""
+
+
+@dataclass(frozen=True)
+class Annealing:
+    """Schedule of a loss with a soft minimum over modes, whose temperature falls (annealed winner-takes-all).
+
+    A mode gets the share softmin(d / T) of the gradient, where d is its distance [m] from the data and T the temperature
+    [m]. At temperatures far above all distances every mode gets the same share; the modes part as the temperature falls, and
+    at the end the closest one gets everything. The loss is the soft minimum
+
+        -T log mean_m exp(-d_m / T),
+
+    which lies between the minimum and the mean over modes, and whose derivative by d_m is that share. So its gradient is
+    that of Xu et al. (Annealed Winner-Takes-All for Motion Forecasting, arXiv 2409.11172), who hold the shares constant.
+    Their temperatures start at about 10 and fall by a factor of 0.834 per epoch; here the fall is geometric too, but counted
+    in optimisation steps.
+
+    Attributes:
+        temperature: T [m] at the first step; 0 is the paper's loss. Useful values are about the distance between modes.
+        steps: optimisation steps in which T falls to :data:`HARDEST`. The loss is the hard minimum from then on.
+    """
+
+    temperature: float = 0.0
+    steps: int = 2000
+
+    def __post_init__(self) -> None:
+        if not (self.temperature == 0 or HARDEST < self.temperature < math.inf) or self.steps < 1:
+            raise ValueError(
+                f"annealing must be 0, or a temperature above {HARDEST} m, and annealing_steps 1 or more, not "
+                f"{self.temperature} and {self.steps}"
+            )
+
+    def at(self, step: int) -> float:
+        """The temperature [m] at an optimisation step; 0 for the hard minimum."""
+        if self.temperature == 0 or step >= self.steps:
+            return 0.0
+        return float(self.temperature * (HARDEST / self.temperature) ** (step / self.steps))
+
+
+def soft_minimum(distance: Tensor, temperature: float) -> Tensor:
+    """The soft minimum over dimension 1 at a positive temperature (:class:`Annealing`).
+
+    Modes at an infinite distance do not count.
+    """
+    count = distance.isfinite().sum(1).clamp_min(1).to(distance.dtype)
+    return -temperature * ((-distance / temperature).logsumexp(1) - count.log())
+
+
 def distances(
     positions: Float[Tensor, "B M N K 2"],
     future: Float[Tensor, "B N K 4"],
@@ -74,12 +124,31 @@ def _mean_over_agents(values: Tensor, mask: Bool[Tensor, "B N K"]) -> Tensor:
 
 
 def scene_imitation(
-    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0
+    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0, temperature: float = 0.0
 ) -> tuple[Float[Tensor, ""], Int[Tensor, " B"]]:
-    """L_imit, the minSADE: distance of the joint future closest to the observed one, and the index of that mode."""
+    """L_imit, the minSADE: distance of the joint future closest to the observed one, and the index of that mode.
+
+    Args:
+        distance: distance [m] of every mode and agent (:func:`distances`).
+        mask: observed steps.
+        relaxation: share of the mean over modes (:class:`Relaxation`).
+        temperature: temperature [m] of the soft minimum (:class:`Annealing`); 0 for the minimum.
+    """
     joint = _mean_over_agents(distance, mask)
     closest, mode = joint.min(1)
+    if temperature > 0:
+        closest = soft_minimum(joint, temperature)
     return torch.lerp(closest, joint.mean(1), relaxation).mean(), mode
+
+
+def mode_shares(
+    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], temperature: float
+) -> Float[Tensor, "B M"]:
+    """Share of every mode in an annealed loss, softmin over modes of the distances; without a gradient.
+
+    The temperature must be positive.
+    """
+    return (-_mean_over_agents(distance.detach(), mask) / temperature).softmax(1)
 
 
 def scene_probability(
@@ -109,10 +178,15 @@ def goal(
 
 
 def marginal_imitation(
-    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0
+    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0, temperature: float = 0.0
 ) -> tuple[Float[Tensor, ""], Int[Tensor, "B N"]]:
-    """The minADE: mean over agents of the distance of their own closest futures, and the indices of these modes."""
+    """The minADE: mean over agents of the distance of their own closest futures, and the indices of these modes.
+
+    Arguments as of :func:`scene_imitation`.
+    """
     closest, mode = distance.min(1)
+    if temperature > 0:
+        closest = soft_minimum(distance, temperature)
     return _mean_over_agents(torch.lerp(closest, distance.mean(1), relaxation), mask).mean(), mode
 
 

@@ -50,6 +50,98 @@ def test_relaxation_adds_the_mean_over_modes_and_decays():
         losses.Relaxation(share=2.0)
 
 
+def test_the_temperature_falls_geometrically_to_a_centimetre_and_then_is_zero():
+    annealing = losses.Annealing(temperature=1.0, steps=100)
+    assert [annealing.at(step) for step in (0, 50, 100, 10**6)] == pytest.approx([1.0, 0.1, 0.0, 0.0])
+    assert annealing.at(99) == pytest.approx(losses.HARDEST, rel=0.05)
+    ratios = [annealing.at(step + 1) / annealing.at(step) for step in range(99)]
+    assert ratios == pytest.approx([ratios[0]] * 99)
+    assert losses.Annealing().at(0) == 0.0
+    for wrong in ({"temperature": -1.0}, {"temperature": 0.01}, {"temperature": math.inf}, {"steps": 0}):
+        with pytest.raises(ValueError, match="annealing"):
+            losses.Annealing(**wrong)
+
+
+drawn_distances = st.lists(
+    st.lists(st.lists(st.floats(0.0, 20.0), min_size=3, max_size=3), min_size=2, max_size=2), min_size=1, max_size=4
+)
+"""Distances by scene, agent and mode."""
+
+
+@given(drawn_distances, st.floats(0.05, 50.0), st.floats(0.0, 1.0), st.booleans())
+def test_soft_minima_and_their_gradients_equal_loops(values, temperature, relaxation, absent):
+    distance = torch.tensor(values, dtype=torch.float64).mT.clone().requires_grad_()  # B M N
+    mask = torch.ones(len(values), 2, 1, dtype=torch.bool)
+    mask[0, 1] = not absent
+    for imitation, per_agent in ((losses.scene_imitation, False), (losses.marginal_imitation, True)):
+        expected, shares = 0.0, torch.zeros_like(distance)
+        for b, agents in enumerate(values):
+            counted = [i for i in range(2) if mask[b, i, 0]]
+            rows = [[agents[i]] for i in counted] if per_agent else [[agents[i] for i in counted]]
+            for number, row in enumerate(rows):
+                means = [sum(one[m] for one in row) / len(row) for m in range(3)]
+                powers = [math.exp(-(d - min(means)) / temperature) for d in means]
+                soft = min(means) - temperature * math.log(sum(powers) / 3)
+                assert min(means) - 1e-9 <= soft <= sum(means) / 3 + 1e-9
+                expected += ((1 - relaxation) * soft + relaxation * sum(means) / 3) / len(rows) / len(values)
+                for m in range(3):
+                    share = (1 - relaxation) * powers[m] / sum(powers) + relaxation / 3
+                    for i in [counted[number]] if per_agent else counted:
+                        shares[b, m, i] = share / len(counted) / len(values)
+        loss, mode = imitation(distance, mask, relaxation, temperature)
+        assert loss.item() == pytest.approx(expected, rel=1e-6, abs=1e-9)
+        assert torch.equal(mode, imitation(distance, mask)[1]), "the closest mode is the same"
+        (gradient,) = torch.autograd.grad(loss, distance)
+        torch.testing.assert_close(gradient, shares, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("imitation", [losses.scene_imitation, losses.marginal_imitation])
+def test_annealing_reaches_all_modes_when_hot_and_is_the_hard_loss_when_cold(imitation):
+    distance = torch.tensor([[[1.0, 5.0], [3.0, 1.0], [2.0, 2.5]]], dtype=torch.float64, requires_grad=True)
+    hard, _ = imitation(distance, MASK)
+    (of_hard,) = torch.autograd.grad(hard, distance)
+    hot, _ = imitation(distance, MASK, temperature=1e4)
+    (of_hot,) = torch.autograd.grad(hot, distance)
+    torch.testing.assert_close(of_hot, torch.full_like(of_hot, 1 / 6), rtol=1e-3, atol=0)
+    assert hot.item() == pytest.approx(distance.mean().item(), rel=1e-3)
+    cold, _ = imitation(distance, MASK, temperature=losses.HARDEST)
+    (of_cold,) = torch.autograd.grad(cold, distance)
+    torch.testing.assert_close(of_cold, of_hard, rtol=0, atol=1e-9)
+    assert cold.item() == pytest.approx(hard.item(), abs=2 * losses.HARDEST)
+    off, _ = imitation(distance, MASK, temperature=0.0)
+    assert torch.equal(torch.autograd.grad(off, distance)[0], of_hard)
+    assert torch.equal(off, hard)
+
+
+def test_a_scene_without_observations_has_no_loss_when_annealed():
+    for imitation in (losses.scene_imitation, losses.marginal_imitation):
+        assert imitation(torch.zeros(1, 2, 2), torch.zeros_like(MASK), temperature=1.0)[0] == 0.0
+
+
+def after_training(annealing: losses.Annealing) -> list[float]:
+    """Where two modes end that start at 0.9 m and 6 m, if half of the futures are at -1 m and the others at 1 m."""
+    modes = torch.tensor([0.9, 6.0], dtype=torch.float64, requires_grad=True)
+    future = torch.zeros(2, 1, 1, 4, dtype=torch.float64)
+    future[0, ..., 0], future[1, ..., 0] = -1.0, 1.0
+    mask = torch.ones(2, 1, 1, dtype=torch.bool)
+    optimizer = torch.optim.SGD([modes], 0.2)
+    for step in range(320):
+        positions = torch.stack((modes, torch.zeros_like(modes)), -1).view(1, 2, 1, 1, 2).expand(2, -1, -1, -1, -1)
+        distance = losses.distances(positions, future, mask)
+        loss, _ = losses.scene_imitation(distance, mask, temperature=annealing.at(step))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return sorted(modes.tolist())
+
+
+def test_the_hard_loss_collapses_where_the_annealed_one_teaches_both_modes():
+    near, far = after_training(losses.Annealing())
+    assert far == 6.0, "the mode that is never the closest has not moved"
+    assert -1.1 < near < 1.1
+    assert after_training(losses.Annealing(10.0, 300)) == pytest.approx([-1.0, 1.0], abs=0.11)
+
+
 def test_probabilities_are_scored_at_the_closest_mode():
     logs = torch.tensor([[0.25, 0.75]]).log()
     assert losses.scene_probability(logs, torch.tensor([1]), MASK).item() == pytest.approx(0.2877, abs=1e-4)

@@ -32,6 +32,7 @@ class Marginal(Forecaster):
         modes: number M of modes.
         loss_weights: lambda of ``imitation`` and ``probability``.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
     """
 
     def __init__(
@@ -43,11 +44,14 @@ class Marginal(Forecaster):
         loss_weights: Mapping[str, float],
         relaxation: float = 0.0,
         relaxation_steps: int = 1000,
+        annealing: float = 0.0,
+        annealing_steps: int = 2000,
     ) -> None:
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
+        self.annealing = losses.Annealing(annealing, annealing_steps)
         self.decoder = Trajectories(backbone.width, modes, task.horizon, task.scale)
 
     def forward(self, scene: Scene) -> JointForecast:
@@ -69,7 +73,8 @@ class Marginal(Forecaster):
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         future, mask = observed_future(scene)
         distance = losses.distances(forecast.states[..., :2], future, mask)
-        imitation, mode = losses.marginal_imitation(distance, mask, self.relaxation.at(self.global_step))
+        step = self.global_step
+        imitation, mode = losses.marginal_imitation(distance, mask, self.relaxation.at(step), self.annealing.at(step))
         assert forecast.agent_log_probabilities is not None
         probability = losses.marginal_probability(forecast.agent_log_probabilities, mode, mask)
         return {

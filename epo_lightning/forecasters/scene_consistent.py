@@ -29,6 +29,7 @@ class SceneConsistent(Forecaster):
         loss_weights: lambda of ``imitation`` and ``probability``.
         control_scale: control at a network output of one.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
             (:mod:`~epo_lightning.decoders.probabilities`).
     """
@@ -44,6 +45,8 @@ class SceneConsistent(Forecaster):
         control_scale: float = 0.3,
         relaxation: float = 0.0,
         relaxation_steps: int = 1000,
+        annealing: float = 0.0,
+        annealing_steps: int = 2000,
         probabilities: str = "linear",
     ) -> None:
         check_probabilities(probabilities)
@@ -52,6 +55,7 @@ class SceneConsistent(Forecaster):
         self.dynamics = dynamics
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
+        self.annealing = losses.Annealing(annealing, annealing_steps)
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
         self.probabilities = PROBABILITIES[probabilities](backbone.width, modes, task.horizon, task.scale)
 
@@ -64,4 +68,5 @@ class SceneConsistent(Forecaster):
         return JointForecast(states, logits.softmax(1), controls=controls, logits=logits)
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
-        return imitation_terms(scene, forecast, self.loss_weights, self.relaxation.at(self.global_step))
+        relaxation, temperature = self.relaxation.at(self.global_step), self.annealing.at(self.global_step)
+        return imitation_terms(scene, forecast, self.loss_weights, relaxation, temperature=temperature)

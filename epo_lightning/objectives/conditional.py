@@ -46,17 +46,26 @@ class Conditional(Objective):
             decoded candidates and elsewhere measures how well the candidates cover the observed futures; and of ``goal``
             (unused where no goal is decoded; 0.1 where it is not named).
         density: ``joint`` or ``marginal``.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing` of
+            ``regression``, over the candidates of each agent.
     """
 
     term_names = ("density", "marginal", "regression", "goal")
     through_solution = True
     needs_from_solver = frozenset({TABLES})
 
-    def __init__(self, weights: Mapping[str, float], density: str = "joint") -> None:
+    def __init__(
+        self,
+        weights: Mapping[str, float],
+        density: str = "joint",
+        annealing: float = 0.0,
+        annealing_steps: int = 2000,
+    ) -> None:
         if density not in DENSITIES:
             raise ConfigError(f"unknown objective.density {density!r}: {nearest(str(density), DENSITIES)}")
         self.weights = checked_weights({"goal": GOAL, **weights}, self.term_names)
         self.density = density
+        self.annealing = losses.Annealing(annealing, annealing_steps)
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
         """The terms of a batch; see :meth:`Objective.__call__`.
@@ -86,7 +95,12 @@ class Conditional(Objective):
         else:
             density = losses.marginal_density(tables.log_marginals.transpose(1, 2), closest, mask)
         alone = torch.where(known[:, None, None], (-unary).log_softmax(-1), torch.nan).transpose(1, 2)
-        regression, _ = losses.marginal_imitation(distance.gather(1, closest[:, None]), mask)
+        temperature = self.annealing.at(step)
+        if temperature > 0:
+            taught = torch.where(allowed | ~allowed.any(1, keepdim=True), distance, torch.inf)
+        else:
+            taught = distance.gather(1, closest[:, None])
+        regression, _ = losses.marginal_imitation(taught, mask, temperature=temperature)
         return {
             "density": (self.weights["density"], density),
             "marginal": (self.weights["marginal"], losses.marginal_density(alone, closest, mask)),

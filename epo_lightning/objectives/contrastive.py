@@ -36,6 +36,9 @@ class Contrastive(Objective):
     (:mod:`~epo_lightning.game.tracking`). The controls after an agent's last observed step are unknown; they are copied
     from the sample, so that both energies are defined. A scene without observations has no gradient.
 
+    With annealing, every mode is trained with its share (:func:`~epo_lightning.losses.mode_shares`), until the temperature
+    has fallen and the closest one is trained alone.
+
     Besides the weighted terms, ``tracking`` is logged: the distance [m] between observed positions and those reproduced by
     tracking.
 
@@ -44,14 +47,16 @@ class Contrastive(Objective):
             both could grow without bound; of ``initial``, the distance between initial strategies and samples (cooperative
             training: the network learns to start the chains where they end); of ``goal`` (unused if no goal is decoded);
             and of ``probability``, the cross entropy of the closest mode.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
     """
 
     term_names = ("contrastive", "magnitude", "initial", "goal", "probability")
     needs_from_solver = frozenset({SAMPLES, STATIONARY, PATH})
     needs_from_energy = frozenset({GRADIENT})
 
-    def __init__(self, weights: Mapping[str, float]) -> None:
+    def __init__(self, weights: Mapping[str, float], annealing: float = 0.0, annealing_steps: int = 2000) -> None:
         self.weights = checked_weights(weights, self.term_names)
+        self.annealing = losses.Annealing(annealing, annealing_steps)
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
         future, mask = observed_future(scene)
@@ -61,17 +66,21 @@ class Contrastive(Objective):
         assert starts is not None
         distance = losses.distances(forecast.states[..., :2].detach(), future, mask)
         _, mode = losses.scene_imitation(distance, mask)
-        index = torch.arange(len(mode), device=mode.device)
-        game = games(parameters, index, mode)
         controls, missed = observed_controls(energy.dynamics, scene)
-        drawn = solution.controls.detach()[index, mode][:, None]
+        temperature, drawn, game = self.annealing.at(step), solution.controls.detach(), parameters
+        if temperature > 0:
+            share = losses.mode_shares(distance, mask, temperature)
+        else:
+            index = torch.arange(len(mode), device=mode.device)
+            game, drawn = games(parameters, index, mode), drawn[index, mode][:, None]
+            share = torch.ones_like(distance[:, :1, 0])
         followed = mask.any(-1)
         taught = followed.any(-1)  # without an observation, both energies are those of the sample
         shown = torch.where(demonstrated(scene)[:, None, ..., None], controls[:, None], drawn)
-        of_shown, of_drawn = energy(scene, game, shown)[:, 0], energy(scene, game, drawn)[:, 0]
-        sizes = torch.where(taught, of_shown.square() + of_drawn.square(), 0.0)
+        of_shown, of_drawn = energy(scene, game, shown), energy(scene, game, drawn)
+        sizes = torch.where(taught, (share * (of_shown.square() + of_drawn.square())).sum(1), 0.0)
         values = {
-            "contrastive": (of_shown - of_drawn).mean(),
+            "contrastive": (share * (of_shown - of_drawn)).sum(1).mean(),
             "magnitude": sizes.mean(),
             "initial": proposal(starts, solution.states.detach(), scene.agent_mask & taught[:, None]),
             "probability": losses.scene_probability(forecast.log_probabilities, mode, mask),

@@ -24,6 +24,7 @@ class Imitation(Objective):
             solution (``truncated``, ``implicit``). If orders of agents are decoded, ``probability`` is their cross entropy.
         power: exponent of the distances; the paper's is 1, TGL's 1.05.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
     """
 
     term_names = ("imitation", "goal", "probability", "initial")
@@ -35,16 +36,19 @@ class Imitation(Objective):
         power: float = 1.0,
         relaxation: float = 0.0,
         relaxation_steps: int = 1000,
+        annealing: float = 0.0,
+        annealing_steps: int = 2000,
     ) -> None:
         if power < 1:
             raise ValueError(f"power must be 1 or more, not {power}")
         self.weights = checked_weights(weights, self.term_names)
         self.power = power
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
+        self.annealing = losses.Annealing(annealing, annealing_steps)
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
-        relaxation = self.relaxation.at(step)
-        terms = imitation_terms(scene, forecast, self.weights, relaxation, self.power)
+        how = self.relaxation.at(step), self.power, self.annealing.at(step)
+        terms = imitation_terms(scene, forecast, self.weights, *how)
         if forecast.order_logits is not None and energy.pair_order is not None:
             entropy = order_loss(forecast.order_logits, *energy.pair_order.observed(scene))
             terms["probability"] = (self.weights["probability"], entropy)
@@ -53,6 +57,6 @@ class Imitation(Objective):
             starts is not None and starts.requires_grad
         ):  # EPO detaches them if the solution already teaches the strategies
             initial = dataclasses.replace(forecast, states=starts)
-            closest = imitation_terms(scene, initial, self.weights, relaxation, self.power)["imitation"][1]
+            closest = imitation_terms(scene, initial, self.weights, *how)["imitation"][1]
             terms["initial"] = (self.weights["initial"], closest)
         return terms | goal_term(scene, forecast, self.weights["goal"])

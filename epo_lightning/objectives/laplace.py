@@ -55,17 +55,26 @@ class Laplace(Objective):
         weights: lambda of ``density``; of ``initial``, minSADE of the initial strategies, which the likelihood does not
             train; and of ``goal`` (no effect where no goal is decoded).
         damping: eps, which keeps H positive definite if some controls have no effect on any feature.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing` of
+            ``initial``. (``density`` trains every mode by its own share in the mixture.)
     """
 
     term_names = ("density", "initial", "goal")
     needs_from_solver = frozenset({PATH, STATIONARY, SAMPLES})  # a game for every mode, and strategies to start from
     needs_from_energy = frozenset({RESIDUALS})
 
-    def __init__(self, weights: Mapping[str, float], damping: float = 1e-3) -> None:
+    def __init__(
+        self,
+        weights: Mapping[str, float],
+        damping: float = 1e-3,
+        annealing: float = 0.0,
+        annealing_steps: int = 2000,
+    ) -> None:
         if not 0 <= damping < float("inf"):
             raise ValueError(f"objective.damping must be 0 or more, and finite, not {damping}")
         self.weights = checked_weights(weights, self.term_names)
         self.damping = damping
+        self.annealing = losses.Annealing(annealing, annealing_steps)
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
         future, mask = observed_future(scene)
@@ -82,7 +91,7 @@ class Laplace(Objective):
         count = 2 * demonstrated(scene).sum((1, 2)).clamp_min(1)
         density = torch.where(known, -joint.logsumexp(1) / count, 0.0).mean()
         distance = losses.distances(forecast.initial_states[..., :2], future, mask)
-        initial, _ = losses.scene_imitation(distance, mask)
+        initial, _ = losses.scene_imitation(distance, mask, temperature=self.annealing.at(step))
         followed = mask.any(-1)
         return {
             "density": (self.weights["density"], density),

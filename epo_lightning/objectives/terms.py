@@ -34,11 +34,25 @@ def goal_term(scene: Scene, forecast: JointForecast, weight: float) -> Terms:
 
 
 def imitation_terms(
-    scene: Scene, forecast: JointForecast, weights: Mapping[str, float], relaxation: float, power: float = 1.0
+    scene: Scene,
+    forecast: JointForecast,
+    weights: Mapping[str, float],
+    relaxation: float,
+    power: float = 1.0,
+    temperature: float = 0.0,
 ) -> Terms:
-    """Distance of the closest joint future, and the cross entropy of its probability."""
+    """Distance of the closest joint future, and the cross entropy of its probability.
+
+    Args:
+        scene: the scene with its future.
+        forecast: the forecast.
+        weights: lambda of ``imitation`` and ``probability``.
+        relaxation, temperature: see :func:`~epo_lightning.losses.scene_imitation`. The probability is always that of the
+            closest mode.
+        power: exponent of the distances.
+    """
     future, mask = observed_future(scene)
     distance = losses.distances(forecast.states[..., :2], future, mask, power)
-    imitation, mode = losses.scene_imitation(distance, mask, relaxation)
+    imitation, mode = losses.scene_imitation(distance, mask, relaxation, temperature)
     probability = losses.scene_probability(forecast.log_probabilities, mode, mask)
     return {"imitation": (weights["imitation"], imitation), "probability": (weights["probability"], probability)}

@@ -100,7 +100,7 @@ def test_training_learns_the_side_on_which_agents_pass(kind: str) -> None:
         assert correct > 0.95
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**31), st.integers(1, 3), st.integers(1, 4), st.permutations(range(4)))
 def test_the_order_of_agents_and_padding_change_nothing(seed, modes, agents, order) -> None:
     order = [agent for agent in order if agent < agents]
@@ -124,7 +124,7 @@ def test_the_order_of_agents_and_padding_change_nothing(seed, modes, agents, ord
             torch.testing.assert_close(made(*padded), logits)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**31), st.floats(-4.0, 4.0), st.permutations(range(3)))
 def test_pairwise_logits_follow_the_modes_and_ignore_the_frame(seed, angle, order) -> None:
     z, positions, current, mask = drawn(seed, modes=3)

@@ -1,7 +1,8 @@
-"""Training steps inside Lightning: the loss, gradient clipping, the schedule of the relaxation, scores of an epoch."""
+"""Training steps inside Lightning: the loss, gradient clipping, relaxation and annealing, scores of an epoch."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import lightning
@@ -97,6 +98,44 @@ def test_the_relaxation_fades_with_optimisation_steps(name: str, monkeypatch: py
     monkeypatch.setattr(losses.Relaxation, "at", lambda self, step: (steps.append(step), share(self, step))[1])
     fit(build(name), limit_val_batches=0)
     assert steps == list(range(BATCHES * EPOCHS))
+
+
+ANNEALED = {
+    "marginal": {"forecaster": {"name": "marginal", "modes": 2, "loss_weights": LOSS_WEIGHTS, "annealing": 5.0}},
+    "scene_consistent": {
+        "forecaster": {"name": "scene_consistent", "modes": 2, "loss_weights": LOSS_WEIGHTS, "annealing": 5.0}
+    },
+    "epo": {"forecaster": {"name": "epo", "modes": 2}, "objective": {**IMITATION, "annealing": 5.0}},
+}
+"""The same option in every learned row."""
+
+
+@pytest.mark.parametrize("name", ANNEALED)
+def test_the_temperature_falls_with_optimisation_steps(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[int] = []
+    at = losses.Annealing.at
+    monkeypatch.setattr(losses.Annealing, "at", lambda self, step: (steps.append(step), at(self, step))[1])
+    torch.manual_seed(1)
+    fit(build_forecaster(model(**ANNEALED[name])), limit_val_batches=0)
+    assert steps == list(range(BATCHES * EPOCHS))
+
+
+@pytest.mark.parametrize("name", ANNEALED)
+def test_annealing_trains_all_modes_of_every_row_at_first(name: str) -> None:
+    """The gradient of the imitation term reaches all modes; without annealing, the closest one of each scene."""
+    scene, counts = random_scene(4, 2), {}
+    for kind, rows in (("plain", LEARNED), ("annealed", ANNEALED)):
+        torch.manual_seed(1)
+        config = {key: dict(section) for key, section in rows[name].items()}
+        for section in config.values():
+            section.pop("relaxation", None)
+        forecaster = build_forecaster(model(**config))
+        forecast = forecaster(scene)
+        states = forecast.states.detach().requires_grad_()
+        forecaster.losses(scene, dataclasses.replace(forecast, states=states))["imitation"][1].backward()
+        touched = (states.grad != 0).flatten(3).any(-1)  # scene, mode, agent
+        counts[kind] = touched.sum((1, 2)).tolist()
+    assert counts == {"plain": [2] * 4, "annealed": [4] * 4}
 
 
 def test_validation_scores_are_those_of_their_own_epoch() -> None:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 from games import random_scene
 from suites import ObjectiveSuite
+from suites.games import build_energy
+from suites.objective import ENERGY
 
+from epo_lightning import losses
 from epo_lightning.objectives.terms import imitation_terms
-from epo_lightning.registry import parts
+from epo_lightning.registry import build, parts
 from epo_lightning.scene import JointForecast
 
 
@@ -20,6 +24,10 @@ class TestImitation(ObjectiveSuite):
 
 class TestRelaxedImitation(ObjectiveSuite):
     config = {**TestImitation.config, "relaxation": 0.5, "power": 1.05}
+
+
+class TestAnnealedImitation(ObjectiveSuite):
+    config = {**TestImitation.config, "annealing": 2.0}
 
 
 class TestJointDensity(ObjectiveSuite):
@@ -38,12 +46,87 @@ class TestContrastive(ObjectiveSuite):
     solver = {"name": "langevin", "steps": 4}
 
 
+class TestAnnealedMarginalDensity(TestMarginalDensity):
+    config = {**TestMarginalDensity.config, "annealing": 2.0}
+
+
+class TestAnnealedContrastive(TestContrastive):
+    config = {**TestContrastive.config, "annealing": 2.0}
+
+
 class TestLaplace(ObjectiveSuite):
     config = {"name": "laplace", "weights": {"density": 1.0, "initial": 1.0, "goal": 0.1}}
 
 
+class TestAnnealedLaplace(TestLaplace):
+    config = {**TestLaplace.config, "annealing": 2.0}
+
+
+ANNEALED = (TestAnnealedImitation, TestAnnealedMarginalDensity, TestAnnealedContrastive, TestAnnealedLaplace)
+TERMS = {"imitation": "imitation", "conditional": "regression", "contrastive": "contrastive", "laplace": "initial"}
+"""The term of each objective that annealing softens."""
+
+
+@pytest.mark.parametrize("suite", ANNEALED)
+def test_annealing_trains_every_mode_at_first_and_the_closest_one_at_last(suite: type[ObjectiveSuite]) -> None:
+    """The softened term has a gradient in every mode when hot, and when cold in those of the plain loss."""
+    made, torch_state = suite(), torch.get_rng_state()
+    energy = build_energy(ENERGY)
+
+    def trained(config: dict[str, Any], step: int) -> tuple[torch.Tensor, torch.Tensor]:
+        torch.set_rng_state(torch_state)
+        objective = build("objective", config)
+        scene, game = made.game(energy)
+        game = game.map(lambda tensor: tensor.clone().requires_grad_(tensor.is_floating_point()))
+        forecast = made.forecast(energy, scene, game)
+        value = objective(scene, forecast, energy, step)[TERMS[config["name"]]][1]
+        if config["name"] == "contrastive":  # it trains energies, not futures
+            (gradient,) = torch.autograd.grad(value, game.own_weights["acc"])
+        else:
+            (gradient,) = torch.autograd.grad(value, game.initial_controls)
+        return value, gradient.flatten(2).abs().amax(-1)
+
+    plain_config = {key: value for key, value in suite.config.items() if key != "annealing"}
+    plain, few = trained(plain_config, 0)
+    hot, every = trained({**suite.config, "annealing": 50.0}, 0)
+    cold, same = trained(suite.config, 2000)
+    assert (every > 0).all()
+    assert not (few > 0).all()
+    assert torch.equal(same, few)
+    assert torch.equal(cold, plain)
+    assert not torch.equal(hot, plain)
+
+
 def test_every_built_in_objective_has_its_suite():
     assert {suite.config["name"] for suite in ObjectiveSuite.__subclasses__()} >= set(parts("objective"))
+
+
+def test_annealed_contrastive_terms_are_sums_over_modes_by_their_shares() -> None:
+    """Against the plain terms of every mode alone, each of which is the closest of one mode."""
+    made, energy = TestContrastive(), build_energy(ENERGY)
+    scene, game = made.game(energy)
+    forecast = made.forecast(energy, scene, game)
+    modes = forecast.probabilities.shape[1]
+
+    def alone(mode: int, number: int) -> dict[str, float]:
+        one = forecast[number].map(lambda tensor: tensor[:, mode : mode + 1] if tensor.dim() > 1 else tensor)
+        terms = build("objective", TestContrastive.config)(scene[number], one, energy)
+        return {name: value.item() for name, (_, value) in terms.items()}
+
+    distance = losses.distances(forecast.states[..., :2], scene.future, scene.future_mask)
+    expected = {"contrastive": 0.0, "magnitude": 0.0}
+    for number in range(3):
+        far = [
+            sum(distance[number, mode, i].item() for i in range(3) if scene.future_mask[number, i].any())
+            / sum(bool(scene.future_mask[number, i].any()) for i in range(3))
+            for mode in range(modes)
+        ]
+        powers = [math.exp(-one / 2.0) for one in far]
+        for mode in range(modes):
+            for name in expected:
+                expected[name] += powers[mode] / sum(powers) * alone(mode, number)[name] / 3
+    terms = build("objective", TestAnnealedContrastive.config)(scene, forecast, energy)
+    assert {name: terms[name][1].item() for name in expected} == pytest.approx(expected)
 
 
 def test_imitation_takes_the_closest_mode_and_a_share_of_all_with_distances_to_a_power():

@@ -29,7 +29,7 @@ def modes_at(*errors: float) -> torch.Tensor:
     return torch.tensor([[[[[error, 0.0]]] for error in errors]])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(case=cases)
 def test_scores_equal_loops(case: Case) -> None:
     value = brier_min_sade(case.states, case.probabilities, case.future, case.mask)
@@ -76,7 +76,6 @@ def test_every_statement_is_in_one_bin() -> None:
     assert counts.sum(0)[[0, 1, 9]].tolist() == [2.0, 1.0, 3.0]
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**31), st.integers(0, 5))
 def test_sums_of_parts_are_the_sums_of_the_whole(seed: int, cut: int) -> None:
     """The division of scenes into batches changes nothing."""
