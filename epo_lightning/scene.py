@@ -127,7 +127,8 @@ class Scene(_Batch):
         reference_speed: desired speed of each agent [m/s].
         frame: origin x, y [m] and rotation [rad] of the transformation back to the recording's coordinates:
             world = R(rotation) position + origin.
-        subset: index of the named subset of the data that the future belongs to (RPI: executed 0, alternative 1).
+        subset: index of the named subset of the data that the future belongs to (RPI: executed 0, alternative 1;
+            recorded data: calm 0, interactive 1).
         id: index of the scene's record in its data set.
         goal_headings: heading [rad] that an agent wants at each goal candidate, continuous with the agent's heading: it is
             not wrapped to (-pi, pi], so a difference of 2 pi is a full turn.

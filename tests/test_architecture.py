@@ -29,7 +29,7 @@ FLOORS = {
     "metrics": {"scene", "registry"},
     "decoders": {"scene", "registry", "game"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
-    "data": {"scene", "registry", "schema", "checks", "task"},
+    "data": {"scene", "registry", "schema", "checks", "task", "metrics"},
     "objectives": {"scene", "registry", "game", "solvers", "decoders", "losses"},
     "forecasters": {
         "scene",

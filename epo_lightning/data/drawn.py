@@ -21,6 +21,7 @@ from epo_lightning.data.recorded.routes import ACCELERATING, BEHIND, BEYOND, BRA
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.windows import MOST_AGENTS, SPACING, VECTORS, WindowConfig
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
+from epo_lightning.metrics.functional.interaction import SUBSETS
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import KINDS
 from epo_lightning.task import Task
@@ -192,10 +193,18 @@ LIKE: Mapping[str, Preset] = {
     "highway": Preset(
         WindowConfig.agents,
         WindowConfig.history,
-        Task(WindowConfig.horizon, WindowConfig.dt, shape="box", candidates=LINES * PER_LINE, map=True, scale=20.0),
+        Task(
+            WindowConfig.horizon,
+            WindowConfig.dt,
+            SUBSETS,
+            shape="box",
+            candidates=LINES * PER_LINE,
+            map=True,
+            scale=20.0,
+        ),
         _highway,
     ),
-    "pedestrians": Preset(4, 8, Task(12, 0.4, candidates=0, scale=5.0), _pedestrians),
+    "pedestrians": Preset(4, 8, Task(12, 0.4, SUBSETS, candidates=0, scale=5.0), _pedestrians),
 }
 """The sorts of random scenes, by the name in ``data.like``."""
 
@@ -251,4 +260,5 @@ class DrawnData(SceneDataModule):
             tables = self.preset.tables(-(-self.scenes // 2), self.num_agents, self.preset, draw)
             return RPIDataset(tables, seed=self.seed)
         tables = self.preset.tables(self.scenes, self.num_agents, self.preset, draw)
-        return RecordedScenes(tables, self.task.dt, "aligned", [split])
+        shape = None if split == "train" else self.task.shape
+        return RecordedScenes(tables, self.task.dt, "aligned", [split], shape)

@@ -15,6 +15,7 @@ from epo_lightning.experiment import assembly, logs, truth
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
 from epo_lightning.forecasters import Forecaster
+from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
 from epo_lightning.schema import read
@@ -74,6 +75,8 @@ def score(
     checkpoint = run.checkpoint(settings.checkpoint)
     forecaster = open_checkpoint(of_run, checkpoint)
     data = open_data(run, of_run, settings.batch_size)
+    if data.task.subsets != forecaster.task.subsets:  # a checkpoint that is older than the subsets of its data
+        forecaster.test_metrics = ForecastMetrics(data.task.subsets, data.task.shape)
     loader = split_of(data, settings.split)
     seed_everything(of_run.seed, workers=True, verbose=False)
     machine = machine or of_run.trainer
@@ -132,14 +135,19 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
     """Write scores without ever replacing others, and return the file that holds them.
 
     The scores of the best checkpoint are ``metrics.json`` (``metrics-val.json`` on the validation split). If that file holds
-    the same scores already it stays as it is. Scores of another checkpoint, and scores that differ from those in the file,
-    go to ``scores-<split>-<checkpoint>-<digest>.json``, which records the digest of the checkpoint as well as of the data.
+    the same scores already it stays as it is; if they lack scores that older versions did not compute, these are added.
+    Scores of another checkpoint, and scores that differ from those in the file, go to
+    ``scores-<split>-<checkpoint>-<digest>.json``, which records the digest of the checkpoint as well as of the data.
     """
     file = run.metrics_file(scored["split"])
     if scored["checkpoint"] == "best":
         if not _readable(file):
             write_json(file, scored)
-        if _same(read_json(file), scored):
+        stored = read_json(file)
+        if _same(stored, scored):
+            completed = {**scored, **stored, "metrics": {**scored["metrics"], **stored["metrics"]}}
+            if completed.keys() != stored.keys() or completed["metrics"].keys() != stored["metrics"].keys():
+                write_json(file, completed)
             return file
     digest = hashlib.sha256(checkpoint.read_bytes()).hexdigest()[:16]
     other = run.path / f"scores-{scored['split']}-{Path(scored['checkpoint']).stem}-{digest[:8]}.json"
@@ -157,11 +165,11 @@ def _readable(file: Path) -> bool:
 
 
 def _same(stored: dict[str, Any], scored: dict[str, Any]) -> bool:
-    """Whether two sets of scores are of the same data and checkpoint, and equal up to the last digits."""
+    """Whether new scores are of the same data and checkpoint as stored ones, and equal them up to the last digits."""
     if any(stored.get(key) != scored[key] for key in ("split", "data_digest", "checkpoint")):
         return False
-    pairs = [(stored["metrics"].get(name, math.inf), value) for name, value in scored["metrics"].items()]
-    return len(pairs) == len(stored["metrics"]) and all(
+    pairs = [(value, scored["metrics"].get(name, math.inf)) for name, value in stored["metrics"].items()]
+    return all(
         math.isclose(one, other, rel_tol=TOLERANCE, abs_tol=1e-9) or (math.isnan(one) and math.isnan(other))
         for one, other in pairs
     )

@@ -88,7 +88,7 @@ def predict(settings: PredictSettings) -> list[Path]:
         "data_digest": run.record.get("data_digest"),
         "dt": scenes.dt,
         "scenes": len(scenes.history),
-        "subsets": list(forecaster.configuration["subsets"]),
+        "subsets": list(assembly.build_data(of_run.data).task.subsets),
         "tensors": {name: MEANING.get(name, name.replace("/", " of ")) for name in sorted(tensors)},
         "pictures": [{"file": str(file.relative_to(out)), "rows": rows} for file, rows in pictures],
     }

@@ -148,8 +148,8 @@ def draw(rows: Iterable[Row], folder: Path) -> tuple[list[Path], list[str]]:
     try:
         first = next(iter(runs))
         data, shape = open_data(*runs[first]), forecasters[first].configuration.get("shape", "disc")
-        # Records with two futures are found among all scenes only.
-        scenes, _ = choose(data, "test", None if data.task.subsets else GAMES)
+        # Records with two futures (RPI) are found among all scenes only.
+        scenes, _ = choose(data, "test", None if "alternative" in data.task.subsets else GAMES)
     except ConfigError as error:
         return [], [*notes, f"No scenes are drawn: {error}"]
     folder.mkdir(parents=True, exist_ok=True)

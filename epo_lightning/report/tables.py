@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
+from epo_lightning.metrics.functional.interaction import INTERACTIVE
 from epo_lightning.report.columns import (
     ALTERNATIVES,
     EQUILIBRIUM,
@@ -24,8 +25,6 @@ from epo_lightning.report.paper import PAPER
 from epo_lightning.report.rows import Row, plain_rows, require_comparable
 from epo_lightning.report.runs import EvaluatedRun
 
-INTERACTIVE = "interactive"
-"""Name of the subset that has a table with all columns of the main table."""
 BACKBONES = tuple(dict.fromkeys(backbone for _, backbone, _ in PAPER))
 FORECASTERS = ("marginal", "scene_consistent", "epo")
 """The paper's order of groups, and of rows within a group; others follow in the order of the runs."""

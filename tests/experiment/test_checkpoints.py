@@ -13,7 +13,7 @@ from experiment.test_resume import WORSENING, begin_and_stop
 
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, read_log
+from epo_lightning.run_folder import RunFolder, read_log, write_json
 
 ROW = "experiment=rpi/v_lstm_sc"
 
@@ -67,6 +67,25 @@ def test_the_best_epoch_has_the_smallest_score_and_resuming_restores_the_schedul
     rates = [each["optimizer_states"][0]["param_groups"][0]["lr"] for each in (last, resumed)]
     assert rates[0] == rates[1] < 0.05, "the learning rate has been lowered"
     assert all(torch.equal(weight, resumed["state_dict"][name]) for name, weight in last["state_dict"].items())
+
+
+def test_scores_of_subsets_that_older_versions_did_not_know_are_added(epo: Epo) -> None:
+    run = RunFolder(Path("run"))
+    assert epo("train", ROW, *TINY, "run_dir=run", "score=test") == 0
+    first = json.loads(run.metrics_file().read_text())
+    old = {**first, "metrics": {name: value for name, value in first["metrics"].items() if "executed" not in name}}
+    assert old != first
+    weights = torch.load(run.checkpoint("best"), weights_only=True)
+    weights["configuration"]["subsets"] = []
+    torch.save(weights, run.checkpoint("best"))
+    write_json(run.metrics_file(), old)
+    assert epo("evaluate", "run=run") == 0
+    assert json.loads(run.metrics_file().read_text()) == first
+
+    wrong = {**old, "metrics": {**old["metrics"], "minADE": 2 * old["metrics"]["minADE"]}}
+    write_json(run.metrics_file(), wrong)
+    assert epo("evaluate", "run=run") == 0
+    assert json.loads(run.metrics_file().read_text()) == wrong, "other scores stay as they are"
 
 
 def test_scores_are_never_replaced(epo: Epo, refused: Callable[..., str], capsys: pytest.CaptureFixture[str]) -> None:

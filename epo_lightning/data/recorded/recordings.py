@@ -26,6 +26,7 @@ from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, joined
 from epo_lightning.data.workers import Report, finished
+from epo_lightning.metrics.functional.interaction import SUBSETS
 from epo_lightning.registry import ConfigError, lookup, nearest, register
 from epo_lightning.schema import read
 from epo_lightning.task import Task
@@ -107,7 +108,7 @@ class RecordedData(SceneDataModule):
         self.frame = frame
         candidates = LINES * PER_LINE if map else 0
         self.task = Task(
-            self.windows.horizon, float(self.windows.dt), (), shape, candidates, map=map, scale=float(scale)
+            self.windows.horizon, float(self.windows.dt), SUBSETS, shape, candidates, map=map, scale=float(scale)
         )
         self.root = Path(root).expanduser() if root else cache.default_root()
 
@@ -331,14 +332,15 @@ class RecordedData(SceneDataModule):
         return cache.manifest(self.folder, self.command, self.config)["report"]
 
     def open(self, split: str) -> SceneDataset:
-        """The scenes of a split.
+        """The scenes of a split; those of validation and test splits have a subset, calm or interactive.
 
         Raises:
             cache.CacheError: the data set is missing, broken, of another configuration, or holds numbers that are not
                 finite.
         """
         tables = cache.load(self.folder, split, command=self.command, config=self.config)
-        return RecordedScenes(tables, self.task.dt, self.frame, self.report()["recordings"][split])
+        shape = None if split == "train" else self.task.shape
+        return RecordedScenes(tables, self.task.dt, self.frame, self.report()["recordings"][split], shape)
 
 
 def _absent() -> Recording:

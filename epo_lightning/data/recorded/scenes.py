@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
+from epo_lightning.metrics.functional import interactive_scenes
 from epo_lightning.scene import Scene
 
 FRAMES = ("fixed", "aligned")
 """Axes of a scene: those of the recording, or x along the mean heading of its agents. The origin is their mean position."""
+
+
+UNKNOWN = -1
+"""Subset of a scene that has not been read yet."""
 
 
 class RecordedScenes:
@@ -23,10 +30,17 @@ class RecordedScenes:
         dt: time step [s].
         frame: ``fixed`` (axes of the recording) or ``aligned`` (x along the agents' mean heading).
         names: names of the recordings.
+        shape: agents' outline, ``disc`` or ``box``, for the subset of each scene, calm or interactive
+            (:func:`~epo_lightning.metrics.functional.interaction.interactive_scenes`). None for scenes without
+            ``Scene.subset``: training does not need it. It is computed when a scene is first read, and then kept.
     """
 
-    def __init__(self, tables: Mapping[str, Tensor], dt: float, frame: str, names: Sequence[str]) -> None:
+    def __init__(
+        self, tables: Mapping[str, Tensor], dt: float, frame: str, names: Sequence[str], shape: str | None = None
+    ) -> None:
         self.tables, self.dt, self.frame, self.names = tables, dt, frame, tuple(names)
+        self.shape = shape
+        self._subset = torch.full((len(self),), UNKNOWN)
 
     def __len__(self) -> int:
         return len(self.tables["agents"])
@@ -82,7 +96,7 @@ class RecordedScenes:
                 "reference_mask": present[..., None].expand(*present.shape, LINES),
                 "reference_speed": known(self.tables["reference_speed"][rows]),
             }
-        return Scene(
+        scene = Scene(
             history=history,
             dt=self.dt,
             history_mask=history_mask,
@@ -95,6 +109,14 @@ class RecordedScenes:
             id=indices,
             **on_map,
         )
+        return scene if self.shape is None else dataclasses.replace(scene, subset=self._subset_of(scene, self.shape))
+
+    def _subset_of(self, scene: Scene, shape: str) -> Int[Tensor, " B"]:
+        """Index of the subset of every scene, 0 for calm and 1 for interactive."""
+        assert scene.id is not None
+        if (self._subset[scene.id] == UNKNOWN).any():
+            self._subset[scene.id] = interactive_scenes(scene, shape).long()
+        return self._subset[scene.id]
 
     def provenance(self, indices: Sequence[int]) -> list[dict[str, Any]]:
         """Recording, frame and tracks of each of some scenes."""

@@ -11,6 +11,7 @@ from epo_lightning.metrics.functional.displacement import (
     min_sfde,
     missed,
 )
+from epo_lightning.metrics.functional.interaction import interactive_scenes
 from epo_lightning.metrics.functional.marginal import marginal_to_joint
 from epo_lightning.metrics.functional.overlap import overlap_rate, overlapping_pairs
 
@@ -18,6 +19,7 @@ __all__ = [
     "brier_min_sade",
     "closest_mode",
     "expected_calibration_error",
+    "interactive_scenes",
     "marginal_to_joint",
     "min_ade",
     "min_fde",

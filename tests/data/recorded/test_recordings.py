@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from metrics.slow_interaction import interact
 
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
@@ -20,6 +22,7 @@ from epo_lightning.registry import ConfigError, register
 from .roads import FOUR, curve, recording
 
 WINDOWS = {"dt": 0.2}
+US101 = Path(os.environ.get("EPO_SHARED", Path(__file__).parents[4] / "shared")) / "data" / "us101"
 READ: list[str] = []
 """Recordings that were read, in order."""
 
@@ -75,6 +78,30 @@ def test_generate_once_then_train_from_the_cache(folder):
     assert {name[0] for name in names["test"]} == {"a"}
     assert not set(names["train"]) & set(names["val"])
     assert report["train"]["scenes"] == len(module.dataset("train")) > 0
+
+
+def test_validation_and_test_scenes_are_calm_or_interactive_and_the_data_set_is_the_same(folder):
+    module = data(folder)
+    module.generate(workers=1, progress=False)
+    assert module.task.subsets == ("calm", "interactive")
+    assert "subset" not in cache.load(module.folder, "test")
+    for split, known in (("train", False), ("val", True), ("test", True)):
+        scenes = module.open(split)
+        assert (scenes[torch.arange(3)].subset is not None) is known
+    assert "calm" not in str(module.config), "the subset is computed from the scenes, it is no part of the data set"
+
+
+@pytest.mark.skipif(not US101.is_dir(), reason="no US-101 recordings")
+def test_real_traffic_equals_the_slow_definition(tmp_path):
+    windows = {"dt": 0.2, "smoothing": 1.0, "every": 5}
+    module = RecordedData("us101", "commonroad", str(US101), windows, val_by="group", seed=4, root=str(tmp_path))
+    module.generate(workers=1, progress=False)
+    scenes = module.open("test")
+    batch = scenes[torch.arange(len(scenes))]
+    pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
+    for row in range(len(scenes)):
+        expected = any(interact(batch.to(torch.double), row, i, j, "box") for i, j in pairs)
+        assert bool(batch.subset[row]) == expected
 
 
 def test_splits_are_drawn_by_group_where_none_is_named(folder):

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from metrics.slow_interaction import interact
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.lanes import lane_changes
@@ -316,6 +317,29 @@ def test_a_map_of_another_place_is_refused():
     of = recording()
     with pytest.raises(RecordingError, match="road: 100% of all positions lie on no lane"):
         extract(dataclasses.replace(of, lanes=recording(curve(None, 0.0, (0.0, 500.0))).lanes), WindowConfig())
+
+
+@pytest.mark.parametrize(("shape", "frame"), [("box", "aligned"), ("disc", "fixed")])
+def test_scenes_belong_to_the_subset_of_their_definition(shape, frame):
+    # Vehicle 5 would hit vehicle 7, which is slower, if it did not brake in every scene.
+    vehicles = [(3, 0.0, 0, 25.0, None), (5, 30.0, 1, 31.0, None), (7, 55.0, 1, 25.0, None), (9, 90.0, 0, 25.0, 2.0)]
+    of = recording(vehicles=vehicles)
+    found, _ = extract(of, WindowConfig())
+    columns = tables(found)
+    (rows,) = (columns["track"] == 5).nonzero(as_tuple=True)
+    now, future = columns["history"][rows, -1:], columns["future"][rows]
+    slower = now[..., :2] + 0.8 * (future - now)[..., :2]
+    columns["future"][rows] = torch.cat((slower, future[..., 2:3], 0.8 * future[..., 3:]), -1)
+    data = RecordedScenes(columns, 0.2, frame, [of.name], shape)
+    whole = data[torch.arange(len(data))]
+    pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
+    expected = [any(interact(whole.to(torch.double), row, i, j, shape) for i, j in pairs) for row in range(len(data))]
+    assert whole.subset.tolist() == expected
+    assert {*expected} == {False, True}
+    again = RecordedScenes(columns, 0.2, frame, [of.name], shape)
+    mixed = torch.arange(len(data)).flip(0)[::3]
+    assert again[mixed].subset.tolist() == again[mixed].subset.tolist() == whole.subset[mixed].tolist()
+    assert RecordedScenes(columns, 0.2, frame, [of.name])[mixed].subset is None
 
 
 def test_joined_scenes_are_the_same_scenes():
