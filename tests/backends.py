@@ -39,7 +39,8 @@ def reference(energy, scene, parameters, steps, step_size, damping):
 def gradients(parameters: GameParameters) -> dict[str, torch.Tensor]:
     """The gradients of the leaves, by name."""
     leaves = {"initial_controls": parameters.initial_controls, "goals": parameters.goals}
-    leaves |= {**parameters.own_weights, **parameters.pair_weights}
+    leaves |= {"goal_headings": parameters.goal_headings, **parameters.own_weights, **parameters.pair_weights}
+    leaves |= {f"margin of {name}": margin for name, margin in parameters.margins.items()}
     return {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
 
 
@@ -56,6 +57,7 @@ class Draw:
     bounded: bool
     absent: int
     seed: int
+    ends: tuple[int, int] | None
 
     def make(self) -> tuple[FeatureEnergy, Scene, GameParameters]:
         torch.manual_seed(self.seed)
@@ -64,11 +66,12 @@ class Draw:
         scene = random_scene(2, self.agents, history=2, size=self.size, dtype=torch.float64)
         mask = torch.ones(2, self.agents, dtype=torch.bool)
         mask[1, self.absent : self.absent + 2] = False
-        scene = dataclasses.replace(scene, agent_mask=mask)
+        ends = None if self.ends is None else torch.tensor([min(end, horizon) for end in self.ends])
+        scene = dataclasses.replace(scene, agent_mask=mask, game_steps=ends)
         return (
             FeatureEnergy(sorted(self.own), self.pair, bounds, pair_stride=self.stride),
             scene,
-            random_game(scene, 2, horizon),
+            random_game(scene, 2, horizon, pair=self.pair or ("proximity",)),
         )
 
 
@@ -79,12 +82,13 @@ def games(most: int = 8) -> st.SearchStrategy[Draw]:
         agents=st.integers(1, most),
         horizon=st.integers(3, 40),
         own=st.frozensets(st.sampled_from(ALL), min_size=1),
-        pair=st.sampled_from([("proximity",), ()]),
+        pair=st.sampled_from([("proximity",), ("clearance",), ("proximity", "clearance"), ()]),
         stride=st.sampled_from([1, 2]),
         size=st.sampled_from([0.01, 1.0, 3.0]),
         bounded=st.booleans(),
         absent=st.integers(0, most),
         seed=st.integers(0, 10_000),
+        ends=st.none() | st.tuples(st.integers(1, 40), st.integers(1, 40)),
     )
 
 

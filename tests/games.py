@@ -9,7 +9,7 @@ import torch
 
 from epo_lightning.game import feature_derivatives
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.game.features import OWN_FEATURES
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES
 from epo_lightning.scene import GameParameters, Scene
 from epo_lightning.solvers.gauss_newton.expansion import expand
 
@@ -112,18 +112,25 @@ def reordered(scene: Scene, order: list[int]) -> Scene:
 
 
 def random_game(
-    scene: Scene, modes: int = 2, horizon: int = 7, own: tuple[str, ...] = ALL, spread: float = 0.5
+    scene: Scene,
+    modes: int = 2,
+    horizon: int = 7,
+    own: tuple[str, ...] = ALL,
+    spread: float = 0.5,
+    pair: tuple[str, ...] = ("proximity",),
 ) -> GameParameters:
-    """Weights around one and controls of about ``spread``."""
+    """Weights around one, controls of about ``spread``, and margins of up to 1 m."""
     scenes, agents = scene.agent_mask.shape
     dtype = scene.history.dtype
     pairs = agents * (agents - 1) // 2
     return GameParameters(
         own_weights={name: 0.5 + torch.rand(scenes, modes, agents, dtype=dtype) for name in own},
-        pair_weights={"proximity": 0.5 + 3.0 * torch.rand(scenes, modes, pairs, dtype=dtype)},
+        pair_weights={name: 0.5 + 3.0 * torch.rand(scenes, modes, pairs, dtype=dtype) for name in pair},
         initial_controls=spread * torch.randn(scenes, modes, agents, horizon, 2, dtype=dtype),
         goals=torch.randn(scenes, modes, agents, 2, dtype=dtype),
         reference=None if scene.references is None else torch.randint(2, (scenes, modes, agents)),
+        goal_headings=torch.randn(scenes, modes, agents, dtype=dtype),
+        margins={n: torch.rand(scenes, modes, pairs, dtype=dtype) for n in pair if PAIR_FEATURES[n].margin},
     )
 
 

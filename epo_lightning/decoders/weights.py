@@ -1,7 +1,8 @@
-"""Weight decoding: the weights of the energy's named features for every agent and every pair of agents."""
+"""Weight decoding: weights of the energy's named features for every agent and every pair of agents, and pairs' margins."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -77,3 +78,29 @@ class PairWeights(nn.Module):
         if self.symmetric:
             weights = 0.5 * (weights + self.mlp(torch.cat((z[:, second], z[:, first]), -1)))
         return _by_name(self.start + weights, self.features, self.modes)
+
+
+class Margins(nn.Module):
+    """phi_margin: margins [m] of a pair from the features of both agents, one network for all pairs.
+
+    The margin is largest * sigmoid(s + output) with sigmoid(s) = start / largest, so it stays between 0 and ``largest``.
+
+    Args:
+        width: size of the agent features.
+        modes: number M of joint modes.
+        features: names of the pair features with a margin.
+        largest: upper limit of a margin [m].
+        start: margin at a network output of zero [m].
+        symmetric: whether margins are the same in both orders of the two agents.
+    """
+
+    def __init__(
+        self, width: int, modes: int, features: Sequence[str], largest: float, start: float, symmetric: bool = False
+    ) -> None:
+        super().__init__()
+        self.outputs = PairWeights(width, modes, features, math.log(start / (largest - start)), symmetric)
+        self.largest = largest
+
+    def forward(self, z: Float[Tensor, "B N D"]) -> dict[str, Float[Tensor, "B M P"]]:
+        """Margins by feature name."""
+        return {name: self.largest * output.sigmoid() for name, output in self.outputs(z).items()}

@@ -20,7 +20,7 @@ from epo_lightning.decoders.motions import Motions
 from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
 from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.strategies import InitialStrategies, ZeroStrategies
-from epo_lightning.decoders.weights import OwnWeights, PairWeights
+from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.forecasters.combination import Combination
@@ -80,6 +80,8 @@ class EPO(Forecaster):
             pair weights by the history outside training; None for no correction.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
             (:mod:`~epo_lightning.decoders.probabilities`).
+        margin: ``largest`` margin [m] of pair features with a decoded margin, and the margin before training, ``start``;
+            2 m and 0.5 m by default. Margins that the energy fixes are not decoded.
 
     Raises:
         ConfigError: parts that do not work together, with the changes that would work; or a value out of its range.
@@ -104,6 +106,7 @@ class EPO(Forecaster):
         game_horizon: int | None = None,
         calibration: Mapping[str, float] | None = None,
         probabilities: str = "linear",
+        margin: Mapping[str, float] | None = None,
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         _check_needs(energy, task)
@@ -162,15 +165,19 @@ class EPO(Forecaster):
         else:
             self.strategies = Motions(horizon, strategies, **ranges)
         self.goals: GoalDecoder | GivenGoals | NoGoals
-        if task.candidates > 1 and energy.needs & {"goals", "reference"}:
+        if task.candidates > 1 and energy.needs & {"goals", "goal_headings", "reference"}:
             self.goals = GoalDecoder(width, scale, games)
-        elif "goals" in energy.needs:
+        elif energy.needs & {"goals", "goal_headings"}:
             self.goals = GivenGoals(games)
         else:
             self.goals = NoGoals()
         order = energy.pair_order
         self.orders = None if order is None else Orders(width, games, order.symmetric)
         self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, horizon, scale)
+        # This network is the last one, so that those of energies without decoded margins draw the same initial weights.
+        limits = _check_margin(margin)
+        names = energy.decoded_margins
+        self.margins = Margins(width, games, names, **limits, symmetric=symmetric_pairs) if names else None
 
     def forward(self, scene: Scene) -> JointForecast:
         """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 2."""
@@ -215,10 +222,15 @@ class EPO(Forecaster):
         """The game of every mode: decoded weights and initial strategies, with its goals and orders.
 
         Raises:
-            ValueError: the scene lacks the reference lines that the energy asks for.
+            ValueError: the scene lacks the reference lines or the goal headings that the energy asks for.
         """
         if "reference" in self.energy.needs and goals.reference is None:
             raise ValueError("the energy follows reference lines, but scene.goal_reference [B, N, G] is None")
+        if "goal_headings" in self.energy.needs and goals.headings is None:
+            raise ValueError(
+                "the energy has a feature of the headings wanted at goals, but scene.goal_headings [B, N, G] is None: "
+                "leave the feature out of energy.own, or choose data with goal headings"
+            )
         own_weights = self.own_weights(z, scene.agent_mask)
         # Agents without a goal have the position (0, 0) for it: zero goal weights keep it from attracting them.
         for name in self.energy.goal_terms & own_weights.keys():
@@ -232,6 +244,7 @@ class EPO(Forecaster):
             context=z if "context" in self.energy.needs else None,
             order=None if orders is None else orders.order,
             goal_headings=goals.headings,
+            margins={} if self.margins is None else self.margins(z),
         )
 
     @property
@@ -300,7 +313,7 @@ class EPO(Forecaster):
         return int(sum(counts)) or 1
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
-        return self.objective(scene, forecast, self.energy, self.global_step)
+        return self.objective(self._game_of(scene), forecast, self.energy, self.global_step)
 
 
 def _check_needs(energy: Energy, task: Task) -> None:
@@ -309,7 +322,7 @@ def _check_needs(energy: Energy, task: Task) -> None:
     Raises:
         ConfigError: the message names the missing fields.
     """
-    known = {"size", "context", "order"} | ({"goals"} if task.candidates else set())
+    known = {"size", "context", "order"} | ({"goals", "goal_headings"} if task.candidates else set())
     lacking = energy.needs - known - ({"reference", "reference_speed"} if task.candidates > 1 else set())
     if lacking:
         raise ConfigError(
@@ -336,6 +349,22 @@ def _check_motions(motions: Mapping[str, float] | None) -> dict[str, float]:
             f"{', '.join(sorted(map(str, given))) or 'nothing'}"
         )
     return given
+
+
+def _check_margin(margin: Mapping[str, float] | None) -> dict[str, float]:
+    """Limits of decoded margins: ``largest`` and ``start``.
+
+    Raises:
+        ConfigError: an unknown name, or numbers that are not 0 < start < largest.
+    """
+    limits = {"largest": 2.0, "start": 0.5, **(margin or {})}
+    if set(limits) != {"largest", "start"}:
+        raise ConfigError(
+            f"forecaster.margin has the keys largest and start [m], not {', '.join(map(str, margin or ()))}"
+        )
+    if not 0 < limits["start"] < limits["largest"] < math.inf:
+        raise ConfigError(f"forecaster.margin takes 0 < start < largest [m], not {dict(limits)}")
+    return limits
 
 
 def _check_start(

@@ -72,8 +72,14 @@ class Energy(ABC):
 
     @property
     def needs(self) -> set[str]:
-        """Inputs of the terms: some of ``goals``, ``reference``, ``reference_speed``, ``size``, ``context``, ``order``."""
+        """Inputs of the terms: some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``size``,
+        ``context``, ``order``."""
         return set()
+
+    @property
+    def decoded_margins(self) -> Sequence[str]:
+        """Names of the pair terms that take a decoded margin, ``parameters.margins``."""
+        return ()
 
     @property
     def goal_terms(self) -> set[str]:
@@ -129,6 +135,11 @@ class Energy(ABC):
         if controls.dim() != 5 or controls.shape[0] != batch or controls.shape[2] != agents or controls.shape[4] != 2:
             expected = f"[{batch}, M, {agents}, K, 2]"
             raise ValueError(f"controls have shape {list(controls.shape)}; this scene takes {expected}")
+        if scene.game_steps is not None and FEATURES not in self.offers:
+            raise ValueError(
+                f"scene.game_steps is given, but for {type(self).__name__} all games end with the last control: only "
+                "energy=features has games of different lengths"
+            )
 
     def terms(
         self, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"]

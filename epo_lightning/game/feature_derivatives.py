@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.game.circles import overlap
 from epo_lightning.game.features import SLOWEST_STEERING, OwnFeature, PairFeature, Source
-from epo_lightning.scene import SPEED, TURN_RATE
+from epo_lightning.game.game_end import at_end, until
+from epo_lightning.scene import HEADING, SPEED, TURN_RATE
 
 
 class Derivatives(NamedTuple):
@@ -32,6 +33,14 @@ class Derivatives(NamedTuple):
     value: Tensor
     first: Tensor | None = None
     second: Tensor | None = None
+
+    def within(self, mask: Bool[Tensor, "*#shape"] | None) -> Derivatives:
+        """The same function, constantly zero outside of the mask; None for no mask."""
+        if mask is None:
+            return self
+        first = mask.to(self.value.dtype).expand_as(self.value) if self.first is None else self.first.where(mask, 0.0)
+        second = None if self.second is None else self.second.where(mask, 0.0)
+        return Derivatives(self.value.where(mask, 0.0), first, second)
 
 
 def differentiate(function: Callable[..., Tensor], value: Tensor, *others: Tensor, second: bool = False) -> Derivatives:
@@ -78,6 +87,21 @@ def pair_derivatives(feature: PairFeature, distance: Tensor, reach: Tensor, seco
     return differentiate(feature.function, distance, reach, second=second)
 
 
+def margin_derivatives(
+    feature: PairFeature, distance: Tensor, reach: Tensor, d: Derivatives
+) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
+    """Derivatives by the margin, a part of the reach: of a declared pair feature ``d``, and of its slope ``d.first``."""
+    if feature.function is overlap:
+        assert d.first is not None
+        return -d.first, torch.zeros_like(d.first)
+    reach = reach.expand_as(distance).contiguous()
+
+    def by_distance(reach: Tensor) -> Tensor:
+        return _jvp(lambda z: feature.function(z, reach), distance)[1]
+
+    return _jvp(lambda reach: feature.function(distance, reach), reach)[1], _jvp(by_distance, reach)[1]
+
+
 def violation(value: Float[Tensor, "*shape"], lower: float, upper: float) -> Derivatives:
     """The amount by which a signal leaves [lower, upper]; its derivative is 1 above, -1 below and 0 within."""
     excess = (value - upper).clamp_min(0.0) + (lower - value).clamp_min(0.0)
@@ -98,6 +122,8 @@ class Surroundings:
         line: points of the followed reference lines.
         reference_speed: desired speeds [m/s].
         wheelbase: distances between the axles [m].
+        goal_headings: headings that are wanted at the goals [rad].
+        ends: number of steps of every game; None for all steps of the controls.
     """
 
     initial: Float[Tensor, "B 1 N 4"]
@@ -106,6 +132,8 @@ class Surroundings:
     line: Float[Tensor, "B M N Q 2"] | None = None
     reference_speed: Float[Tensor, "B 1 N"] | None = None
     wheelbase: Float[Tensor, "B 1 N"] | None = None
+    goal_headings: Float[Tensor, "B M N"] | None = None
+    ends: Int[Tensor, " B"] | None = None
 
 
 def linear_signal(
@@ -161,7 +189,8 @@ def signal_and_change(
 ) -> tuple[Float[Tensor, "*batch R"], Float[Tensor, "D *batch R"]]:
     """The signal of a declared feature over time, and its change along D directions of the controls.
 
-    R is K, K - 1 for rates, 2 K (x and y) for lines, and 2 for goals.
+    R is K, K - 1 for rates, 2 K (x and y) for lines, 2 for goals, and 1 for their headings. Goals and headings are those of
+    the last state of the game; the other signals go on after its end.
 
     Args:
         feature: the feature, with any source but TRAJECTORY.
@@ -194,7 +223,11 @@ def signal_and_change(
             return (position - nearest).flatten(-2), change.flatten(-2)
         case Source.FINAL_POSITION:
             assert around.goals is not None
-            return states[..., -1, :2] - around.goals, moved[..., -1, :2]
+            return at_end(states, around.ends)[..., :2] - around.goals, at_end(moved, around.ends)[..., :2]
+        case Source.FINAL_HEADING:
+            assert around.goal_headings is not None
+            heading, turned = at_end(states, around.ends)[..., HEADING], at_end(moved, around.ends)[..., HEADING]
+            return (heading - around.goal_headings)[..., None], turned[..., None]
     raise AssertionError(feature)
 
 
@@ -285,7 +318,11 @@ def undeclared_change(
 
 
 def undeclared_change_by_agent(
-    feature: PairFeature, both: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor], *sizes: Tensor
+    feature: PairFeature,
+    both: tuple[Tensor, Tensor],
+    moved: tuple[Tensor, Tensor],
+    *others: Tensor,
+    ends: Int[Tensor, " E"] | None = None,
 ) -> tuple[Float[Tensor, "*batch R"], Float[Tensor, "D *batch R"], Float[Tensor, "D *batch R"]]:
     """Value of an undeclared pair feature, and its change along D directions of the first and of the second agent.
 
@@ -293,19 +330,21 @@ def undeclared_change_by_agent(
         feature: the feature.
         both: states [.., L, 4] of the first and second agents.
         moved: changes [D, .., L, 4] of both.
-        sizes: lengths and widths of both, for features that need them.
+        others: lengths and widths of both and the margin, for features that need them.
+        ends: number of evaluated steps in the game of every row, for functions that are not stepwise.
     """
     # A residual of one step has only eight derivatives: by the 4 + 4 numbers of both states. The changes follow from these.
     if feature.stepwise:
         unit = torch.eye(8, dtype=both[0].dtype, device=both[0].device)
         unit = unit.view(8, *[1] * (both[0].dim() - 1), 8).expand(-1, *both[0].shape[:-1], -1)
-        value, by_state = undeclared_change(feature.function, both, (unit[..., :4], unit[..., 4:]), *sizes)
+        value, by_state = undeclared_change(feature.function, both, (unit[..., :4], unit[..., 4:]), *others)
         by_first, by_second = (
             (one.movedim(0, -1) * side).sum(-1) for one, side in zip(by_state.split(4), moved, strict=True)
         )
         return value, by_first, by_second
     first, second = moved
     still = torch.zeros_like(first)
-    value, by_first = undeclared_change(feature.function, both, (first, still), *sizes)
-    _, by_second = undeclared_change(feature.function, both, (still, second), *sizes)
+    function = until(feature.function, ends)
+    value, by_first = undeclared_change(function, both, (first, still), *others)
+    _, by_second = undeclared_change(function, both, (still, second), *others)
     return value, by_first, by_second

@@ -9,13 +9,14 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from epo_lightning.checks import check_whole, is_number
+from epo_lightning.checks import check_whole
 from epo_lightning.game.circles import disc, separation
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, check_names
+from epo_lightning.game.feature_checks import check_bounds, check_inputs, check_margins, refuse_asymmetry
 from epo_lightning.game.feature_derivatives import (
     Surroundings,
     own_derivatives,
@@ -24,8 +25,9 @@ from epo_lightning.game.feature_derivatives import (
     undeclared_change,
 )
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, WHEELBASE, OwnFeature, PairFeature
+from epo_lightning.game.game_end import residual_mask, until
 from epo_lightning.game.pairs import pair_mask, pairs
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, Scene
 
 
@@ -56,6 +58,10 @@ class FeatureEnergy(Energy):
             in ``b``: ``{"vel": (-0.05, 2.0)}``.
         dynamics: a :class:`~epo_lightning.game.dynamics.Unicycle`.
         pair_stride: steps between evaluations of pair features: they are evaluated at k = stride, 2 stride, ...
+        margins: fixed margins [m] of pair features, ``{"clearance": 0.5}``; those of other features with a margin are
+            ``parameters.margins``.
+
+    A game of ``scene.game_steps`` steps has no terms after its end (:mod:`~epo_lightning.game.game_end`).
     """
 
     offers = frozenset({GRADIENT, RESIDUALS, FEATURES})
@@ -65,6 +71,7 @@ class FeatureEnergy(Energy):
     bounds: Mapping[str, Sequence[float]] = field(default_factory=dict)
     dynamics: Any = field(default_factory=Unicycle)  # Any, so that other dynamics are refused below with a reason
     pair_stride: int = 1
+    margins: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_names("own", self.own, OWN_FEATURES, "feature")
@@ -78,8 +85,9 @@ class FeatureEnergy(Energy):
             )
         check_whole("energy.pair_stride", self.pair_stride)
         for name, pair in self.pair_features.items():
-            _refuse_asymmetry(name, pair)
-        _check_bounds(self.bounds)
+            refuse_asymmetry(name, pair)
+        check_bounds(self.bounds)
+        check_margins(self.margins)
         for name, feature in self.own_features.items():
             if feature.bounded and feature.signal not in self.bounds:
                 raise ConfigError(f"feature {name!r} needs energy.bounds.{feature.signal}: [lowest, highest]")
@@ -96,18 +104,29 @@ class FeatureEnergy(Energy):
 
     @cached_property
     def needs(self) -> set[str]:
-        """Inputs of the own features: some of ``goals``, ``reference``, ``reference_speed``, ``size``."""
+        """Inputs of the own features: some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``size``."""
         return {feature.needs for feature in self.own_features.values() if feature.needs}
 
     @property
     def goal_terms(self) -> set[str]:
-        """Names of the features of goals and of lines."""
-        return {name for name, feature in self.own_features.items() if feature.needs in ("goals", "reference")}
+        """Names of the features of goals, of their headings and of lines."""
+        goals = ("goals", "goal_headings", "reference")
+        return {name for name, feature in self.own_features.items() if feature.needs in goals}
+
+    @cached_property
+    def decoded_margins(self) -> Sequence[str]:  # type: ignore[override]
+        """Names of the pair features whose margin is ``parameters.margins``, and not fixed."""
+        return [name for name, feature in self.pair_features.items() if feature.margin and name not in self.margins]
 
     @cached_property
     def needs_goals(self) -> bool:
         """Whether a feature needs goals."""
         return "goals" in self.needs
+
+    @cached_property
+    def needs_goal_headings(self) -> bool:
+        """Whether a feature needs the headings that are wanted at goals."""
+        return "goal_headings" in self.needs
 
     @cached_property
     def needs_reach(self) -> bool:
@@ -131,8 +150,9 @@ class FeatureEnergy(Energy):
     ) -> dict[str, Float[Tensor, "B M _ _"]]:
         """Weighted residuals w c by feature: [B, M, N, R] for own features and [B, M, P, R] for pairs.
 
-        R is K, K - 1 for jerk and turnacc, 2 for the goal, 2 K for the lane, the number of evaluated steps for pairs, and
-        the number of values that an undeclared feature returns. Absent agents have residuals of zero.
+        R is K, K - 1 for jerk and turnacc, 2 for the goal, 1 for its heading, 2 K for the lane, the number of evaluated
+        steps for pairs, and the number of values that an undeclared feature returns. Residuals of absent agents, and of
+        steps after the end of a game, are zero.
 
         Raises:
             ValueError: shapes or names of scene, parameters and controls that do not fit together.
@@ -204,11 +224,12 @@ class FeatureEnergy(Energy):
         feature = self.own_features[name]
         if feature.declared:
             signal, change = signal_and_change(feature, *at, *moved, around, slide)
-            value, first, _ = own_derivatives(feature, signal, self.bounds)
+            mask = self.residual_mask(scene, feature, at[1].shape[-2])
+            value, first, _ = own_derivatives(feature, signal, self.bounds).within(mask)
             change = change if first is None else first * change
         else:
             assert feature.function is not None
-            value, change = undeclared_change(feature.function, at, moved)
+            value, change = undeclared_change(until(feature.function, scene.game_steps), at, moved)
             present = scene.agent_mask[:, None, :, None]
             value, change = torch.where(present, value, 0.0), torch.where(present, change, 0.0)
         weight = self.own_weight(scene, parameters, name)[..., None]
@@ -233,13 +254,15 @@ class FeatureEnergy(Energy):
         closing = (normal * (moved[0] - moved[1])[..., :2]).sum(-1)
         for name, pair in self.pair_features.items():
             if pair.declared:
-                value, slope, _ = pair_derivatives(pair, distance, self.reach(scene)[:, None, :, None])
+                value, slope, _ = pair_derivatives(pair, distance, self.reach(scene, parameters, name)[..., None])
                 assert slope is not None
                 change = slope * closing
             else:
-                sizes = [self.size(scene)[:, None, members, None] for members in (first, second) if pair.needs]
-                value, change = undeclared_change(pair.function, both, moved, *sizes)
-            exists = pair_mask(scene)[:, None, :, None]
+                others = [self.size(scene)[:, None, members, None] for members in (first, second) if pair.needs]
+                others += [self.margin(scene, parameters, name)[..., None]] if pair.margin else []
+                function = pair.function if pair.stepwise else until(pair.function, self.evaluated(scene))
+                value, change = undeclared_change(function, both, moved, *others)
+            exists = self.pair_exists(scene, pair, distance.shape[-1])
             weight = self.pair_weight(scene, parameters, name)[..., None]
             yield name, weight * torch.where(exists, value, 0.0), weight * torch.where(exists, change, 0.0)
 
@@ -285,52 +308,12 @@ class FeatureEnergy(Energy):
         """Check that scene, parameters and controls fit together.
 
         Raises:
-            ValueError: a wrong shape, a missing weight, missing goals, references, reference speeds or sizes, or a
-                horizon shorter than ``pair_stride``. The message names the tensor and the expected shape.
+            ValueError: a wrong shape, a missing weight or margin, missing goals, goal headings, references, reference
+                speeds or sizes, a negative margin, a horizon shorter than ``pair_stride``, or a game that ends after the
+                controls. The message names the tensor and the expected shape.
         """
         super().validate(scene, parameters, controls)
-        batch, agents = scene.agent_mask.shape
-        modes, steps = controls.shape[1], controls.shape[3]
-        self.check_horizon(steps)
-        for part, names, given, count in (
-            ("own_weights", self.own, parameters.own_weights, agents),
-            ("pair_weights", self.pair, parameters.pair_weights, agents * (agents - 1) // 2),
-        ):
-            for name in names:
-                if name not in given:
-                    raise ValueError(f"{part} lacks the feature {name!r}; it has {sorted(given)}")
-                shape = list(given[name].shape) if isinstance(given[name], Tensor) else given[name]
-                if shape not in ([batch, modes, count], [batch, 1, count]):
-                    raise ValueError(f"{part}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}")
-        needed: dict[str, tuple[tuple[str, Tensor | None], ...]] = {
-            "goals": (("parameters.goals", parameters.goals),),
-            "reference": (("scene.references", scene.references), ("parameters.reference", parameters.reference)),
-            "reference_speed": (("scene.reference_speed", scene.reference_speed),),
-            "size": (("scene.size", scene.size),),
-        }
-        for name, feature in self.own_features.items():
-            for what, value in needed[feature.needs] if feature.needs else ():
-                if value is None:
-                    raise ValueError(f"the energy has the feature {name!r}, but {what} is None")
-                takes = {"parameters.goals": [agents, 2], "parameters.reference": [agents]}.get(what)
-                if takes and list(value.shape) not in ([batch, modes, *takes], [batch, 1, *takes]):
-                    raise ValueError(
-                        f"{what} has shape {list(value.shape)}; these controls take {[batch, modes, *takes]}"
-                    )
-        if "reference" in self.needs and parameters.reference.is_floating_point():  # type: ignore[union-attr]
-            raise ValueError("parameters.reference holds indices of lines: it takes whole numbers, not floats")
-        if "reference" in self.needs and controls.device.type == "cpu":  # on a GPU, the check would make the host wait
-            assert scene.references is not None
-            assert parameters.reference is not None
-            lines = scene.references.shape[2]
-            index = torch.where(scene.agent_mask[:, None], parameters.reference, 0)
-            if (scene.agent_mask[:, None] & ((index < 0) | (index >= lines))).any():
-                raise ValueError(
-                    f"parameters.reference must be indices 0 .. {lines - 1} of the R = {lines} lines of scene.references"
-                )
-        if (self.needs_reach or self.needs_shape) and scene.size is None:
-            what = "sizes" if self.needs_shape else "radii"
-            raise ValueError(f"pair features take the agents' {what} from scene.size [B, N, 2], which is None")
+        check_inputs(self, scene, parameters, controls)
 
     def finite(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
         """Mask of the games whose inputs are finite.
@@ -347,6 +330,8 @@ class FeatureEnergy(Energy):
         of_modes = finite[:, None].expand(-1, parameters.initial_controls.shape[1])
         for name in self.pair:
             of_modes = of_modes & self.pair_weight(scene, parameters, name).isfinite().all(-1)
+        for name in self.decoded_margins:
+            of_modes = of_modes & self.margin(scene, parameters, name).isfinite().all(-1)
         if "reference" in self.needs:
             line = self.surroundings(scene, parameters).line
             assert line is not None
@@ -358,10 +343,13 @@ class FeatureEnergy(Energy):
     def surroundings(self, scene: Scene, parameters: GameParameters) -> Surroundings:
         """The inputs of own features besides the trajectory."""
         present, needs = scene.agent_mask, self.needs
-        goals = line = reference_speed = wheelbase = None
+        goals = line = reference_speed = wheelbase = headings = None
         if "goals" in needs:
             assert parameters.goals is not None
             goals = torch.where(present[:, None, :, None], parameters.goals, 0.0)
+        if "goal_headings" in needs:
+            assert parameters.goal_headings is not None
+            headings = torch.where(present[:, None], parameters.goal_headings, 0.0)
         if "reference" in needs:
             assert scene.references is not None
             followed, on_line = self._followed(scene, parameters)
@@ -371,7 +359,9 @@ class FeatureEnergy(Energy):
             reference_speed = torch.where(present, scene.reference_speed, 0.0)[:, None]
         if "size" in needs:
             wheelbase = WHEELBASE * self.size(scene)[:, None, :, 0]
-        return Surroundings(self.initial(scene), scene.dt, goals, line, reference_speed, wheelbase)
+        return Surroundings(
+            self.initial(scene), scene.dt, goals, line, reference_speed, wheelbase, headings, scene.game_steps
+        )
 
     def _followed(self, scene: Scene, parameters: GameParameters) -> tuple[tuple[Tensor, ...], Bool[Tensor, "B M N"]]:
         """The indices of the followed lines in ``scene.references``, and a mask of those that exist."""
@@ -394,65 +384,45 @@ class FeatureEnergy(Energy):
         """Weights of a pair feature, zero for pairs with an absent agent."""
         return torch.where(pair_mask(scene)[:, None], parameters.pair_weights[name], 0.0)
 
+    def margin(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B _ P"]:
+        """Margins [m] of a pair feature, fixed or decoded, [B, 1, P] or [B, M, P]; zero for pairs with an absent agent."""
+        exists = pair_mask(scene)[:, None]
+        if name in self.margins:
+            return self.margins[name] * exists.to(scene.history.dtype)
+        return torch.where(exists, parameters.margins[name], 0.0)
+
     def extent(self, scene: Scene) -> Float[Tensor, "B N"] | None:
-        """Largest distance [m] at which agents affect others; None if a pair feature has no limit."""
+        """Largest distance [m] at which agents affect others, without margins; None if a pair feature has no limit."""
         extents = [feature.extent for feature in self.pair_features.values()]
         finite = [extent(self.size(scene)) for extent in extents if extent is not None]
         return torch.stack(finite).amax(0) if len(finite) == len(extents) else None
 
-    def reach(self, scene: Scene) -> Float[Tensor, "B P"]:
-        """The distance [m] at which the discs of two agents touch, r_i + r_j."""
+    def reach(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B _ P"]:
+        """The distance [m] at which the discs of two agents touch, r_i + r_j, with the margin of the pair feature ``name``.
+
+        The shape is [B, M, P] for decoded margins and [B, 1, P] otherwise.
+        """
         radius = disc(self.size(scene))
         first, second = pairs(scene.agent_mask.shape[1], radius.device)
-        return radius[:, first] + radius[:, second]
+        reach = (radius[:, first] + radius[:, second])[:, None]
+        return reach + self.margin(scene, parameters, name) if self.pair_features[name].margin else reach
+
+    def residual_mask(self, scene: Scene, feature: OwnFeature, steps: int) -> Bool[Tensor, "B 1 1 R"] | None:
+        """Mask of the residuals of a declared own feature before the end of each game; None if no residual is after it."""
+        return None if scene.game_steps is None else residual_mask(feature.source, scene.game_steps, steps)
+
+    def evaluated(self, scene: Scene) -> Int[Tensor, " B"] | None:
+        """Number of steps of each game at which pair features are evaluated; None for all evaluated steps."""
+        return None if scene.game_steps is None else scene.game_steps // self.pair_stride
+
+    def pair_exists(self, scene: Scene, feature: PairFeature, steps: int) -> Bool[Tensor, "B 1 P _"]:
+        """Mask of the residuals of a pair feature whose agents are present, at L = ``steps`` evaluated steps, up to the end
+        of each game."""
+        exists, evaluated = pair_mask(scene)[:, None, :, None], self.evaluated(scene)
+        if evaluated is None or not (feature.declared or feature.stepwise):
+            return exists
+        return exists & (torch.arange(steps, device=exists.device) < evaluated[:, None, None, None])
 
     def at_pair_steps(self, states: Float[Tensor, "*batch K X"]) -> Float[Tensor, "*batch L X"]:
         """The states at k = stride, 2 stride, ..., the steps at which pair features are evaluated."""
         return states[..., self.pair_stride - 1 :: self.pair_stride, :]
-
-
-def _check_bounds(bounds: Any) -> None:
-    """Check the bounds of signals.
-
-    Raises:
-        ConfigError: no mapping, an unknown signal, or a value that is not [lowest, highest].
-    """
-    signals = {feature.signal for feature in OWN_FEATURES.values() if feature.bounded}
-    if not isinstance(bounds, Mapping):
-        raise ConfigError(f"energy.bounds must map signals to [lowest, highest], such as vel: [0, 30], not {bounds!r}")
-    for name, bound in bounds.items():
-        if name not in signals:
-            raise ConfigError(f"unknown signal energy.bounds.{name}: {nearest(str(name), signals)}")
-        pair = list(bound) if isinstance(bound, Sequence) and not isinstance(bound, str) else []
-        if len(pair) != 2 or not all(map(is_number, pair)) or not pair[0] < pair[1]:
-            raise ConfigError(
-                f"energy.bounds.{name} must be [lowest, highest], two numbers in rising order, not {bound!r}"
-            )
-
-
-def _refuse_asymmetry(name: str, feature: PairFeature) -> None:
-    """Refuse a pair feature that costs the two agents of a pair different amounts: the game would have no potential.
-
-    Raises:
-        ConfigError: a feature that depends on the order of the agents, or a function that fails on trial inputs.
-    """
-    try:
-        costs = feature.asymmetry
-    except Exception as error:
-        takes = (
-            "states [.., K, 4] and sizes [.., 1, 2] of two agents"
-            if feature.needs
-            else "states [.., K, 4] of two agents"
-        )
-        raise ConfigError(
-            f"pair feature {name!r} fails on trial inputs: {type(error).__name__}: {error}. It takes the {takes} "
-            "and returns residuals [.., R]"
-        ) from error
-    if costs is not None:
-        raise ConfigError(
-            f"pair feature {name!r} is not symmetric: for two trial agents 1/2 |r|^2 is {costs[0]:.4g}, and {costs[1]:.4g} "
-            "when they are swapped, so the game has no potential, and minimising the energy would not give its equilibria. "
-            "Make the feature symmetric, for instance by returning the residuals of both orders. If the agents only weigh "
-            "it differently (a_i E_ij with a_i > 0), keep E_ij symmetric: dividing the own terms of agent i by a_i gives "
-            "the same game, and the decoded own weights can learn this"
-        )

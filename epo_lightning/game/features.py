@@ -62,6 +62,8 @@ class Source(Enum):
     """All positions: each depends on all earlier controls."""
     FINAL_POSITION = "final_position"
     """The last position: it depends on all controls of the agent."""
+    FINAL_HEADING = "final_heading"
+    """The last heading: it is the sum of all turn rates."""
     DISTANCE = "distance"
     """The distance between two agents: it depends on the positions of both."""
     TRAJECTORY = "trajectory"
@@ -77,7 +79,8 @@ class OwnFeature:
         signal: name of the signal, the key of its bounds in ``energy.bounds``.
         channel: index of the control, for signals of controls.
         bounded: whether the feature is zero within the bounds.
-        needs: further input of the signal: ``goals``, ``reference``, ``reference_speed``, ``size``; None for no other input.
+        needs: further input of the signal: ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``size``; None
+            for no other input.
         function: elementwise function of the signal, or of states and controls for the source TRAJECTORY.
     """
 
@@ -109,8 +112,10 @@ class PairFeature:
             agents, and of their sizes if it needs them.
         needs: ``size`` for a function of states that takes the agents' sizes too.
         stepwise: whether a function of states returns one residual per step that depends only on the states at that step.
-        extent: function from an agent's size to the radius [m] around its position within which it can affect others; None
-            if there is no limit.
+        extent: function from an agent's size to the radius [m] around its position within which it can affect others,
+            besides a margin; None if there is no limit.
+        margin: whether the feature takes a margin, an additional distance [m] of every pair: it is added to the reach, or
+            is the last argument of a function of states.
     """
 
     source: Source
@@ -118,6 +123,7 @@ class PairFeature:
     needs: str | None = None
     stepwise: bool = False
     extent: Callable[[Tensor], Tensor] | None = None
+    margin: bool = False
 
     @property
     def declared(self) -> bool:
@@ -129,7 +135,7 @@ class PairFeature:
         """Costs of two trial agents in both orders (:mod:`~epo_lightning.game.symmetry`); None if the costs are equal."""
         if self.declared:
             return None
-        return symmetry.difference(self.function, sizes=self.needs == "size")
+        return symmetry.difference(self.function, sizes=self.needs == "size", margin=self.margin)
 
 
 def _with_bounds(features: Mapping[str, OwnFeature]) -> dict[str, OwnFeature]:
@@ -154,18 +160,22 @@ OWN_FEATURES: dict[str, OwnFeature] = {
             "turnacc": OwnFeature(Source.RATE, "turnacc", TURN_RATE),
         }
     ),
+    "heading": OwnFeature(Source.FINAL_HEADING, "heading", needs="goal_headings"),
 }
 """Own features by name: goal, the offset of the last position from the goal [m]; lane, the offset from the followed
 reference line [m]; vel, the speed, and velref, the speed minus the reference speed [m/s]; acc [m/s^2]; turnr [rad/s]; jerk
-[m/s^3]; turnacc [rad/s^2]; steer, the steering angle [rad]; ``...b``, the amount by which the signal leaves its bounds."""
+[m/s^3]; turnacc [rad/s^2]; steer, the steering angle [rad]; heading, the last heading minus the one that is wanted at the
+goal [rad], not wrapped to (-pi, pi]; ``...b``, the amount by which the signal leaves its bounds."""
 
 
 PAIR_FEATURES: dict[str, PairFeature] = {
     "proximity": PairFeature(Source.DISTANCE, overlap, extent=disc),
+    "clearance": PairFeature(Source.DISTANCE, overlap, extent=disc, margin=True),
     "circles": PairFeature(Source.TRAJECTORY, row_overlap, needs="size", stepwise=True, extent=row_extent),
 }
-"""Pair features by name: ``proximity``, max(0, r_i + r_j - |p_i - p_j|), the overlap of two discs [m]; ``circles``, the
-overlap of two rows of circles [m] (:mod:`~epo_lightning.game.circles`)."""
+"""Pair features by name: ``proximity``, max(0, r_i + r_j - |p_i - p_j|), the overlap of two discs [m]; ``clearance``,
+max(0, r_i + r_j + m_ij - |p_i - p_j|), the same with a margin m_ij [m] (``GameParameters.margins`` or ``energy.margins``);
+``circles``, the overlap of two rows of circles [m] (:mod:`~epo_lightning.game.circles`)."""
 
 _BUILT_IN = {*OWN_FEATURES, *PAIR_FEATURES}
 
@@ -208,7 +218,7 @@ def own_feature(
 
 
 def pair_feature(
-    name: str, source: Source = Source.TRAJECTORY, needs: str | None = None
+    name: str, source: Source = Source.TRAJECTORY, needs: str | None = None, margin: bool = False
 ) -> Callable[[Function], Function]:
     """Decorator that registers a function as a pair feature.
 
@@ -220,6 +230,8 @@ def pair_feature(
             changes when the two agents are swapped. K counts only the steps at which the energy evaluates pairs.
         needs: ``size`` for a function of states that also takes the lengths and widths [.., 1, 2] of the first and of the
             second agent, zero for absent agents.
+        margin: whether pairs have a margin [m], decoded or fixed by ``energy.margins``. It is added to the reach; a function
+            of states takes it as its last argument [.., 1].
 
     Raises:
         ConfigError: the name of a built-in feature, a source that custom functions cannot have, or an unknown need.
@@ -232,7 +244,7 @@ def pair_feature(
         )
 
     def add(function: Function) -> Function:
-        PAIR_FEATURES[name] = PairFeature(source, function, needs)
+        PAIR_FEATURES[name] = PairFeature(source, function, needs, margin=margin)
         return function
 
     return add

@@ -81,6 +81,11 @@ class NetworkEnergy(nn.Module, Energy):
         """Names of the named features of goals and lines."""
         return self.features.goal_terms if self.features else set()
 
+    @property
+    def decoded_margins(self) -> Sequence[str]:
+        """Names of the named pair features with a margin."""
+        return self.features.decoded_margins if self.features else ()
+
     @abstractmethod
     def network_own(
         self, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B C N K 4"]

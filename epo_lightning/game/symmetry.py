@@ -15,6 +15,7 @@ from torch import Tensor
 
 _PAIRS, _STEPS, _DT = (4, 64), 40, 0.1
 _TOLERANCE = 1e-6
+_MARGIN = 0.5  # [m]
 
 
 @cache
@@ -38,20 +39,22 @@ def _agents() -> tuple[tuple[Float[Tensor, "*batch K 4"], Float[Tensor, "*batch 
 
 
 @torch.no_grad()
-def difference(function: Callable[..., Tensor], sizes: bool) -> tuple[float, float] | None:
+def difference(function: Callable[..., Tensor], sizes: bool, margin: bool = False) -> tuple[float, float] | None:
     """The costs 1/2 |r|^2 of the two orders of the trial pair with the largest difference; None for a symmetric function.
 
     Pairs whose cost is not finite are left out.
 
     Args:
         function: takes the states of the first and of the second agent [.., K, 4], and with ``sizes`` their sizes
-            [.., 1, 2]; returns residuals [.., R].
-        sizes: whether the function takes sizes.
+            [.., 1, 2], and with ``margin`` a margin [.., 1]; returns residuals [.., R].
+        sizes, margin: whether the function takes sizes and a margin.
     """
+
+    further = (torch.full((*_PAIRS, 1), _MARGIN, dtype=torch.float64, device="cpu"),) if margin else ()
 
     def cost(*agents: tuple[Tensor, Tensor]) -> Tensor:
         states, their_sizes = ([tensor.clone() for tensor in tensors] for tensors in zip(*agents, strict=True))
-        return 0.5 * function(*states, *(their_sizes if sizes else ())).square().sum(-1).flatten()
+        return 0.5 * function(*states, *(their_sizes if sizes else ()), *further).square().sum(-1).flatten()
 
     first, second = _agents()
     here, there = cost(first, second), cost(second, first)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from epo_lightning.decoders.trajectories import Trajectories
-from epo_lightning.decoders.weights import OwnWeights, PairWeights
+from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights
 
 
 def test_own_weights_start_at_their_configured_values():
@@ -29,6 +29,19 @@ def test_symmetric_pair_weights_ignore_the_order_of_agents(symmetric):
     decoder, z = PairWeights(8, 2, ["proximity"], symmetric=symmetric), torch.randn(3, 2, 8)
     weights, swapped = decoder(z)["proximity"], decoder(z.flip(1))["proximity"]
     assert torch.allclose(weights, swapped, atol=1e-6) == symmetric
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_margins_lie_between_zero_and_the_largest(symmetric):
+    decoder = Margins(8, 2, ["clearance"], largest=1.6, start=0.4, symmetric=symmetric)
+    z = 100.0 * torch.randn(3, 2, 8)
+    margins, swapped = decoder(z)["clearance"], decoder(z.flip(1))["clearance"]
+    assert margins.shape == (3, 2, 1)
+    assert ((margins > 0) & (margins < 1.6)).all()
+    assert torch.allclose(margins, swapped, atol=1e-6) == symmetric
+    torch.nn.init.zeros_(decoder.outputs.mlp.output.weight)
+    torch.nn.init.zeros_(decoder.outputs.mlp.output.bias)
+    torch.testing.assert_close(decoder(z)["clearance"], torch.full((3, 2, 1), 0.4))
 
 
 def test_trajectories_are_decoded_in_units_of_the_scale():

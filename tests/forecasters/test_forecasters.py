@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import jaxtyping
@@ -118,6 +119,36 @@ class TestPairwiseEPO(ForecasterSuite):
 
 
 EPO = TestEPO.config
+KEEPING = {"name": "features", "own": ["goal", "heading", "vel", "acc", "turnr"], "pair": ["clearance"]}
+
+
+def test_margins_and_goal_headings_are_part_of_the_game():
+    torch.manual_seed(0)
+    forecaster = build_forecaster(model(forecaster={**EPO, "margin": {"largest": 1.5}}, energy=KEEPING))
+    scene = dataclasses.replace(
+        random_scene(3, 2), goal_headings=torch.randn(3, 2, 1), game_steps=torch.tensor([40, 9, 1])
+    )
+    game = forecaster.predict(scene).parameters
+    assert torch.equal(game.goal_headings, scene.goal_headings[:, :, 0][:, None].expand(-1, 2, -1))
+    assert ((game.margins["clearance"] > 0) & (game.margins["clearance"] < 1.5)).all()
+    forecaster.train()
+    forecaster(scene).states.square().sum().backward()
+    assert forecaster.margins.outputs.mlp.output.weight.grad.isfinite().all()
+    scene.goal_mask[0, 1] = False
+    assert (forecaster.eval().predict(scene).parameters.own_weights["heading"][0, :, 1] == 0).all()
+    with pytest.raises(ValueError, match=r"scene\.goal_headings \[B, N, G\] is None"):
+        forecaster.predict(random_scene(3, 2))
+
+
+def test_the_decoder_of_margins_leaves_the_other_networks_as_they_are():
+    """Energies whose margins are fixed, or that have none, draw the same initial weights as ever."""
+    drawn = []
+    for energy in (KEEPING, {**KEEPING, "margins": {"clearance": 0.5}}):
+        torch.manual_seed(0)
+        drawn.append(build_forecaster(model(forecaster=EPO, energy=energy)).state_dict())
+    with_decoder, without = drawn
+    assert {name.partition(".")[0] for name in with_decoder.keys() - without.keys()} == {"margins"}
+    assert all(torch.equal(value, with_decoder[name]) for name, value in without.items())
 
 
 @pytest.mark.parametrize(
@@ -133,6 +164,16 @@ EPO = TestEPO.config
             "need reference, reference_speed, which this data does not provide",
         ),
         ({"energy": {"name": "features"}}, r"missing key energy\.own"),
+        (
+            {"energy": {**KEEPING, "margins": {"proximity": 1.0}}},
+            r"energy\.margins\.proximity: no pair feature with a margin has this name",
+        ),
+        (
+            {"energy": {**KEEPING, "margins": {"clearance": -1.0}}},
+            r"energy\.margins\.clearance must be a number of metres",
+        ),
+        ({"forecaster": {**EPO, "margin": {"most": 1.0}}}, r"forecaster\.margin has the keys largest and start"),
+        ({"forecaster": {**EPO, "margin": {"start": 2.0}}}, r"forecaster\.margin takes 0 < start < largest"),
         ({"solver": {"name": "levenberg_marquardt", "stepsize": 1}}, "did you mean 'step_size'"),
         ({"optimizer": {"name": "adam", "lr": -1.0}}, "optimizer.lr must be positive"),
         ({"optimizer": {"name": "adam", "schedule": "cosin"}}, "did you mean 'cosine'"),

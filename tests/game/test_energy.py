@@ -81,6 +81,8 @@ def slow_energy(scene, parameters, controls, b, m, stride=1):
             total += 0.5 * sum((own[name + "b"][b, m, i].item() * max(0, z - high, low - z)) ** 2 for z in values)
         goal = parameters.goals[b, m, i].tolist()
         total += 0.5 * own["goal"][b, m, i].item() ** 2 * ((x - goal[0]) ** 2 + (y - goal[1]) ** 2)
+        wanted = parameters.goal_headings[b, m, i].item()
+        total += 0.5 * (own["heading"][b, m, i].item() * (theta - wanted)) ** 2
         paths.append(path)
     pair = 0
     for i in range(len(paths)):

@@ -14,7 +14,7 @@ from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarq
 
 from .games import MODES, build_energy, game_of, in_order, padded, poisoned
 
-NEEDS = {"goals", "reference", "reference_speed", "size", "context", "order"}
+NEEDS = {"goals", "goal_headings", "reference", "reference_speed", "size", "context", "order"}
 
 
 class EnergySuite:
@@ -44,6 +44,7 @@ class EnergySuite:
         assert energy.offers <= {GRADIENT, RESIDUALS, FEATURES}
         assert energy.needs <= NEEDS
         assert ("order" in energy.needs) == (energy.pair_order is not None)
+        assert set(energy.decoded_margins) <= set(pair)
         total = energy(scene, game, game.initial_controls)
         assert total.isfinite().all()
         torch.testing.assert_close(total, sum(term.sum(-1) for term in terms.values()))
@@ -61,7 +62,8 @@ class EnergySuite:
     def test_a_missing_required_input_is_named(self, energy):
         scene, game = game_of(energy)
         for name in energy.needs:
-            lacking, holder = (game, "game") if name in ("goals", "reference", "context", "order") else (scene, "scene")
+            of_game = name in ("goals", "goal_headings", "reference", "context", "order")
+            lacking, holder = (game, "game") if of_game else (scene, "scene")
             lacking = dataclasses.replace(lacking, **{name: None})
             with pytest.raises(ValueError, match=name):
                 energy(*((scene, lacking) if holder == "game" else (lacking, game)), game.initial_controls)

@@ -42,6 +42,10 @@ def game_of(energy: Energy, scenes: int = 3, agents: int = 3, starts: int = MODE
         reference=torch.randint(2, (scenes, MODES, agents)) if "reference" in energy.needs else None,
         context=torch.randn(scenes, agents, WIDTH, dtype=torch.float64) if "context" in energy.needs else None,
         order=torch.randn(scenes, MODES, count).sign().double() if "order" in energy.needs else None,
+        goal_headings=torch.randn(scenes, MODES, agents, dtype=torch.float64)
+        if "goal_headings" in energy.needs
+        else None,
+        margins={name: weight(count) for name in energy.decoded_margins},
     )
     return scene, parameters
 
@@ -74,6 +78,8 @@ def padded(scene: Scene, parameters: GameParameters, filling: float, agents: int
         reference=grow(parameters.reference),
         context=grow(parameters.context, 1),
         order=grow_pairs(parameters.order),
+        goal_headings=grow(parameters.goal_headings),
+        margins={name: grow_pairs(margin) for name, margin in parameters.margins.items()},
     )
 
 
@@ -92,13 +98,14 @@ def in_order(
         return table[:, :, agents][:, :, :, agents][:, :, first, second]
 
     pair_order = energy.pair_order
-    changes = dict.fromkeys(("goals", "reference", "initial_controls"))
+    changes = dict.fromkeys(("goals", "goal_headings", "reference", "initial_controls"))
     moved = {name: value[:, :, agents] for name in changes if (value := getattr(parameters, name)) is not None}
     return reordered(scene, agents), dataclasses.replace(
         parameters,
         **moved,
         own_weights={name: weight[:, :, agents] for name, weight in parameters.own_weights.items()},
         pair_weights={name: pairs(weight) for name, weight in parameters.pair_weights.items()},
+        margins={name: pairs(margin) for name, margin in parameters.margins.items()},
         context=None if parameters.context is None else parameters.context[:, agents],
         order=pairs(parameters.order, 1.0 if pair_order is None or pair_order.symmetric else -1.0),
     )

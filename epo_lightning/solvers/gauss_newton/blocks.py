@@ -136,9 +136,10 @@ class _Parts:
         def exact(values: Tensor) -> Tensor:
             return values.to(torch.float64)
 
-        # Absent agents get unit matrices of their own, so that they are regular even without damping.
+        # Absent agents and steps after the end of a game get unit matrices, so that they are regular even without damping.
         control = exact(model.control) + damping.reshape(len(damping), -1, 1, 1)
-        control = torch.where(model.at.present[..., None, None], control, 1.0)
+        present = model.at.present[..., None, None]
+        control = torch.where(present if model.at.active is None else present & model.at.active, control, 1.0)
         moves, node, pull = exact(model.at.moves), exact(model.node), exact(model.position)
         rows = [model.at.dt * moves.flatten(2, 3), control / model.at.dt**2, node, pull]
         sizes = [4, 2, 2, 3]

@@ -28,6 +28,7 @@ from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.kernel.interface import (
     MOST_AGENTS,
     OWN,
+    PAIR,
     SIGNALS,
     Address,
     EpoGame,
@@ -46,7 +47,7 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
     if energy.dynamics.integrator != "euler":
         return f"the compiled layer integrates by euler, not {energy.dynamics.integrator}"
     for name in (*energy.own, *energy.pair):
-        if name not in OWN and name != "proximity":
+        if name not in (*OWN, *PAIR):
             return f"the compiled layer does not know the feature {name!r}"
     if scene.agent_mask.shape[1] > MOST_AGENTS:
         return f"the compiled layer takes up to {MOST_AGENTS} agents, not {scene.agent_mask.shape[1]}"
@@ -75,8 +76,8 @@ def solve(
 ) -> Solution:
     """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
 
-    The solution is differentiable with respect to weights, goals and initial controls. Problems are shared out among
-    ``torch.get_num_threads()`` threads; results do not depend on the number of threads.
+    The solution is differentiable with respect to weights, margins, goals, their headings and initial controls. Problems
+    are shared out among ``torch.get_num_threads()`` threads; results do not depend on the number of threads.
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates)
     if call.record:
@@ -129,16 +130,21 @@ class _Call:
             weights = {**weights, "lane": energy.own_weight(scene, parameters, "lane")}
         self.own = [_as(controls.dtype, weights[name]) for name in energy.own]
         self.pair = [_as(controls.dtype, parameters.pair_weights[name]) for name in energy.pair]
+        self.margins = [_as(controls.dtype, parameters.margins[name]) for name in energy.decoded_margins]
         self.goals = [_as(controls.dtype, parameters.goals)] if energy.needs_goals else []  # type: ignore[arg-type]
-        self.inputs = (*self.own, *self.pair, *self.goals)
+        headed = energy.needs_goal_headings
+        self.headings = [_as(controls.dtype, parameters.goal_headings)] if headed else []  # type: ignore[arg-type]
+        self.inputs = (*self.own, *self.pair, *self.margins, *self.goals, *self.headings)
         self.slots = [OWN.index(name) for name in energy.own]
+        self.pair_slots = [PAIR.index(name) for name in energy.pair]
+        self.margin_slots = [PAIR.index(name) for name in energy.decoded_margins]
         self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs))
         self.tape = _Tape()
         self._describe(energy, scene, parameters)
         self._reserve(step_size, damping)
 
     def _describe(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> None:
-        """Fill the kernel's description of the games: sizes, bounds, addresses and strides of scenes, weights and goals."""
+        """Fill the kernel's description of the games: sizes, bounds, addresses and strides of its tensors."""
         batch, modes, agents, horizon, _ = self.controls.shape
         like = self.controls.dtype
         kept: list[Tensor] = []
@@ -161,12 +167,22 @@ class _Call:
             game.size = hold(_as(like, scene.size).contiguous()).data_ptr()
         for slot, weight in zip(self.slots, self.own, strict=True):
             game.own[slot], game.own_strides[slot][:] = weight.data_ptr(), weight.stride()
-        if self.pair and agents > 1:
-            game.pair = self.pair[0].data_ptr()
-            game.pair_b, game.pair_m, game.pair_p = self.pair[0].stride()
+        if agents > 1:
+            for slot, weight in zip(self.pair_slots, self.pair, strict=True):
+                game.pair[slot], game.pair_strides[slot][:] = weight.data_ptr(), weight.stride()
+            margins = dict(zip(self.margin_slots, self.margins, strict=True))
+            for name in energy.margins.keys() & set(energy.pair):
+                fixed = hold(_as(like, energy.margin(scene, parameters, name)))
+                margins[PAIR.index(name)] = fixed.expand(-1, modes, -1)
+            for slot, margin in margins.items():
+                game.margins[slot], game.margin_strides[slot][:] = margin.data_ptr(), margin.stride()
         if self.goals:
             game.goals = self.goals[0].data_ptr()
             game.goals_b, game.goals_m, game.goals_n, game.goals_x = self.goals[0].stride()
+        if self.headings:
+            game.goal_headings, game.goal_heading_strides[:] = self.headings[0].data_ptr(), self.headings[0].stride()
+        if scene.game_steps is not None:
+            game.ends = hold(_as(torch.int64, scene.game_steps).contiguous()).data_ptr()
         if "lane" in energy.own:
             assert scene.references is not None
             assert parameters.reference is not None
@@ -228,8 +244,10 @@ class _Call:
         batch, modes, agents = self.controls.shape[:3]
         new = self.controls.new_zeros
         own = new((len(self.own), batch, modes, agents))
-        pair = new((batch, modes, agents * (agents - 1) // 2)) if self.pair else None
-        goals = new((batch, modes, agents, 2)) if self.goals else None
+        shared = (batch, modes, agents * (agents - 1) // 2)
+        pair, margins = new((len(self.pair), *shared)), new((len(self.margins), *shared))
+        goals = [new((batch, modes, agents, 2)) for _ in self.goals]
+        headings = [new((batch, modes, agents)) for _ in self.headings]
         gradients = EpoGradients(controls=controls.data_ptr())
         if iterates is not None:
             gradients.iterates = iterates.data_ptr()
@@ -237,13 +255,17 @@ class _Call:
             gradients.states = states.data_ptr()
         for slot, gradient in zip(self.slots, own, strict=True):
             gradients.own[slot] = gradient.data_ptr()
-        if pair is not None:
-            gradients.pair = pair.data_ptr()
-        if goals is not None:
-            gradients.goals = goals.data_ptr()
+        for slot, gradient in zip(self.pair_slots, pair, strict=True):
+            gradients.pair[slot] = gradient.data_ptr()
+        for slot, gradient in zip(self.margin_slots, margins, strict=True):
+            gradients.margins[slot] = gradient.data_ptr()
+        for gradient in goals:
+            gradients.goals = gradient.data_ptr()
+        for gradient in headings:
+            gradients.goal_headings = gradient.data_ptr()
 
         _check(interface.library().epo_differentiate(self.tape.address, self.game, self.arguments, gradients))
-        return [*own.unbind(0), *([pair] if pair is not None else []), *([goals] if goals is not None else [])]
+        return [*own.unbind(0), *pair.unbind(0), *margins.unbind(0), *goals, *headings]
 
 
 def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:

@@ -51,7 +51,7 @@ class Edges:
     ) -> Edges:
         """The pairs that may interact: both agents are present, a pair weight is not zero, and the agents come close.
 
-        They come close if the bounding boxes of their trajectories, widened by their extents, overlap.
+        They come close if the bounding boxes of their trajectories, widened by their extents and margins, overlap.
         """
         batch, modes, agents = states.shape[:3]
         weights = torch.stack([energy.pair_weight(scene, parameters, name) for name in energy.pair])
@@ -63,7 +63,13 @@ class Edges:
             if position.shape[3]:
                 extent = extent[:, None, :, None]
                 low, high = position.amin(3) - extent, position.amax(3) + extent
-                matters &= ((low[:, :, first] < high[:, :, second]) & (low[:, :, second] < high[:, :, first])).all(-1)
+                margins = [energy.margin(scene, parameters, n) for n, one in energy.pair_features.items() if one.margin]
+                if margins:
+                    wider = torch.stack([margin.expand_as(matters) for margin in margins]).amax(0)[..., None]
+                    one, other = low[:, :, first] - wider, low[:, :, second] - wider
+                else:
+                    one, other = low[:, :, first], low[:, :, second]
+                matters &= ((one < high[:, :, second]) & (other < high[:, :, first])).all(-1)
         if matters.all():
             return cls.all(batch * modes, agents, states.device)
         pair = matters.flatten().nonzero()[:, 0]

@@ -12,6 +12,7 @@ from torch import Tensor
 from epo_lightning.game.feature_derivatives import (
     add_linear_gradient,
     linear_signal,
+    margin_derivatives,
     nearest_point,
     own_derivatives,
     pair_derivatives,
@@ -21,12 +22,12 @@ from epo_lightning.game.feature_derivatives import (
 )
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OwnFeature, PairFeature, Source
-from epo_lightning.game.pairs import pair_mask
-from epo_lightning.scene import TURN_RATE, GameParameters, Scene
+from epo_lightning.scene import HEADING, TURN_RATE, GameParameters, Scene
 from epo_lightning.solvers.gauss_newton.edges import Edges
 from epo_lightning.solvers.gauss_newton.iterate import Iterate, suffix_sums
 from epo_lightning.solvers.gauss_newton.quadratic_model import (
     GoalTerm,
+    HeadingTerm,
     LaneTerm,
     OwnTerm,
     PairTerm,
@@ -74,7 +75,7 @@ def expand(
     if separation is not None:
         for name, pair_feature in energy.pair_features.items():
             if not pair_feature.declared:
-                linked |= _add_undeclared_pair(sums, edges, pair_feature, _edge_weight(at, edges, name))
+                linked |= _add_undeclared_pair(sums, edges, pair_feature, name)
         pair = _pair_terms(at, edges, separation)
         if pair:
             linked |= _add_pairs(sums, edges, separation, pair)
@@ -162,6 +163,8 @@ def _add_own(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -
             return _add_lane(sums, weight)
         case Source.FINAL_POSITION:
             return _add_goal(sums, weight)
+        case Source.FINAL_HEADING:
+            return _add_heading(sums, weight)
         case _:
             return _add_signal(sums, feature, weight)
 
@@ -171,7 +174,11 @@ def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]
     signal = linear_signal(feature, at.u, at.speed, at.dt, channels=-2)
     if feature.needs:
         signal = signal - at.by_sample(at.around.reference_speed)
-    c = own_derivatives(feature, signal, at.energy.bounds, second=True)
+    active = at.active
+    if active is not None:
+        # Entry l of a rate is that from control l to control l + 1, which must be part of the game.
+        active = active[:, :, 0, 1:] if feature.source is Source.RATE else active[:, :, 0]
+    c = own_derivatives(feature, signal, at.energy.bounds, second=True).within(active)
     scaled = square * c.value
     sums.add_value(scaled, c.value)
     curvature = square if c.first is None else square * c.first.square()
@@ -195,6 +202,10 @@ def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]
 def _add_steering(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
     at, square = sums.at, weight.square()
     angle, by_turn_rate, by_speed = steering(*at.steered())
+    if at.active is not None:
+        angle, by_turn_rate, by_speed = (
+            part.where(at.active[:, :, 0], 0.0) for part in (angle, by_turn_rate, by_speed)
+        )
     scaled = square * angle
     sums.add_value(scaled, angle)
     curvature = [square * by_turn_rate.square(), square * by_turn_rate * by_speed, square * by_speed.square()]
@@ -219,6 +230,8 @@ def _add_lane(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
     nearest, tangent = nearest_point(position, at.around.line)
     offset, tangent = (rows.flatten(0, 1).transpose(-1, -2).contiguous() for rows in (position - nearest, tangent))
     square = weight.square()[..., None]
+    if at.active is not None:
+        offset, square = offset.where(at.active, 0.0), square.where(at.active, 0.0)
     scaled = square * offset
     sums.positions[:, :, :2] += scaled
     sums.positions[:, :, 2::2] += square
@@ -231,12 +244,22 @@ def _add_lane(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
 def _add_goal(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
     at, square = sums.at, weight.square()
     assert at.around.goals is not None
-    offset = at.x[:, :, :2, -1] - at.around.goals.flatten(0, 1)
+    offset = at.last(at.x[:, :, :2]) - at.around.goals.flatten(0, 1)
     scaled = square * offset
-    sums.positions[:, :, :2, -1] += scaled
-    sums.positions[:, :, 2::2, -1] += square
+    at.add_last_(sums.positions[:, :, :2], scaled)
+    at.add_last_(sums.positions[:, :, 2::2], square)
     sums.add_value(scaled, offset)
     return GoalTerm(weight, offset)
+
+
+def _add_heading(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> HeadingTerm:
+    at, square = sums.at, weight.square()
+    offset = at.last(at.x[:, :, HEADING, None]) - at.by_sample(at.around.goal_headings)
+    scaled = square * offset
+    at.add_last_(sums.node_gradient[:, :, 1:], scaled)
+    at.add_last_(sums.node[:, :, 1:], square)
+    sums.add_value(scaled, offset)
+    return HeadingTerm(weight, offset)
 
 
 def _add_undeclared(sums: _Sums, name: str) -> None:
@@ -254,8 +277,19 @@ def _add_undeclared(sums: _Sums, name: str) -> None:
         sums.blocks = block if sums.blocks is None else sums.blocks + block
 
 
+def _by_edge(at: Iterate, edges: Edges, values: Float[Tensor, "B _ P"]) -> Float[Tensor, "E 1"]:
+    """Values of pairs by edge; those that are the same in all modes may have a dimension of 1 for modes."""
+    return edges.of_pairs(values.expand(-1, at.modes, -1).flatten())[:, None]
+
+
+def _edge_exists(at: Iterate, edges: Edges, feature: PairFeature, steps: int) -> Bool[Tensor, "E _"]:
+    """Mask of the edges whose agents are present, at the evaluated steps of their game."""
+    exists = at.energy.pair_exists(at.scene, feature, steps).expand(-1, at.modes, -1, -1).flatten(0, 2)
+    return exists.index_select(0, edges.pair)
+
+
 def _edge_weight(at: Iterate, edges: Edges, name: str) -> Float[Tensor, "E 1"]:
-    return edges.of_pairs(at.energy.pair_weight(at.scene, at.parameters, name).flatten())[:, None]
+    return _by_edge(at, edges, at.energy.pair_weight(at.scene, at.parameters, name))
 
 
 def _pair_terms(at: Iterate, edges: Edges, separation: Separation) -> dict[str, PairTerm]:
@@ -263,9 +297,16 @@ def _pair_terms(at: Iterate, edges: Edges, separation: Separation) -> dict[str, 
     terms = {}
     for name, feature in at.energy.pair_features.items():
         if feature.declared:
-            reach = at.energy.reach(at.scene)[:, None].expand(-1, at.modes, -1).flatten()
-            d = pair_derivatives(feature, separation.distance, edges.of_pairs(reach)[:, None], second=True)
-            terms[name] = PairTerm(_edge_weight(at, edges, name), d)
+            reach = _by_edge(at, edges, at.energy.reach(at.scene, at.parameters, name))
+            d = pair_derivatives(feature, separation.distance, reach, second=True)
+            by_margin = None
+            if name in at.energy.decoded_margins:
+                by_margin = margin_derivatives(feature, separation.distance, reach, d)
+            if at.active is not None:
+                active = _edge_exists(at, edges, feature, separation.distance.shape[-1])
+                d = d.within(active)
+                by_margin = by_margin and (by_margin[0].where(active, 0.0), by_margin[1].where(active, 0.0))
+            terms[name] = PairTerm(_edge_weight(at, edges, name), d, by_margin)
     return terms
 
 
@@ -297,20 +338,23 @@ def _add_pairs(sums: _Sums, edges: Edges, separation: Separation, terms: dict[st
     return (curvature != 0).any(1)
 
 
-def _add_undeclared_pair(
-    sums: _Sums, edges: Edges, feature: PairFeature, weight: Float[Tensor, "E 1"]
-) -> Bool[Tensor, " E"]:
+def _add_undeclared_pair(sums: _Sums, edges: Edges, feature: PairFeature, name: str) -> Bool[Tensor, " E"]:
     """Add an undeclared pair feature; returns the edges that couple their agents."""
     at, energy = sums.at, sums.at.energy
     both = edges.ends(energy.at_pair_steps(at.states.flatten(0, 1)))
     moved = energy.dynamics.tangent(at.states, at.node_directions(), at.dt).flatten(1, 2)
     moved = energy.at_pair_steps(moved).permute(1, 2, 0, 3, 4)  # [S, N, 2 K, L, 4]
     first, second = (side.transpose(0, 1) for side in edges.ends(moved))
-    sizes: tuple[Tensor, ...] = ()
+    others: tuple[Tensor, ...] = ()
     if feature.needs:
-        sizes = edges.ends(energy.size(at.scene).repeat_interleave(at.modes, 0)[:, :, None])
-    exists = pair_mask(at.scene)[:, None].expand(-1, at.modes, -1).flatten().index_select(0, edges.pair)[:, None]
-    found = undeclared_change_by_agent(feature, both, (first, second), *sizes)
+        others = edges.ends(energy.size(at.scene).repeat_interleave(at.modes, 0)[:, :, None])
+    if feature.margin:
+        others = (*others, _by_edge(at, edges, energy.margin(at.scene, at.parameters, name)))
+    weight, exists = _edge_weight(at, edges, name), _edge_exists(at, edges, feature, both[0].shape[-2])
+    ends = energy.evaluated(at.scene)
+    if ends is not None:
+        ends = ends[edges.first // (at.agents * at.modes)]
+    found = undeclared_change_by_agent(feature, both, (first, second), *others, ends=ends)
     value, by_first, by_second = (weight * torch.where(exists, part, 0.0) for part in found)
     jacobians = by_first.permute(1, 0, 2), by_second.permute(1, 0, 2)  # [E, 2 K, R]
     gradients = (side @ value[..., None] for side in jacobians)
@@ -322,7 +366,7 @@ def _add_undeclared_pair(
         edges.spread_(sums.blocks, *(side @ side.mT for side in jacobians))
         shared = jacobians[0] @ jacobians[1].mT
         sums.pair_blocks = shared if sums.pair_blocks is None else sums.pair_blocks + shared
-    return ((by_first != 0).any(-1).any(0)) & exists[:, 0]
+    return ((by_first != 0) & exists).any(-1).any(0)
 
 
 def _add_pair_value(sums: _Sums, edges: Edges, value: Float[Tensor, "E L"]) -> None:

@@ -14,6 +14,7 @@ Arrays are laid out [S, N, component, K] with S = B M samples. Component 0 is sp
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -106,6 +107,32 @@ class Iterate:
     def speed(self) -> Float[Tensor, "S N K"]:
         """Speeds at the nodes 1 .. K."""
         return self.x[:, :, SPEED]
+
+    @cached_property
+    def active(self) -> Bool[Tensor, "S 1 1 K"] | None:
+        """Mask of the steps of each game (``scene.game_steps``); None if all games have K steps."""
+        if self.around.ends is None:
+            return None
+        ends = self.around.ends.repeat_interleave(self.modes)[:, None, None, None]
+        return torch.arange(self.steps, device=ends.device) < ends
+
+    @cached_property
+    def _last(self) -> Bool[Tensor, "S 1 1 K"] | None:
+        """Mask of the last step of each game; None if all games have K steps."""
+        return (
+            None if self.active is None else self.active & (self.active.cumsum(-1) == self.active.sum(-1, keepdim=True))
+        )
+
+    def last(self, values: Float[Tensor, "S N C K"]) -> Float[Tensor, "S N C"]:
+        """The entries of the last step of every game."""
+        return values[..., -1] if self._last is None else values.where(self._last, 0.0).sum(-1)
+
+    def add_last_(self, onto: Float[Tensor, "S N C K"], values: Float[Tensor, "S N #C"]) -> None:
+        """Add values to the entries of the last step of every game, in place."""
+        if self._last is None:
+            onto[..., -1] += values
+        else:
+            onto += self._last * values[..., None]
 
     @property
     def present(self) -> Bool[Tensor, "S N"]:

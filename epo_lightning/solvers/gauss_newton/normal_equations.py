@@ -27,7 +27,7 @@ from epo_lightning.game.feature_derivatives import (
 )
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OwnFeature, Source
-from epo_lightning.game.pairs import pair_mask, pairs
+from epo_lightning.game.pairs import pairs
 from epo_lightning.scene import ACCELERATION, GameParameters, Scene
 
 
@@ -45,7 +45,8 @@ def normal_equations(
 ) -> tuple[Float[Tensor, "B M n"], Float[Tensor, "B M n n"]]:
     """The gradient J^T r and the upper half of H = J^T J + eps I, in double precision.
 
-    Both are differentiable with respect to the parameters. Absent agents have rows of the unit matrix. For lines, the exact
+    Both are differentiable with respect to the parameters. Absent agents, and controls after the end of a game, have rows of
+    the unit matrix. For lines, the exact
     derivative is used (``slide`` of :func:`~epo_lightning.game.feature_derivatives.signal_and_change`), so that motion along
     a line has no cost. (Solvers hold the nearest point fixed, which changes no solution but would change a density.)
 
@@ -55,7 +56,12 @@ def normal_equations(
     """
     energy.validate(scene, parameters, controls)
     steps = controls.shape[3]
-    present = by_channel(scene.agent_mask[:, None, :, None, None].expand(-1, 1, *controls.shape[2:]))
+    present = scene.agent_mask[:, None, :, None, None].expand(-1, 1, *controls.shape[2:])
+    if scene.game_steps is not None:
+        present = present & (
+            torch.arange(steps, device=present.device)[:, None] < scene.game_steps.view(-1, 1, 1, 1, 1)
+        )
+    present = by_channel(present)
     controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
     states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
     # The 2 K unit directions of every agent, all of acceleration before all of turn rate.
@@ -167,7 +173,9 @@ def _of_agents(
             continue
         weight = energy.own_weight(scene, parameters, name)[..., None]
         signal, _ = signal_and_change(feature, *at, *still, around)
-        value, first, _ = own_derivatives(feature, signal, energy.bounds)
+        value, first, _ = own_derivatives(feature, signal, energy.bounds).within(
+            energy.residual_mask(scene, feature, steps)
+        )
         first = torch.ones_like(value) if first is None else first
         force, stiffness = weight.square() * first * value, (weight * first).square()
         linear.setdefault(_signal_of(feature), []).append((force, stiffness))
@@ -205,21 +213,23 @@ def _of_pairs(
     ends = torch.cat((first, second))
     both = [energy.at_pair_steps(states[:, :, members]) for members in (first, second)]
     distance, normal = separation(both[0][..., :2], both[1][..., :2])
-    exists = pair_mask(scene)[:, None, :, None]
+    ends_of_games = energy.evaluated(scene)
     rows, changes = [distance[..., :0]], [moved.new_zeros(*moved.shape[:3], len(ends), 0)]
     for name, pair in energy.pair_features.items():
         weight = energy.pair_weight(scene, parameters, name)[..., None]
+        exists = energy.pair_exists(scene, pair, distance.shape[-1])
         if pair.declared:
-            value, slope, _ = pair_derivatives(pair, distance, energy.reach(scene)[:, None, :, None])
+            value, slope, _ = pair_derivatives(pair, distance, energy.reach(scene, parameters, name)[..., None])
             assert slope is not None
             force = weight * torch.where(exists, slope, 0.0)
             apart = energy.at_pair_steps(moved[..., :2][:, :, :, ends])
             change = torch.cat((force, -force), 2) * (torch.cat((normal, normal), 2) * apart).sum(-1)
         else:
-            sizes = [energy.size(scene)[:, None, members, None] for members in (first, second) if pair.needs]
+            others = [energy.size(scene)[:, None, members, None] for members in (first, second) if pair.needs]
+            others += [energy.margin(scene, parameters, name)[..., None]] if pair.margin else []
             ends_moved = [energy.at_pair_steps(moved[:, :, :, members]) for members in (first, second)]
             value, *by_ends = undeclared_change_by_agent(
-                pair, (both[0], both[1]), (ends_moved[0], ends_moved[1]), *sizes
+                pair, (both[0], both[1]), (ends_moved[0], ends_moved[1]), *others, ends=ends_of_games
             )
             change = weight.repeat(1, 1, 2, 1) * torch.where(exists.repeat(1, 1, 2, 1), torch.cat(by_ends, 3), 0.0)
         rows.append(weight * torch.where(exists, value, 0.0))

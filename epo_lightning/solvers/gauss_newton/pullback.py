@@ -22,6 +22,7 @@ from epo_lightning.scene import TURN_RATE
 from epo_lightning.solvers.gauss_newton.iterate import following, suffix_sums
 from epo_lightning.solvers.gauss_newton.quadratic_model import (
     GoalTerm,
+    HeadingTerm,
     LaneTerm,
     QuadraticModel,
     SignalTerm,
@@ -37,12 +38,16 @@ class Gradients:
         controls: gradient by the controls.
         own, pair: gradients by the weights, by name of the feature.
         goals: gradient by the goals; None without a feature that needs goals.
+        goal_headings: gradient by the headings wanted at the goals; None without a feature that needs them.
+        margins: gradients by decoded margins, by name of the pair feature.
     """
 
     controls: Float[Tensor, "S N 2 K"]
     own: dict[str, Float[Tensor, "S N"]]
     pair: dict[str, Float[Tensor, "S P"]]
     goals: Float[Tensor, "S N 2"] | None
+    goal_headings: Float[Tensor, "S N"] | None
+    margins: dict[str, Float[Tensor, "S P"]]
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
     changes = _Changes(controls, nodes, at.to_positions((at.moves * nodes[:, :, :, :, None]).sum(3)))
     sums = _gradients_along_mu(model, changes)
     own: dict[str, Tensor] = {}
-    goals = None
+    goals = headings = None
     for name, term in model.own.items():
         match term:
             case SignalTerm():
@@ -85,12 +90,16 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
             case SteeringTerm():
                 along_mu, ahead = _pull_steering(model, term, changes, sums)
             case LaneTerm():
-                along_mu, ahead = _pull_lane(term, changes, sums)
+                along_mu, ahead = _pull_lane(model, term, changes, sums)
             case GoalTerm():
-                along_mu, ahead = _pull_goal(term, changes, sums)
+                along_mu, ahead = _pull_goal(model, term, changes, sums)
                 goals = term.weight.square() * along_mu
+            case HeadingTerm():  # its derivative by the heading is in `_gradients_along_mu`
+                along_mu, along_d = (at.last(change[:, :, 1:]) for change in changes.nodes)
+                ahead = term.offset + along_d
+                headings = (term.weight.square() * along_mu)[..., 0]
         own[name] = -2.0 * term.weight[..., 0] * (along_mu * ahead).flatten(2).sum(-1)
-    pair = _pull_pairs(model, changes, sums)
+    pair, margins = _pull_pairs(model, changes, sums)
     after = at.to_velocities(sums.positions)
     along_e, along_left = ((direction[:, :, None] * after).sum(3) for direction in (at.unit, at.left))  # [S, N, 3, K]
     faster, turned = nodes.movedim(0, 2).unbind(3)  # [S, N, 2, K]
@@ -98,7 +107,7 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
     node[:, :, 0] += along_e[:, :, 0] + (turned * along_left[:, :, 1:]).sum(2)
     node[:, :, 1] += at.speed * (along_left[:, :, 0] - (turned * along_e[:, :, 1:]).sum(2))
     node[:, :, 1] += (faster * along_left[:, :, 1:]).sum(2)
-    return Gradients(sums.controls + dt * suffix_sums(node), own, pair, goals)
+    return Gradients(sums.controls + dt * suffix_sums(node), own, pair, goals, headings, margins)
 
 
 def _gradients_along_mu(model: QuadraticModel, changes: _Changes) -> _Sums:
@@ -147,9 +156,10 @@ def _pull_steering(model: QuadraticModel, term: SteeringTerm, changes: _Changes,
     return along_mu, ahead
 
 
-def _pull_lane(term: LaneTerm, changes: _Changes, sums: _Sums) -> tuple[Tensor, Tensor]:
+def _pull_lane(model: QuadraticModel, term: LaneTerm, changes: _Changes, sums: _Sums) -> tuple[Tensor, Tensor]:
     square = term.weight.square()[..., None]
-    along_mu, along_d = changes.positions
+    active = model.at.active
+    along_mu, along_d = changes.positions if active is None else changes.positions.where(active, 0.0)
     ahead = term.offset + along_d
     across = along_mu - term.tangent * (term.tangent * along_mu).sum(2, keepdim=True)
     sums.positions[:, :, 0] -= square * across
@@ -158,22 +168,25 @@ def _pull_lane(term: LaneTerm, changes: _Changes, sums: _Sums) -> tuple[Tensor, 
     return along_mu, ahead
 
 
-def _pull_goal(term: GoalTerm, changes: _Changes, sums: _Sums) -> tuple[Tensor, Tensor]:
+def _pull_goal(model: QuadraticModel, term: GoalTerm, changes: _Changes, sums: _Sums) -> tuple[Tensor, Tensor]:
     square = term.weight.square()
-    along_mu, along_d = changes.positions[..., -1]
+    at = model.at
+    along_mu, along_d = (at.last(change) for change in changes.positions)
     ahead = term.offset + along_d
     scaled = square * along_mu
-    sums.positions[:, :, 0, :, -1] -= scaled
-    sums.positions[:, :, 1, :, -1] -= square * ahead
-    sums.positions[:, :, 2, :, -1] -= scaled
+    for part, gradient in enumerate((scaled, square * ahead, scaled)):
+        at.add_last_(sums.positions[:, :, part], -gradient)
     return along_mu, ahead
 
 
-def _pull_pairs(model: QuadraticModel, changes: _Changes, sums: _Sums) -> dict[str, Float[Tensor, "S P"]]:
-    """Adds the derivatives of the declared pair features; returns the gradient by their weights."""
+def _pull_pairs(
+    model: QuadraticModel, changes: _Changes, sums: _Sums
+) -> tuple[dict[str, Float[Tensor, "S P"]], dict[str, Float[Tensor, "S P"]]]:
+    """Adds the derivatives of the declared pair features; returns the gradients by their weights and by their margins."""
     by_weight: dict[str, Tensor] = {}
+    by_margin: dict[str, Tensor] = {}
     if not model.pair:
-        return by_weight
+        return by_weight, by_margin
     at, edges, separation = model.at, model.edges, model.separation
     assert separation is not None
     normal = separation.normal
@@ -194,14 +207,23 @@ def _pull_pairs(model: QuadraticModel, changes: _Changes, sums: _Sums) -> dict[s
         outward -= square * gain
         with_mu -= square * first * ahead
         with_d -= square * gain
-        weighed = -2.0 * term.weight[:, 0] * (slid * ahead).sum(-1)
-        if not edges.every:
-            rows = weighed.new_zeros(at.samples * at.agents * (at.agents - 1) // 2)
-            weighed = rows.index_copy_(0, edges.pair, weighed)
-        by_weight[name] = weighed.view(at.samples, -1)
+        by_weight[name] = _of_all_pairs(model, -2.0 * term.weight[:, 0] * (slid * ahead).sum(-1))
+        if term.by_margin is not None:
+            wider, steeper = term.by_margin
+            widened = steeper * along_mu * ahead + slid * (wider + steeper * along_d)
+            by_margin[name] = _of_all_pairs(model, -square[:, 0] * widened.sum(-1))
     turning = (apart - closing[:, :, None] * normal[:, None]) * separation.inverse[:, None, None]
     gradient = outward[:, None] * normal + with_mu[:, None] * turning[:, 0] + with_d[:, None] * turning[:, 1]
     gradient = torch.stack((gradient, with_mu[:, None] * normal, with_d[:, None] * normal), 1)
     gradient = at.at_every_step(gradient.flatten(1, 2)).view(-1, 3, 2, at.steps)
     edges.spread_(sums.positions, gradient, -gradient)
-    return by_weight
+    return by_weight, by_margin
+
+
+def _of_all_pairs(model: QuadraticModel, values: Float[Tensor, " E"]) -> Float[Tensor, "S P"]:
+    """Values of edges as values of all pairs, zero for pairs that are no edge."""
+    at, edges = model.at, model.edges
+    if not edges.every:
+        rows = values.new_zeros(at.samples * at.agents * (at.agents - 1) // 2)
+        values = rows.index_copy_(0, edges.pair, values)
+    return values.view(at.samples, -1)

@@ -63,15 +63,24 @@ class GoalTerm:
     offset: Float[Tensor, "S N 2"]
 
 
-OwnTerm = SignalTerm | SteeringTerm | LaneTerm | GoalTerm
+@dataclass(frozen=True)
+class HeadingTerm:
+    """The last heading minus the one that is wanted at the goal."""
+
+    weight: Float[Tensor, "S N 1"]
+    offset: Float[Tensor, "S N 1"]
+
+
+OwnTerm = SignalTerm | SteeringTerm | LaneTerm | GoalTerm | HeadingTerm
 
 
 @dataclass(frozen=True)
 class PairTerm:
-    """A feature of the distance: d(|p_i - p_j|) with derivatives."""
+    """A feature of the distance, d(|p_i - p_j|), with derivatives; those of d and d' by the margin where it is decoded."""
 
     weight: Float[Tensor, "E 1"]
     d: Derivatives
+    by_margin: tuple[Float[Tensor, "E L"], Float[Tensor, "E L"]] | None = None
 
 
 @dataclass(frozen=True)

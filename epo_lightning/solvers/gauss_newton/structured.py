@@ -58,8 +58,8 @@ def solve(
 ) -> Solution:
     """Take ``steps`` steps from ``parameters.initial_controls``.
 
-    The controls and states of the solution are differentiable with respect to weights, goals and initial controls, by
-    unrolling.
+    The controls and states of the solution are differentiable with respect to weights, margins, goals, their headings and
+    initial controls, by unrolling.
 
     Args:
         energy, scene, parameters: the game, already validated.
@@ -115,23 +115,29 @@ class Game:
         return self.energy.finite(self.scene, self.parameters)
 
     def tensors(self, parameters: GameParameters) -> list[Tensor]:
-        """The tensors of a game that have a gradient: weights, and goals if a feature needs them."""
+        """The tensors of a game that have a gradient: weights, margins, and goals and goal headings if they are needed."""
         tensors = [parameters.own_weights[name] for name in self.energy.own]
         tensors += [parameters.pair_weights[name] for name in self.energy.pair]
+        tensors += [parameters.margins[name] for name in self.energy.decoded_margins]
         if self.energy.needs_goals:
             assert parameters.goals is not None
             tensors.append(parameters.goals)
+        if self.energy.needs_goal_headings:
+            assert parameters.goal_headings is not None
+            tensors.append(parameters.goal_headings)
         return tensors
 
     def with_tensors(self, tensors: Sequence[Tensor]) -> GameParameters:
         """The game's parameters with these tensors."""
-        own, pair = list(self.energy.own), list(self.energy.pair)
-        goals = tensors[len(own) + len(pair) :]
+        given = iter(tensors)
+        parameters = self.parameters
         return dataclasses.replace(
-            self.parameters,
-            own_weights=dict(zip(own, tensors[: len(own)], strict=True)),
-            pair_weights=dict(zip(pair, tensors[len(own) : len(own) + len(pair)], strict=True)),
-            goals=goals[0] if goals else self.parameters.goals,
+            parameters,
+            own_weights={name: next(given) for name in self.energy.own},
+            pair_weights={name: next(given) for name in self.energy.pair},
+            margins={name: next(given) for name in self.energy.decoded_margins},
+            goals=next(given) if self.energy.needs_goals else parameters.goals,
+            goal_headings=next(given) if self.energy.needs_goal_headings else parameters.goal_headings,
         )
 
     def gradient_of_phi(
@@ -143,8 +149,11 @@ class Game:
         by_controls = found.controls.transpose(-1, -2).reshape(shape)
         gradients = [found.own.get(name) for name in self.energy.own]
         gradients += [found.pair.get(name) for name in self.energy.pair]
+        gradients += [found.margins.get(name) for name in self.energy.decoded_margins]
         if self.energy.needs_goals:
             gradients.append(found.goals)
+        if self.energy.needs_goal_headings:
+            gradients.append(found.goal_headings)
         by = [
             torch.zeros_like(tensor) if gradient is None else gradient.reshape(tensor.shape)
             for tensor, gradient in zip(tensors, gradients, strict=True)
@@ -212,10 +221,15 @@ class Factorisation:
     held: Bool[Tensor, "S N"] | None = None
 
     def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
-        """(J^T J + lambda I)^-1 times a covector of the controls."""
+        """(J^T J + lambda I)^-1 times a covector of the controls; zero for controls after the end of a game."""
+        active = self.model.at.active
+        if active is not None:
+            right = right.where(active, 0.0)
         exact = self.model.at.to_nodes(right.to(torch.float64))
         parts = [f.solve(_gather(group, exact)) for f, group in zip(self.factors, self.groups, strict=True)]
         solved = self.model.at.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
+        if active is not None:
+            solved = solved.where(active, 0.0)
         return solved if self.held is None else torch.where(self.held[..., None, None], 0.0, solved)
 
 

@@ -7,7 +7,10 @@
 #include <cstdint>
 
 /// Weighted own features, in the order in which weights and their gradients are passed.
-enum Own { GOAL, LANE, VELREF, VEL, ACC, TURNR, JERK, TURNACC, STEER, VELB, ACCB, TURNRB, JERKB, TURNACCB, OWN_COUNT };
+enum Own { GOAL, LANE, VELREF, VEL, ACC, TURNR, JERK, TURNACC, STEER, VELB, ACCB, TURNRB, JERKB, TURNACCB, HEADING, OWN_COUNT };
+
+/// Weighted pair features, in the same order as in Python.
+enum Pair { PROXIMITY, CLEARANCE, PAIR_COUNT };
 
 /// Index of a control, as in the arrays of the caller.
 enum Control { ACCELERATION, TURN_RATE };
@@ -40,13 +43,18 @@ struct EpoGame {
     const void* size;          // [B, N, 2] length, width
     const void* own[OWN_COUNT];  // [B, M, N] each
     int64_t own_strides[OWN_COUNT][3];
-    const void* pair;          // [B, M, P]
-    int64_t pair_b, pair_m, pair_p;
+    const void* pair[PAIR_COUNT];  // [B, M, P] each
+    int64_t pair_strides[PAIR_COUNT][3];
+    const void* margins[PAIR_COUNT];  // [B, M, P] each, for the pair features that take one
+    int64_t margin_strides[PAIR_COUNT][3];
     const void* goals;         // [B, M, N, 2]
     int64_t goals_b, goals_m, goals_n, goals_x;
     const void* references;    // [B, N, R, Q, 2]
     const int64_t* reference;  // [B, M, N]
     const void* reference_speed;  // [B, N]
+    const void* goal_headings;  // [B, M, N]
+    int64_t goal_heading_strides[3];
+    const int64_t* ends;       // [B] numbers of steps of the games, or null if all games have K steps
 };
 
 /// Arguments and results of S steps from `start`, in which the controls of absent agents are zero. Every array of controls is
@@ -75,8 +83,10 @@ struct EpoGradients {
     const void* iterates;      // [S + 1, B, M, N, K, 2] further cotangents of u_0 .. u_S, or null
     const void* states;        // [B, M, N, K, 4] or null
     void* own[OWN_COUNT];      // [B, M, N] each, zero on entry
-    void* pair;                // [B, M, P], zero on entry
+    void* pair[PAIR_COUNT];    // [B, M, P] each, zero on entry
+    void* margins[PAIR_COUNT];  // [B, M, P] each, zero on entry; null for fixed margins
     void* goals;               // [B, M, N, 2], zero on entry
+    void* goal_headings;       // [B, M, N], zero on entry
 };
 }
 

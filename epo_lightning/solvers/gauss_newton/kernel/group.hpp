@@ -1,6 +1,7 @@
 // W independent games of n agents side by side: their parameters, trajectories and features, step by step.
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <vector>
 
@@ -123,28 +124,65 @@ struct Nearest {
     }
 };
 
+/// Whether a game has pair features.
+inline bool interacts(const EpoGame& game) {
+    for (const void* weights : game.pair)
+        if (weights) return true;
+    return false;
+}
+
+/// Entry of an array [B, M, P] with strides.
+template <class T>
+INLINE T of_pair(const void* values, const int64_t* strides, int64_t b, int64_t m, int64_t pair) {
+    return static_cast<const T*>(values)[b * strides[0] + m * strides[1] + pair * strides[2]];
+}
+
 template <class T, int N>
 struct Group {
     static constexpr int W = Lanes<T>::W;
     const EpoGame& game;
     const Count<N> count;
     const int K, pairs;
+    const bool coupled;                   // whether there is a pair feature
+    const bool cut;                       // whether games may end before step K
     const T dt;
     Arena<T>& arena;
     int problem[W], scene[W], mode[W], *agent;  // agent[i * W + lane]
     Vec<T>*weight;                        // [OWN_COUNT, n]
-    Vec<T>*pair_weight, *reach;           // [pairs]
-    Vec<T>*goal_x, *goal_y, *reference_speed, *wheelbase;  // [n]
+    Vec<T>*pair_weight, *reach;           // [PAIR_COUNT, pairs]
+    Vec<T>* given;                        // the weights of agents and pairs, of which `enter` sets some to zero; only where `cut`
+    Vec<T> end;                           // numbers of steps of the games; only where `cut`
+    Vec<T>*goal_x, *goal_y, *goal_heading, *reference_speed, *wheelbase;  // [n]
     Nearest<T> nearest;                   // from `find_nearest`, or kept by an earlier call
     Vec<T>*turn, *thrust;                 // controls [n, K]
     std::vector<Path<T>> path;
 
     Vec<T> own(int feature, int i) const { return weight[feature * count.agents() + i]; }
     bool has(int feature) const { return game.own[feature] != nullptr; }
+    bool has_pair(int feature) const { return game.pair[feature] != nullptr; }
+
+    /// Whether a game of some lane ends with this state, and the weight of a feature of the last state in these lanes.
+    INLINE bool ends_at(int state) const { return cut ? any<T>(end == splat<T>(T(state))) : state == K; }
+    INLINE Vec<T> final_weight(int feature, int i, int state) const {
+        return cut ? (end == splat<T>(T(state)) ? own(feature, i) : Vec<T>{}) : own(feature, i);
+    }
+
+    /// The lanes whose games have a step k.
+    INLINE Mask<T> has_step(int k) const { return end > splat<T>(T(k)); }
+
+    /// Call at step k of every loop over all steps, which go backwards: sets the weights to zero in lanes whose game has ended
+    /// before, and to their values in the others. All costs of step k and of the state after it, and the rate from step k - 1
+    /// to step k, then vanish after the end of a game.
+    INLINE void enter(int k) const {
+        if (!cut || (k + 1 < K && !any<T>(end == splat<T>(T(k + 1))))) return;
+        const Mask<T> live = has_step(k);
+        for (int e = 0; e < OWN_COUNT * count.agents() + PAIR_COUNT * pairs; ++e) weight[e] = live ? given[e] : Vec<T>{};
+    }
 
     /// Lane `lane` holds the row items[lane * (n + 1)]: the problem, then its agents. Unused lanes repeat the last row.
     Group(const EpoGame& game, Arena<T>& arena, Count<N> count, const int32_t* items, int filled, const T* controls)
-        : game(game), count(count), K(int(game.K)), pairs(count.agents() * (count.agents() - 1) / 2), dt(T(game.dt)), arena(arena) {
+        : game(game), count(count), K(int(game.K)), pairs(count.agents() * (count.agents() - 1) / 2),
+          coupled(interacts(game)), cut(game.ends != nullptr), dt(T(game.dt)), arena(arena) {
         const int n = count.agents();
         owners_.resize(n * W);
         agent = owners_.data();
@@ -257,7 +295,7 @@ struct Group {
         }
     }
 
-    bool pairs_count_at(int state) const { return game.pair != nullptr && state % game.pair_stride == 0; }
+    bool pairs_count_at(int state) const { return coupled && state % game.pair_stride == 0; }
 
     INLINE Vec<T> rate(const Vec<T>* control, int k) const { return (control[k] - control[k - 1]) * (T(1) / dt); }
 
@@ -295,7 +333,9 @@ struct Group {
     /// Loads weights, goals and radii, which the features need and a bare rollout does not.
     void load_parameters() {
         const int n = count.agents();
-        weight = arena.take(OWN_COUNT * n);
+        const int weights = OWN_COUNT * n + PAIR_COUNT * pairs;
+        weight = arena.take(weights);
+        pair_weight = weight + OWN_COUNT * n;
         for (int f = 0; f < OWN_COUNT; ++f) {
             if (!game.own[f]) continue;
             for (int lane = 0; lane < W; ++lane) {
@@ -306,10 +346,10 @@ struct Group {
         }
         goal_x = arena.take(n);
         goal_y = arena.take(n);
+        goal_heading = arena.take(n);
         reference_speed = arena.take(n);
         wheelbase = arena.take(n);
-        pair_weight = arena.take(pairs);
-        reach = arena.take(pairs);
+        reach = arena.take(PAIR_COUNT * pairs);
         for (int lane = 0; lane < W; ++lane) {
             const int64_t b = scene[lane], m = mode[lane];
             const T* size = static_cast<const T*>(game.size);
@@ -320,19 +360,32 @@ struct Group {
                     goal_x[i][lane] = goal[0];
                     goal_y[i][lane] = goal[game.goals_x];
                 }
+                if (has(HEADING)) {
+                    const int64_t* strides = game.goal_heading_strides;
+                    goal_heading[i][lane] =
+                        static_cast<const T*>(game.goal_headings)[b * strides[0] + m * strides[1] + a * strides[2]];
+                }
                 if (has(VELREF)) reference_speed[i][lane] = static_cast<const T*>(game.reference_speed)[row];
                 if (has(STEER)) wheelbase[i][lane] = T(kWheelbase) * size[2 * row];
             }
-            if (!game.pair) continue;
             int p = 0;
-            for (int i = 0; i < n; ++i)
+            for (int i = 0; coupled && i < n; ++i)
                 for (int j = i + 1; j < n; ++j, ++p) {
                     const int64_t a = agent[i * W + lane], c = agent[j * W + lane];
                     const int64_t pair = a * game.N - a * (a + 1) / 2 + c - a - 1;  // a < c, as in the item
-                    pair_weight[p][lane] = static_cast<const T*>(game.pair)[b * game.pair_b + m * game.pair_m + pair * game.pair_p];
-                    reach[p][lane] = T(0.5) * size[2 * (b * game.N + a)] + T(0.5) * size[2 * (b * game.N + c)];
+                    const T radii = T(0.5) * size[2 * (b * game.N + a)] + T(0.5) * size[2 * (b * game.N + c)];
+                    for (int f = 0; f < PAIR_COUNT; ++f) {
+                        if (!has_pair(f)) continue;
+                        pair_weight[f * pairs + p][lane] = of_pair<T>(game.pair[f], game.pair_strides[f], b, m, pair);
+                        reach[f * pairs + p][lane] =
+                            game.margins[f] ? radii + of_pair<T>(game.margins[f], game.margin_strides[f], b, m, pair) : radii;
+                    }
                 }
         }
+        if (!cut) return;
+        given = arena.take(weights);
+        std::copy(weight, weight + weights, given);
+        for (int lane = 0; lane < W; ++lane) end[lane] = T(game.ends[scene[lane]]);
     }
 
   private:

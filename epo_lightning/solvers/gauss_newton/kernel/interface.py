@@ -29,8 +29,11 @@ OWN = (
     "turnrb",
     "jerkb",
     "turnaccb",
+    "heading",
 )
 """Own features in the kernel's order."""
+PAIR = ("proximity", "clearance")
+"""Pair features in the kernel's order."""
 SIGNALS = ("vel", "acc", "turnr", "jerk", "turnacc")
 """Signals with bounds in the kernel's order."""
 MOST_AGENTS = 64
@@ -52,11 +55,15 @@ class EpoGame(ctypes.Structure):
         ("size", Address),
         ("own", Address * len(OWN)),
         ("own_strides", Integer * 3 * len(OWN)),
-        ("pair", Address),
-        *((name, Integer) for name in ("pair_b", "pair_m", "pair_p")),
+        ("pair", Address * len(PAIR)),
+        ("pair_strides", Integer * 3 * len(PAIR)),
+        ("margins", Address * len(PAIR)),
+        ("margin_strides", Integer * 3 * len(PAIR)),
         ("goals", Address),
         *((name, Integer) for name in ("goals_b", "goals_m", "goals_n", "goals_x")),
-        *((name, Address) for name in ("references", "reference", "reference_speed")),
+        *((name, Address) for name in ("references", "reference", "reference_speed", "goal_headings")),
+        ("goal_heading_strides", Integer * 3),
+        ("ends", Address),
     )
 
 
@@ -84,8 +91,10 @@ class EpoGradients(ctypes.Structure):
         ("iterates", Address),
         ("states", Address),
         ("own", Address * len(OWN)),
-        ("pair", Address),
+        ("pair", Address * len(PAIR)),
+        ("margins", Address * len(PAIR)),
         ("goals", Address),
+        ("goal_headings", Address),
     )
 
 
@@ -101,6 +110,7 @@ def layout() -> dict[str, float]:
         found[f"sizeof {name}"] = ctypes.sizeof(structure)
         found |= {f"{name}.{field[0]}": getattr(structure, field[0]).offset for field in structure._fields_}
     found |= {name.upper(): index for index, name in enumerate(OWN)} | {"OWN_COUNT": len(OWN)}
+    found |= {name.upper(): index for index, name in enumerate(PAIR)} | {"PAIR_COUNT": len(PAIR)}
     found |= {f"BOUND_{name.upper()}": index for index, name in enumerate(SIGNALS)} | {"BOUND_COUNT": len(SIGNALS)}
     found |= {status.name: status.value for status in Status}
     return found | {

@@ -32,6 +32,8 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
     Vec<T>* given = arena.take(2 * K);
     const T dt = T(game.dt);
     Mask<T>* present = reinterpret_cast<Mask<T>*>(arena.take(N));
+    Vec<T> end{};
+    for (int lane = 0; game.ends && lane < W; ++lane) end[lane] = T(game.ends[problems[lane] / game.M]);
     for (int i = 0; i < N; ++i) {
         Vec<T> start_x, start_y, start_heading, start_speed, moved_x{}, moved_y{}, turned{}, faster{};
         const T* rows[W];
@@ -73,7 +75,15 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
     int pair = 0;
     for (int i = 0; i < N; ++i)
         for (int j = i + 1; j < N; ++j, ++pair) {
-            const Vec<T> reach = radius[i] + radius[j], *a = box + 4 * i, *c = box + 4 * j;
+            Vec<T> reach = radius[i] + radius[j];
+            for (int f = 0; f < PAIR_COUNT; ++f) {
+                if (!game.margins[f]) continue;
+                Vec<T> wider;
+                for (int lane = 0; lane < W; ++lane)
+                    wider[lane] = of_pair<T>(game.margins[f], game.margin_strides[f], problems[lane] / game.M, problems[lane] % game.M, pair);
+                reach = most<T>(reach, radius[i] + radius[j] + wider);
+            }
+            const Vec<T>*a = box + 4 * i, *c = box + 4 * j;
             const Mask<T> near = present[i] && present[j] && a[0] - c[2] < reach && c[0] - a[2] < reach &&
                                  a[1] - c[3] < reach && c[1] - a[3] < reach;
             if (!any<T>(near)) continue;
@@ -81,13 +91,17 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
             Mask<T> touch{};
             for (int k = 0; k < kept; ++k) {
                 const Vec<T> dx = x[i * kept + k] - x[j * kept + k], dy = y[i * kept + k] - y[j * kept + k];
-                touch |= dx * dx + dy * dy < squared;
+                const Mask<T> here = dx * dx + dy * dy < squared;
+                touch |= game.ends ? here & (end >= splat<T>(T((k + 1) * stride))) : here;
             }
             touch &= near;
             for (int lane = 0; lane < W; ++lane) {
                 if (!touch[lane]) continue;
                 const int64_t b = problems[lane] / game.M, m = problems[lane] % game.M;
-                if (static_cast<const T*>(game.pair)[b * game.pair_b + m * game.pair_m + pair * game.pair_p] == 0) continue;
+                bool matters = false;
+                for (int f = 0; f < PAIR_COUNT; ++f)
+                    matters |= game.pair[f] && of_pair<T>(game.pair[f], game.pair_strides[f], b, m, pair) != 0;
+                if (!matters) continue;
                 touching[i * W + lane] |= uint64_t(1) << j;
                 touching[j * W + lane] |= uint64_t(1) << i;
             }
@@ -103,7 +117,7 @@ Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last
     std::vector<uint64_t> touching(std::size_t(N) * W, 0);
     for (int64_t start = first; start < last; start += W) {
         const int filled = int(std::min<int64_t>(W, last - start));
-        if (game.pair) {
+        if (interacts(game)) {
             int problems[W];
             for (int lane = 0; lane < W; ++lane) problems[lane] = int(start + std::min(lane, filled - 1));
             arena.clear();
@@ -182,6 +196,7 @@ INLINE bool finite(T value) {
 /// result, such as the weight of a pair that never touches, or points of a line that are never the nearest.
 template <class T>
 bool valid(const EpoGame& game, int64_t problem) {
+    const bool coupled = interacts(game);
     const int64_t b = problem / game.M, m = problem % game.M;
     const uint8_t* present = game.present + b * game.N;
     int64_t pair = 0;
@@ -191,7 +206,7 @@ bool valid(const EpoGame& game, int64_t problem) {
             const T* start = static_cast<const T*>(game.initial) + b * game.initial_b + i * game.initial_n;
             for (int e = 0; e < 4; ++e)
                 if (!finite(start[e])) return false;
-            if ((game.pair || game.own[STEER]) && !finite(static_cast<const T*>(game.size)[2 * row])) return false;
+            if ((coupled || game.own[STEER]) && !finite(static_cast<const T*>(game.size)[2 * row])) return false;
             if (game.reference) {
                 const int64_t line = game.reference[problem * game.N + i];
                 if (line < 0 || line >= game.lines) return false;
@@ -201,10 +216,12 @@ bool valid(const EpoGame& game, int64_t problem) {
                 if (!all) return false;
             }
         }
-        for (int64_t j = i + 1; game.pair && j < game.N; ++j, ++pair)
-            if (present[i] && present[j] &&
-                !finite(static_cast<const T*>(game.pair)[b * game.pair_b + m * game.pair_m + pair * game.pair_p]))
-                return false;
+        for (int64_t j = i + 1; coupled && j < game.N; ++j, ++pair)
+            for (int f = 0; f < PAIR_COUNT; ++f) {
+                if (!present[i] || !present[j] || !game.pair[f]) continue;
+                if (!finite(of_pair<T>(game.pair[f], game.pair_strides[f], b, m, pair))) return false;
+                if (game.margins[f] && !finite(of_pair<T>(game.margins[f], game.margin_strides[f], b, m, pair))) return false;
+            }
     }
     return true;
 }
@@ -396,10 +413,12 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
                 mu_thrust[e] = T(run.step_size) * bar_thrust[e];
             }
             solve_adjoint(group, factors, mu_turn, mu_thrust);
-            const ParameterGradients<T> by{arena.take(OWN_COUNT * n), arena.take(group.pairs), arena.take(n), arena.take(n)};
+            const int shared = PAIR_COUNT * group.pairs;
+            const ParameterGradients<T> by{
+                arena.take(OWN_COUNT * n), arena.take(shared), arena.take(shared), arena.take(n), arena.take(n), arena.take(n)};
             for (int e = 0; e < OWN_COUNT * n; ++e) by.own[e] = Vec<T>{};
-            for (int e = 0; e < group.pairs; ++e) by.pair[e] = Vec<T>{};
-            for (int e = 0; e < n; ++e) by.goal_x[e] = by.goal_y[e] = Vec<T>{};
+            for (int e = 0; e < shared; ++e) by.pair[e] = by.margin[e] = Vec<T>{};
+            for (int e = 0; e < n; ++e) by.goal_x[e] = by.goal_y[e] = by.goal_heading[e] = Vec<T>{};
             differentiate(group, mu_turn, mu_thrust, d_turn, d_thrust, bar_turn, bar_thrust, by);
             // A step that was not taken passes its cotangent on unchanged.
             const auto taken = [&](int lane) { return step.taken[group.problem[lane] - first] != 0; };
@@ -415,10 +434,15 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
                         static_cast<T*>(gradients.goals)[2 * row] += by.goal_x[i][lane];
                         static_cast<T*>(gradients.goals)[2 * row + 1] += by.goal_y[i][lane];
                     }
-                    for (int j = i + 1; game.pair && j < n; ++j, ++pair) {
+                    if (game.own[HEADING]) static_cast<T*>(gradients.goal_headings)[row] += by.goal_heading[i][lane];
+                    for (int j = i + 1; group.coupled && j < n; ++j, ++pair) {
                         const int64_t a = group.agent[i * Lanes<T>::W + lane], c = group.agent[j * Lanes<T>::W + lane];
-                        static_cast<T*>(gradients.pair)[group.problem[lane] * P + a * game.N - a * (a + 1) / 2 + c - a - 1] +=
-                            by.pair[pair][lane];
+                        const int64_t entry = group.problem[lane] * P + a * game.N - a * (a + 1) / 2 + c - a - 1;
+                        for (int f = 0; f < PAIR_COUNT; ++f) {
+                            if (game.pair[f]) static_cast<T*>(gradients.pair[f])[entry] += by.pair[f * group.pairs + pair][lane];
+                            if (gradients.margins[f])
+                                static_cast<T*>(gradients.margins[f])[entry] += by.margin[f * group.pairs + pair][lane];
+                        }
                     }
                 }
             }

@@ -13,36 +13,11 @@ struct Factors {
     static Factors at(Vec<T>* memory, int n, int64_t K) { return {memory, memory + std::size_t(K) * 4 * n * n}; }
 };
 
-/// Adds the second derivatives of the costs of a state to P [3m, 3m] (unless it is null) and their gradient to y [3m]; returns
-/// their energy.
+/// Adds the costs of an overlap of discs at one state; arguments as for `add_state_costs`.
 template <class T, int N>
-INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>* y) {
+INLINE void add_disc_costs(const Group<T, N>& g, int feature, int state, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
-    Vec<T> energy{};
-    for (int i = 0; i < n; ++i) {
-        const Model<T> speed = g.speed_model(i, state);
-        energy += speed.energy;
-        y[m + 2 * i + 1] += speed.pull;
-        if (P) P[(m + 2 * i + 1) * ld + m + 2 * i + 1] += speed.stiffness;
-        Model<T> in_x, in_y;
-        if (g.has(LANE)) {
-            in_x.add(g.own(LANE, i), g.path[i].x[state] - g.nearest.x[i * (g.K + 1) + state]);
-            in_y.add(g.own(LANE, i), g.path[i].y[state] - g.nearest.y[i * (g.K + 1) + state]);
-        }
-        if (g.has(GOAL) && state == g.K) {
-            in_x.add(g.own(GOAL, i), g.path[i].x[state] - g.goal_x[i]);
-            in_y.add(g.own(GOAL, i), g.path[i].y[state] - g.goal_y[i]);
-        }
-        energy += in_x.energy + in_y.energy;
-        y[2 * i] += in_x.pull;
-        y[2 * i + 1] += in_y.pull;
-        if (P) {
-            P[2 * i * ld + 2 * i] += in_x.stiffness;
-            P[(2 * i + 1) * ld + 2 * i + 1] += in_y.stiffness;
-        }
-    }
-    if (!g.pairs_count_at(state)) return energy;
-    int pair = 0;
+    int pair = feature * g.pairs;
     for (int i = 0; i < n; ++i)
         for (int j = i + 1; j < n; ++j, ++pair) {
             const Vec<T> dx = g.path[i].x[state] - g.path[j].x[state], dy = g.path[i].y[state] - g.path[j].y[state];
@@ -69,6 +44,47 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>
             P[(2 * j + 1) * ld + 2 * i] -= xy;
             P[(2 * j + 1) * ld + 2 * i + 1] -= yy;
         }
+}
+
+/// Adds the second derivatives of the costs of a state to P [3m, 3m] (unless it is null) and their gradient to y [3m]; returns
+/// their energy.
+template <class T, int N>
+INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>* y) {
+    const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
+    Vec<T> energy{};
+    for (int i = 0; i < n; ++i) {
+        const Model<T> speed = g.speed_model(i, state);
+        energy += speed.energy;
+        y[m + 2 * i + 1] += speed.pull;
+        if (P) P[(m + 2 * i + 1) * ld + m + 2 * i + 1] += speed.stiffness;
+        Model<T> in_x, in_y;
+        if (g.has(LANE)) {
+            in_x.add(g.own(LANE, i), g.path[i].x[state] - g.nearest.x[i * (g.K + 1) + state]);
+            in_y.add(g.own(LANE, i), g.path[i].y[state] - g.nearest.y[i * (g.K + 1) + state]);
+        }
+        if (g.has(GOAL) && g.ends_at(state)) {
+            const Vec<T> weight = g.final_weight(GOAL, i, state);
+            in_x.add(weight, g.path[i].x[state] - g.goal_x[i]);
+            in_y.add(weight, g.path[i].y[state] - g.goal_y[i]);
+        }
+        if (g.has(HEADING) && g.ends_at(state)) {
+            Model<T> heading;
+            heading.add(g.final_weight(HEADING, i, state), g.path[i].heading[state] - g.goal_heading[i]);
+            energy += heading.energy;
+            y[m + 2 * i] += heading.pull;
+            if (P) P[(m + 2 * i) * ld + m + 2 * i] += heading.stiffness;
+        }
+        energy += in_x.energy + in_y.energy;
+        y[2 * i] += in_x.pull;
+        y[2 * i + 1] += in_y.pull;
+        if (P) {
+            P[2 * i * ld + 2 * i] += in_x.stiffness;
+            P[(2 * i + 1) * ld + 2 * i + 1] += in_y.stiffness;
+        }
+    }
+    if (!g.pairs_count_at(state)) return energy;
+    for (const int feature : {PROXIMITY, CLEARANCE})
+        if (g.has_pair(feature)) add_disc_costs(g, feature, state, P, y, energy);
     return energy;
 }
 
@@ -146,11 +162,14 @@ void solve_step(
     positive = ~Mask<T>{};
     for (int k = g.K - 1; k >= 0; --k) {
         Vec<T>*L = factors.L + std::size_t(k) * m * m, *G = factors.G + std::size_t(k) * m * ld, *linear = h + k * m;
+        g.enter(k);
         energy += add_state_costs(g, k + 1, P, y);
         costs.set(g, k);
         energy += costs.energy;
         g.motions(k, Z);
         for (int r = 0; r < m; ++r) damped[r] = costs.stiffness[r] + damping[r / 2];
+        if (g.cut)  // steps after the end of a game have no costs: a unit matrix keeps them regular without damping
+            for (int r = 0; r < m; ++r) damped[r] = g.has_step(k) ? damped[r] : splat<T>(1);
         control_block(g.count, P, g.dt, damped, L);
         factorise<T>(g.count, L, positive);
         if (k > 0) {
@@ -169,7 +188,7 @@ void solve_step(
     push(g, factors, h, turn, thrust);
 }
 
-/// Overwrites a cotangent v [n, K] of turn rates and accelerations with mu = H^-1 v.
+/// Overwrites a cotangent v [n, K] of turn rates and accelerations with mu = H^-1 v, zero after the end of a game.
 template <class T, int N>
 void solve_adjoint(const Group<T, N>& g, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
@@ -182,6 +201,8 @@ void solve_adjoint(const Group<T, N>& g, const Factors<T>& factors, Vec<T>* turn
             h[k * m + 2 * i] = -turn[i * g.K + k];
             h[k * m + 2 * i + 1] = -thrust[i * g.K + k];
         }
+        if (g.cut)
+            for (int r = 0; r < m; ++r) h[k * m + r] = g.has_step(k) ? h[k * m + r] : Vec<T>{};
         pull_linear(
             g.count, factors.L + std::size_t(k) * m * m, factors.G + std::size_t(k) * m * ld, g.dt, Z, k == 0, y, h + k * m);
     }
@@ -198,6 +219,7 @@ void evaluate(const Group<T, N>& g, Vec<T>& energy, Vec<T>& squared_norm) {
     for (int e = 0; e < 3 * m; ++e) y[e] = Vec<T>{};
     energy = squared_norm = Vec<T>{};
     for (int k = g.K - 1; k >= 0; --k) {
+        g.enter(k);
         energy += add_state_costs<T, N>(g, k + 1, nullptr, y);
         costs.set(g, k);
         energy += costs.energy;
@@ -217,17 +239,18 @@ void evaluate(const Group<T, N>& g, Vec<T>& energy, Vec<T>& squared_norm) {
 /// Gradients of one group with respect to its parameters.
 template <class T>
 struct ParameterGradients {
-    Vec<T>*own, *pair, *goal_x, *goal_y;  // [OWN_COUNT, n], [pairs], [n], [n]
+    Vec<T>*own, *pair, *margin;               // [OWN_COUNT, n], [PAIR_COUNT, pairs] twice
+    Vec<T>*goal_x, *goal_y, *goal_heading;    // [n]
 };
 
-/// The part of `differentiate` that belongs to the pairs, at one state: adds to the cotangents `sums` [n, 6] of positions and to the
-/// gradient by the pairs' weights.
+/// The part of `differentiate` that belongs to an overlap of discs, at one state: adds to the cotangents `sums` [n, 6] of positions
+/// and to the gradients by the pairs' weights and margins.
 template <class T, int N>
-INLINE void differentiate_pairs(
-    const Group<T, N>& g, int state, const std::vector<Tangent<T>>& first, const std::vector<Tangent<T>>& second, Vec<T>* sums,
-    Vec<T>* by_pair) {
+INLINE void differentiate_discs(
+    const Group<T, N>& g, int feature, int state, const std::vector<Tangent<T>>& first, const std::vector<Tangent<T>>& second,
+    Vec<T>* sums, const ParameterGradients<T>& by) {
     const int n = g.count.agents();
-    int pair = 0;
+    int pair = feature * g.pairs;
     for (int i = 0; i < n; ++i)
         for (int j = i + 1; j < n; ++j, ++pair) {
             const Vec<T> dx = g.path[i].x[state] - g.path[j].x[state], dy = g.path[i].y[state] - g.path[j].y[state];
@@ -249,7 +272,8 @@ INLINE void differentiate_pairs(
                 sums[6 * i + e] += P[e];
                 sums[6 * j + e] -= P[e];
             }
-            by_pair[pair] += T(2) * w * t1 * h;
+            by.pair[pair] += T(2) * w * t1 * h;
+            by.margin[pair] += push;
         }
 }
 
@@ -277,6 +301,7 @@ void differentiate(
     for (int e = 0; e < 2 * n; ++e) nodes[e] = Vec<T>{};
     for (int k = K - 1; k >= 0; --k) {
         const int state = k + 1;
+        g.enter(k);
         for (int i = 0; i < n; ++i) {
             const Path<T>& p = g.path[i];
             const Tangent<T>&t1 = first[i], &t2 = second[i];
@@ -297,10 +322,10 @@ void differentiate(
             if (g.has(VELREF)) speed.add(g.own(VELREF, i), p.speed[state] - g.reference_speed[i], weigh(VELREF));
             if (g.has(VELB)) speed.add_bounded(g.own(VELB, i), p.speed[state], g.game.bounds[BOUND_VEL], weigh(VELB));
             nodes[2 * i + 1] += speed.cotangent;
-            const auto pull_to = [&](int feature, Vec<T> x, Vec<T> y, Vec<T> tangent_x, Vec<T> tangent_y) {
+            const auto pull_to = [&](int feature, Vec<T> w, Vec<T> x, Vec<T> y, Vec<T> tangent_x, Vec<T> tangent_y) {
                 // The nearest point of a reference line moves along the line with the agent. Along the line, the residual therefore
                 // has the derivative zero.
-                const Vec<T> w = g.own(feature, i), squared = w * w;
+                const Vec<T> squared = w * w;
                 const Vec<T> gap_x = p.x[state] - x + t2.x[state], gap_y = p.y[state] - y + t2.y[state];
                 const Vec<T> along_line = t1.x[state] * tangent_x + t1.y[state] * tangent_y;
                 s[0] -= squared * (t1.x[state] - along_line * tangent_x);
@@ -313,16 +338,26 @@ void differentiate(
             };
             if (g.has(LANE)) {
                 const int at = i * (K + 1) + state;
-                pull_to(LANE, g.nearest.x[at], g.nearest.y[at], g.nearest.tangent_x[at], g.nearest.tangent_y[at]);
+                pull_to(LANE, g.own(LANE, i), g.nearest.x[at], g.nearest.y[at], g.nearest.tangent_x[at], g.nearest.tangent_y[at]);
             }
-            if (g.has(GOAL) && state == K) {
-                pull_to(GOAL, g.goal_x[i], g.goal_y[i], Vec<T>{}, Vec<T>{});
-                const Vec<T> squared = g.own(GOAL, i) * g.own(GOAL, i);
+            if (g.has(GOAL) && g.ends_at(state)) {
+                const Vec<T> w = g.final_weight(GOAL, i, state);
+                pull_to(GOAL, w, g.goal_x[i], g.goal_y[i], Vec<T>{}, Vec<T>{});
+                const Vec<T> squared = w * w;
                 by.goal_x[i] += squared * t1.x[state];
                 by.goal_y[i] += squared * t1.y[state];
             }
+            if (g.has(HEADING) && g.ends_at(state)) {
+                const Vec<T> w = g.final_weight(HEADING, i, state);
+                Adjoint<T> heading{t1.heading[state], t2.heading[state]};
+                heading.add(w, p.heading[state] - g.goal_heading[i], weigh(HEADING));
+                nodes[2 * i] += heading.cotangent;
+                by.goal_heading[i] -= heading.cotangent;
+            }
         }
-        if (g.pairs_count_at(state)) differentiate_pairs(g, state, first, second, sums, by.pair);
+        if (g.pairs_count_at(state))
+            for (const int feature : {PROXIMITY, CLEARANCE})
+                if (g.has_pair(feature)) differentiate_discs(g, feature, state, first, second, sums, by);
         for (int i = 0; i < n; ++i) {
             const Tangent<T>&t1 = first[i], &t2 = second[i];
             const auto weigh = [&](int feature) -> Vec<T>& { return by.own[feature * n + i]; };

@@ -1,0 +1,160 @@
+"""Checks of feature energies: their configuration, and the inputs of their features."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from epo_lightning.checks import is_number
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, PairFeature
+from epo_lightning.game.game_end import check_game_steps
+from epo_lightning.game.pairs import pair_mask
+from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.scene import GameParameters, Scene
+
+if TYPE_CHECKING:
+    from epo_lightning.game.feature_energy import FeatureEnergy
+
+
+def check_inputs(energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
+    """Check that scene and parameters have all inputs of the features, with the shapes that the controls ask for.
+
+    Raises:
+        ValueError: see :meth:`~epo_lightning.game.feature_energy.FeatureEnergy.validate`.
+    """
+    batch, agents = scene.agent_mask.shape
+    modes, steps = controls.shape[1], controls.shape[3]
+    energy.check_horizon(steps)
+    for part, names, given, count in (
+        ("own_weights", energy.own, parameters.own_weights, agents),
+        ("pair_weights", energy.pair, parameters.pair_weights, agents * (agents - 1) // 2),
+    ):
+        for name in names:
+            if name not in given:
+                raise ValueError(f"{part} lacks the feature {name!r}; it has {sorted(given)}")
+            shape = list(given[name].shape) if isinstance(given[name], Tensor) else given[name]
+            if shape not in ([batch, modes, count], [batch, 1, count]):
+                raise ValueError(f"{part}[{name!r}] has shape {shape}; these controls take {[batch, modes, count]}")
+    needed: dict[str, tuple[tuple[str, Tensor | None], ...]] = {
+        "goals": (("parameters.goals", parameters.goals),),
+        "goal_headings": (("parameters.goal_headings", parameters.goal_headings),),
+        "reference": (("scene.references", scene.references), ("parameters.reference", parameters.reference)),
+        "reference_speed": (("scene.reference_speed", scene.reference_speed),),
+        "size": (("scene.size", scene.size),),
+    }
+    for name, feature in energy.own_features.items():
+        for what, value in needed[feature.needs] if feature.needs else ():
+            if value is None:
+                raise ValueError(f"the energy has the feature {name!r}, but {what} is None")
+            per_agent = {"goals": [agents, 2], "goal_headings": [agents], "reference": [agents]}
+            takes = per_agent.get(what.removeprefix("parameters."))
+            if takes and list(value.shape) not in ([batch, modes, *takes], [batch, 1, *takes]):
+                raise ValueError(f"{what} has shape {list(value.shape)}; these controls take {[batch, modes, *takes]}")
+    _check_decoded_margins(energy, scene, parameters, controls)
+    check_game_steps(scene, steps)
+    if "reference" in energy.needs and parameters.reference.is_floating_point():  # type: ignore[union-attr]
+        raise ValueError("parameters.reference holds indices of lines: it takes whole numbers, not floats")
+    if "reference" in energy.needs and controls.device.type == "cpu":  # on a GPU, the check would make the host wait
+        assert scene.references is not None
+        assert parameters.reference is not None
+        lines = scene.references.shape[2]
+        index = torch.where(scene.agent_mask[:, None], parameters.reference, 0)
+        if (scene.agent_mask[:, None] & ((index < 0) | (index >= lines))).any():
+            raise ValueError(
+                f"parameters.reference must be indices 0 .. {lines - 1} of the R = {lines} lines of scene.references"
+            )
+    if (energy.needs_reach or energy.needs_shape) and scene.size is None:
+        what = "sizes" if energy.needs_shape else "radii"
+        raise ValueError(f"pair features take the agents' {what} from scene.size [B, N, 2], which is None")
+
+
+def _check_decoded_margins(energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
+    """Check the margins of those pair features whose margin is not fixed.
+
+    Raises:
+        ValueError: a missing margin, a wrong shape, or, on a CPU, a negative value.
+    """
+    modes, exists = controls.shape[1], pair_mask(scene)
+    batch, count = exists.shape
+    for name in energy.decoded_margins:
+        margin = parameters.margins.get(name)
+        if margin is None:
+            raise ValueError(
+                f"the pair feature {name!r} takes a margin, but parameters.margins lacks it; it has "
+                f"{sorted(parameters.margins)}. energy.margins.{name} fixes one for all pairs [m]"
+            )
+        if list(margin.shape) not in ([batch, modes, count], [batch, 1, count]):
+            raise ValueError(
+                f"margins[{name!r}] has shape {list(margin.shape)}; these controls take {[batch, modes, count]}"
+            )
+        if margin.device.type == "cpu" and ((margin < 0) & exists[:, None]).any():
+            raise ValueError(f"margins[{name!r}] must be 0 or more [m], but the least one is {float(margin.min())}")
+
+
+def check_bounds(bounds: Any) -> None:
+    """Check the bounds of signals.
+
+    Raises:
+        ConfigError: no mapping, an unknown signal, or a value that is not [lowest, highest].
+    """
+    signals = {feature.signal for feature in OWN_FEATURES.values() if feature.bounded}
+    if not isinstance(bounds, Mapping):
+        raise ConfigError(f"energy.bounds must map signals to [lowest, highest], such as vel: [0, 30], not {bounds!r}")
+    for name, bound in bounds.items():
+        if name not in signals:
+            raise ConfigError(f"unknown signal energy.bounds.{name}: {nearest(str(name), signals)}")
+        pair = list(bound) if isinstance(bound, Sequence) and not isinstance(bound, str) else []
+        if len(pair) != 2 or not all(map(is_number, pair)) or not pair[0] < pair[1]:
+            raise ConfigError(
+                f"energy.bounds.{name} must be [lowest, highest], two numbers in rising order, not {bound!r}"
+            )
+
+
+def check_margins(margins: Any) -> None:
+    """Check fixed margins. A margin of a pair feature that the energy does not have, has no effect.
+
+    Raises:
+        ConfigError: no mapping, an unknown pair feature, one that takes no margin, or a negative value.
+    """
+    if not isinstance(margins, Mapping):
+        raise ConfigError(f"energy.margins must map pair features to metres, such as clearance: 0.5, not {margins!r}")
+    takes = [name for name, feature in PAIR_FEATURES.items() if feature.margin]
+    for name, margin in margins.items():
+        if name not in takes:
+            raise ConfigError(
+                f"energy.margins.{name}: no pair feature with a margin has this name; {nearest(name, takes)}"
+            )
+        if not is_number(margin) or not 0 <= margin < math.inf:
+            raise ConfigError(f"energy.margins.{name} must be a number of metres, 0 or more, not {margin!r}")
+
+
+def refuse_asymmetry(name: str, feature: PairFeature) -> None:
+    """Refuse a pair feature that costs the two agents of a pair different amounts: the game would have no potential.
+
+    Raises:
+        ConfigError: a feature that depends on the order of the agents, or a function that fails on trial inputs.
+    """
+    try:
+        costs = feature.asymmetry
+    except Exception as error:
+        takes = (
+            "states [.., K, 4] and sizes [.., 1, 2] of two agents"
+            if feature.needs
+            else "states [.., K, 4] of two agents"
+        )
+        raise ConfigError(
+            f"pair feature {name!r} fails on trial inputs: {type(error).__name__}: {error}. It takes the {takes} "
+            "and returns residuals [.., R]"
+        ) from error
+    if costs is not None:
+        raise ConfigError(
+            f"pair feature {name!r} is not symmetric: for two trial agents 1/2 |r|^2 is {costs[0]:.4g}, and {costs[1]:.4g} "
+            "when they are swapped, so the game has no potential, and minimising the energy would not give its equilibria. "
+            "Make the feature symmetric, for instance by returning the residuals of both orders. If the agents only weigh "
+            "it differently (a_i E_ij with a_i > 0), keep E_ij symmetric: dividing the own terms of agent i by a_i gives "
+            "the same game, and the decoded own weights can learn this"
+        )
