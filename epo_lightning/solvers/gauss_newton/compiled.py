@@ -73,13 +73,14 @@ def solve(
     step_size: float,
     damping: Float[Tensor, "B M *agents"],
     keep_iterates: bool = False,
+    exact: bool = False,
 ) -> Solution:
     """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
 
     The solution is differentiable with respect to weights, margins, goals, their headings and initial controls. Problems
     are shared out among ``torch.get_num_threads()`` threads; results do not depend on the number of threads.
     """
-    call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates)
+    call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact)
     if call.record:
         controls, states, *iterates = _Unrolled.apply(call, parameters.initial_controls, *call.inputs)
     else:
@@ -95,6 +96,34 @@ def solve(
         status=call.status,
         iterates=tuple(iterates) if keep_iterates else None,
     )
+
+
+@torch.no_grad()
+def descend(
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    steps: int,
+    step_size: float,
+    damping: Float[Tensor, "B M"],
+    exact: bool = False,
+) -> tuple[Solution, Float[Tensor, "B M"]]:
+    """S adaptive steps in one call, without a derivative; see :class:`~.levenberg_marquardt.LevenbergMarquardt`.
+
+    Returns:
+        the solution, and the damping to continue with.
+    """
+    call = _Call(energy, scene, parameters, steps, step_size, damping, False, exact=exact, adaptive=True)
+    call.run()
+    solution = Solution(
+        controls=call.iterates[0],
+        states=call.states,
+        initial_energy=call.initial_energy,
+        energy=call.energy,
+        gradient_norm=call.gradient_norm,
+        status=call.status,
+    )
+    return solution, call.damping
 
 
 class _Tape:
@@ -121,9 +150,12 @@ class _Call:
         step_size: float,
         damping: Tensor,
         keep_iterates: bool,
+        exact: bool = False,
+        adaptive: bool = False,
     ) -> None:
         controls = parameters.initial_controls
         self.controls, self.steps, self.keep_iterates = controls, steps, keep_iterates
+        self.exact, self.adaptive = exact, adaptive
         self.doubles = controls.dtype == torch.float64
         weights = parameters.own_weights
         if _has_gaps(energy, scene):  # the weight of a line that does not exist is zero
@@ -201,12 +233,13 @@ class _Call:
         """Allocate what the kernel writes: results, and iterates and directions of all steps if they are recorded."""
         controls, shape = self.controls, self.controls.shape
         stacked = self.record or self.keep_iterates
-        self.iterates = controls.new_empty((self.steps + 1 if stacked else 1, *shape))
+        kept = self.steps + 1 if stacked else 1 + self.adaptive  # adaptive: the best iterate and the trial
+        self.iterates = controls.new_empty((kept, *shape))
         self.directions = controls.new_empty((max(self.steps, 1) if self.record else 1, *shape))
         self.states: Tensor | None = controls.new_empty((*shape[:-1], 4))
         self.initial_energy, self.energy, self.gradient_norm = controls.new_empty((3, *shape[:2])).unbind(0)
         self.status = torch.empty(shape[:2], dtype=torch.int64)
-        self.damping = _as(controls.dtype, damping).contiguous()
+        self.damping = _as(controls.dtype, damping).clone(memory_format=torch.contiguous_format)
         by_agent = damping.dim() == 3
         self.start = controls.detach().contiguous()
         self.arguments = EpoRun(
@@ -215,10 +248,12 @@ class _Call:
             damping=self.damping.data_ptr(),
             damping_problem=shape[2] if by_agent else 1,
             damping_agent=int(by_agent),
+            exact=self.exact,
+            adaptive=self.adaptive,
             record=self.record,
             start=self.start.data_ptr(),
             iterates=self.iterates.data_ptr(),
-            iterate_stride=controls.numel() if stacked else 0,
+            iterate_stride=controls.numel() if stacked or self.adaptive else 0,
             directions=self.directions.data_ptr(),
             states=self.states.data_ptr(),
             initial_energy=self.initial_energy.data_ptr(),

@@ -23,15 +23,14 @@ from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
 from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, MOST_DAMPING
 from epo_lightning.solvers.general import descent
 
-Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool], Solution]
-"""(energy, scene, parameters, steps, step size, damping [B, M] or [B, M, N], keep iterates) -> solution.
+Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool, bool], Solution]
+"""(energy, scene, parameters, steps, step size, damping [B, M] or [B, M, N], keep iterates, exact) -> solution.
 
 An agent with infinite damping keeps its controls exactly; its trajectory is then a constant for the other agents."""
 
-LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e7
-"""Range of the adaptive damping."""
 BACKENDS = ("auto", "pytorch", "compiled")
 
 
@@ -58,6 +57,8 @@ class LevenbergMarquardt(Stepwise):
             is divided by 10 (down to 1e-7); any other step is rejected, and the damping is multiplied by 10 (up to 1e7).
             These decisions have no gradient.
         test_steps: number of steps outside training; None for the same number.
+        newton_steps: number of adaptive steps with the Hessian that follow. Near a minimum they converge quadratically,
+            and Gauss-Newton steps linearly. They have no derivative: use ``backward=implicit``.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it supports the game.
     """
 
@@ -70,12 +71,16 @@ class LevenbergMarquardt(Stepwise):
     keep_iterates: bool = False
     adaptive: bool = False
     test_steps: int | None = None
+    newton_steps: int = 0
     backend: str = "auto"
 
     def __post_init__(self) -> None:
         check_whole("solver.steps", self.steps, least=0)
         if self.test_steps is not None:
             check_whole("solver.test_steps", self.test_steps, least=0)
+        check_whole("solver.newton_steps", self.newton_steps, least=0)
+        if self.newton_steps and not self.adaptive:
+            raise ConfigError("solver.newton_steps needs solver.adaptive=true: a Newton step may go uphill")
         if not is_number(self.step_size) or not 0 < self.step_size <= 1:
             raise ConfigError(f"solver.step_size must be a number in (0, 1], not {self.step_size!r}")
         check_number("solver.damping", self.damping, zero=True)
@@ -86,10 +91,37 @@ class LevenbergMarquardt(Stepwise):
         """The solver to use outside training."""
         return self if self.test_steps is None else self.with_steps(self.test_steps)
 
+    def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
+        """S steps, and then the Newton steps.
+
+        Raises:
+            ValueError: as :meth:`run`, or a gradient is needed through Newton steps.
+        """
+        if not self.newton_steps:
+            return super().__call__(energy, scene, parameters)
+        if torch.is_grad_enabled():
+            raise ValueError("solver.newton_steps have no derivative: use backward=implicit, truncated or detached")
+        first, damping = self.run(energy, scene, parameters, self.steps)
+        onward = dataclasses.replace(parameters, initial_controls=first.controls)
+        last, _ = self.run(energy, scene, onward, self.newton_steps, damping, exact=True)
+        iterates = (*first.iterates, *last.iterates[1:]) if first.iterates and last.iterates else None
+        return dataclasses.replace(
+            last,
+            initial_energy=first.initial_energy,
+            status=torch.maximum(first.status.clamp_max(Status.DAMPED), last.status),
+            iterates=iterates,
+        )
+
     def run(
-        self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Tensor | None = None
+        self,
+        energy: Energy,
+        scene: Scene,
+        parameters: GameParameters,
+        steps: int,
+        memory: Tensor | None = None,
+        exact: bool = False,
     ) -> tuple[Solution, Tensor]:
-        """Take a number of steps; returns the solution and the damping to continue with.
+        """Take a number of steps, with the Hessian if ``exact``; returns the solution and the damping to continue with.
 
         Raises:
             ValueError: scene and parameters do not fit together (the message names the tensor and its expected shape), or
@@ -111,11 +143,13 @@ class LevenbergMarquardt(Stepwise):
             return descent.nothing(start), damping
         solve = choose_backend(self.backend, energy, scene, parameters)
         if not self.adaptive:
-            return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates), damping
-        solution = solve(energy, scene, parameters, 0, self.step_size, damping, True)
+            return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates, exact), damping
+        if solve is compiled.solve and not torch.is_grad_enabled() and not self.keep_iterates:
+            return compiled.descend(energy, scene, parameters, steps, self.step_size, damping, exact)
+        solution = solve(energy, scene, parameters, 0, self.step_size, damping, True, False)
         for _ in range(steps):
             here = dataclasses.replace(parameters, initial_controls=solution.controls)
-            trial = solve(energy, scene, here, 1, self.step_size, damping, False)
+            trial = solve(energy, scene, here, 1, self.step_size, damping, False, exact)
             better = trial.energy < solution.energy
             damping = torch.where(
                 better, (damping / 10.0).clamp_min(LEAST_DAMPING), (damping * 10.0).clamp_max(MOST_DAMPING)

@@ -38,6 +38,8 @@ from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.pullback import pullback
 from epo_lightning.solvers.gauss_newton.quadratic_model import QuadraticModel
 
+LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e7
+"""Range of the adaptive damping."""
 RETRIES = 4
 """Number of times that a failed Cholesky factorisation is repeated with more damping."""
 LEAST_RAISED_DAMPING = 1e-3
@@ -54,6 +56,7 @@ def solve(
     step_size: float,
     damping: Float[Tensor, "B M *agents"],
     keep_iterates: bool = False,
+    exact: bool = False,
     split: bool | None = None,
 ) -> Solution:
     """Take ``steps`` steps from ``parameters.initial_controls``.
@@ -67,11 +70,12 @@ def solve(
         step_size: alpha.
         damping: lambda of every sample, or of every agent; infinite damping keeps the agent's controls exactly.
         keep_iterates: whether the solution carries u_0 .. u_S.
+        exact: whether the steps use the Hessian (Newton steps); they have no derivative.
         split: whether samples are split into components; by default, on a CPU.
     """
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
     split = controls.device.type == "cpu" if split is None else split
-    game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(0, 1), split)
+    game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(0, 1), split, exact)
     tensors = game.tensors(parameters)
     status = torch.where(game.finite, Status.SOLVED, Status.STOPPED)
     iterates = [controls]
@@ -108,6 +112,7 @@ class Game:
     step_size: float
     damping: Float[Tensor, "S *agents"]
     split: bool
+    exact: bool = False
 
     @cached_property
     def finite(self) -> Bool[Tensor, "B M"]:
@@ -172,7 +177,7 @@ class _Step(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, game: Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parameters = game.with_tensors(tensors)
-        model = expand(game.energy, game.scene, parameters, controls, not game.split)
+        model = expand(game.energy, game.scene, parameters, controls, not game.split, game.exact)
         factors = factorise(model, game.damping, game.split)
         step = factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
         status = factors.status.view(controls.shape[:2])

@@ -26,6 +26,7 @@ constexpr int64_t kMostAgents = 64;         // contacts are a 64-bit mask per ag
 constexpr double kWheelbase = 0.6;          // distance between the axles as a share of a vehicle's length
 constexpr double kSlowestSteering = 1.0;    // [m/s]; at lower speeds, a steering angle is computed with this speed
 constexpr int64_t kRetries = 4;             // number of times that a failed factorisation is repeated with more damping
+constexpr double kLeastDamping = 1e-7, kMostDamping = 1e7;  // range of the adaptive damping
 constexpr double kLeastRaisedDamping = 1e-3;  // repetition k adds 10^k times the damping, but at least 10^k times this
 
 extern "C" {
@@ -62,11 +63,13 @@ struct EpoGame {
 struct EpoRun {
     int64_t steps;
     double step_size;
-    const void* damping;       // [B, M], or [B, M, N]: infinite for agents that do not move
+    void* damping;             // [B, M], or [B, M, N]: infinite for agents that do not move; if adaptive, overwritten by the last one
     int64_t damping_problem, damping_agent;
+    int64_t exact;             // whether steps use the Hessian; such steps have no adjoint
+    int64_t adaptive;          // whether every problem accepts or rejects its steps and adapts its damping; nothing is recorded
     int64_t record;            // whether to keep factors and nearest points for the adjoint
     const void* start;
-    void* iterates;            // [S + 1, ...], or one array that is overwritten where iterate_stride is 0
+    void* iterates;            // [S + 1, ...], or one array that is overwritten where iterate_stride is 0; two if adaptive
     int64_t iterate_stride;
     void* directions;          // [S, ...] if record, else one array of scratch
     void* states;              // [B, M, N, K, 4]

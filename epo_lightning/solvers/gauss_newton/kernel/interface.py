@@ -12,7 +12,7 @@ import functools
 from epo_lightning.game.features import SLOWEST_STEERING, WHEELBASE
 from epo_lightning.scene import Status
 from epo_lightning.solvers.gauss_newton.kernel.build import load
-from epo_lightning.solvers.gauss_newton.structured import LEAST_RAISED_DAMPING, RETRIES
+from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, LEAST_RAISED_DAMPING, MOST_DAMPING, RETRIES
 
 OWN = (
     "goal",
@@ -75,7 +75,7 @@ class EpoRun(ctypes.Structure):
         ("step_size", Real),
         ("damping", Address),
         *((name, Integer) for name in ("damping_problem", "damping_agent")),
-        ("record", Integer),
+        *((name, Integer) for name in ("exact", "adaptive", "record")),
         ("start", Address),
         ("iterates", Address),
         ("iterate_stride", Integer),
@@ -119,6 +119,8 @@ def layout() -> dict[str, float]:
         "kSlowestSteering": SLOWEST_STEERING,
         "kRetries": RETRIES,
         "kLeastRaisedDamping": LEAST_RAISED_DAMPING,
+        "kLeastDamping": LEAST_DAMPING,
+        "kMostDamping": MOST_DAMPING,
     }
 
 

@@ -27,7 +27,8 @@ constexpr EpoLayoutEntry kLayout[] = {
     EPO_FIELD(EpoGame, reference_speed), EPO_FIELD(EpoGame, goal_headings), EPO_FIELD(EpoGame, goal_heading_strides),
     EPO_FIELD(EpoGame, ends),
     EPO_FIELD(EpoRun, steps), EPO_FIELD(EpoRun, step_size), EPO_FIELD(EpoRun, damping), EPO_FIELD(EpoRun, damping_problem),
-    EPO_FIELD(EpoRun, damping_agent), EPO_FIELD(EpoRun, record), EPO_FIELD(EpoRun, start), EPO_FIELD(EpoRun, iterates),
+    EPO_FIELD(EpoRun, damping_agent), EPO_FIELD(EpoRun, exact), EPO_FIELD(EpoRun, adaptive),
+    EPO_FIELD(EpoRun, record), EPO_FIELD(EpoRun, start), EPO_FIELD(EpoRun, iterates),
     EPO_FIELD(EpoRun, iterate_stride), EPO_FIELD(EpoRun, directions), EPO_FIELD(EpoRun, states),
     EPO_FIELD(EpoRun, initial_energy), EPO_FIELD(EpoRun, energy), EPO_FIELD(EpoRun, gradient_norm), EPO_FIELD(EpoRun, status),
     EPO_FIELD(EpoGradients, controls), EPO_FIELD(EpoGradients, iterates), EPO_FIELD(EpoGradients, states),
@@ -41,6 +42,6 @@ constexpr EpoLayoutEntry kLayout[] = {
     EPO_CONSTANT(BOUND_TURNACC), EPO_CONSTANT(BOUND_COUNT),
     EPO_CONSTANT(SOLVED), EPO_CONSTANT(DAMPED), EPO_CONSTANT(STOPPED),
     EPO_CONSTANT(kMostAgents), EPO_CONSTANT(kWheelbase), EPO_CONSTANT(kSlowestSteering), EPO_CONSTANT(kRetries),
-    EPO_CONSTANT(kLeastRaisedDamping),
+    EPO_CONSTANT(kLeastRaisedDamping), EPO_CONSTANT(kLeastDamping), EPO_CONSTANT(kMostDamping),
     {nullptr, 0.0},
 };

@@ -226,67 +226,70 @@ bool valid(const EpoGame& game, int64_t problem) {
     return true;
 }
 
+/// The problems first .. last of a call, with the memory that its steps share.
 template <class T>
-std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t first, int64_t last) {
-    constexpr int W = Lanes<T>::W;
-    const int64_t row = game.K * 2, size = game.N * row;
-    const bool record = run.record != 0, has_lines = game.own[LANE] != nullptr;
-    auto tape = std::make_unique<Tape<T>>(Tape<T>{first, last, {}});
-    T* const energies[2] = {static_cast<T*>(run.initial_energy), static_cast<T*>(run.energy)};
-    T* const norm = static_cast<T*>(run.gradient_norm);
-    Arena<T> arena;
-    std::vector<Buffer<T>> reused(game.N + 1);
-    std::vector<char> inputs_valid(last - first);
-    for (int64_t problem = first; problem < last; ++problem) {
-        inputs_valid[problem - first] = valid<T>(game, problem);
-        run.status[problem] = inputs_valid[problem - first] ? SOLVED : STOPPED;
+class Range {
+  public:
+    Range(const EpoGame& game, const EpoRun& run, int64_t first, int64_t last)
+        : game_(game), run_(run), first_(first), last_(last), row_(game.K * 2), size_(game.N * row_), reused_(game.N + 1),
+          valid_(last - first) {
+        for (int64_t problem = first; problem < last; ++problem) {
+            valid_[problem - first] = valid<T>(game, problem);
+            run.status[problem] = valid_[problem - first] ? SOLVED : STOPPED;
+        }
+        for (int64_t problem = first; problem < last; ++problem)
+            for (int64_t i = 0; i < game.N; ++i) {
+                const T* from = static_cast<const T*>(run.start) + problem * size_ + i * row_;
+                T* to = iterate(0) + problem * size_ + i * row_;
+                if (game.present[problem / game.M * game.N + i])
+                    std::copy(from, from + row_, to);
+                else
+                    std::fill(to, to + row_, T(0));
+            }
     }
-    for (int64_t problem = first; problem < last; ++problem)
-        for (int64_t i = 0; i < game.N; ++i) {
-            const T* from = static_cast<const T*>(run.start) + problem * size + i * row;
-            T* to = static_cast<T*>(run.iterates) + problem * size + i * row;
-            if (game.present[problem / game.M * game.N + i])
-                std::copy(from, from + row, to);
-            else
-                std::fill(to, to + row, T(0));
-        }
-    for (int64_t s = 0; s < run.steps; ++s) {
-        T* const controls = static_cast<T*>(run.iterates) + s * run.iterate_stride;
-        T* const next = controls + run.iterate_stride;
-        T* const directions = static_cast<T*>(run.directions) + (record ? s * game.B * game.M * size : 0);
+
+    T* iterate(int64_t index) const { return static_cast<T*>(run_.iterates) + index * run_.iterate_stride; }
+
+    /// Takes one step from `controls` to `next`. `energy` becomes that of `controls`, unless it is null; `status` is raised where a step
+    /// needed more damping or was not possible. `directions` are written as well.
+    StepTape<T> step(const T* controls, T* next, T* directions, T* energy, int64_t* status) {
+        constexpr int W = Lanes<T>::W;
+        const bool record = run_.record != 0, has_lines = game_.own[LANE] != nullptr, exact = run_.exact != 0;
         StepTape<T> step;
-        step.plan = make_plan<T>(game, arena, first, last, controls);
-        step.factors.resize(game.N + 1);
-        step.nearest.resize(game.N + 1);
-        step.taken = inputs_valid;
-        for (int n = 1; n <= game.N; ++n) {
+        step.plan = make_plan<T>(game_, arena_, first_, last_, controls);
+        step.factors.resize(game_.N + 1);
+        step.nearest.resize(game_.N + 1);
+        step.taken = valid_;
+        for (int n = 1; n <= game_.N; ++n) {
             const std::size_t groups = step.plan.groups(n, W);
-            if (groups && (record || !reused[n]))
-                (record ? step.factors : reused)[n] = Buffer<T>((record ? groups : 1) * Factors<T>::size(n, game.K));
-            if (groups && record && has_lines) step.nearest[n] = Buffer<T>(groups * Nearest<T>::size(n, game.K));
+            if (groups && (record || !reused_[n]))
+                (record ? step.factors : reused_)[n] = Buffer<T>((record ? groups : 1) * Factors<T>::size(n, game_.K));
+            if (groups && record && has_lines) step.nearest[n] = Buffer<T>(groups * Nearest<T>::size(n, game_.K));
         }
-        if (s == 0) std::fill(energies[0] + first, energies[0] + last, T(0));
-        for_each_group<T>(game, arena, step.plan, controls, [&](auto& group, int64_t index, int filled) {
+        if (energy) std::fill(energy + first_, energy + last_, T(0));
+        for_each_group<T>(game_, arena_, step.plan, controls, [&](auto& group, int64_t index, int filled) {
             const int n = group.count.agents();
             group.load_parameters();
             if (has_lines && record)
-                group.template find_nearest<true>(Nearest<T>::at(step.nearest[n].data() + index * Nearest<T>::size(n, game.K), n, game.K));
+                group.template find_nearest<true>(Nearest<T>::at(step.nearest[n].data() + index * Nearest<T>::size(n, game_.K), n, game_.K));
+            else if (has_lines && exact)
+                group.template find_nearest<true>(Nearest<T>::at(arena_.take(Nearest<T>::size(n, game_.K)), n, game_.K));
             else if (has_lines)
-                group.template find_nearest<false>(Nearest<T>::at(arena.take(Nearest<T>::size(n, game.K)), n, game.K));
-            Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game.K) : reused[n].data();
-            const auto factors = Factors<T>::at(memory, n, game.K);
-            Vec<T>*turn = arena.take(n * game.K), *thrust = arena.take(n * game.K), energy;
-            Vec<T>*given = arena.take(n), *damping = arena.take(n), *raised = arena.take(n);
+                group.template find_nearest<false>(Nearest<T>::at(arena_.take(Nearest<T>::size(n, game_.K)), n, game_.K));
+            Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game_.K) : reused_[n].data();
+            const auto factors = Factors<T>::at(memory, n, game_.K);
+            Vec<T>*turn = arena_.take(n * game_.K), *thrust = arena_.take(n * game_.K), found;
+            Vec<T>*given = arena_.take(n), *damping = arena_.take(n), *raised = arena_.take(n);
             for (int i = 0; i < n; ++i) {
                 for (int lane = 0; lane < W; ++lane)
                     given[i][lane] = static_cast<const T*>(
-                        run.damping)[group.problem[lane] * run.damping_problem + group.agent[i * W + lane] * run.damping_agent];
+                        run_.damping)[group.problem[lane] * run_.damping_problem + group.agent[i * W + lane] * run_.damping_agent];
                 damping[i] = given[i];
                 raised[i] = most<T>(given[i], splat<T>(T(kLeastRaisedDamping)));
             }
             Mask<T> positive, failed{};
             for (int attempt = 0;; ++attempt) {
-                solve_step(group, damping, factors, turn, thrust, energy, positive);
+                solve_step(group, exact, damping, factors, turn, thrust, found, positive);
                 if (attempt == kRetries || !any<T>(~positive)) break;
                 failed |= ~positive;
                 for (int i = 0; i < n; ++i) {
@@ -296,53 +299,119 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
             }
             for (int lane = 0; lane < filled; ++lane) {
                 const int problem = group.problem[lane];
-                if (failed[lane]) run.status[problem] = std::max<int64_t>(run.status[problem], DAMPED);
-                if (!positive[lane]) step.taken[problem - first] = 0;
-                if (s == 0) energies[0][problem] += energy[lane];
+                if (failed[lane]) status[problem] = std::max<int64_t>(status[problem], DAMPED);
+                if (!positive[lane]) step.taken[problem - first_] = 0;
+                if (energy) energy[problem] += found[lane];
             }
             group.store(turn, thrust, filled, directions, [](int) { return true; });
         });
-        for (int64_t problem = first; problem < last; ++problem) {
-            T *d = directions + problem * size, *from = controls + problem * size, *to = next + problem * size;
-            const T alpha = T(run.step_size);
+        for (int64_t problem = first_; problem < last_; ++problem) {
+            T *d = directions + problem * size_, *to = next + problem * size_;
+            const T *from = controls + problem * size_, alpha = T(run_.step_size);
             // Absent agents are in no group, so no direction was stored for them.
-            const uint8_t* present = game.present + problem / game.M * game.N;
-            for (int64_t i = 0; i < game.N; ++i)
-                if (!present[i]) std::fill(d + i * row, d + (i + 1) * row, T(0));
-            bool taken = step.taken[problem - first];
-            for (int64_t e = 0; e < size; ++e) taken &= finite(from[e] + alpha * d[e]);
-            step.taken[problem - first] = taken;
-            if (!taken) run.status[problem] = STOPPED;
-            for (int64_t e = 0; e < size; ++e) to[e] = taken ? from[e] + alpha * d[e] : from[e];
+            const uint8_t* present = game_.present + problem / game_.M * game_.N;
+            for (int64_t i = 0; i < game_.N; ++i)
+                if (!present[i]) std::fill(d + i * row_, d + (i + 1) * row_, T(0));
+            bool taken = step.taken[problem - first_];
+            for (int64_t e = 0; e < size_; ++e) taken &= finite(from[e] + alpha * d[e]);
+            step.taken[problem - first_] = taken;
+            if (!taken) status[problem] = STOPPED;
+            for (int64_t e = 0; e < size_; ++e) to[e] = taken ? from[e] + alpha * d[e] : from[e];
         }
-        if (record) tape->steps.push_back(std::move(step));
+        return step;
     }
-    T* const controls = static_cast<T*>(run.iterates) + run.steps * run.iterate_stride;
-    std::fill(energies[1] + first, energies[1] + last, T(0));
-    std::fill(norm + first, norm + last, T(0));
-    std::memset(static_cast<T*>(run.states) + first * size * 2, 0, sizeof(T) * (last - first) * size * 2);
-    for_each_group<T>(game, arena, make_plan<T>(game, arena, first, last, controls), controls, [&](auto& group, int64_t, int filled) {
-        const int n = group.count.agents();
-        group.load_parameters();
-        if (has_lines) group.template find_nearest<false>(Nearest<T>::at(arena.take(Nearest<T>::size(n, game.K)), n, game.K));
-        Vec<T> energy, squared;
-        evaluate(group, energy, squared);
-        for (int lane = 0; lane < filled; ++lane) {
-            energies[1][group.problem[lane]] += energy[lane];
-            norm[group.problem[lane]] += squared[lane];
+
+    /// Writes the energy of `controls`, the norm of its gradient and the states to the results of the call.
+    void measure(const T* controls, T* energy) {
+        constexpr int W = Lanes<T>::W;
+        T* const norm = static_cast<T*>(run_.gradient_norm);
+        std::fill(energy + first_, energy + last_, T(0));
+        std::fill(norm + first_, norm + last_, T(0));
+        std::memset(static_cast<T*>(run_.states) + first_ * size_ * 2, 0, sizeof(T) * (last_ - first_) * size_ * 2);
+        const Plan plan = make_plan<T>(game_, arena_, first_, last_, controls);
+        for_each_group<T>(game_, arena_, plan, controls, [&](auto& group, int64_t, int filled) {
+            const int n = group.count.agents();
+            group.load_parameters();
+            if (game_.own[LANE])
+                group.template find_nearest<false>(Nearest<T>::at(arena_.take(Nearest<T>::size(n, game_.K)), n, game_.K));
+            Vec<T> found, squared;
+            evaluate(group, found, squared);
+            for (int lane = 0; lane < filled; ++lane) {
+                energy[group.problem[lane]] += found[lane];
+                norm[group.problem[lane]] += squared[lane];
+            }
+            for (int i = 0; i < n; ++i) {
+                const auto& path = group.path[i];
+                const Vec<T>* const entries[4] = {path.x, path.y, path.heading, path.speed};
+                T* rows[W];
+                for (int lane = 0; lane < W; ++lane)
+                    rows[lane] = lane < filled ? static_cast<T*>(run_.states) + group.row_of(i, lane) * game_.K * 4 : nullptr;
+                scatter<T>([&](int e) { return entries[e % 4][e / 4 + 1]; }, 4 * group.K, rows);
+            }
+        });
+        for (int64_t problem = first_; problem < last_; ++problem) norm[problem] = std::sqrt(norm[problem]);
+    }
+
+    /// S steps in a row.
+    std::unique_ptr<Tape<T>> solve() {
+        auto tape = std::make_unique<Tape<T>>(Tape<T>{first_, last_, {}});
+        T *const before = static_cast<T*>(run_.initial_energy), *const after = static_cast<T*>(run_.energy);
+        for (int64_t s = 0; s < run_.steps; ++s) {
+            T* directions = static_cast<T*>(run_.directions) + (run_.record ? s * game_.B * game_.M * size_ : 0);
+            StepTape<T> taken = step(iterate(s), iterate(s + 1), directions, s == 0 ? before : nullptr, run_.status);
+            if (run_.record) tape->steps.push_back(std::move(taken));
         }
-        for (int i = 0; i < n; ++i) {
-            const auto& path = group.path[i];
-            const Vec<T>* const entries[4] = {path.x, path.y, path.heading, path.speed};
-            T* rows[W];
-            for (int lane = 0; lane < W; ++lane)
-                rows[lane] = lane < filled ? static_cast<T*>(run.states) + group.row_of(i, lane) * game.K * 4 : nullptr;
-            scatter<T>([&](int e) { return entries[e % 4][e / 4 + 1]; }, 4 * group.K, rows);
+        measure(iterate(run_.steps), after);
+        if (run_.steps == 0) std::copy(after + first_, after + last_, before + first_);
+        return run_.record ? std::move(tape) : nullptr;
+    }
+
+    /// S steps, each accepted or rejected by every problem. An accepted step lowers the energy and divides the damping by 10; a
+    /// rejected one multiplies it by 10.
+    void descend() {
+        T *const controls = iterate(0), *const trial = iterate(1), *const damping = static_cast<T*>(run_.damping);
+        T *const best = static_cast<T*>(run_.energy), *const before = static_cast<T*>(run_.initial_energy);
+        std::vector<int64_t> tried(last_ - first_);
+        std::vector<T> found(last_ - first_);
+        measure(controls, best);
+        std::copy(best + first_, best + last_, before + first_);
+        for (int64_t s = 0; s < run_.steps; ++s) {
+            for (int64_t problem = first_; problem < last_; ++problem)
+                tried[problem - first_] = valid_[problem - first_] ? SOLVED : STOPPED;
+            step(controls, trial, static_cast<T*>(run_.directions), nullptr, tried.data() - first_);
+            measure(trial, found.data() - first_);
+            for (int64_t problem = first_; problem < last_; ++problem) {
+                const int64_t at = problem - first_;
+                if (found[at] < best[problem]) {
+                    std::copy(trial + problem * size_, trial + (problem + 1) * size_, controls + problem * size_);
+                    best[problem] = found[at];
+                    damping[problem] = std::max(damping[problem] / T(10), T(kLeastDamping));
+                    run_.status[problem] = std::max(run_.status[problem], tried[at]);
+                } else {
+                    damping[problem] = std::min(damping[problem] * T(10), T(kMostDamping));
+                }
+            }
         }
-    });
-    for (int64_t problem = first; problem < last; ++problem) norm[problem] = std::sqrt(norm[problem]);
-    if (run.steps == 0) std::copy(energies[1] + first, energies[1] + last, energies[0] + first);
-    return record ? std::move(tape) : nullptr;
+        measure(controls, best);
+        for (int64_t problem = first_; problem < last_; ++problem)
+            if (!finite(best[problem])) run_.status[problem] = STOPPED;
+    }
+
+  private:
+    const EpoGame& game_;
+    const EpoRun& run_;
+    const int64_t first_, last_, row_, size_;
+    Arena<T> arena_;
+    std::vector<Buffer<T>> reused_;
+    std::vector<char> valid_;
+};
+
+template <class T>
+std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t first, int64_t last) {
+    Range<T> range(game, run, first, last);
+    if (!run.adaptive) return range.solve();
+    range.descend();
+    return nullptr;
 }
 
 /// Adds the pullback of a cotangent of the states x_1 .. x_K to the cotangent of the controls.

@@ -15,7 +15,7 @@ struct Factors {
 
 /// Adds the costs of an overlap of discs at one state; arguments as for `add_state_costs`.
 template <class T, int N>
-INLINE void add_disc_costs(const Group<T, N>& g, int feature, int state, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
+INLINE void add_disc_costs(const Group<T, N>& g, int feature, int state, bool exact, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
     int pair = feature * g.pairs;
     for (int i = 0; i < n; ++i)
@@ -33,7 +33,13 @@ INLINE void add_disc_costs(const Group<T, N>& g, int feature, int state, Vec<T>*
             y[2 * j + 1] += push_y;
             if (!P) continue;
             const Vec<T> nx = weight * contact.x, ny = weight * contact.y;
-            const Vec<T> xx = nx * nx, xy = nx * ny, yy = ny * ny;
+            Vec<T> xx = nx * nx, xy = nx * ny, yy = ny * ny;
+            if (exact) {
+                const Vec<T> turning = contact.active && contact.distance > 0 ? pushed / contact.distance : Vec<T>{};
+                xx -= turning * contact.y * contact.y;
+                xy += turning * contact.x * contact.y;
+                yy -= turning * contact.x * contact.x;
+            }
             for (const int a : {i, j}) {
                 P[2 * a * ld + 2 * a] += xx;
                 P[(2 * a + 1) * ld + 2 * a] += xy;
@@ -47,9 +53,9 @@ INLINE void add_disc_costs(const Group<T, N>& g, int feature, int state, Vec<T>*
 }
 
 /// Adds the second derivatives of the costs of a state to P [3m, 3m] (unless it is null) and their gradient to y [3m]; returns
-/// their energy.
+/// their energy. Unless `exact`, the second derivatives of residuals are left out (Gauss-Newton).
 template <class T, int N>
-INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>* y) {
+INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, bool exact, Vec<T>* P, Vec<T>* y) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
     Vec<T> energy{};
     for (int i = 0; i < n; ++i) {
@@ -81,10 +87,17 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, Vec<T>* P, Vec<T>
             P[2 * i * ld + 2 * i] += in_x.stiffness;
             P[(2 * i + 1) * ld + 2 * i + 1] += in_y.stiffness;
         }
+        if (P && exact && g.has(LANE)) {  // the nearest point of the line moves with the agent
+            const int at = i * (g.K + 1) + state;
+            const Vec<T> x = g.own(LANE, i) * g.nearest.tangent_x[at], y_ = g.own(LANE, i) * g.nearest.tangent_y[at];
+            P[2 * i * ld + 2 * i] -= x * x;
+            P[(2 * i + 1) * ld + 2 * i] -= x * y_;
+            P[(2 * i + 1) * ld + 2 * i + 1] -= y_ * y_;
+        }
     }
     if (!g.pairs_count_at(state)) return energy;
     for (const int feature : {PROXIMITY, CLEARANCE})
-        if (g.has_pair(feature)) add_disc_costs(g, feature, state, P, y, energy);
+        if (g.has_pair(feature)) add_disc_costs(g, feature, state, exact, P, y, energy);
     return energy;
 }
 
@@ -101,7 +114,7 @@ struct ControlCosts {
           speed_pull(arena.take(n)), speed_stiffness(arena.take(n)), coupling(arena.take(n)) {}
 
     template <int N>
-    INLINE void set(const Group<T, N>& g, int k) {
+    INLINE void set(const Group<T, N>& g, int k, bool exact) {
         energy = Vec<T>{};
         for (int i = 0; i < g.count.agents(); ++i) {
             for (const int channel : {ACCELERATION, TURN_RATE}) {
@@ -123,6 +136,10 @@ struct ControlCosts {
             speed_pull[i] = value * steer.by_speed;
             speed_stiffness[i] = squared * steer.by_speed * steer.by_speed;
             coupling[i] = squared * steer.by_turn * steer.by_speed;
+            if (!exact) continue;
+            stiffness[unknown(i, TURN_RATE)] += value * steer.turn_turn;
+            speed_stiffness[i] += value * steer.speed_speed;
+            coupling[i] += value * steer.turn_speed;
         }
     }
 };
@@ -144,27 +161,32 @@ INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* 
     }
 }
 
-/// Computes the damped Gauss-Newton direction of every lane: the changes [n, K] of turn rates (`turn`) and accelerations
+/// Computes the damped Gauss-Newton direction (or, if `exact`, the damped Newton direction) of every lane: the changes [n, K] of turn rates (`turn`) and accelerations
 /// (`thrust`). Also writes the factors, the energy, and a mask of the lanes in which the damped matrix is positive definite.
 ///
 /// Every agent has its own damping [n]. Infinite damping makes the reciprocal pivots zero, and therefore the direction as well.
 template <class T, int N>
 void solve_step(
-    const Group<T, N>& g, const Vec<T>* damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust, Vec<T>& energy,
-    Mask<T>& positive) {
+    const Group<T, N>& g, bool exact, const Vec<T>* damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust,
+    Vec<T>& energy, Mask<T>& positive) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
     Vec<T>*P = g.arena.take(ld * ld), *y = g.arena.take(ld), *h = g.arena.take(g.K * m), *damped = g.arena.take(m);
     Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
     ControlCosts<T> costs(g.arena, n);
     for (int e = 0; e < ld * ld; ++e) P[e] = Vec<T>{};
     for (int e = 0; e < ld; ++e) y[e] = Vec<T>{};
+    // Only if `exact`: the gradient of the energy by a common shift of all later positions of an agent, and y before a state.
+    Vec<T>*shift = g.arena.take(m), *before = g.arena.take(m);
+    for (int e = 0; e < m; ++e) shift[e] = Vec<T>{};
     energy = Vec<T>{};
     positive = ~Mask<T>{};
     for (int k = g.K - 1; k >= 0; --k) {
         Vec<T>*L = factors.L + std::size_t(k) * m * m, *G = factors.G + std::size_t(k) * m * ld, *linear = h + k * m;
         g.enter(k);
-        energy += add_state_costs(g, k + 1, P, y);
-        costs.set(g, k);
+        for (int e = 0; exact && e < m; ++e) before[e] = y[e];
+        energy += add_state_costs(g, k + 1, exact, P, y);
+        for (int e = 0; exact && e < m; ++e) shift[e] += y[e] - before[e];
+        costs.set(g, k, exact);
         energy += costs.energy;
         g.motions(k, Z);
         for (int r = 0; r < m; ++r) damped[r] = costs.stiffness[r] + damping[r / 2];
@@ -183,6 +205,11 @@ void solve_step(
             const int v = m + 2 * i + 1;
             y[v] += costs.speed_pull[i];
             P[v * ld + v] += costs.speed_stiffness[i];
+            if (!exact) continue;
+            // The second derivatives of the step's displacement dt v (cos, sin) by heading and speed.
+            const Vec<T> x = shift[2 * i], y_ = shift[2 * i + 1];
+            P[(v - 1) * ld + v - 1] -= g.path[i].speed[k] * (x * Z[i].x_speed + y_ * Z[i].y_speed);
+            P[v * ld + v - 1] += y_ * Z[i].x_speed - x * Z[i].y_speed;
         }
     }
     push(g, factors, h, turn, thrust);
@@ -220,8 +247,8 @@ void evaluate(const Group<T, N>& g, Vec<T>& energy, Vec<T>& squared_norm) {
     energy = squared_norm = Vec<T>{};
     for (int k = g.K - 1; k >= 0; --k) {
         g.enter(k);
-        energy += add_state_costs<T, N>(g, k + 1, nullptr, y);
-        costs.set(g, k);
+        energy += add_state_costs<T, N>(g, k + 1, false, nullptr, y);
+        costs.set(g, k, false);
         energy += costs.energy;
         g.motions(k, Z);
         for (int r = 0; r < m; ++r) {

@@ -1,0 +1,126 @@
+"""Adaptive steps inside of the compiled layer, and Newton steps with the Hessian, in both backends."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from games import ALL, BOUNDS, leaves_of, random_game, random_scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.solvers.backward import Implicit, Unrolled
+from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+
+PAIR = ("proximity", "clearance")
+ADAPTIVE = {"step_size": 1.0, "damping": 1.0, "adaptive": True}
+
+
+def make(
+    seed: int,
+    dtype: torch.dtype = torch.float64,
+    agents: int = 3,
+    own: tuple[str, ...] = ALL,
+    pair: tuple[str, ...] = PAIR,
+    ends: tuple[int, int, int] | None = None,
+) -> tuple[FeatureEnergy, Scene, GameParameters]:
+    """Three random scenes with two modes and seven steps, in which agents overlap and bounds are violated."""
+    torch.manual_seed(seed)
+    scene = random_scene(3, agents, history=2, size=1.5, dtype=dtype)
+    if ends is not None:
+        scene = dataclasses.replace(scene, game_steps=torch.tensor(ends))
+    return FeatureEnergy(own, pair, BOUNDS), scene, random_game(scene, 2, 7, own, 0.5, pair)
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 10_000),
+    agents=st.integers(1, 4),
+    own=st.sets(st.sampled_from(ALL), min_size=1).map(lambda names: tuple(sorted(names))),
+    pair=st.sampled_from([(), ("proximity",), PAIR]),
+    ends=st.none() | st.tuples(*[st.integers(2, 7)] * 3),
+    damping=st.sampled_from([1e-2, 1.0, 50.0]),
+)
+def test_a_newton_step_is_the_same_in_both_backends(seed, agents, own, pair, ends, damping) -> None:
+    energy, scene, game = make(seed, agents=agents, own=own, pair=pair, ends=ends)
+    lambda_ = torch.full((3, 2), damping, dtype=torch.float64)
+    found = [
+        solve(energy, scene, game, 1, 0.7, lambda_, exact=True, **more)
+        for solve, more in ((structured.solve, {"split": True}), (compiled.solve, {}))
+    ]
+    torch.testing.assert_close(found[1].controls, found[0].controls, rtol=1e-7, atol=1e-9)
+    assert torch.equal(found[1].status, found[0].status)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("steps", [0, 1, 12])
+@pytest.mark.parametrize("exact", [False, True])
+def test_steps_inside_of_the_compiled_layer_equal_single_calls_bit_for_bit(dtype, steps, exact) -> None:
+    """With a gradient enabled, Python decides on every step; without, the compiled layer does."""
+    energy, scene, game = make(0, dtype, ends=(7, 4, 2))
+    scene.history[1, 0, -1, 0] = torch.nan
+    game.initial_controls[2] *= 50.0  # steps that are rejected
+    solver = LevenbergMarquardt(backend="compiled", **ADAPTIVE)
+    with torch.enable_grad():
+        one, damping_one = solver.run(energy, scene, game, steps, exact=exact)
+    with torch.no_grad():
+        other, damping_other = solver.run(energy, scene, game, steps, exact=exact)
+    for name in ("controls", "states", "initial_energy", "energy", "gradient_norm", "status"):
+        assert torch.equal(getattr(one, name).nan_to_num(7.0), getattr(other, name).nan_to_num(7.0)), name
+    assert torch.equal(damping_one, damping_other)
+    assert (other.status[1] == Status.STOPPED).all()
+    assert (other.status[[0, 2]] != Status.STOPPED).all()
+
+
+def test_a_given_damping_is_not_overwritten() -> None:
+    energy, scene, game = make(1)
+    given_damping = torch.ones(3, 2, dtype=torch.float64)
+    with torch.no_grad():
+        _, after = LevenbergMarquardt(**ADAPTIVE).run(energy, scene, game, 4, given_damping)
+    assert (given_damping == 1.0).all()
+    assert (after != 1.0).any()
+
+
+@pytest.mark.parametrize("backend", ["pytorch", "compiled"])
+def test_newton_steps_converge_where_gauss_newton_steps_do_not(backend) -> None:
+    """Goals out of reach leave large residuals, whose second derivatives Gauss-Newton steps lack."""
+    energy, scene, game = make(2, own=("goal", "acc", "turnr"), pair=())
+    game.goals.mul_(5.0)
+    norms = {}
+    for steps, newton in ((10, 0), (6, 4)):
+        solver = LevenbergMarquardt(steps=steps, newton_steps=newton, backend=backend, **ADAPTIVE)
+        with torch.no_grad():
+            norms[newton] = solver(energy, scene, game).gradient_norm
+    assert norms[4].max() < 1e-8
+    assert norms[0].max() > 1e-6
+
+
+def test_newton_steps_never_raise_the_energy_and_keep_the_energy_of_the_start() -> None:
+    energy, scene, game = make(3)
+    with torch.no_grad():
+        first = LevenbergMarquardt(steps=3, **ADAPTIVE)(energy, scene, game)
+        both = LevenbergMarquardt(steps=3, newton_steps=4, keep_iterates=True, **ADAPTIVE)(energy, scene, game)
+    assert (both.energy <= first.energy).all()
+    assert torch.equal(both.initial_energy, first.initial_energy)
+    assert both.iterates is not None
+    assert len(both.iterates) == 1 + 3 + 4
+    assert torch.equal(both.iterates[-1], both.controls)
+
+
+def test_newton_steps_have_an_implicit_derivative_and_no_unrolled_one() -> None:
+    energy, scene, game = make(4, own=("goal", "vel", "acc", "turnr"), pair=())
+    solver = LevenbergMarquardt(steps=10, newton_steps=10, **ADAPTIVE)
+    leaves = leaves_of(game)
+    Implicit()(solver, energy, scene, leaves).states.square().sum().backward()
+    assert leaves.own_weights["goal"].grad.abs().sum() > 0
+    with pytest.raises(ValueError, match="newton_steps have no derivative: use backward=implicit"):
+        Unrolled()(solver, energy, scene, leaves_of(game))
+    with pytest.raises(ConfigError, match=r"solver\.newton_steps needs solver\.adaptive=true"):
+        LevenbergMarquardt(newton_steps=2)
+    with pytest.raises(ConfigError, match=r"solver\.newton_steps"):
+        LevenbergMarquardt(newton_steps=-1, adaptive=True)
