@@ -7,6 +7,7 @@ with the recordings that are not finished.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -18,9 +19,9 @@ from epo_lightning.data.simulate import recording
 from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.data.simulate.motion import move
-from epo_lightning.data.simulate.traffic import RATE, WARM_UP, simulate, simulator
+from epo_lightning.data.simulate.traffic import RATE, STYLES, WARM_UP, Style, simulate, simulator
 from epo_lightning.data.workers import Report, finished
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, nearest
 
 RECIPE = 2
 """Version of the simulation: raised whenever the same configuration would give other recordings."""
@@ -29,7 +30,11 @@ MOST_DROPPED = 0.05
 
 
 def config(
-    seed: int = 0, recordings: int = 3, minutes: float = 9.0, layouts: Sequence[int] | None = None
+    seed: int = 0,
+    recordings: int = 3,
+    minutes: float = 9.0,
+    layouts: Sequence[int] | None = None,
+    traffic: str = "free",
 ) -> dict[str, Any]:
     """Configuration of simulated recordings: all values that they depend on.
 
@@ -38,10 +43,15 @@ def config(
         recordings: number per layout.
         minutes: duration of each recording.
         layouts: ids of the layouts; None for all.
+        traffic: style of the traffic, ``free`` or ``dense``
+            (:data:`~epo_lightning.data.simulate.traffic.STYLES`). Free traffic is not named in the configuration, as it was
+            the only one once: recordings of older versions stay valid.
 
     Raises:
         ConfigError: a value is out of range.
     """
+    if traffic not in STYLES:
+        raise ConfigError(f"unknown data.traffic {traffic!r}: {nearest(str(traffic), tuple(STYLES))}")
     known = [layout.id for layout in LAYOUTS]
     chosen = known if layouts is None else sorted(set(layouts))
     for layout in chosen:
@@ -63,7 +73,14 @@ def config(
         "layouts": chosen,
         "rate": RATE,
         "warm_up": WARM_UP,
+        **({"traffic": {"name": traffic, **_plain(STYLES[traffic])}} if traffic != "free" else {}),
     }
+
+
+def _plain(style: Style) -> dict[str, Any]:
+    """A style as JSON stores it."""
+    values = dataclasses.asdict(style).items()
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values}
 
 
 def map_path(layout: Layout) -> str:
@@ -71,14 +88,14 @@ def map_path(layout: Layout) -> str:
     return f"maps/lanelet2/{layout.id}_{layout.name}/location{layout.id}.osm"
 
 
-def record(work: Path, name: str, number: int, place: Layout, seed: int, seconds: float) -> int:
+def record(work: Path, name: str, number: int, place: Layout, seed: int, seconds: float, style: str = "free") -> int:
     """Simulate and write recording ``number`` of the configuration with the digest ``name``; its ``.done`` file comes last.
 
     Raises:
         ConfigError: SUMO is missing or fails, too many vehicles have accidents, or there is no lane change.
     """
     with tempfile.TemporaryDirectory() as folder:
-        traffic = simulate(place, [seed, number], seconds, Path(folder))
+        traffic = simulate(place, [seed, number], seconds, Path(folder), style=STYLES[style])
     motion = move(traffic, place, seconds)
     dropped = sum(motion.dropped.values())
     if dropped > MOST_DROPPED * len(traffic.size):
@@ -183,7 +200,8 @@ def _make(folder: Path, config: Mapping[str, Any], workers: int | None, progress
     numbers = dict(enumerate(layout for layout in config["layouts"] for _ in range(config["recordings"])))
     missing = [number for number in numbers if _finished(work, number, name) is None]
     seconds = config["minutes"] * 60.0
-    tasks = [(work, name, number, LAYOUTS[numbers[number]], config["seed"], seconds) for number in missing]
+    style = config.get("traffic", {"name": "free"})["name"]
+    tasks = [(work, name, number, LAYOUTS[numbers[number]], config["seed"], seconds, style) for number in missing]
     report = Report(
         tasks, lambda task: task[2], "recording", "simulating", "simulated", len(numbers) - len(missing), progress
     )

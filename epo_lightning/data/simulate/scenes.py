@@ -22,6 +22,7 @@ class SimulatedHighway(RecordedData):
         recordings: number of recordings per layout.
         minutes: duration of each recording.
         layouts: ids of the layouts; null for all.
+        traffic: ``free`` or ``dense``: more vehicles, shorter headways, and drivers that brake more often.
         dataset, windows, test, val_share, val_by, frame, scale, root, batch_size, share: as in
             :class:`~epo_lightning.data.recorded.recordings.RecordedData`.
         seed: seed of the traffic and of the splits, and of the order of batches unless a run sets its own.
@@ -33,6 +34,7 @@ class SimulatedHighway(RecordedData):
         recordings: int = 3,
         minutes: float = 9.0,
         layouts: Sequence[int] | None = None,
+        traffic: str = "free",
         dataset: str = "highway_sim",
         test: Sequence[str] | None = ("0",),
         val_share: float = 0.18,
@@ -44,7 +46,7 @@ class SimulatedHighway(RecordedData):
         batch_size: int = 32,
         share: float = 1.0,
     ) -> None:
-        self.simulation = simulate.config(seed, recordings, minutes, layouts)
+        self.simulation = simulate.config(seed, recordings, minutes, layouts, traffic)
         home = Path(root).expanduser() if root else cache.default_root()
         super().__init__(
             dataset=dataset,

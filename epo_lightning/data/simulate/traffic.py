@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import subprocess
 from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -36,6 +36,36 @@ FASTEST = 60.0
 """Largest speed [m/s]; a vehicle with more was moved by the simulator."""
 CLASSES = ("car", "van", "truck", "motorcycle")
 """Vehicle classes of exiD."""
+
+
+@dataclass(frozen=True)
+class Style:
+    """How busy a road is and how its drivers drive; the defaults are those of a free flow.
+
+    Attributes:
+        main, on, off: factors of the layout's flows on the road, on the on-ramp and to the off-ramp.
+        headway: factor of the drivers' desired time headways.
+        every: mean time [s] between two moments at which a driver brakes for reasons that the simulator does not know, for
+            instance to let another vehicle in, or before an exit. None for never: then drivers foresee each other so well
+            that they rarely have to give way.
+        braking: smallest and largest deceleration [m/s^2] of such a moment.
+        lasting: its shortest and longest duration [s].
+    """
+
+    main: float = 1.0
+    on: float = 1.0
+    off: float = 1.0
+    headway: float = 1.0
+    every: float | None = None
+    braking: tuple[float, float] = (2.0, 4.0)
+    lasting: tuple[float, float] = (1.0, 2.5)
+
+
+STYLES: Mapping[str, Style] = {
+    "free": Style(),
+    "dense": Style(main=1.1, on=1.5, off=1.2, headway=0.8, every=15.0),
+}
+"""The styles of traffic, by the name in ``data.traffic``."""
 
 
 @dataclass(frozen=True)
@@ -252,17 +282,20 @@ def _drivers(random: np.random.Generator, layout: Layout) -> list[dict[str, Any]
 
 
 def _demand(
-    layout: Layout, edges: list[_Edge], random: np.random.Generator, until: float, path: Path
+    layout: Layout, edges: list[_Edge], random: np.random.Generator, until: float, path: Path, style: Style
 ) -> list[dict[str, Any]]:
     """Write the flows of vehicles between edges, and return the vehicle types."""
     drivers = _drivers(random, layout)
+    for row in drivers:
+        row["tau"] = round(row["tau"] * style.headway, 3)
+    main, on_ramp, off_ramp = layout.main * style.main, layout.on * style.on, layout.off * style.off
     busy = random.uniform(0.85, 1.05)
     roads = {road: [edge for edge in edges if edge.road == road] for road in dict.fromkeys(edge.road for edge in edges)}
     flows: list[tuple[str, str, float]] = []
     on = next((road for road in roads if road.startswith("on")), None)
     off = next((road for road in roads if road.startswith("off")), None)
-    leaving = layout.off / (layout.main + layout.on)
-    for source, rate in (("main", layout.main), (on, layout.on)):
+    leaving = off_ramp / (main + on_ramp)
+    for source, rate in (("main", main), (on, on_ramp)):
         # Vehicles from the on-ramp leave again on weaving lanes only, and less often than others.
         weave = source == "main" or any(np.isfinite((strip.join, strip.leave)).all() for strip in layout.lanes)
         away = leaving * (1.0 if source == "main" else 0.4) if off and weave else 0.0
@@ -293,7 +326,19 @@ def _demand(
     return drivers
 
 
-def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path, rate: int = RATE) -> Traffic:
+def _brake(libsumo: ModuleType, names: Iterable[str], style: Style, rate: int, random: np.random.Generator) -> None:
+    """Let some drivers brake, so that on average each does so once in ``style.every`` seconds."""
+    assert style.every is not None
+    for name in names:
+        if random.random() < 1 / (style.every * rate):
+            seconds = random.uniform(*style.lasting)
+            slower = libsumo.vehicle.getSpeed(name) - seconds * random.uniform(*style.braking)
+            libsumo.vehicle.slowDown(name, max(slower, 0.0), seconds)
+
+
+def simulate(
+    layout: Layout, seed: Sequence[int], seconds: float, folder: Path, rate: int = RATE, style: Style = STYLES["free"]
+) -> Traffic:
     """Simulated traffic of ``seconds`` after the warm-up.
 
     Args:
@@ -302,6 +347,7 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path, 
         seconds: duration after the warm-up.
         folder: folder for SUMO's input files.
         rate: steps per second [Hz].
+        style: how busy the road is and how drivers drive.
 
     Raises:
         ConfigError: SUMO is not installed or fails.
@@ -312,7 +358,7 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path, 
     net = _network(layout, edges, programs, folder)
     warm_up = round(WARM_UP * rate)
     steps = warm_up + round((seconds + MARGIN) * rate)
-    drivers = _demand(layout, edges, random, steps / rate, folder / "routes.xml")
+    drivers = _demand(layout, edges, random, steps / rate, folder / "routes.xml", style)
     where = {f"{edge.name}_{lane}": (strip, edge.begin) for edge in edges for lane, strip in enumerate(edge.strips)}
     constants = libsumo.constants
     variables = (constants.VAR_LANE_ID, constants.VAR_LANEPOSITION, constants.VAR_LANEPOSITION_LAT)
@@ -345,6 +391,8 @@ def simulate(layout: Layout, seed: Sequence[int], seconds: float, folder: Path, 
                 types.append(libsumo.vehicle.getTypeID(name))
             for hit in libsumo.simulation.getCollisions():
                 crashed |= {hit.collider, hit.victim}
+            if style.every is not None:
+                _brake(libsumo, libsumo.vehicle.getIDList(), style, rate, random)
             if step >= first:
                 for name, values in libsumo.vehicle.getAllSubscriptionResults().items():
                     lane, position, aside = (values[variable] for variable in variables)

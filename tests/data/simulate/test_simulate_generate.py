@@ -20,9 +20,11 @@ import pytest
 from epo_lightning.data import cache
 from epo_lightning.data.simulate import config, generate, make_recordings
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
-from epo_lightning.data.simulate.traffic import Traffic
+from epo_lightning.data.simulate.traffic import STYLES, Style, Traffic
 from epo_lightning.registry import ConfigError, lookup
 
+FREE = "8bbdc1b0f23c"
+"""Beginning of the digest of the default configuration, which is part of the name of existing folders."""
 SMALL = config(seed=3, recordings=2, minutes=0.25, layouts=[2])
 
 
@@ -39,11 +41,22 @@ def test_a_configuration_is_plain_and_names_everything_that_matters():
     assert config(layouts=[3, 1, 1]) == config(layouts=[1, 3])
 
 
+def test_free_traffic_keeps_the_configuration_of_older_versions_and_dense_traffic_has_its_own():
+    assert config(traffic="free") == config()
+    assert "traffic" not in config()
+    assert cache.digest(config())[:12] == FREE
+    dense = config(traffic="dense")
+    assert json.loads(json.dumps(dense)) == dense
+    assert dense["traffic"]["every"] == STYLES["dense"].every
+    assert {**dense, "traffic": None} == {**config(), "traffic": None}
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"layouts": [0, 99]}, "unknown layout 99: known are 0, 1"),
         ({"layouts": []}, "layouts is empty"),
+        ({"traffic": "denser"}, r"unknown data\.traffic 'denser': did you mean 'dense'"),
         ({"recordings": 0}, "recordings is 0"),
         ({"minutes": 0.01}, "minutes is 0.01"),
         ({"minutes": float("nan")}, "minutes is nan"),
@@ -100,7 +113,7 @@ def test_other_folders_are_not_overwritten(tmp_path: Path):
 def test_every_recording_and_every_seed_has_traffic_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     drawn: list[tuple[int, ...]] = []
 
-    def simulate(place: Layout, seed: Sequence[int], seconds: float, folder: Path) -> Traffic:
+    def simulate(place: Layout, seed: Sequence[int], seconds: float, folder: Path, style: Style) -> Traffic:
         drawn.append(tuple(np.random.default_rng(seed).integers(2**31, size=3).tolist()))
         raise ConfigError("the seed is all that is asked for")
 
