@@ -130,7 +130,8 @@ class Implicit(Backward):
             return solution
         exact, games = self.hessian == "exact", parameters.for_modes(solution.controls.shape[1])
         if isinstance(energy, FeatureEnergy):
-            controls, status = implicit.attach(energy, scene, games, solution.controls, exact)
+            backend = getattr(minimiser, "backend", "auto")
+            controls, status = implicit.attach(energy, scene, games, solution.controls, exact, backend)
         else:
             controls, status = dense.attach(energy, scene, games, solution.controls, exact)
         states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)

@@ -13,17 +13,18 @@ effect when the call has ended, and no thread can write to memory that was relea
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import warnings
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.kernel.interface import (
     MOST_AGENTS,
@@ -35,6 +36,7 @@ from epo_lightning.solvers.gauss_newton.kernel.interface import (
     EpoGradients,
     EpoRun,
 )
+from epo_lightning.solvers.general import descent
 
 
 def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
@@ -124,6 +126,24 @@ def descend(
         status=call.status,
     )
     return solution, call.damping
+
+
+def attach(
+    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"], exact: bool
+) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
+    """The controls of a solution with their implicit derivative, and a status; see :func:`.implicit.attach`.
+
+    The factors are those of one undamped step from the solution, in float64. Its adjoint at a direction of zero is the
+    implicit derivative.
+    """
+    game = dataclasses.replace(parameters, initial_controls=controls.double())
+    none = game.initial_controls.new_zeros(controls.shape[:2])
+    call = _Call(energy, scene, game, 1, 1.0, none, False, exact=exact)
+    if not call.record:
+        call.run()
+        return controls, _definite(call)
+    found, status = _Implicit.apply(call, game.initial_controls, *call.inputs)
+    return found.to(controls.dtype), status
 
 
 class _Tape:
@@ -341,6 +361,34 @@ class _Unrolled(torch.autograd.Function):
             states = states.contiguous()
         gradients = call.differentiate(bar, along, states)
         return None, bar, *gradients
+
+
+class _Implicit(torch.autograd.Function):
+    """Autograd function of the implicit derivative; returns the given controls and a status."""
+
+    @staticmethod
+    def forward(ctx: Any, call: _Call, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        call.run()
+        status = _definite(call)
+        descent.warn_if_far(call.initial_energy, (call.initial_energy - call.energy).abs(), status != Status.STOPPED)
+        call.directions.zero_()
+        call.states = None
+        ctx.call, ctx.definite = call, status != Status.STOPPED
+        ctx.save_for_backward(*inputs, *call.kept)
+        ctx.mark_non_differentiable(status)
+        return controls.view_as(controls), status
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        _ = ctx.saved_tensors
+        bar = torch.where(ctx.definite[..., None, None, None], cotangent, 0.0).contiguous()
+        return None, None, *ctx.call.differentiate(bar, None, None)
+
+
+def _definite(call: _Call) -> Tensor:
+    """STOPPED for problems whose matrix was not positive definite without damping."""
+    return torch.where(call.status == Status.SOLVED, Status.SOLVED, Status.STOPPED)
 
 
 def _as(dtype: torch.dtype, tensor: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ held constant. It does not depend on the path of the minimisation, so initial co
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import torch
@@ -15,13 +16,20 @@ from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.solvers.gauss_newton import compiled
 from epo_lightning.solvers.gauss_newton.expansion import expand
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import choose_backend
 from epo_lightning.solvers.gauss_newton.structured import Game, factorise, planar
 from epo_lightning.solvers.general import descent
 
 
 def attach(
-    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    controls: Tensor,
+    exact: bool,
+    backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """The controls of a solution with their implicit derivative, and a status.
 
@@ -29,11 +37,17 @@ def attach(
         energy, scene, parameters: the game.
         controls: the solution of the game.
         exact: whether H is the Hessian or its Gauss-Newton approximation.
+        backend: the solver's backend, which computes the derivative as well.
 
     Returns:
         controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H is not positive definite, so that the controls
         are no minimum; such a sample has a gradient of zero.
     """
+    if (
+        choose_backend(backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls))
+        is compiled.solve
+    ):
+        return compiled.attach(energy, scene, parameters, controls, exact)
     none = controls.new_zeros(controls.shape[:2]).flatten()
     game = Game(energy, scene, parameters, 1.0, none, controls.device.type == "cpu")
     found, status = _Attach.apply(game, exact, controls, *game.tensors(parameters))
@@ -47,7 +61,8 @@ class _Attach(torch.autograd.Function):
         ctx.factors = factorise(model, game.damping, game.split, retry=False)
         slope = model.gradient
         left = ctx.factors.solve(slope).flatten(1)
-        descent.warn_if_far(model.value, slope.flatten(1), left, ctx.factors.status != Status.STOPPED)
+        decrement = 0.5 * (slope.flatten(1) * left).sum(-1)
+        descent.warn_if_far(model.value, decrement, ctx.factors.status != Status.STOPPED)
         ctx.game = game
         ctx.save_for_backward(*tensors)
         status = ctx.factors.status.view(controls.shape[:2])

@@ -139,7 +139,8 @@ def attach(
     with torch.enable_grad():
         value, slope = gradient(energy, scene, parameters, torch.where(_wide(definite, controls), controls, 0.0))
         flat = slope.detach().flatten(2)
-        descent.warn_if_far(value, flat, torch.cholesky_solve(flat[..., None], factor)[..., 0], definite)
+        step = torch.cholesky_solve(flat[..., None], factor)[..., 0]
+        descent.warn_if_far(value, 0.5 * (flat * step).sum(-1), definite)
         move = torch.cholesky_solve((slope - slope.detach()).flatten(2)[..., None], factor).view_as(controls)
         attached = controls - torch.where(_wide(definite, move), move, 0.0)
         return attached, torch.where(definite, Status.SOLVED, Status.STOPPED).long()

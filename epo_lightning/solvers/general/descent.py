@@ -110,27 +110,23 @@ def first_status(is_finite: Bool[Tensor, "B M"]) -> Tensor:
 
 def warn_if_far(
     value: Float[Tensor, "*batch"],
-    slope: Float[Tensor, "*batch n"],
-    step: Float[Tensor, "*batch n"],
+    decrement: Float[Tensor, "*batch"],
     definite: Bool[Tensor, "*batch"],
 ) -> None:
     """Warn, once per process, if more than half of the implicitly differentiated solutions are no minima.
 
-    The Newton decrement 1/2 g . H^-1 g is the decrease that a quadratic model still predicts. The test runs on CPUs only;
-    on other devices it would make the host wait.
+    The test runs on CPUs only; on other devices it would make the host wait.
 
     Args:
         value: E at the solutions.
-        slope: gradient g of E at the solutions.
-        step: H^-1 g.
+        decrement: the Newton decrement 1/2 g . H^-1 g, the decrease that a quadratic model still predicts.
         definite: whether H is positive definite.
     """
     global _warned
     if _warned or not definite.numel() or definite.device.type != "cpu":
         return
     with torch.no_grad():
-        left = 0.5 * (slope * step).sum(-1)
-        far = ~(definite & (left <= _FAR * value.abs() + _TINY))
+        far = ~(definite & (decrement <= _FAR * value.abs() + _TINY))
         share = far.double().mean().item()
     if share > 0.5:
         _warned = True

@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 import torch
+from backends import gradients
 from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -124,3 +125,36 @@ def test_newton_steps_have_an_implicit_derivative_and_no_unrolled_one() -> None:
         LevenbergMarquardt(newton_steps=2)
     with pytest.raises(ConfigError, match=r"solver\.newton_steps"):
         LevenbergMarquardt(newton_steps=-1, adaptive=True)
+
+
+@settings(max_examples=15)
+@given(
+    seed=st.integers(0, 10_000),
+    agents=st.integers(1, 3),
+    own=st.sets(st.sampled_from(ALL), min_size=1).map(lambda names: tuple(sorted({"acc", "turnr", *names}))),
+    pair=st.sampled_from([(), ("proximity",), PAIR]),
+    ends=st.none() | st.tuples(*[st.integers(2, 7)] * 3),
+    hessian=st.sampled_from(["exact", "gauss_newton"]),
+)
+def test_implicit_derivatives_are_the_same_in_both_backends(seed, agents, own, pair, ends, hessian) -> None:
+    energy, scene, game = make(seed, agents=agents, own=own, pair=pair, ends=ends)
+    found = []
+    for backend in ("pytorch", "compiled"):
+        leaves = leaves_of(game)
+        solver = LevenbergMarquardt(steps=15, newton_steps=5, backend=backend, **ADAPTIVE)
+        solution = Implicit(hessian)(solver, energy, scene, leaves)
+        weigh = torch.linspace(-1.0, 1.0, solution.states.numel(), dtype=torch.float64).view_as(solution.states)
+        within = (
+            torch.ones_like(weigh)
+            if ends is None
+            else torch.arange(7).view(-1, 1) < torch.tensor(ends).view(-1, 1, 1, 1, 1)
+        )
+        (solution.states * weigh * within).sum().backward()
+        found.append((solution, gradients(leaves)))
+    (one, by_one), (other, by_other) = found
+    same = (one.controls - other.controls).flatten(2).abs().amax(-1) < 1e-6  # descents may end in different minima
+    assert torch.equal(one.status[same], other.status[same])
+    for name, gradient in by_one.items():
+        torch.testing.assert_close(
+            by_other[name][same], gradient[same], rtol=1e-4, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}"
+        )
