@@ -18,6 +18,10 @@ def _by_name(weights: Float[Tensor, "B R out"], names: Sequence[str], modes: int
     return dict(zip(names, per_mode.unbind(-1), strict=True))
 
 
+def _starts(features: Sequence[str], start: float | Mapping[str, float]) -> list[float]:
+    return [float(start.get(name, 1.0) if isinstance(start, Mapping) else start) for name in features]
+
+
 class OwnWeights(nn.Module):
     """phi_own: weights W_i of the energy's own features, decoded from z_i alone, by one network for all agents.
 
@@ -36,8 +40,7 @@ class OwnWeights(nn.Module):
     ) -> None:
         super().__init__()
         self.modes, self.features = modes, tuple(features)
-        starts = [float(start.get(name, 1.0) if isinstance(start, Mapping) else start) for name in self.features]
-        self.register_buffer("start", torch.tensor(starts * modes), persistent=False)
+        self.register_buffer("start", torch.tensor(_starts(features, start) * modes), persistent=False)
         self.mlp = MLP(width, 64, modes * len(self.features), norm="batch") if self.features else None
 
     def forward(self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> dict[str, Float[Tensor, "B M N"]]:
@@ -45,6 +48,33 @@ class OwnWeights(nn.Module):
         if self.mlp is None:
             return {}
         return _by_name(self.start * (1.0 + self.mlp(z, mask)), self.features, self.modes)
+
+
+class SharedWeights(nn.Module):
+    """Weights of own features that all agents, modes and scenes share: one learned number for each feature.
+
+    For populations whose agents differ only in how they weigh each other, as in RPI: all scenes together then determine what
+    a single history does not.
+
+    Args:
+        modes: number M of games.
+        features: names of the own features.
+        start: weights before training, as for :class:`OwnWeights`. The weight is start * exp(learned number).
+    """
+
+    start: Tensor
+
+    def __init__(self, modes: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0) -> None:
+        super().__init__()
+        self.modes, self.features = modes, tuple(features)
+        self.register_buffer("start", torch.tensor(_starts(features, start)), persistent=False)
+        self.logarithms = nn.Parameter(torch.zeros(len(self.features)))
+
+    def forward(self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> dict[str, Float[Tensor, "B M N"]]:
+        """Weights by feature name."""
+        weights = (self.start * self.logarithms.exp()).unbind()
+        shape = len(z), self.modes, z.shape[1]
+        return {name: weight.expand(shape) for name, weight in zip(self.features, weights, strict=True)}
 
 
 class PairWeights(nn.Module):

@@ -20,7 +20,7 @@ from epo_lightning.decoders.motions import Motions
 from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
 from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.strategies import InitialStrategies, ZeroStrategies
-from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights
+from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, SharedWeights
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.forecasters.combination import Combination
@@ -36,6 +36,8 @@ from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.task import Task
 
+OWN_WEIGHTS = ("decoded", "shared")
+"""Sources of the weights of own features: decoded for each agent, or one learned number per feature for all."""
 INITIAL = ("decoded", "zero", "motions")
 """Sources of the initial strategies: decoded by the network, controls of zero (the paper's ablation "no init"), or a mixture
 of motions of the unicycle. For solvers that choose among candidates, these strategies are the candidates."""
@@ -76,6 +78,7 @@ class EPO(Forecaster):
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
             the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
             (``game_steps``). Initial controls after the first K steps are zero.
+        own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
         calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which corrects the inferred
             pair weights by the history outside training; None for no correction.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
@@ -105,6 +108,7 @@ class EPO(Forecaster):
         motions: Mapping[str, float] | None = None,
         game_horizon: int | None = None,
         calibration: Mapping[str, float] | None = None,
+        own_weights: str = "decoded",
         probabilities: str = "linear",
         margin: Mapping[str, float] | None = None,
     ) -> None:
@@ -120,6 +124,10 @@ class EPO(Forecaster):
         chooses = TABLES in solver.provides
         if modes < 1:
             raise ConfigError(f"forecaster.modes must be 1 or more, not {modes}")
+        if own_weights not in OWN_WEIGHTS:
+            raise ConfigError(
+                f"unknown forecaster.own_weights {own_weights!r}: {nearest(str(own_weights), OWN_WEIGHTS)}"
+            )
         if initial not in INITIAL:
             raise ConfigError(f"unknown forecaster.initial {initial!r}: {nearest(str(initial), INITIAL)}")
         if chooses and initial == "zero":
@@ -155,7 +163,11 @@ class EPO(Forecaster):
         start = _check_start(own_start, own, energy.own)
         ranges = {} if motions is None and initial != "motions" else _check_motions(motions)
         # Do not change the order: every module draws its initial weights from the same sequence of random numbers.
-        self.own_weights = OwnWeights(width, games, own, start)
+        self.own_weights: OwnWeights | SharedWeights
+        if own_weights == "shared":
+            self.own_weights = SharedWeights(games, own, start)
+        else:
+            self.own_weights = OwnWeights(width, games, own, start)
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs)
         self.strategies: InitialStrategies | ZeroStrategies | Motions
         if initial == "decoded":

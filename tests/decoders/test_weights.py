@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from epo_lightning.decoders.trajectories import Trajectories
-from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights
+from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, SharedWeights
 
 
 def test_own_weights_start_at_their_configured_values():
@@ -22,6 +22,20 @@ def test_own_weights_start_at_their_configured_values():
     weights = decoder(z, everyone)
     assert (weights["goal"] == 1.0).all()
     assert (weights["vel"] == torch.tensor(0.05)).all()
+
+
+def test_shared_weights_are_one_positive_number_per_feature():
+    decoder = SharedWeights(3, ["goal", "vel"], {"vel": 0.05})
+    z, everyone = torch.randn(2, 4, 8), torch.ones(2, 4, dtype=torch.bool)
+    weights = decoder(z, everyone)
+    assert {name: weight.shape for name, weight in weights.items()} == dict.fromkeys(("goal", "vel"), (2, 3, 4))
+    assert (weights["goal"] == 1.0).all()
+    assert (weights["vel"] == torch.tensor(0.05)).all()
+    sum(weight.sum() for weight in weights.values()).backward()
+    torch.testing.assert_close(decoder.logarithms.grad, torch.tensor([24.0, 24.0 * 0.05]))
+    with torch.no_grad():
+        decoder.logarithms -= 9.0
+    assert all((weight > 0).all() for weight in decoder(z, everyone).values())
 
 
 @pytest.mark.parametrize("symmetric", [False, True])

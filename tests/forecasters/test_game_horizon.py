@@ -1,0 +1,135 @@
+"""Forecasters that solve a game to its own end, with shared weights and calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import pytest
+import torch
+from games import random_scene
+from suites import ForecasterSuite, model
+
+from epo_lightning.forecasters import build_forecaster
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import JointForecast, Scene
+
+BOUNDS = {"vel": [-0.05, 2.0], "acc": [-9.81, 9.81], "turnr": [-0.2, 0.2]}
+ENERGY = {
+    "name": "features",
+    "own": ["goal", "heading", "vel", "acc", "turnr", "velb", "accb", "turnrb"],
+    "pair": ["clearance"],
+    "margins": {"clearance": 0.5},
+    "bounds": BOUNDS,
+}
+SOLVER = {
+    "name": "levenberg_marquardt",
+    "steps": 6,
+    "newton_steps": 3,
+    "step_size": 1.0,
+    "damping": 1.0,
+    "adaptive": True,
+}
+GAME = {"name": "epo", "modes": 2, "own_weights": "shared", "game_horizon": 46, "calibration": {"steps": 2}}
+PARTS = {"energy": ENERGY, "solver": SOLVER, "backward": {"name": "implicit"}}
+
+
+def scenes(count: int = 3, horizon: int = 40) -> Scene:
+    scene = random_scene(count, 2, horizon=horizon)
+    return dataclasses.replace(
+        scene, goal_headings=torch.zeros(count, 2, 1), game_steps=torch.arange(42, 42 + count).clamp_max(60)
+    )
+
+
+class TestGame(ForecasterSuite):
+    config = GAME
+    lessons = 90
+    tolerance = {"rtol": 0.0, "atol": 3e-3}  # in float32, steps near the minimum are accepted or rejected by rounding errors
+
+    def model(self, **changes: Any) -> dict[str, Any]:
+        return model(self.config, **{**PARTS, **changes})
+
+    def scene(self, scenes: int, **details: Any) -> Scene:
+        scene = super().scene(scenes, **details)
+        return dataclasses.replace(scene, goal_headings=torch.zeros(*scene.agent_mask.shape, 1))
+
+
+def built(**changes: Any) -> Any:
+    torch.manual_seed(0)
+    return build_forecaster(model({**GAME, **changes}, **PARTS)).eval()
+
+
+def test_the_forecast_is_the_beginning_of_the_solution_of_the_longer_game() -> None:
+    forecaster, scene = built(), scenes()
+    forecast = forecaster.predict(scene)
+    assert forecast.solution is not None
+    assert forecast.solution.states.shape == (3, 2, 2, 46, 4)
+    assert forecast.states.shape == (3, 2, 2, 40, 4)
+    assert forecast.controls is not None
+    assert forecast.controls.shape == (3, 2, 2, 40, 2)
+    assert torch.equal(forecast.states, forecast.solution.states[..., :40, :])
+    assert forecast.parameters is not None
+    assert (forecast.parameters.initial_controls[..., 40:, :] == 0).all()
+    with torch.no_grad():
+        again = forecaster.solver(forecaster.energy, scene, forecast.parameters)
+    torch.testing.assert_close(again.states, forecast.solution.states)
+
+
+def test_the_end_of_the_game_matters_only_for_forecasters_that_solve_it() -> None:
+    scene = scenes()
+    for horizon, same in ((46, False), (None, True)):
+        forecaster = built(game_horizon=horizon, calibration=None)
+        found = [
+            forecaster.predict(dataclasses.replace(scene, game_steps=end)).states for end in (None, scene.game_steps)
+        ]
+        assert torch.equal(*found) == same
+
+
+def test_games_that_last_longer_are_cut_at_the_horizon() -> None:
+    forecaster, scene = built(calibration=None), scenes()
+    late = dataclasses.replace(scene, game_steps=torch.full((3,), 99))
+    last = dataclasses.replace(scene, game_steps=torch.full((3,), 46))
+    assert torch.equal(forecaster.predict(late).states, forecaster.predict(last).states)
+
+
+def test_energies_and_equilibria_are_those_of_the_whole_game() -> None:
+    forecaster, scene = built(), scenes()
+    with torch.no_grad():
+        forecast: JointForecast = forecaster.examine(scene, forecaster.explain(scene, forecaster(scene)))
+    assert forecast.own_energy is not None
+    assert forecast.pair_energy is not None
+    assert forecast.solution is not None
+    assert forecast.equilibrium is not None
+    total = sum(value.sum(-1) for terms in (forecast.own_energy, forecast.pair_energy) for value in terms.values())
+    torch.testing.assert_close(total, forecast.solution.energy)
+    best = forecast.probabilities.argmax(1)
+    torch.testing.assert_close(
+        forecast.equilibrium.energy.float(), forecast.solution.energy[torch.arange(3), best], rtol=1e-4, atol=1e-4
+    )
+
+
+def test_calibration_runs_outside_of_training_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    forecaster, scene = built(), scenes()
+    seen = []
+    monkeypatch.setattr(
+        type(forecaster.calibration), "__call__", lambda self, *arguments: seen.append(1) or arguments[-1]
+    )
+    forecaster.train()(scene)
+    assert seen == []
+    forecaster.predict(scene)
+    assert seen == [1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"game_horizon": 39}, r"forecaster\.game_horizon must be 40 or more"),
+        ({"own_weights": "decode"}, r"unknown forecaster\.own_weights 'decode': did you mean 'decoded'\?"),
+        ({"calibration": {"noise": math.nan}}, r"calibration\.noise"),
+        ({"calibration": {"step": 3}}, "step"),
+    ],
+)
+def test_invalid_settings_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        built(**changes)
