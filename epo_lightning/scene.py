@@ -422,6 +422,8 @@ class JointForecast(_Batch):
         own_energy: energy by feature and agent at the solution.
         pair_energy: energy by feature and pair at the solution.
         equilibrium: distance of the most likely mode from an equilibrium, where it was measured.
+        states_without_pairs: solution of the same games from the same start, but without their pair terms, where it was
+            computed.
         logits: unnormalised log-probabilities of the joint modes, of which ``probabilities`` are the softmax; -inf for
             modes that repeat an earlier one.
         agent_logits: the same for ``agent_probabilities``, over dimension 1.
@@ -440,6 +442,7 @@ class JointForecast(_Batch):
     own_energy: Mapping[str, Float[Tensor, "B M N"]] | None = None
     pair_energy: Mapping[str, Float[Tensor, "B M P"]] | None = None
     equilibrium: Equilibrium | None = None
+    states_without_pairs: Float[Tensor, "B M N K 4"] | None = None
     logits: Float[Tensor, "B M"] | None = None
     agent_logits: Float[Tensor, "B M N"] | None = None
     goal_logits: Float[Tensor, "B N G"] | None = None

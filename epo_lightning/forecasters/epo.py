@@ -304,6 +304,8 @@ class EPO(Forecaster):
 
     @torch.no_grad()
     def examine(self, scene: Scene, forecast: JointForecast) -> JointForecast:
+        """The forecast with its distance from an equilibrium, and with the solutions of its games without pair terms."""
+        forecast = dataclasses.replace(forecast, states_without_pairs=self._states_without_pairs(scene, forecast))
         assert forecast.solution is not None
         cheap = FEATURES in self.energy.offers or forecast.solution.tables is not None
         scenes = len(scene.history)
@@ -317,6 +319,25 @@ class EPO(Forecaster):
             report = dataclasses.replace(report, objective=torch.full_like(report.objective, torch.nan))
         whole = report.map(lambda t: t.new_full((scenes, *t.shape[1:]), torch.nan).index_copy(0, chosen, t))
         return dataclasses.replace(forecast, equilibrium=whole)
+
+    def _states_without_pairs(self, scene: Scene, forecast: JointForecast) -> Tensor | None:
+        """States of the same games' solutions from the same start, but with pair weights of zero; [B, M, N, K, 4].
+
+        None for games without pair terms, for energies with other interaction than named features, and for choices among
+        candidates.
+        """
+        game = forecast.parameters
+        if (
+            game is None
+            or not game.pair_weights
+            or FEATURES not in self.energy.offers
+            or TABLES in self.solver.provides
+        ):
+            return None
+        alone = {name: torch.zeros_like(weight) for name, weight in game.pair_weights.items()}
+        parameters = dataclasses.replace(game, pair_weights=alone)
+        solution = self.solve(self._minimiser, self.energy, self._game_of(scene), parameters)
+        return solution.states[..., : self.task.horizon, :]
 
     @property
     def _batches(self) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, get_args
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics import Metric
 
@@ -46,13 +46,24 @@ PROBABILITY_METRICS = ("brier_minSADE",)
 """Scores of displacements and probabilities together, for forecasts with several modes."""
 COLLAPSE_METRICS = ("missed",)
 """Scores of the modes of a subset's scenes: the share of scenes without any mode near the future."""
-COLUMNS = METRICS + INITIAL_METRICS + EQUILIBRIUM_METRICS + MODE_METRICS + PROBABILITY_METRICS + COLLAPSE_METRICS
+PAIR_METRICS = ("pair_effect",)
+"""Mean displacement [m] between the most likely joint mode and the solution of the same game without its pair terms."""
+COLUMNS = (
+    *METRICS,
+    *INITIAL_METRICS,
+    *EQUILIBRIUM_METRICS,
+    *MODE_METRICS,
+    *PROBABILITY_METRICS,
+    *COLLAPSE_METRICS,
+    *PAIR_METRICS,
+)
 """Scores that are means over scenes."""
 SCORES = (*COLUMNS, "ECE")
 """All scores; ``ECE`` is the calibration error of the probabilities of several modes
 (:mod:`~epo_lightning.metrics.functional.calibration`)."""
 _OF_SUBSETS = tuple(
-    name in (*METRICS, *INITIAL_METRICS, MODE_METRICS[0], *PROBABILITY_METRICS, *COLLAPSE_METRICS) for name in COLUMNS
+    name in (*METRICS, *INITIAL_METRICS, MODE_METRICS[0], *PROBABILITY_METRICS, *COLLAPSE_METRICS, *PAIR_METRICS)
+    for name in COLUMNS
 )
 _OF_ALL = tuple(name not in COLLAPSE_METRICS for name in COLUMNS)
 
@@ -173,6 +184,7 @@ def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> Float[
     columns += [none] * (len(MODE_METRICS) - modes)
     columns.append(brier_min_sade(states, forecast.probabilities, future, mask) if modes else none)
     columns.append(missed(states, future, mask))
+    columns.append(pair_effect(forecast, scene.agent_mask))
     return torch.stack([column.double() for column in columns], dim=1)
 
 
@@ -191,6 +203,20 @@ def calibration_values(forecast: JointForecast, scene: Scene) -> Float[Tensor, "
         known = torch.zeros_like(known)
     closest = closest_mode(forecast.states, scene.future, mask)
     return torch.where(known[:, None, None], reliability(probabilities.nan_to_num(0.0), closest), 0.0)
+
+
+def pair_effect(forecast: JointForecast, agent_mask: Bool[Tensor, "B N"]) -> Float[Tensor, " B"]:
+    """Mean displacement [m] over agents and steps between the most likely mode and its game's solution without pair terms.
+
+    NaN for forecasts whose games were not solved without pair terms, for scenes without agents, and for broken forecasts.
+    """
+    rows = torch.arange(len(forecast.states), device=forecast.states.device)
+    if forecast.states_without_pairs is None:
+        return forecast.states.new_full((len(rows),), torch.nan)
+    likely = forecast.probabilities.argmax(1)
+    change = forecast.states[rows, likely, ..., :2] - forecast.states_without_pairs[rows, likely, ..., :2]
+    moved = torch.linalg.vector_norm(change, dim=-1).mean(-1).where(agent_mask, 0.0).sum(-1) / agent_mask.sum(-1)
+    return moved.where(moved.isfinite(), torch.nan)
 
 
 def equilibrium_values(forecast: JointForecast) -> list[Float[Tensor, " B"]]:

@@ -24,8 +24,14 @@ class Column:
 
     @property
     def ranked(self) -> bool:
-        """Whether rows are ranked by it; energies and their gradients and gaps have different units in each row."""
-        return self.metric not in OWN_UNITS
+        """Whether rows are ranked by it; energies and their gradients and gaps have different units in each row, and the
+        effect of pair terms is neither good nor bad."""
+        return self.metric not in OWN_UNITS and not self.is_effect
+
+    @property
+    def is_effect(self) -> bool:
+        """Whether it shows the effect of pair terms, of all scenes or of a subset."""
+        return self.metric.split("/")[-1] == PAIR_EFFECT
 
     def text(self, value: float) -> str:
         """A value as tables print it: metrics of the game with three significant digits, others with fixed decimals."""
@@ -36,6 +42,8 @@ class Column:
         return f"{value:.6g}" if self.metric in GAME and not math.isnan(value) else number(value, 6)
 
 
+PAIR_EFFECT = "pair_effect"
+"""Metric of the displacement [m] that the pair terms of a game make."""
 OWN_UNITS = ("energy_initial", "energy_solved", "energy_optimum", "gradient_norm", "nash_gap")
 GAME = (*OWN_UNITS, "nash_gap_relative")
 """Metrics of the game that a forecaster solves; those of ``OWN_UNITS`` have the units of the row's own energy."""

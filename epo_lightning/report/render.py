@@ -48,6 +48,12 @@ MISSED = (
     "Missed is the share of the scenes of that alternative whose future is more than 0.25 m (SADE) from every mode."
 )
 
+EFFECT = (
+    "Effect of the other agents: mean displacement in m between the most likely joint mode and the solution of the same "
+    "game from the same start without its pair terms. The start was decoded with knowledge of all agents, so this is the "
+    "part of the game alone; a large effect is not better than a small one."
+)
+
 CSV_HEADER = (
     *("data", "split", "method", "backbone", "forecaster", "goal", "budget", "seeds", "n"),
     *("metric", "mean", "std", "paper", "difference"),
@@ -125,7 +131,9 @@ def legend(
     overlaps = any("overlap" in metric for metric in metrics)
     rates = "; overlap rates (OR) of the most likely joint mode" if overlaps else ""
     few = "; with k, over the k most likely" if any(map(OF_MODES.fullmatch, metrics)) else ""
-    errors = any(metric not in GAME and "overlap" not in metric for metric in metrics)
+    errors = any(
+        metric not in GAME and not Column(metric, "").is_effect and "overlap" not in metric for metric in metrics
+    )
     mean = "Mean ± sample standard deviation over n seeds" if any(cell.deviation is not None for cell in cells) else ""
     paper = (
         f"{where}, the paper's value and ours minus the paper's"
@@ -145,6 +153,7 @@ def legend(
         f"{numbers[0].upper()}{numbers[1:]}." if numbers else "",
         ranked if any(cell.rank for cell in cells) else "",
         rules if overlaps else "",
+        EFFECT if any(Column(metric, "").is_effect for metric in metrics) else "",
         GAMES if metrics & {*GAME} else "",
         CHANCES if "ECE" in metrics else "",
         MISSED if any(metric.endswith("/missed") for metric in metrics) else "",

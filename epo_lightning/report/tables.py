@@ -17,6 +17,7 @@ from epo_lightning.report.columns import (
     MAIN,
     OF_ALTERNATIVES,
     OF_MODES,
+    PAIR_EFFECT,
     PROBABILITIES,
     Column,
 )
@@ -56,8 +57,8 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
     """Tables of every data set and split: the main table, and tables of subsets, modes and games.
 
     The further tables show scores by subset, of the k most likely modes, of probabilities and missed alternatives, of
-    initial beside solved strategies, and the distance of forecasts from an equilibrium of their game. They contain the rows
-    that have such scores.
+    initial beside solved strategies, the effect of pair terms, and the distance of forecasts from an equilibrium of their
+    game. They contain the rows that have such scores.
 
     Raises:
         ConfigError: rows of one table that were trained under different conditions, or the same run twice.
@@ -90,6 +91,8 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
             for prefix, stage in (("initial/", "initial"), ("", "solved"))
         )
         tables += _shown(f"{where}: initial and solved strategies", initial, rows)
+        effect = (Column(PAIR_EFFECT, "all scenes"), *subset_columns(rows, (Column(PAIR_EFFECT, ""),)))
+        tables += _partly_shown(f"{where}: effect of the other agents", effect, rows)
         tables += _partly_shown(f"{where}: equilibrium", EQUILIBRIUM, [row for row in rows if "nash_gap" in row.cells])
     return tables
 
@@ -99,7 +102,7 @@ def subset_columns(rows: Iterable[Row], columns: Sequence[Column]) -> tuple[Colu
     names = {metric.split("/")[0] for row in rows for metric in row.cells if "/" in metric}
     # The executed mode comes first, although "alternative" precedes "executed" in the files.
     subsets = sorted(names - {"initial"}, key=lambda name: (name != "executed", name))
-    return tuple(Column(f"{name}/{c.metric}", f"{name} {c.label}") for name in subsets for c in columns)
+    return tuple(Column(f"{name}/{c.metric}", f"{name} {c.label}".strip()) for name in subsets for c in columns)
 
 
 def distinct(tables: Iterable[Table]) -> list[Row]:

@@ -45,7 +45,10 @@ def scenes(count: int = 3, horizon: int = 40) -> Scene:
 class TestGame(ForecasterSuite):
     config = GAME
     lessons = 90
-    tolerance = {"rtol": 0.0, "atol": 3e-3}  # in float32, steps near the minimum are accepted or rejected by rounding errors
+    tolerance = {
+        "rtol": 0.0,
+        "atol": 3e-3,
+    }  # in float32, steps near the minimum are accepted or rejected by rounding errors
 
     def model(self, **changes: Any) -> dict[str, Any]:
         return model(self.config, **{**PARTS, **changes})

@@ -169,6 +169,23 @@ def test_interactive_scenes_have_a_table_with_all_columns(tmp_path: Path) -> Non
     assert [row.cells[column.metric].mean for column in table.columns] == [0.4, 0.4, 0.4, 0.4, 0.1, 0.1]
 
 
+def test_the_effect_of_pair_terms_is_shown_and_not_ranked(tmp_path: Path) -> None:
+    for title, effect in (("game", 0.1), ("other game", 0.3)):
+        values = {"pair_effect": effect, "calm/pair_effect": effect / 2, "interactive/pair_effect": 2 * effect}
+        make_run(tmp_path / title, title, "epo", scores(0.1) | values)
+    make_run(tmp_path / "sc", "V-LSTM + SC", "scene_consistent", scores(0.3))
+    (table,) = [table for table in build_tables(collect(tmp_path)) if "other agents" in table.title]
+    assert table.title == "rpi, test split: effect of the other agents"
+    assert [column.label for column in table.columns] == ["all scenes", "calm", "interactive"]
+    assert [[row.cells[column.metric].mean for column in table.columns] for row in table.rows] == [
+        [0.1, 0.05, 0.2],
+        [0.3, 0.15, 0.6],
+    ]
+    assert {row.cells[column.metric].rank for row in table.rows for column in table.columns} == {None}
+    assert "same start without its pair terms" in legend([table])
+    assert "lower is better" not in legend([table])
+
+
 def test_splits_are_tables_apart(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3), digest="abc")
     make_run(tmp_path / "b", "V-LSTM", "marginal", scores(0.2), digest="xyz", split="val")
