@@ -17,6 +17,15 @@ from hypothesis import strategies as st
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Status
 
+STATE_PAIRS = (
+    ("circles",),
+    ("headway", "proximity"),
+    ("longitudinal",),
+    ("lateral", "clearance"),
+    ("time_to_conflict",),
+)
+"""Pair features of states, some of them with a feature of the distance."""
+
 
 def stacked(energy, scene, parameters, controls):
     return torch.cat([r.flatten(2) for r in energy.residuals(scene, parameters, controls).values()], -1)
@@ -64,6 +73,7 @@ class Draw:
         horizon = self.horizon if self.agents <= 3 else min(self.horizon, 12)  # the reference is dense
         bounds = BOUNDS if self.bounded else dict.fromkeys(BOUNDS, (-99.0, 99.0))
         scene = random_scene(2, self.agents, history=2, size=self.size, dtype=torch.float64)
+        scene.size[..., 1] *= 0.4
         mask = torch.ones(2, self.agents, dtype=torch.bool)
         mask[1, self.absent : self.absent + 2] = False
         ends = None if self.ends is None else torch.tensor([min(end, horizon) for end in self.ends])
@@ -82,7 +92,7 @@ def games(most: int = 8) -> st.SearchStrategy[Draw]:
         agents=st.integers(1, most),
         horizon=st.integers(3, 40),
         own=st.frozensets(st.sampled_from(ALL), min_size=1),
-        pair=st.sampled_from([("proximity",), ("clearance",), ("proximity", "clearance"), ()]),
+        pair=st.sampled_from([("proximity",), ("clearance",), ("proximity", "clearance"), *STATE_PAIRS, ()]),
         stride=st.sampled_from([1, 2]),
         size=st.sampled_from([0.01, 1.0, 3.0]),
         bounded=st.booleans(),

@@ -36,6 +36,7 @@ from torch import Tensor
 
 from epo_lightning.game import symmetry
 from epo_lightning.game.circles import disc, overlap, row_extent, row_overlap
+from epo_lightning.game.vehicles import half_sizes, headway, lateral, longitudinal, time_to_conflict
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import ACCELERATION, TURN_RATE
 
@@ -168,14 +169,23 @@ reference line [m]; vel, the speed, and velref, the speed minus the reference sp
 goal [rad], not wrapped to (-pi, pi]; ``...b``, the amount by which the signal leaves its bounds."""
 
 
+def _of_vehicles(function: Callable[..., Tensor], extent: Callable[[Tensor], Tensor] | None = None) -> PairFeature:
+    return PairFeature(Source.TRAJECTORY, function, needs="size", stepwise=True, extent=extent, margin=True)
+
+
 PAIR_FEATURES: dict[str, PairFeature] = {
     "proximity": PairFeature(Source.DISTANCE, overlap, extent=disc),
     "clearance": PairFeature(Source.DISTANCE, overlap, extent=disc, margin=True),
     "circles": PairFeature(Source.TRAJECTORY, row_overlap, needs="size", stepwise=True, extent=row_extent),
+    "headway": _of_vehicles(headway),
+    "longitudinal": _of_vehicles(longitudinal, half_sizes),
+    "lateral": _of_vehicles(lateral, half_sizes),
+    "time_to_conflict": _of_vehicles(time_to_conflict),
 }
 """Pair features by name: ``proximity``, max(0, r_i + r_j - |p_i - p_j|), the overlap of two discs [m]; ``clearance``,
 max(0, r_i + r_j + m_ij - |p_i - p_j|), the same with a margin m_ij [m] (``GameParameters.margins`` or ``energy.margins``);
-``circles``, the overlap of two rows of circles [m] (:mod:`~epo_lightning.game.circles`)."""
+``circles``, the overlap of two rows of circles [m] (:mod:`~epo_lightning.game.circles`); ``headway``, ``longitudinal``,
+``lateral``, ``time_to_conflict``, missing distances [m] of vehicles with margins (:mod:`~epo_lightning.game.vehicles`)."""
 
 _BUILT_IN = {*OWN_FEATURES, *PAIR_FEATURES}
 

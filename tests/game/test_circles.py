@@ -20,7 +20,7 @@ from epo_lightning.game.features import PAIR_FEATURES, Source, pair_feature
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Status
 from epo_lightning.solvers.backward import Implicit, Unrolled
-from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton import structured
 from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -328,15 +328,19 @@ def test_sizes_that_are_missing_or_no_numbers_are_noticed():
     assert (solve(energy, scene, parameters).status == Status.SOLVED).all()
 
 
-def test_the_compiled_layer_refuses_and_pytorch_takes_its_place():
+def test_both_backends_solve_rows_of_circles():
     scene, parameters = traffic()
     energy = FeatureEnergy(OWN, ["circles"])
-    compiled.say_once.cache_clear()
-    with pytest.warns(UserWarning, match="does not know the feature 'circles'.*Plain PyTorch does the same"):
-        by_default = LevenbergMarquardt()(energy, scene, parameters)
-    assert torch.equal(by_default.controls, LevenbergMarquardt(backend="pytorch")(energy, scene, parameters).controls)
-    with pytest.raises(ValueError, match=r"solver\.backend is 'compiled'.*does not know the feature 'circles'"):
-        LevenbergMarquardt(backend="compiled")(energy, scene, parameters)
+    results = []
+    for backend in ("auto", "compiled", "pytorch"):
+        leaves = leaves_of(parameters)
+        solution = LevenbergMarquardt(backend=backend)(energy, scene, leaves)
+        solution.states.square().sum().backward()
+        results.append([solution.controls, leaves.pair_weights["circles"].grad, leaves.initial_controls.grad])
+    assert results[0][1].abs().max() > 0
+    for by_default, by_kernel, by_pytorch in zip(*results, strict=True):
+        assert torch.equal(by_default, by_kernel)
+        torch.testing.assert_close(by_kernel, by_pytorch, rtol=1e-9, atol=1e-9)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
+from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.pairs import pairs
@@ -298,11 +299,10 @@ def test_scenes_without_agents_have_zero_gaps():
         assert (found.nash_gap[1] > 0).all()
 
 
-def test_features_unknown_to_the_kernel_are_supported():
+def test_games_unknown_to_the_kernel_are_supported():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, 1, 4, own=OWN)
-    parameters = dataclasses.replace(parameters, pair_weights={"circles": parameters.pair_weights["proximity"]})
-    energy = FeatureEnergy(OWN, ["circles"])
+    energy = FeatureEnergy(OWN, ["proximity"], dynamics=Unicycle("heun"))
     compiled.say_once.cache_clear()
     with pytest.warns(UserWarning, match="compiled"):
         found = report(energy, scene, parameters, parameters.initial_controls)

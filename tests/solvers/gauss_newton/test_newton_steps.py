@@ -33,6 +33,7 @@ def make(
     """Three random scenes with two modes and seven steps, in which agents overlap and bounds are violated."""
     torch.manual_seed(seed)
     scene = random_scene(3, agents, history=2, size=1.5, dtype=dtype)
+    scene.size[..., 1] *= 0.6
     if ends is not None:
         scene = dataclasses.replace(scene, game_steps=torch.tensor(ends))
     return FeatureEnergy(own, pair, BOUNDS), scene, random_game(scene, 2, 7, own, 0.5, pair)
@@ -43,7 +44,7 @@ def make(
     seed=st.integers(0, 10_000),
     agents=st.integers(1, 4),
     own=st.sets(st.sampled_from(ALL), min_size=1).map(lambda names: tuple(sorted(names))),
-    pair=st.sampled_from([(), ("proximity",), PAIR]),
+    pair=st.sampled_from([(), ("proximity",), PAIR, *STATE_PAIRS]),
     ends=st.none() | st.tuples(*[st.integers(2, 7)] * 3),
     damping=st.sampled_from([1e-2, 1.0, 50.0]),
 )

@@ -10,7 +10,7 @@
 enum Own { GOAL, LANE, VELREF, VEL, ACC, TURNR, JERK, TURNACC, STEER, VELB, ACCB, TURNRB, JERKB, TURNACCB, HEADING, OWN_COUNT };
 
 /// Weighted pair features, in the same order as in Python.
-enum Pair { PROXIMITY, CLEARANCE, PAIR_COUNT };
+enum Pair { PROXIMITY, CLEARANCE, CIRCLES, HEADWAY, LONGITUDINAL, LATERAL, TIME_TO_CONFLICT, PAIR_COUNT };
 
 /// Index of a control, as in the arrays of the caller.
 enum Control { ACCELERATION, TURN_RATE };
@@ -27,6 +27,11 @@ constexpr double kWheelbase = 0.6;          // distance between the axles as a s
 constexpr double kSlowestSteering = 1.0;    // [m/s]; at lower speeds, a steering angle is computed with this speed
 constexpr int64_t kRetries = 4;             // number of times that a failed factorisation is repeated with more damping
 constexpr double kLeastDamping = 1e-7, kMostDamping = 1e7;  // range of the adaptive damping
+constexpr double kThreeFrom = 4.0, kFiveFrom = 8.0;  // lengths [m] from which vehicles have three and five circles
+constexpr double kTimeGap = 1.0;            // [s], of headways
+constexpr double kConflictTime = 3.0;       // [s] up to which conflicts count
+constexpr double kSlow = 0.01;              // [m^2/s^2], added to the squared relative speed of conflicts
+constexpr double kLeastSize = 1e-3;         // [m], the least size in a denominator
 constexpr double kLeastRaisedDamping = 1e-3;  // repetition k adds 10^k times the damping, but at least 10^k times this
 
 extern "C" {

@@ -8,6 +8,7 @@
 #include "buffers.hpp"
 #include "game.hpp"
 #include "lanes.hpp"
+#include "pairs.hpp"
 #include "riccati.hpp"
 
 namespace EPO_LEVEL {
@@ -144,12 +145,14 @@ struct Group {
     const Count<N> count;
     const int K, pairs;
     const bool coupled;                   // whether there is a pair feature
+    const bool state_pairs;               // whether there is one of states, and not only of distances
     const bool cut;                       // whether games may end before step K
     const T dt;
     Arena<T>& arena;
     int problem[W], scene[W], mode[W], *agent;  // agent[i * W + lane]
     Vec<T>*weight;                        // [OWN_COUNT, n]
-    Vec<T>*pair_weight, *reach;           // [PAIR_COUNT, pairs]
+    Vec<T>*pair_weight, *reach, *margin;  // [PAIR_COUNT, pairs]
+    Vec<T>*length, *width;                // [n], only for pair features of states
     Vec<T>* given;                        // the weights of agents and pairs, of which `enter` sets some to zero; only where `cut`
     Vec<T> end;                           // numbers of steps of the games; only where `cut`
     Vec<T>*goal_x, *goal_y, *goal_heading, *reference_speed, *wheelbase;  // [n]
@@ -182,7 +185,7 @@ struct Group {
     /// Lane `lane` holds the row items[lane * (n + 1)]: the problem, then its agents. Unused lanes repeat the last row.
     Group(const EpoGame& game, Arena<T>& arena, Count<N> count, const int32_t* items, int filled, const T* controls)
         : game(game), count(count), K(int(game.K)), pairs(count.agents() * (count.agents() - 1) / 2),
-          coupled(interacts(game)), cut(game.ends != nullptr), dt(T(game.dt)), arena(arena) {
+          coupled(interacts(game)), state_pairs(has_state_pairs(game)), cut(game.ends != nullptr), dt(T(game.dt)), arena(arena) {
         const int n = count.agents();
         owners_.resize(n * W);
         agent = owners_.data();
@@ -256,6 +259,7 @@ struct Group {
                 p.heading[k + 1] = p.heading[0] + turned;
                 p.speed[k + 1] = p.speed[0] + faster;
             }
+            if (state_pairs) sincos<T>(p.heading[K], p.sine[K], p.cosine[K]);
         }
     }
 
@@ -296,6 +300,39 @@ struct Group {
     }
 
     bool pairs_count_at(int state) const { return coupled && state % game.pair_stride == 0; }
+
+    /// Whether a pair may be within the range of a pair feature of states in some lane.
+    INLINE bool in_range(int feature, int pair, int i, int j, int state) const {
+        const Path<T>&p = path[i], &q = path[j];
+        const Vec<T> dx = p.x[state] - q.x[state], dy = p.y[state] - q.y[state];
+        const Vec<T> moving = most<T>(p.speed[state], -p.speed[state]) + most<T>(q.speed[state], -q.speed[state]);
+        const Vec<T> range = reach[feature * pairs + pair] + T(look_ahead(feature)) * moving;
+        return any<T>(dx * dx + dy * dy < range * range);
+    }
+
+    INLINE Body<T, Vec<T>> body(int i, int state) const {
+        const Path<T>& p = path[i];
+        return {p.x[state], p.y[state], p.cosine[state], p.sine[state], p.speed[state], length[i], width[i]};
+    }
+
+    /// The same with its derivatives by the entries `e` and `e + 1` of x, y, heading, speed; other numbers stand for no entry.
+    INLINE Body<T, Dual<T>> shifted_body(int i, int state, int e) const {
+        const Path<T>& p = path[i];
+        const Vec<T> c = p.cosine[state], s = p.sine[state], one = splat<T>(1), zero{};
+        const bool moves = e == 0, turns = e == 2;
+        return {{p.x[state], moves ? one : zero, zero}, {p.y[state], zero, moves ? one : zero},
+                {c, turns ? -s : zero, zero}, {s, turns ? c : zero, zero},
+                {p.speed[state], zero, turns ? one : zero}, length[i], width[i]};
+    }
+
+    /// The same with its derivatives along the directions of two tangents.
+    INLINE Body<T, Dual<T>> body(int i, int state, const Tangent<T>& a, const Tangent<T>& b) const {
+        const Path<T>& p = path[i];
+        const Vec<T> c = p.cosine[state], s = p.sine[state], turned_a = a.heading[state], turned_b = b.heading[state];
+        return {{p.x[state], a.x[state], b.x[state]}, {p.y[state], a.y[state], b.y[state]},
+                {c, -s * turned_a, -s * turned_b}, {s, c * turned_a, c * turned_b},
+                {p.speed[state], a.speed[state], b.speed[state]}, length[i], width[i]};
+    }
 
     INLINE Vec<T> rate(const Vec<T>* control, int k) const { return (control[k] - control[k - 1]) * (T(1) / dt); }
 
@@ -350,6 +387,9 @@ struct Group {
         reference_speed = arena.take(n);
         wheelbase = arena.take(n);
         reach = arena.take(PAIR_COUNT * pairs);
+        margin = arena.take(PAIR_COUNT * pairs);
+        length = arena.take(n);
+        width = arena.take(n);
         for (int lane = 0; lane < W; ++lane) {
             const int64_t b = scene[lane], m = mode[lane];
             const T* size = static_cast<const T*>(game.size);
@@ -366,6 +406,10 @@ struct Group {
                         static_cast<const T*>(game.goal_headings)[b * strides[0] + m * strides[1] + a * strides[2]];
                 }
                 if (has(VELREF)) reference_speed[i][lane] = static_cast<const T*>(game.reference_speed)[row];
+                if (state_pairs) {
+                    length[i][lane] = size[2 * row];
+                    width[i][lane] = size[2 * row + 1];
+                }
                 if (has(STEER)) wheelbase[i][lane] = T(kWheelbase) * size[2 * row];
             }
             int p = 0;
@@ -373,12 +417,13 @@ struct Group {
                 for (int j = i + 1; j < n; ++j, ++p) {
                     const int64_t a = agent[i * W + lane], c = agent[j * W + lane];
                     const int64_t pair = a * game.N - a * (a + 1) / 2 + c - a - 1;  // a < c, as in the item
-                    const T radii = T(0.5) * size[2 * (b * game.N + a)] + T(0.5) * size[2 * (b * game.N + c)];
+                    const T *first = size + 2 * (b * game.N + a), *second = size + 2 * (b * game.N + c);
                     for (int f = 0; f < PAIR_COUNT; ++f) {
                         if (!has_pair(f)) continue;
                         pair_weight[f * pairs + p][lane] = of_pair<T>(game.pair[f], game.pair_strides[f], b, m, pair);
-                        reach[f * pairs + p][lane] =
-                            game.margins[f] ? radii + of_pair<T>(game.margins[f], game.margin_strides[f], b, m, pair) : radii;
+                        const T wider = game.margins[f] ? of_pair<T>(game.margins[f], game.margin_strides[f], b, m, pair) : T(0);
+                        margin[f * pairs + p][lane] = wider;
+                        reach[f * pairs + p][lane] = range_of(f, first, second, wider);
                     }
                 }
         }

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import functools
 
+from epo_lightning.game import circles, vehicles
 from epo_lightning.game.features import SLOWEST_STEERING, WHEELBASE
 from epo_lightning.scene import Status
 from epo_lightning.solvers.gauss_newton.kernel.build import load
@@ -32,7 +33,7 @@ OWN = (
     "heading",
 )
 """Own features in the kernel's order."""
-PAIR = ("proximity", "clearance")
+PAIR = ("proximity", "clearance", "circles", "headway", "longitudinal", "lateral", "time_to_conflict")
 """Pair features in the kernel's order."""
 SIGNALS = ("vel", "acc", "turnr", "jerk", "turnacc")
 """Signals with bounds in the kernel's order."""
@@ -117,6 +118,12 @@ def layout() -> dict[str, float]:
         "kMostAgents": MOST_AGENTS,
         "kWheelbase": WHEELBASE,
         "kSlowestSteering": SLOWEST_STEERING,
+        "kThreeFrom": circles.THREE_FROM,
+        "kFiveFrom": circles.FIVE_FROM,
+        "kTimeGap": vehicles.TIME_GAP,
+        "kConflictTime": vehicles.CONFLICT_TIME,
+        "kSlow": vehicles.SLOW,
+        "kLeastSize": vehicles.LEAST_SIZE,
         "kRetries": RETRIES,
         "kLeastRaisedDamping": LEAST_RAISED_DAMPING,
         "kLeastDamping": LEAST_DAMPING,

@@ -26,9 +26,11 @@ template <class T>
 void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, const T* controls, uint64_t* touching) {
     constexpr int W = Lanes<T>::W;
     const int N = int(game.N), K = int(game.K);
+    const bool state_pairs = has_state_pairs(game);
     // Only the states at which pairs are evaluated are kept.
     const int stride = int(game.pair_stride), kept = K / stride;
     Vec<T>*x = arena.take(N * kept), *y = arena.take(N * kept), *box = arena.take(4 * N), *radius = arena.take(N);
+    Vec<T>* fastest = arena.take(N);  // largest speed after the first step
     Vec<T>* given = arena.take(2 * K);
     const T dt = T(game.dt);
     Mask<T>* present = reinterpret_cast<Mask<T>*>(arena.take(N));
@@ -52,6 +54,7 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
         Vec<T>*low_x = box + 4 * i, *low_y = low_x + 1, *high_x = low_x + 2, *high_y = low_x + 3;
         *low_x = *low_y = splat<T>(T(INFINITY));
         *high_x = *high_y = splat<T>(-T(INFINITY));
+        fastest[i] = Vec<T>{};
         for (int k = 0; k < K; ++k) {
             Vec<T> sine, cosine;
             const Vec<T> speed = start_speed + faster;
@@ -60,6 +63,7 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
             moved_y += dt * speed * sine;
             turned += dt * given[2 * k + 1];
             faster += dt * given[2 * k];
+            if (state_pairs) fastest[i] = most<T>(fastest[i], most<T>(start_speed + faster, -start_speed - faster));
             const Vec<T> px = start_x + moved_x, py = start_y + moved_y;
             if ((k + 1) % stride) continue;
             const int at = i * kept + (k + 1) / stride - 1;
@@ -76,12 +80,17 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
     for (int i = 0; i < N; ++i)
         for (int j = i + 1; j < N; ++j, ++pair) {
             Vec<T> reach = radius[i] + radius[j];
-            for (int f = 0; f < PAIR_COUNT; ++f) {
-                if (!game.margins[f]) continue;
-                Vec<T> wider;
-                for (int lane = 0; lane < W; ++lane)
-                    wider[lane] = of_pair<T>(game.margins[f], game.margin_strides[f], problems[lane] / game.M, problems[lane] % game.M, pair);
-                reach = most<T>(reach, radius[i] + radius[j] + wider);
+            for (int f = CLEARANCE; f < PAIR_COUNT; ++f) {
+                if (!game.pair[f]) continue;
+                Vec<T> range;
+                for (int lane = 0; lane < W; ++lane) {
+                    const int64_t b = problems[lane] / game.M, m = problems[lane] % game.M;
+                    const T* size = static_cast<const T*>(game.size) + 2 * b * N;
+                    const T wider = game.margins[f] ? of_pair<T>(game.margins[f], game.margin_strides[f], b, m, pair) : T(0);
+                    range[lane] = range_of(f, size + 2 * i, size + 2 * j, wider);
+                }
+                if (look_ahead(f) > 0) range += T(look_ahead(f)) * (fastest[i] + fastest[j]);
+                reach = most<T>(reach, range);
             }
             const Vec<T>*a = box + 4 * i, *c = box + 4 * j;
             const Mask<T> near = present[i] && present[j] && a[0] - c[2] < reach && c[0] - a[2] < reach &&
@@ -207,6 +216,7 @@ bool valid(const EpoGame& game, int64_t problem) {
             for (int e = 0; e < 4; ++e)
                 if (!finite(start[e])) return false;
             if ((coupled || game.own[STEER]) && !finite(static_cast<const T*>(game.size)[2 * row])) return false;
+            if (has_state_pairs(game) && !finite(static_cast<const T*>(game.size)[2 * row + 1])) return false;
             if (game.reference) {
                 const int64_t line = game.reference[problem * game.N + i];
                 if (line < 0 || line >= game.lines) return false;

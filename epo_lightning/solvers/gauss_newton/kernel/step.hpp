@@ -52,6 +52,48 @@ INLINE void add_disc_costs(const Group<T, N>& g, int feature, int state, bool ex
         }
 }
 
+/// Indices of the entries of P and y that belong to position, heading and speed of two agents, in the order of `Slope`.
+INLINE void entries_of(int i, int j, int m, int* at) {
+    const int both[2] = {i, j};
+    for (int side = 0; side < 2; ++side)
+        for (int e = 0; e < 4; ++e) at[4 * side + e] = 2 * both[side] + e % 2 + (e < 2 ? 0 : m);
+}
+
+/// Adds the costs of the pair features of states at one state; arguments as for `add_state_costs`.
+template <class T, int N>
+__attribute__((noinline)) void add_state_pair_costs(const Group<T, N>& g, int state, bool exact, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
+    const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
+    for (int feature = 0; feature < PAIR_COUNT; ++feature) {
+        if (of_discs(feature) || !g.has_pair(feature)) continue;
+        int pair = 0;
+        for (int i = 0; i < n; ++i)
+            for (int j = i + 1; j < n; ++j, ++pair) {
+                if (!g.in_range(feature, pair, i, j, state)) continue;
+                PairValue<Vec<T>> d;
+                const int entry = feature * g.pairs + pair;
+                evaluate_pair<T, Vec<T>>(feature, g.body(i, state), g.body(j, state), g.margin[entry], d);
+                const Vec<T> weight = g.pair_weight[entry], pushed = weight * weight * d.value;
+                energy += T(0.5) * pushed * d.value;
+                int at[8];
+                entries_of(i, j, m, at);
+                for (int e = 0; e < 8; ++e) y[at[e]] += pushed * d.by[e];
+                if (!P) continue;
+                Vec<T> row[8];
+                for (int e = 0; e < 8; ++e) row[e] = weight * d.by[e];
+                for (int e = 0; e < 8; ++e)
+                    for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += row[e] * row[f];
+                for (int e = 0; exact && e < 8; e += 2) {  // two columns of the feature's Hessian
+                    PairValue<Dual<T>> h;
+                    const Dual<T> margin{g.margin[entry], Vec<T>{}, Vec<T>{}};
+                    evaluate_pair<T, Dual<T>>(feature, g.shifted_body(i, state, e), g.shifted_body(j, state, e - 4), margin, h);
+                    for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += pushed * h.by[f].a;
+                    for (int f = 0; f <= e + 1; ++f)
+                        P[std::max(at[e + 1], at[f]) * ld + std::min(at[e + 1], at[f])] += pushed * h.by[f].b;
+                }
+            }
+    }
+}
+
 /// Adds the second derivatives of the costs of a state to P [3m, 3m] (unless it is null) and their gradient to y [3m]; returns
 /// their energy. Unless `exact`, the second derivatives of residuals are left out (Gauss-Newton).
 template <class T, int N>
@@ -98,6 +140,7 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, bool exact, Vec<T
     if (!g.pairs_count_at(state)) return energy;
     for (const int feature : {PROXIMITY, CLEARANCE})
         if (g.has_pair(feature)) add_disc_costs(g, feature, state, exact, P, y, energy);
+    if (g.state_pairs) add_state_pair_costs(g, state, exact, P, y, energy);
     return energy;
 }
 
@@ -304,6 +347,44 @@ INLINE void differentiate_discs(
         }
 }
 
+/// The part of `differentiate` that belongs to the pair features of states, at one state; also adds to the cotangents `nodes` [n, 2]
+/// of headings and speeds.
+template <class T, int N>
+__attribute__((noinline)) void differentiate_state_pairs(
+    const Group<T, N>& g, int state, const std::vector<Tangent<T>>& first, const std::vector<Tangent<T>>& second, Vec<T>* sums,
+    Vec<T>* nodes, const ParameterGradients<T>& by) {
+    const int n = g.count.agents();
+    for (int feature = 0; feature < PAIR_COUNT; ++feature) {
+        if (of_discs(feature) || !g.has_pair(feature)) continue;
+        int pair = 0;
+        for (int i = 0; i < n; ++i)
+            for (int j = i + 1; j < n; ++j, ++pair) {
+                if (!g.in_range(feature, pair, i, j, state)) continue;
+                PairValue<Dual<T>> d;
+                const int entry = feature * g.pairs + pair;
+                evaluate_pair<T, Dual<T>>(
+                    feature, g.body(i, state, first[i], second[i]), g.body(j, state, first[j], second[j]),
+                    Dual<T>{g.margin[entry], Vec<T>{}, Vec<T>{}}, d);
+                // phi = -w^2 (g mu) (f + g d) with the gradient g of the feature f.
+                const Vec<T> w = g.pair_weight[entry], squared = w * w, along_mu = d.value.a, ahead = d.value.v + d.value.b;
+                const auto slope = [&](int e) { return -squared * (d.by[e].a * ahead + along_mu * (d.by[e].v + d.by[e].b)); };
+                const int both[2] = {i, j};
+                for (int side = 0; side < 2; ++side) {
+                    Vec<T>* s = sums + 6 * both[side];
+                    for (int axis = 0; axis < 2; ++axis) {
+                        const int e = 4 * side + axis;
+                        s[axis] += slope(e);
+                        s[2 + axis] -= squared * ahead * d.by[e].v;
+                        s[4 + axis] -= squared * along_mu * d.by[e].v;
+                        nodes[2 * both[side] + axis] += slope(e + 2);
+                    }
+                }
+                by.pair[entry] -= T(2) * w * along_mu * ahead;
+                by.margin[entry] += slope(MARGIN);
+            }
+    }
+}
+
 /// Adds the gradient of phi = -<J mu, r + J d>, with mu and d held constant: by the controls to the cotangent [n, K] (`bar_turn`,
 /// `bar_thrust`), and by the parameters to `by`.
 ///
@@ -385,6 +466,7 @@ void differentiate(
         if (g.pairs_count_at(state))
             for (const int feature : {PROXIMITY, CLEARANCE})
                 if (g.has_pair(feature)) differentiate_discs(g, feature, state, first, second, sums, by);
+        if (g.state_pairs && g.pairs_count_at(state)) differentiate_state_pairs(g, state, first, second, sums, nodes, by);
         for (int i = 0; i < n; ++i) {
             const Tangent<T>&t1 = first[i], &t2 = second[i];
             const auto weigh = [&](int feature) -> Vec<T>& { return by.own[feature * n + i]; };
