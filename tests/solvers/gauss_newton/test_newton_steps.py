@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from backends import gradients
+from backends import STATE_PAIRS, gradients
 from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
