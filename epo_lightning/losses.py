@@ -48,19 +48,20 @@ HARDEST = 0.01
 class Annealing:
     """Schedule of a loss with a soft minimum over modes, whose temperature falls (annealed winner-takes-all).
 
-    A mode gets the share softmin(d / T) of the gradient, where d is its distance [m] from the data and T the temperature
-    [m]. At temperatures far above all distances every mode gets the same share; the modes part as the temperature falls, and
-    at the end the closest one gets everything. The loss is the soft minimum
+    With the distances d_m [m] of the modes from the data and the temperature T [m], the loss is
 
-        -T log mean_m exp(-d_m / T),
+        -T log mean_m exp(-h(d_m) / T),    h(d) = sqrt(d^2 + T^2) - T,
 
-    which lies between the minimum and the mean over modes, and whose derivative by d_m is that share. So its gradient is
-    that of Xu et al. (Annealed Winner-Takes-All for Motion Forecasting, arXiv 2409.11172), who hold the shares constant.
-    Their temperatures start at about 10 and fall by a factor of 0.834 per epoch; here the fall is geometric too, but counted
-    in optimisation steps.
+    so every mode gets the share softmin(h(d) / T) of the gradient: at a high temperature every mode the same, and less and
+    less the farther ones as the temperature falls. At the end the closest one gets everything. This is the loss of Xu et al.
+    (Annealed Winner-Takes-All for Motion Forecasting, arXiv 2409.11172), whose temperatures start at about 10 and fall by a
+    factor of 0.834 per epoch, with two differences. The fall is geometric too, but counted in optimisation steps. And h,
+    which is quadratic below T and nearly d far above it, takes the place of d: modes that lie on the likeliest of two
+    alternatives would otherwise be held there by a pull that does not fade with the distance, and would hardly part.
 
     Attributes:
-        temperature: T [m] at the first step; 0 is the paper's loss. Useful values are about the distance between modes.
+        temperature: T [m] at the first step; 0 is the paper's loss. Useful values are below half the distance between
+            modes that should be found; at higher ones all modes first go to one place and may be late to part.
         steps: optimisation steps in which T falls to :data:`HARDEST`. The loss is the hard minimum from then on.
     """
 
@@ -87,7 +88,14 @@ def soft_minimum(distance: Tensor, temperature: float) -> Tensor:
     Modes at an infinite distance do not count.
     """
     count = distance.isfinite().sum(1).clamp_min(1).to(distance.dtype)
-    return -temperature * ((-distance / temperature).logsumexp(1) - count.log())
+    return -temperature * ((-_rounded(distance, temperature) / temperature).logsumexp(1) - count.log())
+
+
+def _rounded(distance: Tensor, temperature: float) -> Tensor:
+    """h(d) = sqrt(d^2 + T^2) - T, without the cancellation for small d; infinite for an infinite d, without a gradient."""
+    known = distance.isfinite()
+    square = torch.where(known, distance, 0.0).square()
+    return torch.where(known, square / ((square + temperature**2).sqrt() + temperature), distance)
 
 
 def distances(
@@ -144,11 +152,8 @@ def scene_imitation(
 def mode_shares(
     distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], temperature: float
 ) -> Float[Tensor, "B M"]:
-    """Share of every mode in an annealed loss, softmin over modes of the distances; without a gradient.
-
-    The temperature must be positive.
-    """
-    return (-_mean_over_agents(distance.detach(), mask) / temperature).softmax(1)
+    """Share of every mode in an annealed loss at a positive temperature (:class:`Annealing`), without a gradient."""
+    return (-_rounded(_mean_over_agents(distance.detach(), mask), temperature) / temperature).softmax(1)
 
 
 def scene_probability(

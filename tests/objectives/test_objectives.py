@@ -121,7 +121,7 @@ def test_annealed_contrastive_terms_are_sums_over_modes_by_their_shares() -> Non
             / sum(bool(scene.future_mask[number, i].any()) for i in range(3))
             for mode in range(modes)
         ]
-        powers = [math.exp(-one / 2.0) for one in far]
+        powers = [math.exp(-(math.hypot(one, 2.0) - 2.0) / 2.0) for one in far]
         for mode in range(modes):
             for name in expected:
                 expected[name] += powers[mode] / sum(powers) * alone(mode, number)[name] / 3
