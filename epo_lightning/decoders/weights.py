@@ -90,13 +90,22 @@ class PairWeights(nn.Module):
         features: names of the pair features; without any there is no network.
         start: weight at a network output of zero.
         symmetric: whether weights are the same in both orders of the two agents.
+        positive: whether the weight is start * exp(output) rather than start + output. A weight enters the energy squared,
+            so that one that has reached zero has no gradient and stays there.
     """
 
     def __init__(
-        self, width: int, modes: int, features: Sequence[str], start: float = 3.0, symmetric: bool = False
+        self,
+        width: int,
+        modes: int,
+        features: Sequence[str],
+        start: float = 3.0,
+        symmetric: bool = False,
+        positive: bool = False,
     ) -> None:
         super().__init__()
-        self.modes, self.features, self.start, self.symmetric = modes, tuple(features), start, symmetric
+        self.modes, self.features, self.start = modes, tuple(features), start
+        self.symmetric, self.positive = symmetric, positive
         self.mlp = MLP(2 * width, 64, modes * len(self.features), norm="layer") if self.features else None
 
     def forward(self, z: Float[Tensor, "B N D"]) -> dict[str, Float[Tensor, "B M P"]]:
@@ -107,7 +116,8 @@ class PairWeights(nn.Module):
         weights = self.mlp(torch.cat((z[:, first], z[:, second]), -1))
         if self.symmetric:
             weights = 0.5 * (weights + self.mlp(torch.cat((z[:, second], z[:, first]), -1)))
-        return _by_name(self.start + weights, self.features, self.modes)
+        weights = self.start * weights.exp() if self.positive else self.start + weights
+        return _by_name(weights, self.features, self.modes)
 
 
 class Margins(nn.Module):

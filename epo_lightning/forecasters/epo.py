@@ -78,6 +78,8 @@ class EPO(Forecaster):
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
             the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
             (``game_steps``). Initial controls after the first K steps are zero.
+        one_game: whether the modes are equilibria of one game, found from M initial strategies; its pair weights are
+            positive. Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
         calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which corrects the inferred
             pair weights by the history outside training; None for no correction.
@@ -109,12 +111,14 @@ class EPO(Forecaster):
         game_horizon: int | None = None,
         calibration: Mapping[str, float] | None = None,
         own_weights: str = "decoded",
+        one_game: bool = False,
         probabilities: str = "linear",
         margin: Mapping[str, float] | None = None,
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         _check_needs(energy, task)
         self.calibration = None if calibration is None else Calibration(**calibration)  # type: ignore[arg-type]
+        self.one_game = one_game
         self.game_horizon = task.horizon if game_horizon is None else game_horizon
         if self.game_horizon < task.horizon:
             raise ConfigError(
@@ -127,6 +131,11 @@ class EPO(Forecaster):
         if own_weights not in OWN_WEIGHTS:
             raise ConfigError(
                 f"unknown forecaster.own_weights {own_weights!r}: {nearest(str(own_weights), OWN_WEIGHTS)}"
+            )
+        if one_game and (chooses or energy.pair_order is not None):
+            raise ConfigError(
+                "forecaster.one_game=true needs a solver that begins at initial strategies, and an energy without orders of "
+                "pairs: choices among candidates and orders are modes of one game already"
             )
         if initial not in INITIAL:
             raise ConfigError(f"unknown forecaster.initial {initial!r}: {nearest(str(initial), INITIAL)}")
@@ -156,8 +165,8 @@ class EPO(Forecaster):
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
         # `solve` runs the minimiser, with the derivative of its solution that the part `backward` defines.
         self.solve, self.objective = backward, objective
-        # M games with one initial strategy each; for solvers that choose, one game with C candidates.
-        games, strategies = solver.games(modes), solver.strategies(modes)
+        # M games with one initial strategy each, or one game with M; for solvers that choose, one game with C candidates.
+        games, strategies = 1 if one_game else solver.games(modes), solver.strategies(modes)
         width, scale, horizon = backbone.width, task.scale, task.horizon
         own, pair = energy.weighted
         start = _check_start(own_start, own, energy.own)
@@ -168,7 +177,7 @@ class EPO(Forecaster):
             self.own_weights = SharedWeights(games, own, start)
         else:
             self.own_weights = OwnWeights(width, games, own, start)
-        self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs)
+        self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs, positive=one_game)
         self.strategies: InitialStrategies | ZeroStrategies | Motions
         if initial == "decoded":
             self.strategies = InitialStrategies(width, strategies, horizon, control_scale)
@@ -247,7 +256,7 @@ class EPO(Forecaster):
         # Agents without a goal have the position (0, 0) for it: zero goal weights keep it from attracting them.
         for name in self.energy.goal_terms & own_weights.keys():
             own_weights[name] = own_weights[name].where(goals.exist[:, None], 0.0)
-        return GameParameters(
+        parameters = GameParameters(
             own_weights=own_weights,
             pair_weights=self.pair_weights(z),
             initial_controls=F.pad(self.strategies(z, scene), (0, 0, 0, self.game_horizon - self.task.horizon)),
@@ -258,6 +267,7 @@ class EPO(Forecaster):
             goal_headings=goals.headings,
             margins={} if self.margins is None else self.margins(z),
         )
+        return parameters.for_modes(self.modes) if self.one_game else parameters
 
     @property
     def _minimiser(self) -> Minimiser:

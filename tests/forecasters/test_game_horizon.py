@@ -31,7 +31,14 @@ SOLVER = {
     "damping": 1.0,
     "adaptive": True,
 }
-GAME = {"name": "epo", "modes": 2, "own_weights": "shared", "game_horizon": 46, "calibration": {"steps": 2}}
+GAME = {
+    "name": "epo",
+    "modes": 2,
+    "one_game": True,
+    "own_weights": "shared",
+    "game_horizon": 46,
+    "calibration": {"steps": 2},
+}
 PARTS = {"energy": ENERGY, "solver": SOLVER, "backward": {"name": "implicit"}}
 
 
@@ -110,6 +117,18 @@ def test_energies_and_equilibria_are_those_of_the_whole_game() -> None:
     torch.testing.assert_close(
         forecast.equilibrium.energy.float(), forecast.solution.energy[torch.arange(3), best], rtol=1e-4, atol=1e-4
     )
+
+
+def test_the_modes_of_one_game_have_the_same_positive_weights_and_different_starts() -> None:
+    forecaster, scene = built(calibration=None, pair_start=0.1), scenes()
+    game = forecaster.predict(scene).parameters
+    assert game is not None
+    for weights in (*game.own_weights.values(), *game.pair_weights.values()):
+        assert weights.shape[1] == 2
+        assert torch.equal(weights[:, 0], weights[:, 1])
+        assert (weights > 0).all()
+    assert game.pair_weights["clearance"].std() > 0
+    assert not torch.equal(game.initial_controls[:, 0], game.initial_controls[:, 1])
 
 
 def test_calibration_runs_outside_of_training_only(monkeypatch: pytest.MonkeyPatch) -> None:
