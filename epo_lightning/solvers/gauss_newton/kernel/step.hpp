@@ -33,22 +33,22 @@ INLINE void add_disc_costs(const Group<T, N>& g, int feature, int state, bool ex
             y[2 * j + 1] += push_y;
             if (!P) continue;
             const Vec<T> nx = weight * contact.x, ny = weight * contact.y;
-            Vec<T> xx = nx * nx, xy = nx * ny, yy = ny * ny;
-            if (exact) {
-                const Vec<T> turning = contact.active && contact.distance > 0 ? pushed / contact.distance : Vec<T>{};
-                xx -= turning * contact.y * contact.y;
-                xy += turning * contact.x * contact.y;
-                yy -= turning * contact.x * contact.x;
-            }
-            for (const int a : {i, j}) {
-                P[2 * a * ld + 2 * a] += xx;
-                P[(2 * a + 1) * ld + 2 * a] += xy;
-                P[(2 * a + 1) * ld + 2 * a + 1] += yy;
-            }
-            P[2 * j * ld + 2 * i] -= xx;
-            P[2 * j * ld + 2 * i + 1] -= xy;
-            P[(2 * j + 1) * ld + 2 * i] -= xy;
-            P[(2 * j + 1) * ld + 2 * i + 1] -= yy;
+            // Each product goes straight into its sum, so that the compiler can fuse them whether or not `exact` adds more.
+            const auto add = [&](Vec<T> xx, Vec<T> xy, Vec<T> yy) INLINE_LAMBDA {
+                for (const int a : {i, j}) {
+                    P[2 * a * ld + 2 * a] += xx;
+                    P[(2 * a + 1) * ld + 2 * a] += xy;
+                    P[(2 * a + 1) * ld + 2 * a + 1] += yy;
+                }
+                P[2 * j * ld + 2 * i] -= xx;
+                P[2 * j * ld + 2 * i + 1] -= xy;
+                P[(2 * j + 1) * ld + 2 * i] -= xy;
+                P[(2 * j + 1) * ld + 2 * i + 1] -= yy;
+            };
+            add(nx * nx, nx * ny, ny * ny);
+            if (!exact) continue;
+            const Vec<T> turning = contact.active && contact.distance > 0 ? pushed / contact.distance : Vec<T>{};
+            add(-turning * contact.y * contact.y, turning * contact.x * contact.y, -turning * contact.x * contact.x);
         }
 }
 
