@@ -19,7 +19,7 @@ from epo_lightning.scene import JointForecast, Scene
 
 def scenes() -> Scene:
     """Two agents that pass a common point, in eight random records."""
-    return DrawnData("rpi").open("test")[torch.arange(16)]  # type: ignore[return-value]
+    return DrawnData("rpi").open("test")[torch.arange(16)]
 
 
 def forecaster(pair: list[str], **changes: Any) -> Any:

@@ -19,13 +19,14 @@ from epo_lightning.report.rows import Row, plain_rows
 from epo_lightning.report.runs import collect, read_run
 from epo_lightning.report.tables import build_tables
 from epo_lightning.report.worth import LEGEND, build_worth, twins
+from epo_lightning.run_folder import RunFolder
 
 from .run_folders import make_run, scores
 
 
 def game_run(
     path: Path, title: str, pair: Sequence[str] | None, metrics: Mapping[str, float], seed: int = 0, **changes: Any
-) -> Any:
+) -> RunFolder:
     """A run of a forecaster with an inferred game; runs with another pair term differ in nothing else, titles included."""
     own = {"energy.name": "features", "energy.own": ["goal"], "forecaster.note": "", "forecaster.name": "epo"}
     return make_run(path, title, "epo", metrics, seed=seed, settings=own | {"energy.pair": pair} | changes)
@@ -64,10 +65,10 @@ def test_a_row_is_compared_with_its_twin_seed_by_seed(tmp_path: Path) -> None:
 
 
 def test_subsets_are_compared_as_well(tmp_path: Path) -> None:
-    for pair, value in ((["proximity"], 0.1), ([], 0.3)):
+    for terms, value in ((["proximity"], 0.1), ([], 0.3)):
         for seed in (0, 1):
             subset = {f"interactive/{name}": score for name, score in scores(value * (2 + seed), 0.5 * value).items()}
-            game_run(tmp_path / f"{len(pair)}-{seed}", "row", pair, scores(value) | subset, seed)
+            game_run(tmp_path / f"{len(terms)}-{seed}", "row", terms, scores(value) | subset, seed)
     (found,) = build_worth(build_tables(collect(tmp_path)))
     (pair,) = found.pairs
     assert [column.label for column in found.columns][3:] == [
@@ -88,8 +89,8 @@ def test_the_twin_has_no_values_of_the_paper(tmp_path: Path) -> None:
 
 def test_names_do_not_make_twins(tmp_path: Path) -> None:
     game_run(tmp_path / "a", "V-LSTM + EPO", ["proximity"], scores(0.1))
-    game_run(tmp_path / "b", "V-LSTM + EPO, no pair", [], scores(0.2), **{"solver.steps": 8})
-    game_run(tmp_path / "c", "circles", ["circles"], scores(0.2), **{"optimizer.lr": 0.1})
+    game_run(tmp_path / "b", "V-LSTM + EPO, no pair", [], scores(0.2), 0, **{"solver.steps": 8})
+    game_run(tmp_path / "c", "circles", ["circles"], scores(0.2), 0, **{"optimizer.lr": 0.1})
     make_run(tmp_path / "sc", "V-LSTM + SC", "scene_consistent", scores(0.3), settings={"energy.pair": []})
     assert build_worth(build_tables(collect(tmp_path))) == []
 
@@ -142,7 +143,7 @@ def test_twins_equal_those_of_the_definition(
     folder = tmp_path_factory.mktemp("runs")
     runs = []
     for number, (pair, change, forecaster, seed) in enumerate(drawn):
-        other = {"forecaster.name": forecaster, **({change: 4} if change else {})}
+        other: dict[str, Any] = {"forecaster.name": forecaster, **({change: 4} if change else {})}
         runs.append(game_run(folder / str(number), "row", pair, scores(0.1), seed, **other))
     rows = plain_rows(evaluated for run in runs for evaluated in read_run(run))
     games = [row for row in rows if row.forecaster == "epo"]
