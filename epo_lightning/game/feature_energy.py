@@ -114,7 +114,7 @@ class FeatureEnergy(Energy):
         return {name for name, feature in self.own_features.items() if feature.needs in goals}
 
     @cached_property
-    def decoded_margins(self) -> Sequence[str]:  # type: ignore[override]
+    def decoded_margins(self) -> Sequence[str]:
         """Names of the pair features whose margin is ``parameters.margins``, and not fixed."""
         return [name for name, feature in self.pair_features.items() if feature.margin and name not in self.margins]
 

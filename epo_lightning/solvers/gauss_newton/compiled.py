@@ -117,6 +117,7 @@ def descend(
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, False, exact=exact, adaptive=True)
     call.run()
+    assert call.states is not None
     solution = Solution(
         controls=call.iterates[0],
         states=call.states,
