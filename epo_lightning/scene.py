@@ -250,8 +250,8 @@ def _check_tensor(name: str, value: Any, numbers: str, shape: tuple[str | int, .
     if not isinstance(value, Tensor):
         given = type(value)
         raise TypeError(f"scene.{name} is a {given.__module__}.{given.__qualname__}; convert it with torch.as_tensor")
-    given = "boolean" if value.dtype == torch.bool else "floating-point" if value.is_floating_point() else "integer"
-    if given != numbers:
+    kind = "boolean" if value.dtype == torch.bool else "floating-point" if value.is_floating_point() else "integer"
+    if kind != numbers:
         hint = "; masks are torch.bool, True where an entry is real" if numbers == _MASK else ""
         raise ValueError(f"scene.{name} is of type {value.dtype}, expected {numbers} numbers{hint}")
     expected = [sizes.get(dim, dim) if isinstance(dim, str) else dim for dim in shape]

@@ -148,7 +148,7 @@ def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent:
     energy.validate(scene, game, start)
     solve = choose_backend("auto", energy, scene, game)
     damping = start.new_full((len(start), 1), _START)
-    here = solve(energy, scene, game, 0, 1.0, damping, False)
+    here = solve(energy, scene, game, 0, 1.0, damping, False, False)
     controls, value = here.controls.clone(), here.energy.clone()
     left = value[:, 0].isfinite().nonzero()[:, 0]
     for step, count in ((_gauss_newton, _GAUSS_NEWTON), (_newton, _NEWTON)):
@@ -176,7 +176,7 @@ def _gauss_newton(
     solve: Backend, energy: FeatureEnergy, scene: Scene, game: GameParameters, damping: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Controls and energy after a damped Gauss-Newton step."""
-    there = solve(energy, scene, game, 1, 1.0, damping, False)
+    there = solve(energy, scene, game, 1, 1.0, damping, False, False)
     return there.controls, there.energy
 
 
@@ -189,7 +189,7 @@ def _newton(
     model = expand(energy, scene, game, controls, not split, exact=True)
     factors = structured.factorise(model, damping.flatten(0, 1), split, retry=False)
     moved = controls + factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
-    there = solve(energy, scene, dataclasses.replace(game, initial_controls=moved), 0, 1.0, damping, False)
+    there = solve(energy, scene, dataclasses.replace(game, initial_controls=moved), 0, 1.0, damping, False, False)
     failed = (factors.status == Status.STOPPED).view(there.energy.shape)
     return there.controls, torch.where(failed, torch.inf, there.energy)
 
