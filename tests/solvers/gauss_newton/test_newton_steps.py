@@ -55,8 +55,8 @@ def test_a_newton_step_is_the_same_in_both_backends(seed, agents, own, pair, end
         solve(energy, scene, game, 1, 0.7, lambda_, exact=True, **more)
         for solve, more in ((structured.solve, {"split": True}), (compiled.solve, {}))
     ]
-    # A matrix that is not positive definite is damped more, for all agents that are factorised together. Which agents these are
-    # is known less exactly for pair features of states.
+    # A matrix that is not positive definite is damped more, for all agents that are factorised together. For pair features
+    # of states, the two backends find other sets of these agents.
     solved = [one.status == Status.SOLVED for one in found]
     same = solved[0] & solved[1] if set(pair) - set(PAIR) else torch.ones(3, 2, dtype=torch.bool)
     torch.testing.assert_close(found[1].controls[same], found[0].controls[same], rtol=1e-6, atol=1e-8)
