@@ -178,23 +178,23 @@ def test_the_energy_is_an_exact_potential_of_the_agents_costs():
 def test_a_registered_feature_works_in_every_energy(kind):
     try:
 
-        @own_feature("lateral")
-        def lateral(states, controls):
+        @own_feature("sideways")
+        def sideways(states, controls):
             return states[..., 3] * controls[..., 1]
 
         @pair_feature("like_minded")
         def like_minded(first, second):
             return first[..., 3] - second[..., 3]
 
-        energy = KINDS[kind](own=["lateral"], pair=["like_minded"]).double()
-        scene, game = crowd(own=["lateral"])
+        energy = KINDS[kind](own=["sideways"], pair=["like_minded"]).double()
+        scene, game = crowd(own=["sideways"])
         terms = energy.terms(scene, game, game.initial_controls)
     finally:
-        OWN_FEATURES.pop("lateral", None)
+        OWN_FEATURES.pop("sideways", None)
         PAIR_FEATURES.pop("like_minded", None)
     states = energy.dynamics.rollout(scene.current[:, None], game.initial_controls, scene.dt)
     squared = (states[..., 3] * game.initial_controls[..., 1]).square().sum(-1)
-    torch.testing.assert_close(terms["lateral"], 0.5 * game.own_weights["lateral"].square() * squared)
+    torch.testing.assert_close(terms["sideways"], 0.5 * game.own_weights["sideways"].square() * squared)
     speed = (states[:, :, 0, :, 3] - states[:, :, 1, :, 3]).square().sum(-1)
     torch.testing.assert_close(
         terms["like_minded"][..., 0], 0.5 * game.pair_weights["like_minded"][..., 0] ** 2 * speed
