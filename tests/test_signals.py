@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 
 import pytest
 
@@ -20,7 +21,13 @@ def test_a_stopped_verb_prints_a_message(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     before = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(cli, "_run", lambda words: os.kill(os.getpid(), number) or signal.pause())
+
+    def run(_: object) -> None:
+        os.kill(os.getpid(), number)
+        while True:  # the system may give the signal to another thread: then `signal.pause` would wait for ever
+            time.sleep(0.01)
+
+    monkeypatch.setattr(cli, "_run", run)
     with pytest.raises(SystemExit) as ended:
         cli.main([verb])
     assert ended.value.code == status
