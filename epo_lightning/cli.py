@@ -266,8 +266,9 @@ def _sweep(arguments: Arguments) -> None:
             raise ConfigError(
                 f"the sweep's name is missing: `epo sweep <name> {' '.join(words)}`; known: {', '.join(known)}"
             )
+        width = max(map(len, known)) + 2
         for option, says in known.items():
-            print(fill(says, 120, initial_indent=f"  {option:<22}", subsequent_indent=" " * 24))
+            print(fill(says, 120, initial_indent=f"  {option:<{width}}", subsequent_indent=" " * (width + 2)))
         return
     if name not in known:
         raise ConfigError(f"unknown sweep {name!r}: {nearest(name, known)}")

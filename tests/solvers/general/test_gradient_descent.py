@@ -88,7 +88,7 @@ def test_path_derivative_is_that_of_the_truncated_problem(steps):
     cotangent = torch.randn_like(parameters.initial_controls)
     (cotangent * solve(GAME, scene, leaves).controls).sum().backward()
     found = [tensor.grad for tensor in floats(leaves)]
-    assert len(found) == len(ALL) + 3  # own weights, one pair weight, goals and initial controls
+    assert len(found) == len(ALL) + 4  # own weights, one pair weight, goals, headings, initial controls
     moves = [torch.randn_like(tensor) for tensor in found]
 
     def value(size: float) -> torch.Tensor:
