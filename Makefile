@@ -39,7 +39,7 @@ print(*project["dependencies"], *project["optional-dependencies"]["local"], sep=
 endef
 export LIST_REQUIREMENTS
 
-# The layer is compiled on one core while packages are downloaded and unpacked on another: half a minute less than one after the other.
+# The layer is compiled on one core while packages are downloaded and unpacked on another.
 # Without a compiler its build fails, and the last line says so.
 # --no-compile: Python compiles the modules that are used, when they are used, instead of twelve thousand at once.
 $(INSTALLED): $(SOURCES)

@@ -6,6 +6,7 @@ A machine without a C++ compiler gets a package without the kernel, which says s
 from __future__ import annotations
 
 import importlib.util
+import os
 import sysconfig
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,8 @@ class KernelHook(BuildHookInterface):
         kernel = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(kernel)  # by path: importing the package would need PyTorch
         try:
-            kernel.build()
+            # An editable installation stays on this machine; a wheel goes to others.
+            kernel.build(portable=version != "editable" or os.environ.get("EPO_PORTABLE") == "1")
         except OSError as error:
             self.app.display_warning(f"the compiled EPO layer was not built, plain PyTorch will do its work: {error}")
             return

@@ -1,8 +1,9 @@
 """Build of the compiled layer: `python -m epo_lightning.solvers.gauss_newton.kernel.build`.
 
 Installing the package runs it too. It needs a C++17 compiler (GCC or Clang: `$CXX`, or the first of c++, g++, clang++), but
-neither PyTorch nor Python's headers. On x86-64 the sources are compiled for three levels of instructions, and the library
-chooses one when it is loaded, so that a wheel built on one machine runs on all of them.
+neither PyTorch nor Python's headers. On x86-64 there are three levels of instructions. A checkout compiles its sources for the
+best one of this machine, which takes a third of the time. A wheel has all three, so that it runs on other machines as well; the
+library chooses one when it is loaded. `--portable`, or EPO_PORTABLE=1 in the environment, builds such a library in a checkout.
 
 `--sanitize` builds a second library with AddressSanitizer and UndefinedBehaviorSanitizer, which `make asan` tests.
 """
@@ -25,6 +26,10 @@ HERE = Path(__file__).parent
 LIBRARY = HERE / "epo_kernel.so.1"  # Python would take a plain ".so" for an extension module
 SANITIZED = HERE / "epo_kernel.sanitized.so.1"
 _LEVELS = {"epo_plain": [], "epo_v3": ["-march=x86-64-v3"], "epo_v4": ["-march=x86-64-v4"]}
+"""Options of the compiler for every level, the best one last."""
+_NEEDED = {"epo_v3": {"__AVX2__", "__FMA__"}}
+_NEEDED["epo_v4"] = _NEEDED["epo_v3"] | {f"__AVX512{part}__" for part in ("F", "BW", "CD", "DQ", "VL")}
+"""Macros that a compiler defines for a processor that has the instructions of a level."""
 # Contraction to fused multiply-adds is the only change of the arithmetic that the compiler may make.
 _FLAGS = [
     "-std=c++17",
@@ -52,7 +57,7 @@ def load(path: Path | None = None) -> ctypes.CDLL:
     """The library: the given one, the one that the environment variable ``EPO_KERNEL`` names, or the installed one.
 
     Raises:
-        OSError: the file does not exist, cannot be loaded, or was built from other sources.
+        OSError: the file does not exist, cannot be loaded, or was built from other sources or for another processor.
     """
     path = path or Path(os.environ.get("EPO_KERNEL") or LIBRARY)
     if not path.exists():
@@ -65,6 +70,9 @@ def load(path: Path | None = None) -> ctypes.CDLL:
     library.epo_fingerprint.restype = ctypes.c_int64
     if library.epo_fingerprint() != fingerprint():
         raise OSError(f"{path} was built from other sources than those beside it")
+    library.epo_levels.restype = ctypes.c_int64
+    if library.epo_levels() == 0:
+        raise OSError(f"{path} was built for a processor with instructions that this one lacks (--portable builds for all)")
     return library
 
 
@@ -89,29 +97,50 @@ def _run(commands: list[list[str]]) -> None:
             raise OSError(f"{shlex.join(command)} ended with {process.returncode}\n{words[-2000:]}")
 
 
-def build(target: Path = LIBRARY) -> None:
+def _native(compiler: list[str]) -> str:
+    """The best level of instructions that this machine's processor has."""
+    asked = [*compiler, "-march=native", "-dM", "-E", "-x", "c++", os.devnull]
+    done = subprocess.run(asked, capture_output=True, text=True)
+    defined = {line.split()[1] for line in done.stdout.splitlines() if line.startswith("#define ")}
+    return [level for level in _LEVELS if _NEEDED.get(level, set()) <= defined][-1]
+
+
+def _serves(target: Path, portable: bool) -> bool:
+    """Whether a library is there that was built from these sources, for this machine or, if ``portable``, for all levels."""
+    try:
+        return load(target).epo_built() == len(_LEVELS) if portable and _x86() else bool(load(target))
+    except OSError:
+        return False
+
+
+def _x86() -> bool:
+    return platform.machine().lower() in ("x86_64", "amd64")
+
+
+def build(target: Path = LIBRARY, portable: bool = False) -> None:
     """Compile and link, unless the library is up to date.
 
     Args:
         target: :data:`LIBRARY`, or :data:`SANITIZED` for one with sanitizers.
+        portable: whether the library has all levels of instructions, or only the best one of this machine.
 
     Raises:
         OSError: there is no compiler, or it fails; the message holds its output.
     """
     sanitized = target == SANITIZED
-    if not sanitized:
-        try:
-            load(target)
-            return
-        except OSError:
-            pass  # missing or stale: it is replaced once the new one has been built
+    if not sanitized and _serves(target, portable):
+        return  # a missing or stale one is replaced once the new one has been built
     compiler = [_found("clang++")] if sanitized else _compiler()
-    x86 = platform.machine().lower() in ("x86_64", "amd64") and not sanitized
-    # A sanitized library runs where it was built: one level of instructions, the machine's own.
-    levels = _LEVELS if x86 else {"epo_plain": ["-march=native"] if sanitized else []}
+    if sanitized:
+        levels = {"epo_plain": ["-march=native"]}
+    elif not _x86():
+        levels = {"epo_plain": []}
+    else:
+        levels = _LEVELS if portable else {(level := _native(compiler)): _LEVELS[level]}
     options = [*_FLAGS, *(_SANITIZE if sanitized else _FAST)]
     with tempfile.TemporaryDirectory() as folder:
-        compile_ = [*compiler, *options, f"-DEPO_FINGERPRINT={fingerprint()}", *(["-DEPO_X86"] if x86 else []), "-c"]
+        built = [f"-DHAS_{level.upper()}" for level in levels]
+        compile_ = [*compiler, *options, f"-DEPO_FINGERPRINT={fingerprint()}", *built, "-c"]
         objects = {f"{folder}/{level}.o": [*flags, f"-DEPO_LEVEL={level}"] for level, flags in levels.items()}
         commands = [[*compile_, *flags, str(HERE / "solve.cpp"), "-o", object_] for object_, flags in objects.items()]
         commands.append([*compile_, str(HERE / "dispatch.cpp"), "-o", f"{folder}/dispatch.o"])
@@ -129,11 +158,14 @@ def build(target: Path = LIBRARY) -> None:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    everywhere = os.environ.get("EPO_PORTABLE") == "1"
+    parser.add_argument("--portable", action="store_true", default=everywhere, help="build for every processor")
     parser.add_argument("--sanitize", action="store_true", help=f"build {SANITIZED.name}, with ASan and UBSan")
-    target = SANITIZED if parser.parse_args().sanitize else LIBRARY
+    arguments = parser.parse_args()
+    target = SANITIZED if arguments.sanitize else LIBRARY
     print("building the compiled layer takes a minute or two ...")
     try:
-        build(target)
+        build(target, arguments.portable)
         print(f"{target} is up to date")
     except OSError as error:
         sys.exit(f"the compiled layer was not built: {error}")

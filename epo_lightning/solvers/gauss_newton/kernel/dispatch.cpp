@@ -17,20 +17,25 @@
     const EpoLevel& level(); \
     }
 DECLARE(epo_plain)
-#ifdef EPO_X86
 DECLARE(epo_v3)
 DECLARE(epo_v4)
-#endif
 
 namespace {
 
-/// The levels that this processor can run, best last.
+/// The levels in this library that the processor can run, best last. `build.py` defines a macro for every level in the library.
 std::vector<const EpoLevel*> runnable() {
-    std::vector<const EpoLevel*> levels = {&epo_plain::level()};
-#ifdef EPO_X86
+    std::vector<const EpoLevel*> levels;
+#ifdef HAS_EPO_PLAIN
+    levels.push_back(&epo_plain::level());
+#endif
+#if defined(HAS_EPO_V3) || defined(HAS_EPO_V4)
     __builtin_cpu_init();
     const bool v3 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+#endif
+#ifdef HAS_EPO_V3
     if (v3) levels.push_back(&epo_v3::level());
+#endif
+#ifdef HAS_EPO_V4
     if (v3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
         __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd"))
         levels.push_back(&epo_v4::level());
@@ -39,7 +44,7 @@ std::vector<const EpoLevel*> runnable() {
 }
 
 const std::vector<const EpoLevel*> levels = runnable();
-const EpoLevel* chosen = levels.back();
+const EpoLevel* chosen = levels.empty() ? nullptr : levels.back();
 
 /// The tapes of one call, one per range of problems, and the level that reads them.
 struct Handle {
@@ -86,7 +91,23 @@ extern "C" {
 /// Hash of the sources from which the library was built.
 int64_t epo_fingerprint() { return EPO_FINGERPRINT; }
 
+/// Number of levels that the processor can run; a library without any must not be called.
 int64_t epo_levels() { return int64_t(levels.size()); }
+
+/// Number of levels in the library.
+int64_t epo_built() {
+    int64_t built = 0;
+#ifdef HAS_EPO_PLAIN
+    ++built;
+#endif
+#ifdef HAS_EPO_V3
+    ++built;
+#endif
+#ifdef HAS_EPO_V4
+    ++built;
+#endif
+    return built;
+}
 
 /// Sizes, offsets and constants, up to an entry without a name.
 const EpoLayoutEntry* epo_layout() { return kLayout; }

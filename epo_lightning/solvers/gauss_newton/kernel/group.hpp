@@ -138,19 +138,20 @@ INLINE T of_pair(const void* values, const int64_t* strides, int64_t b, int64_t 
     return static_cast<const T*>(values)[b * strides[0] + m * strides[1] + pair * strides[2]];
 }
 
-template <class T, int N>
-struct Group {
+/// W independent games of n agents. What it does does not gain from a number of agents that is known at compile time, so that it
+/// is compiled once for all numbers.
+template <class T>
+struct Games {
     static constexpr int W = Lanes<T>::W;
     const EpoGame& game;
-    const Count<N> count;
-    const int K, pairs;
+    const int n, K, pairs;
     const bool coupled;                   // whether there is a pair feature
     const bool state_pairs;               // whether there is one of states, and not only of distances
     const bool cut;                       // whether games may end before step K
     const T dt;
     Arena<T>& arena;
     int problem[W], scene[W], mode[W], *agent;  // agent[i * W + lane]
-    Vec<T>*weight;                        // [OWN_COUNT, n]
+    Vec<T>*weight;                        // [n, OWN_COUNT]
     Vec<T>*pair_weight, *reach, *margin;  // [PAIR_COUNT, pairs]
     Vec<T>*length, *width;                // [n], only for pair features of states
     Vec<T>* given;                        // the weights of agents and pairs, of which `enter` sets some to zero; only where `cut`
@@ -160,7 +161,7 @@ struct Group {
     Vec<T>*turn, *thrust;                 // controls [n, K]
     std::vector<Path<T>> path;
 
-    Vec<T> own(int feature, int i) const { return weight[feature * count.agents() + i]; }
+    Vec<T> own(int feature, int i) const { return weight[i * OWN_COUNT + feature]; }
     bool has(int feature) const { return game.own[feature] != nullptr; }
     bool has_pair(int feature) const { return game.pair[feature] != nullptr; }
 
@@ -179,14 +180,13 @@ struct Group {
     INLINE void enter(int k) const {
         if (!cut || (k + 1 < K && !any<T>(end == splat<T>(T(k + 1))))) return;
         const Mask<T> live = has_step(k);
-        for (int e = 0; e < OWN_COUNT * count.agents() + PAIR_COUNT * pairs; ++e) weight[e] = live ? given[e] : Vec<T>{};
+        for (int e = 0; e < OWN_COUNT * n + PAIR_COUNT * pairs; ++e) weight[e] = live ? given[e] : Vec<T>{};
     }
 
     /// Lane `lane` holds the row items[lane * (n + 1)]: the problem, then its agents. Unused lanes repeat the last row.
-    Group(const EpoGame& game, Arena<T>& arena, Count<N> count, const int32_t* items, int filled, const T* controls)
-        : game(game), count(count), K(int(game.K)), pairs(count.agents() * (count.agents() - 1) / 2),
+    NOINLINE Games(const EpoGame& game, Arena<T>& arena, int n, const int32_t* items, int filled, const T* controls)
+        : game(game), n(n), K(int(game.K)), pairs(n * (n - 1) / 2),
           coupled(interacts(game)), state_pairs(has_state_pairs(game)), cut(game.ends != nullptr), dt(T(game.dt)), arena(arena) {
-        const int n = count.agents();
         owners_.resize(n * W);
         agent = owners_.data();
         for (int lane = 0; lane < W; ++lane) {
@@ -204,22 +204,31 @@ struct Group {
     }
 
     /// Read [B, M, N, K, 2] into [n, K] vectors.
-    void load(const T* from, Vec<T>* turns, Vec<T>* thrusts) const {
-        for (int i = 0; i < count.agents(); ++i) {
+    NOINLINE void load(const T* from, Vec<T>* turns, Vec<T>* thrusts) const {
+        for (int i = 0; i < n; ++i) {
             const T* rows[W];
             for (int lane = 0; lane < W; ++lane) rows[lane] = from + row_of(i, lane) * K * 2;
             gather<T>(rows, 2 * K, [&](int e, Vec<T> value) { (e % 2 ? turns : thrusts)[i * K + e / 2] = value; });
         }
     }
 
-    /// Write [n, K] vectors of the first lanes, where `chosen`, to [B, M, N, K, 2].
-    template <class Chosen>
-    void store(const Vec<T>* turns, const Vec<T>* thrusts, int filled, T* to, const Chosen& chosen) const {
-        for (int i = 0; i < count.agents(); ++i) {
+    /// Write [n, K] vectors of the lanes whose bit is set in `lanes` to [B, M, N, K, 2].
+    NOINLINE void store(const Vec<T>* turns, const Vec<T>* thrusts, uint32_t lanes, T* to) const {
+        for (int i = 0; i < n; ++i) {
             T* rows[W];
             for (int lane = 0; lane < W; ++lane)
-                rows[lane] = lane < filled && chosen(lane) ? to + row_of(i, lane) * K * 2 : nullptr;
+                rows[lane] = lanes >> lane & 1 ? to + row_of(i, lane) * K * 2 : nullptr;
             scatter<T>([&](int e) { return (e % 2 ? turns : thrusts)[i * K + e / 2]; }, 2 * K, rows);
+        }
+    }
+
+    /// Write the states 1 .. K of the first lanes to [B, M, N, K, 4].
+    NOINLINE void store_states(int filled, T* to) const {
+        for (int i = 0; i < n; ++i) {
+            const Vec<T>* const entries[4] = {path[i].x, path[i].y, path[i].heading, path[i].speed};
+            T* rows[W];
+            for (int lane = 0; lane < W; ++lane) rows[lane] = lane < filled ? to + row_of(i, lane) * K * 4 : nullptr;
+            scatter<T>([&](int e) { return entries[e % 4][e / 4 + 1]; }, 4 * K, rows);
         }
     }
 
@@ -235,8 +244,8 @@ struct Group {
         return {turns, thrusts, arena.take(steps), arena.take(steps), arena.take(steps), arena.take(steps)};
     }
 
-    void roll() {
-        for (int i = 0; i < count.agents(); ++i) {
+    NOINLINE void roll() {
+        for (int i = 0; i < n; ++i) {
             Path<T>& p = path[i];
             for (int lane = 0; lane < W; ++lane) {
                 const T* start = static_cast<const T*>(game.initial) + scene[lane] * game.initial_b + agent[i * W + lane] * game.initial_n;
@@ -278,7 +287,7 @@ struct Group {
 
     /// The matrix Z of step k for every agent.
     void motions(int k, Motion<T>* Z) const {
-        for (int i = 0; i < count.agents(); ++i) {
+        for (int i = 0; i < n; ++i) {
             const Path<T>& p = path[i];
             const Vec<T> along = dt * p.speed[k];
             Z[i] = {-along * p.sine[k], along * p.cosine[k], dt * p.cosine[k], dt * p.sine[k]};
@@ -287,11 +296,11 @@ struct Group {
 
     /// Computes the nearest points of the reference lines, with TANGENTS also the unit tangents there, and writes them to `found`.
     template <bool TANGENTS>
-    void find_nearest(const Nearest<T>& found) {
+    NOINLINE void find_nearest(const Nearest<T>& found) {
         nearest = found;
         Vec<T>* segments = arena.take((game.points - 1) * 5);
         // Four states at a time: each segment is loaded once for all four, and the processor can overlap their comparisons.
-        for (int i = 0; i < count.agents(); ++i) {
+        for (int i = 0; i < n; ++i) {
             load_line(i, segments);
             int k = 1;
             for (; k + 4 <= K + 1; k += 4) find_nearest_at<TANGENTS, 4>(i, k, segments);
@@ -368,8 +377,7 @@ struct Group {
     }
 
     /// Loads weights, goals and radii, which the features need and a bare rollout does not.
-    void load_parameters() {
-        const int n = count.agents();
+    NOINLINE void load_parameters() {
         const int weights = OWN_COUNT * n + PAIR_COUNT * pairs;
         weight = arena.take(weights);
         pair_weight = weight + OWN_COUNT * n;
@@ -378,7 +386,7 @@ struct Group {
             for (int lane = 0; lane < W; ++lane) {
                 const int64_t* strides = game.own_strides[f];
                 const T* from = static_cast<const T*>(game.own[f]) + scene[lane] * strides[0] + mode[lane] * strides[1];
-                for (int i = 0; i < n; ++i) weight[f * n + i][lane] = from[agent[i * W + lane] * strides[2]];
+                for (int i = 0; i < n; ++i) weight[i * OWN_COUNT + f][lane] = from[agent[i * W + lane] * strides[2]];
             }
         }
         goal_x = arena.take(n);
@@ -497,6 +505,15 @@ struct Group {
             s[4] = squared > 0 ? T(1) / squared : Vec<T>{};
         }
     }
+};
+
+/// Games whose number of agents the compiler knows (N = 0: it does not).
+template <class T, int N>
+struct Group : Games<T> {
+    const Count<N> count;
+
+    Group(const EpoGame& game, Arena<T>& arena, Count<N> count, const int32_t* items, int filled, const T* controls)
+        : Games<T>(game, arena, count.agents(), items, filled, controls), count(count) {}
 };
 
 }  // namespace EPO_LEVEL

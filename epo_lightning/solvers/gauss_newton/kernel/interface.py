@@ -174,7 +174,7 @@ def find() -> ctypes.CDLL | str:
     loaded.epo_solve.argtypes = (Integer, *run, Integer, ctypes.POINTER(Address))
     loaded.epo_differentiate.argtypes = (Address, *run, ctypes.POINTER(EpoGradients))
     loaded.epo_release.argtypes, loaded.epo_release.restype = (Address,), None
-    for name in ("epo_solve", "epo_differentiate", "epo_levels"):
+    for name in ("epo_solve", "epo_differentiate", "epo_levels", "epo_built"):
         getattr(loaded, name).restype = Integer
     loaded.epo_choose.argtypes, loaded.epo_choose.restype = (Integer,), None
     return loaded

@@ -11,6 +11,7 @@
 #include <utility>
 
 #define INLINE inline __attribute__((always_inline))
+#define NOINLINE __attribute__((noinline))
 #define INLINE_LAMBDA __attribute__((always_inline))
 
 namespace EPO_LEVEL {

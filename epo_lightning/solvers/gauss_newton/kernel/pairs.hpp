@@ -225,7 +225,7 @@ INLINE PairValue<S> conflict(const Body<T, S>& p, const Body<T, S>& q, S margin)
 
 /// Value and gradient of a pair feature of states. It is no inline function, because it is used for every size of groups.
 template <class T, class S>
-__attribute__((noinline)) void evaluate_pair(int feature, const Body<T, S>& p, const Body<T, S>& q, const S& margin, PairValue<S>& found) {
+NOINLINE void evaluate_pair(int feature, const Body<T, S>& p, const Body<T, S>& q, const S& margin, PairValue<S>& found) {
     switch (feature) {
         case CIRCLES: found = circles<T, S>(p, q); break;
         case HEADWAY: found = clearance_of_boxes<T, HEADWAY, S>(p, q, margin); break;

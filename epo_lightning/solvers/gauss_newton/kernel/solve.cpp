@@ -196,6 +196,9 @@ void for_each_group(const EpoGame& game, Arena<T>& arena, const Plan& plan, cons
     }
 }
 
+/// The set of the first lanes, one bit per lane.
+INLINE uint32_t first_lanes(int filled) { return (uint32_t(1) << filled) - 1; }
+
 template <class T>
 INLINE bool finite(T value) {
     return value - value == 0;
@@ -313,7 +316,7 @@ class Range {
                 if (!positive[lane]) step.taken[problem - first_] = 0;
                 if (energy) energy[problem] += found[lane];
             }
-            group.store(turn, thrust, filled, directions, [](int) { return true; });
+            group.store(turn, thrust, first_lanes(filled), directions);
         });
         for (int64_t problem = first_; problem < last_; ++problem) {
             T *d = directions + problem * size_, *to = next + problem * size_;
@@ -331,35 +334,28 @@ class Range {
         return step;
     }
 
-    /// Writes the energy of `controls`, the norm of its gradient and the states to the results of the call.
-    void measure(const T* controls, T* energy) {
-        constexpr int W = Lanes<T>::W;
+    /// Writes the energy of `controls` and, unless `states` is null, the norm of its gradient and the states to the results of the call.
+    void measure(const T* controls, T* energy, T* states) {
         T* const norm = static_cast<T*>(run_.gradient_norm);
         std::fill(energy + first_, energy + last_, T(0));
-        std::fill(norm + first_, norm + last_, T(0));
-        std::memset(static_cast<T*>(run_.states) + first_ * size_ * 2, 0, sizeof(T) * (last_ - first_) * size_ * 2);
+        if (states) {
+            std::fill(norm + first_, norm + last_, T(0));
+            std::memset(states + first_ * size_ * 2, 0, sizeof(T) * (last_ - first_) * size_ * 2);
+        }
         const Plan plan = make_plan<T>(game_, arena_, first_, last_, controls);
         for_each_group<T>(game_, arena_, plan, controls, [&](auto& group, int64_t, int filled) {
-            const int n = group.count.agents();
+            const int n = group.n;
             group.load_parameters();
             if (game_.own[LANE])
                 group.template find_nearest<false>(Nearest<T>::at(arena_.take(Nearest<T>::size(n, game_.K)), n, game_.K));
             Vec<T> found, squared;
             evaluate(group, found, squared);
-            for (int lane = 0; lane < filled; ++lane) {
-                energy[group.problem[lane]] += found[lane];
-                norm[group.problem[lane]] += squared[lane];
-            }
-            for (int i = 0; i < n; ++i) {
-                const auto& path = group.path[i];
-                const Vec<T>* const entries[4] = {path.x, path.y, path.heading, path.speed};
-                T* rows[W];
-                for (int lane = 0; lane < W; ++lane)
-                    rows[lane] = lane < filled ? static_cast<T*>(run_.states) + group.row_of(i, lane) * game_.K * 4 : nullptr;
-                scatter<T>([&](int e) { return entries[e % 4][e / 4 + 1]; }, 4 * group.K, rows);
-            }
+            for (int lane = 0; lane < filled; ++lane) energy[group.problem[lane]] += found[lane];
+            if (!states) return;
+            for (int lane = 0; lane < filled; ++lane) norm[group.problem[lane]] += squared[lane];
+            group.store_states(filled, states);
         });
-        for (int64_t problem = first_; problem < last_; ++problem) norm[problem] = std::sqrt(norm[problem]);
+        for (int64_t problem = first_; states && problem < last_; ++problem) norm[problem] = std::sqrt(norm[problem]);
     }
 
     /// S steps in a row.
@@ -371,7 +367,7 @@ class Range {
             StepTape<T> taken = step(iterate(s), iterate(s + 1), directions, s == 0 ? before : nullptr, run_.status);
             if (run_.record) tape->steps.push_back(std::move(taken));
         }
-        measure(iterate(run_.steps), after);
+        measure(iterate(run_.steps), after, static_cast<T*>(run_.states));
         if (run_.steps == 0) std::copy(after + first_, after + last_, before + first_);
         return run_.record ? std::move(tape) : nullptr;
     }
@@ -383,13 +379,13 @@ class Range {
         T *const best = static_cast<T*>(run_.energy), *const before = static_cast<T*>(run_.initial_energy);
         std::vector<int64_t> tried(last_ - first_);
         std::vector<T> found(last_ - first_);
-        measure(controls, best);
+        measure(controls, best, nullptr);
         std::copy(best + first_, best + last_, before + first_);
         for (int64_t s = 0; s < run_.steps; ++s) {
             for (int64_t problem = first_; problem < last_; ++problem)
                 tried[problem - first_] = valid_[problem - first_] ? SOLVED : STOPPED;
             step(controls, trial, static_cast<T*>(run_.directions), nullptr, tried.data() - first_);
-            measure(trial, found.data() - first_);
+            measure(trial, found.data() - first_, nullptr);
             for (int64_t problem = first_; problem < last_; ++problem) {
                 const int64_t at = problem - first_;
                 if (found[at] < best[problem]) {
@@ -402,7 +398,7 @@ class Range {
                 }
             }
         }
-        measure(controls, best);
+        measure(controls, best, static_cast<T*>(run_.states));
         for (int64_t problem = first_; problem < last_; ++problem)
             if (!finite(best[problem])) run_.status[problem] = STOPPED;
     }
@@ -427,41 +423,75 @@ std::unique_ptr<Tape<T>> solve(const EpoGame& game, const EpoRun& run, int64_t f
 /// Adds the pullback of a cotangent of the states x_1 .. x_K to the cotangent of the controls.
 template <class T>
 void pull_states(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last, const T* controls, const T* states, T* bar) {
-    Plan single;
-    single.items.resize(2);
+    constexpr int W = Lanes<T>::W;
+    std::vector<int32_t> items;  // a problem and one of its agents
     for (int64_t problem = first; problem < last; ++problem)
         for (int64_t i = 0; i < game.N; ++i)
-            if (game.present[problem / game.M * game.N + i]) single.items[1].insert(single.items[1].end(), {int32_t(problem), int32_t(i)});
-    for_each_group<T>(game, arena, single, controls, [&](auto& group, int64_t, int filled) {
-        const int K = group.K;
-        const auto& path = group.path[0];
+            if (game.present[problem / game.M * game.N + i]) items.insert(items.end(), {int32_t(problem), int32_t(i)});
+    const int count = int(items.size()) / 2;
+    for (int start = 0; start < count; start += W) {
+        const int filled = std::min(W, count - start);
+        arena.clear();
+        const Games<T> games(game, arena, 1, items.data() + 2 * start, filled, controls);
+        const int K = games.K;
+        const auto& path = games.path[0];
         Vec<T>*turn = arena.take(K), *thrust = arena.take(K), *given = arena.take(4 * K), x{}, y{}, heading{}, speed{};
-        group.load(bar, turn, thrust);
-        const T* rows[Lanes<T>::W];
-        for (int lane = 0; lane < Lanes<T>::W; ++lane) rows[lane] = states + group.row_of(0, lane) * K * 4;
+        games.load(bar, turn, thrust);
+        const T* rows[W];
+        for (int lane = 0; lane < W; ++lane) rows[lane] = states + games.row_of(0, lane) * K * 4;
         gather<T>(rows, 4 * K, [&](int e, Vec<T> value) { given[e] = value; });
         for (int k = K - 1; k >= 0; --k) {
             const Vec<T> c = path.cosine[k + 1], s = path.sine[k + 1];
             if (k + 1 < K) {
-                heading += group.dt * path.speed[k + 1] * (c * y - s * x);
-                speed += group.dt * (c * x + s * y);
+                heading += games.dt * path.speed[k + 1] * (c * y - s * x);
+                speed += games.dt * (c * x + s * y);
             }
             x += given[4 * k];
             y += given[4 * k + 1];
             heading += given[4 * k + 2];
             speed += given[4 * k + 3];
-            turn[k] += group.dt * heading;
-            thrust[k] += group.dt * speed;
+            turn[k] += games.dt * heading;
+            thrust[k] += games.dt * speed;
         }
-        group.store(turn, thrust, filled, bar, [](int) { return true; });
-    });
+        games.store(turn, thrust, first_lanes(filled), bar);
+    }
+}
+
+/// Adds the gradients of the games in the lanes whose bit is set in `lanes` to the results of the call.
+template <class T>
+void add_gradients(const Games<T>& games, const ParameterGradients<T>& by, uint32_t lanes, const EpoGradients& gradients) {
+    const EpoGame& game = games.game;
+    const int n = games.n;
+    const int64_t P = game.N * (game.N - 1) / 2;
+    for (int lane = 0; lane < Lanes<T>::W; ++lane) {
+        if (!(lanes >> lane & 1)) continue;
+        int pair = 0;
+        for (int i = 0; i < n; ++i) {
+            const int64_t row = games.row_of(i, lane);
+            for (int f = 0; f < OWN_COUNT; ++f)
+                if (game.own[f]) static_cast<T*>(gradients.own[f])[row] += by.own[f * n + i][lane];
+            if (game.own[GOAL]) {
+                static_cast<T*>(gradients.goals)[2 * row] += by.goal_x[i][lane];
+                static_cast<T*>(gradients.goals)[2 * row + 1] += by.goal_y[i][lane];
+            }
+            if (game.own[HEADING]) static_cast<T*>(gradients.goal_headings)[row] += by.goal_heading[i][lane];
+            for (int j = i + 1; games.coupled && j < n; ++j, ++pair) {
+                const int64_t a = games.agent[i * Lanes<T>::W + lane], c = games.agent[j * Lanes<T>::W + lane];
+                const int64_t entry = games.problem[lane] * P + a * game.N - a * (a + 1) / 2 + c - a - 1;
+                for (int f = 0; f < PAIR_COUNT; ++f) {
+                    if (game.pair[f]) static_cast<T*>(gradients.pair[f])[entry] += by.pair[f * games.pairs + pair][lane];
+                    if (gradients.margins[f])
+                        static_cast<T*>(gradients.margins[f])[entry] += by.margin[f * games.pairs + pair][lane];
+                }
+            }
+        }
+    }
 }
 
 /// The adjoint of `solve`: from the last step to the first.
 template <class T>
 void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& run, const EpoGradients& gradients) {
     const int64_t first = tape.first, last = tape.last, size = game.N * game.K * 2, all = game.B * game.M * size;
-    const int64_t P = game.N * (game.N - 1) / 2;
     T* const bar = static_cast<T*>(gradients.controls);
     Arena<T> arena;
     const auto add_iterate = [&](int64_t s) {
@@ -500,31 +530,10 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
             for (int e = 0; e < n; ++e) by.goal_x[e] = by.goal_y[e] = by.goal_heading[e] = Vec<T>{};
             differentiate(group, mu_turn, mu_thrust, d_turn, d_thrust, bar_turn, bar_thrust, by);
             // A step that was not taken passes its cotangent on unchanged.
-            const auto taken = [&](int lane) { return step.taken[group.problem[lane] - first] != 0; };
-            group.store(bar_turn, bar_thrust, filled, bar, taken);
-            for (int lane = 0; lane < filled; ++lane) {
-                if (!taken(lane)) continue;
-                int pair = 0;
-                for (int i = 0; i < n; ++i) {
-                    const int64_t row = group.row_of(i, lane);
-                    for (int f = 0; f < OWN_COUNT; ++f)
-                        if (game.own[f]) static_cast<T*>(gradients.own[f])[row] += by.own[f * n + i][lane];
-                    if (game.own[GOAL]) {
-                        static_cast<T*>(gradients.goals)[2 * row] += by.goal_x[i][lane];
-                        static_cast<T*>(gradients.goals)[2 * row + 1] += by.goal_y[i][lane];
-                    }
-                    if (game.own[HEADING]) static_cast<T*>(gradients.goal_headings)[row] += by.goal_heading[i][lane];
-                    for (int j = i + 1; group.coupled && j < n; ++j, ++pair) {
-                        const int64_t a = group.agent[i * Lanes<T>::W + lane], c = group.agent[j * Lanes<T>::W + lane];
-                        const int64_t entry = group.problem[lane] * P + a * game.N - a * (a + 1) / 2 + c - a - 1;
-                        for (int f = 0; f < PAIR_COUNT; ++f) {
-                            if (game.pair[f]) static_cast<T*>(gradients.pair[f])[entry] += by.pair[f * group.pairs + pair][lane];
-                            if (gradients.margins[f])
-                                static_cast<T*>(gradients.margins[f])[entry] += by.margin[f * group.pairs + pair][lane];
-                        }
-                    }
-                }
-            }
+            uint32_t taken = 0;
+            for (int lane = 0; lane < filled; ++lane) taken |= uint32_t(step.taken[group.problem[lane] - first] != 0) << lane;
+            group.store(bar_turn, bar_thrust, taken, bar);
+            add_gradients<T>(group, by, taken, gradients);
         });
         add_iterate(s);
     }

@@ -60,9 +60,9 @@ INLINE void entries_of(int i, int j, int m, int* at) {
 }
 
 /// Adds the costs of the pair features of states at one state; arguments as for `add_state_costs`.
-template <class T, int N>
-__attribute__((noinline)) void add_state_pair_costs(const Group<T, N>& g, int state, bool exact, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
-    const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
+template <class T>
+NOINLINE void add_state_pair_costs(const Games<T>& g, int state, bool exact, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
+    const int n = g.n, m = 2 * n, ld = 3 * m;
     for (int feature = 0; feature < PAIR_COUNT; ++feature) {
         if (of_discs(feature) || !g.has_pair(feature)) continue;
         int pair = 0;
@@ -140,7 +140,7 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, bool exact, Vec<T
     if (!g.pairs_count_at(state)) return energy;
     for (const int feature : {PROXIMITY, CLEARANCE})
         if (g.has_pair(feature)) add_disc_costs(g, feature, state, exact, P, y, energy);
-    if (g.state_pairs) add_state_pair_costs(g, state, exact, P, y, energy);
+    if (g.state_pairs) add_state_pair_costs<T>(g, state, exact, P, y, energy);
     return energy;
 }
 
@@ -204,8 +204,8 @@ INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* 
     }
 }
 
-/// Computes the damped Gauss-Newton direction (or, if `exact`, the damped Newton direction) of every lane: the changes [n, K] of turn rates (`turn`) and accelerations
-/// (`thrust`). Also writes the factors, the energy, and a mask of the lanes in which the damped matrix is positive definite.
+/// Computes the damped Gauss-Newton direction (or, if `exact`, the damped Newton direction) of every lane: the changes [n, K] of turn
+/// rates (`turn`) and accelerations (`thrust`). Also writes the factors, the energy, and a mask of the lanes in which the damped matrix is positive definite.
 ///
 /// Every agent has its own damping [n]. Infinite damping makes the reciprocal pivots zero, and therefore the direction as well.
 template <class T, int N>
@@ -349,11 +349,11 @@ INLINE void differentiate_discs(
 
 /// The part of `differentiate` that belongs to the pair features of states, at one state; also adds to the cotangents `nodes` [n, 2]
 /// of headings and speeds.
-template <class T, int N>
-__attribute__((noinline)) void differentiate_state_pairs(
-    const Group<T, N>& g, int state, const std::vector<Tangent<T>>& first, const std::vector<Tangent<T>>& second, Vec<T>* sums,
+template <class T>
+NOINLINE void differentiate_state_pairs(
+    const Games<T>& g, int state, const std::vector<Tangent<T>>& first, const std::vector<Tangent<T>>& second, Vec<T>* sums,
     Vec<T>* nodes, const ParameterGradients<T>& by) {
-    const int n = g.count.agents();
+    const int n = g.n;
     for (int feature = 0; feature < PAIR_COUNT; ++feature) {
         if (of_discs(feature) || !g.has_pair(feature)) continue;
         int pair = 0;
@@ -466,7 +466,7 @@ void differentiate(
         if (g.pairs_count_at(state))
             for (const int feature : {PROXIMITY, CLEARANCE})
                 if (g.has_pair(feature)) differentiate_discs(g, feature, state, first, second, sums, by);
-        if (g.state_pairs && g.pairs_count_at(state)) differentiate_state_pairs(g, state, first, second, sums, nodes, by);
+        if (g.state_pairs && g.pairs_count_at(state)) differentiate_state_pairs<T>(g, state, first, second, sums, nodes, by);
         for (int i = 0; i < n; ++i) {
             const Tangent<T>&t1 = first[i], &t2 = second[i];
             const auto weigh = [&](int feature) -> Vec<T>& { return by.own[feature * n + i]; };
