@@ -132,8 +132,8 @@ class Scene(_Batch):
         id: index of the scene's record in its data set.
         goal_headings: heading [rad] that an agent wants at each goal candidate, continuous with the agent's heading: it is
             not wrapped to (-pi, pi], so a difference of 2 pi is a full turn.
-        game_steps: number of steps from t0 to the end of each scene's game, 1 .. K of the controls. Controls after the end
-            have no cost and no effect. None if all games end with the last control.
+        game_steps: number of steps from t0 to the end of each scene's game. Controls after the end have no cost and no
+            effect. A forecaster with a shorter horizon cuts its game there. None if all games end with the last control.
 
     Raises:
         TypeError: a field that is not a tensor (numpy arrays included), or a time step that is not a number.

@@ -68,9 +68,8 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
     if settings.logger.mlflow is not None:
         mlflow.check_settings(settings.logger.mlflow)
     data = build_data(settings.data)
-    data.order_seed = (
-        settings.seed
-    )  # the order of the batches belongs to the run; data.seed draws the scenes and splits
+    # The order of the batches belongs to the run; data.seed draws the scenes and splits.
+    data.order_seed = settings.seed
     check_divisible(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)
     forecaster = build_model(settings, data)
     check_monitor(settings.callbacks.monitor, data.task)

@@ -11,10 +11,11 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 
 from epo_lightning import pretrained
-from epo_lightning.experiment import assembly, logs, truth
+from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
-from epo_lightning.forecasters import Forecaster
+from epo_lightning.experiment.truth import TruthTest
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
@@ -82,6 +83,7 @@ def score(
     machine = machine or of_run.trainer
     torch.set_num_threads(machine.threads)
     double = of_run.trainer.precision == "64-true"
+    truths = TruthTest(data.records(settings.split)["weight"]) if isinstance(data, RPIData) else None
     with assembly.naming(machine, run):
         trainer = Trainer(
             accelerator=machine.accelerator,
@@ -90,6 +92,7 @@ def score(
             plugins=[assembly.Double()] if double else None,
             deterministic=of_run.trainer.deterministic,
             inference_mode=False,  # the layer differentiates its energy also when it only forecasts
+            callbacks=[] if truths is None else [truths],
             logger=False,
             enable_checkpointing=False,
             enable_progress_bar=False,
@@ -105,30 +108,13 @@ def score(
         "data_digest": data.digest,
         "checkpoint": settings.checkpoint if settings.checkpoint in ("best", "last") else checkpoint.name,
         "metrics": metrics,
-        **_truth(forecaster, data, settings.split),
     }
+    if truths is not None and (costs := truths.scores()):
+        scored["truth"] = costs
     file = keep(run, scored, checkpoint)
     if file == run.metrics_file():
         logs.publish(run)
     return file, metrics
-
-
-@torch.no_grad()
-def _truth(forecaster: Forecaster, data: Any, split: str) -> dict[str, Any]:
-    """The section ``truth`` of a scores file: inferred costs beside the true ones, on data that knows them.
-
-    Every record counts once, with its executed future.
-    """
-    if not hasattr(data, "true_weights"):
-        return {}
-    weights, batches = data.true_weights(split), []
-    for scene in split_of(data, split):
-        scene = scene[scene.subset == 0]
-        forecast = forecaster.predict(scene)
-        if not truth.knows_truth(data, forecast.parameters):
-            return {}
-        batches.append(truth.collect(forecast, weights[scene.id]))
-    return {"truth": truth.compare({name: torch.cat([batch[name] for batch in batches]) for name in batches[0]})}
 
 
 def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:

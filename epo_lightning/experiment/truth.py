@@ -14,11 +14,13 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from lightning import LightningModule
+from lightning.pytorch import Callback, Trainer
 from scipy import stats
 from torch import Tensor
 
 from epo_lightning.data.rpi.game import GameConstants
-from epo_lightning.scene import GameParameters, JointForecast
+from epo_lightning.scene import GameParameters, JointForecast, Scene
 
 OWN = {"goal": "terminal", "vel": "slowness"}
 """Own terms that are compared, with their true weight in :class:`GameConstants`."""
@@ -42,15 +44,33 @@ def inferred_costs(parameters: GameParameters, mode: Tensor) -> dict[str, Tensor
     return found
 
 
-def collect(forecast: JointForecast, true_weight: Tensor) -> dict[str, Tensor]:
-    """True and inferred costs of a batch: ``true`` and the names of :func:`inferred_costs`, [B] each.
+class TruthTest(Callback):
+    """Collector of true and inferred costs during a test. Every record counts once, with its executed future.
 
     Args:
-        forecast: forecasts with an inferred game.
-        true_weight: w of every scene.
+        weights: w of every record of the split; ``Scene.id`` holds indices of records.
     """
-    assert forecast.parameters is not None
-    return {"true": true_weight.double(), **inferred_costs(forecast.parameters, forecast.probabilities.argmax(1))}
+
+    def __init__(self, weights: Tensor) -> None:
+        self._weights = weights.double()
+        self._batches: list[dict[str, Tensor]] = []
+
+    def on_test_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Scene, batch_idx: int, *_: Any
+    ) -> None:
+        assert batch.subset is not None
+        assert batch.id is not None
+        executed = (batch.subset == 0).nonzero().flatten()
+        forecast: JointForecast = outputs["forecast"][executed].map(Tensor.cpu)
+        if forecast.parameters is not None and forecast.parameters.own_weights.keys() >= NEEDED:
+            costs = inferred_costs(forecast.parameters, forecast.probabilities.argmax(1))
+            self._batches.append({"true": self._weights[batch.id[executed].cpu()], **costs})
+
+    def scores(self) -> dict[str, float]:
+        """Scores of all collected costs (:func:`compare`); empty for forecasts without the terms to compare."""
+        if not self._batches:
+            return {}
+        return compare({name: torch.cat([batch[name] for batch in self._batches]) for name in self._batches[0]})
 
 
 def compare(costs: dict[str, Tensor]) -> dict[str, float]:
@@ -70,8 +90,3 @@ def compare(costs: dict[str, Tensor]) -> dict[str, float]:
     if "pair" in costs:
         scores["pair_rank"] = float(stats.spearmanr(costs["pair"].numpy(), costs["true"].numpy()).statistic)
     return scores
-
-
-def knows_truth(data: Any, parameters: GameParameters | None) -> bool:
-    """Whether the data knows its games' weights and the forecast has the terms to compare."""
-    return hasattr(data, "true_weights") and parameters is not None and parameters.own_weights.keys() >= NEEDED

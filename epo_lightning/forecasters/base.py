@@ -95,8 +95,10 @@ class Forecaster(LightningModule):
     def on_validation_epoch_end(self) -> None:
         self._log_metrics("val", self.val_metrics)
 
-    def test_step(self, scene: Scene, _: int) -> None:
-        self.test_metrics.update(self.examine(scene, self(scene)), scene)
+    def test_step(self, scene: Scene, _: int) -> dict[str, JointForecast]:
+        forecast = self.examine(scene, self(scene))
+        self.test_metrics.update(forecast, scene)
+        return {"forecast": forecast}
 
     def on_test_epoch_end(self) -> None:
         self._log_metrics("test", self.test_metrics)

@@ -53,9 +53,8 @@ class Imitation(Objective):
             entropy = order_loss(forecast.order_logits, *energy.pair_order.observed(scene))
             terms["probability"] = (self.weights["probability"], entropy)
         starts = forecast.initial_states
-        if (
-            starts is not None and starts.requires_grad
-        ):  # EPO detaches them if the solution already teaches the strategies
+        # EPO detaches them if the solution already teaches the strategies.
+        if starts is not None and starts.requires_grad:
             initial = dataclasses.replace(forecast, states=starts)
             closest = imitation_terms(scene, initial, self.weights, *how)["imitation"][1]
             terms["initial"] = (self.weights["initial"], closest)

@@ -1,4 +1,4 @@
-"""What the game is worth: the scores of a row beside those of its twin without pair terms.
+"""Worth of the game: the scores of a row beside those of its twin without pair terms.
 
 The agents of an inferred game interact through its pair terms (``energy.pair``) alone. Two rows whose recorded
 configurations are equal in everything else show what these terms contribute to the forecasts.

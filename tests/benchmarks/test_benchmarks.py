@@ -11,7 +11,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import dashboards, epo_layer, extraction, scaling, training_step
+from benchmarks import dashboards, epo_layer, extraction, scaling, training_step, true_game
+from epo_lightning.data.rpi.scenes import RPIData
 
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
 SMALL = ["--B", "2", "--M", "1", "--K", "4", "--S", "1", "--repeats", "1"]
@@ -88,6 +89,19 @@ def test_extraction_is_timed(capsys):
     for stage in ("reading", "extraction", "loading"):
         (number,) = [line.split()[1] for line in shown.splitlines() if line.startswith(stage)][:1]
         assert float(number.replace(",", "")) > 0
+
+
+def test_true_games_are_measured(capsys, tmp_path):
+    small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null"]
+    assert "epo generate" in refused(true_game.main, *small)
+    generate = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None)
+    generate.generate(workers=1, progress=False)
+    true_game.main(["--records", "4", *small])
+    lines = capsys.readouterr().out.splitlines()[-8:]
+    assert [line.split(" w")[0] for line in lines[:6]] == ["1", "0.85", "1.15", "0.5", "2", "0"]
+    assert float(lines[0].split("executed ")[1].split()[0]) < 1e-5
+    assert "fewer than 4000" in refused(true_game.main, "--records", 4000, *small)
+    assert "data=rpi" in refused(true_game.main, "data=drawn")
 
 
 @pytest.mark.parametrize("format_", ["commonroad", "ucy", "exid"])

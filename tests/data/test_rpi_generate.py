@@ -14,18 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from safetensors.numpy import load_file
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks import true_game
 from epo_lightning.data import cache
-from epo_lightning.data.rpi.game import GameConstants
 from epo_lightning.data.rpi.report import markdown
-from epo_lightning.data.rpi.scenes import DISC_DIAMETER, RPIData
+from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.splits import PAPER_SIZES, assign, games_of
-from epo_lightning.data.rpi.subgames import FUTURE, HISTORY
-from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import GameParameters
-from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 SMALL = {"games": 3, "placements": 2, "seed": 1}
 
@@ -221,46 +218,12 @@ def test_a_missing_set_names_the_command(tmp_path):
 
 def test_the_layer_with_the_true_game_reproduces_the_modes(data: RPIData) -> None:
     """From zero controls, the layer finds the executed mode; from a start on its side, the alternative one."""
-    scenes = data.open("train")
-    weight = data.true_weights("train")
-    executed = np.random.default_rng(0).choice(np.flatnonzero((scenes.mode == 0).numpy()), 60, replace=False)
-    scene = scenes[torch.from_numpy(np.sort(executed))].to(torch.double)
-    assert scene.id is not None
-    assert scene.goal_candidates is not None
-    assert scene.goal_headings is not None
-    constants = GameConstants()
-    squared = {
-        **dict.fromkeys(("goal", "heading"), constants.terminal),
-        **dict.fromkeys(("acc", "turnr"), constants.effort),
-        "vel": constants.slowness,
-        **dict.fromkeys(("accb", "turnrb", "velb"), 2 * constants.bound),
-    }
-    energy = FeatureEnergy(
-        own=list(squared),
-        pair=["clearance"],
-        margins={"clearance": constants.radius - DISC_DIAMETER},
-        bounds={
-            "vel": (constants.speed_min, constants.speed_max),
-            "acc": (-constants.acceleration_limit, constants.acceleration_limit),
-            "turnr": (-constants.turn_limit, constants.turn_limit),
-        },
-    )
-    solver = LevenbergMarquardt(steps=20, newton_steps=10, step_size=1.0, damping=1.0, adaptive=True)
-    start = torch.zeros(60, 2, 2, constants.steps - HISTORY, 2, dtype=torch.double)
-    records = load_file(data.folder / "train.safetensors")
-    start[:, 1, :, :FUTURE] = torch.from_numpy(records["controls"][scene.id, 1])
-    game = GameParameters(
-        own_weights={name: torch.full((60, 2, 2), value**0.5, dtype=torch.double) for name, value in squared.items()},
-        pair_weights={"clearance": (2 * weight[scene.id]).sqrt()[:, None, None].expand(60, 2, 1)},
-        initial_controls=start,
-        goals=scene.goal_candidates[:, None, :, 0].expand(-1, 2, -1, -1),
-        goal_headings=scene.goal_headings[:, None, :, 0].expand(-1, 2, -1),
-    )
-    with torch.no_grad():
-        solution = solver(energy, scene, game)
-    states = torch.from_numpy(records["states"][scene.id].astype(np.float64))
-    missed = (solution.states[..., :FUTURE, :2] - states[..., :2]).norm(dim=-1).mean((2, 3))
-    both = torch.from_numpy(records["modes"][scene.id] == 2)
-    assert both.sum() > 10
-    assert missed[:, 0].max() < 1e-5
-    assert missed[both, 1].max() < 1e-5
+    _, solver, energy, calibration = true_game.parts([])
+    games = true_game.TrueGames.draw(data, "train", 60)
+    assert games.both.sum() > 10
+    for missed in games.missed(solver, energy, games.game()):
+        assert missed.max() < 1e-5
+    wrong = games.game(2.0)
+    assert games.missed(solver, energy, wrong)[0].mean() > 1e-3
+    found = calibration(solver, energy, games.scene, wrong).pair_weights["clearance"][:, 0, 0].square() / 2
+    assert (found / games.weight - 1).abs().max() < 0.01, "the history tells the weight"

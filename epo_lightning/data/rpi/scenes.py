@@ -198,10 +198,12 @@ class RPIData(SceneDataModule):
         records["game_steps"] = GameConstants().steps - records["step"]
         return RPIDataset(records, self.targets, self.seed)
 
-    def true_weights(self, split: str) -> Tensor:
-        """The weight w of the game of every record [R] of a split; ``Scene.id`` holds indices of records.
+    def records(self, split: str) -> dict[str, Tensor]:
+        """The records of a split [R, ...] with their modes, controls and the weight w of their game.
+
+        ``Scene.id`` holds indices of records.
 
         Raises:
             cache.CacheError: as :meth:`open`.
         """
-        return cache.load(self.folder, split, ("weight",), self.command, self.config)["weight"]
+        return cache.load(self.folder, split, ("states", "controls", "modes", "weight"), self.command, self.config)

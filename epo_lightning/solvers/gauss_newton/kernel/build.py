@@ -1,9 +1,10 @@
 """Build of the compiled layer: `python -m epo_lightning.solvers.gauss_newton.kernel.build`.
 
-Installing the package runs it too. It needs a C++17 compiler (GCC or Clang: `$CXX`, or the first of c++, g++, clang++), but
-neither PyTorch nor Python's headers. On x86-64 there are three levels of instructions. A checkout compiles its sources for the
-best one of this machine, which takes a third of the time. A wheel has all three, so that it runs on other machines as well; the
-library chooses one when it is loaded. `--portable`, or EPO_PORTABLE=1 in the environment, builds such a library in a checkout.
+Installing the package runs it too. It needs a C++17 compiler (GCC or Clang: `$CXX`, or the first of c++, g++, clang++),
+but neither PyTorch nor Python's headers. On x86-64 there are three levels of instructions. A checkout compiles its sources
+for the best one of this machine, which takes a third of the time. A wheel has all three, so that it runs on other machines
+as well, and the library chooses one when it is loaded. `--portable`, or EPO_PORTABLE=1 in the environment, builds such a
+library in a checkout.
 
 `--sanitize` builds a second library with AddressSanitizer and UndefinedBehaviorSanitizer, which `make asan` tests.
 """
@@ -72,7 +73,9 @@ def load(path: Path | None = None) -> ctypes.CDLL:
         raise OSError(f"{path} was built from other sources than those beside it")
     library.epo_levels.restype = ctypes.c_int64
     if library.epo_levels() == 0:
-        raise OSError(f"{path} was built for a processor with instructions that this one lacks (--portable builds for all)")
+        raise OSError(
+            f"{path} was built for a processor with instructions that this one lacks (--portable builds for all)"
+        )
     return library
 
 

@@ -1,0 +1,165 @@
+"""Accuracy of the layer on the games that made RPI: with their true weights, with wrong ones, and with calibrated ones.
+
+    epo generate data=rpi_hard data.placements=8
+    python -m benchmarks.true_game data=rpi_hard data.placements=8
+
+Energy, solver and calibration are those of the row `rpi/v_lstm_epo_game`; overrides are those of `epo train`. Nothing is
+learned: the weights are those with which the generator made the records. Executed modes start from controls of zero,
+alternative ones from their recorded controls.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from benchmarks.measure import positive
+from epo_lightning.data.rpi.game import GameConstants
+from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.data.rpi.subgames import FUTURE
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.compose import compose
+from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.forecasters.calibration import Calibration
+from epo_lightning.forecasters.epo import EPO
+from epo_lightning.game.energy import Energy
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.schema import read
+from epo_lightning.solvers.base import Minimiser
+
+FACTORS = (1.0, 0.85, 1.15, 0.5, 2.0, 0.0)
+"""Factors of the true weight of the pair term."""
+FROM = 2.0
+"""Factor of the true weight from which the calibration begins."""
+
+
+@dataclass(frozen=True)
+class TrueGames:
+    """Records of RPI with the games that made them, in float64.
+
+    Attributes:
+        scene: scenes, whose games end ``game_steps`` after t0.
+        weight: w of every game [B].
+        states: recorded executed and alternative modes [B, 2, N, K, 4].
+        controls: their controls [B, 2, N, K, 2].
+        both: whether a record has an alternative mode [B].
+    """
+
+    scene: Scene
+    weight: Tensor
+    states: Tensor
+    controls: Tensor
+    both: Tensor
+
+    @classmethod
+    def draw(cls, data: RPIData, split: str, count: int) -> TrueGames:
+        """Random records of a split, in the same order on every machine.
+
+        Raises:
+            ConfigError: the split has fewer records.
+        """
+        scenes, records = data.open(split), data.records(split)
+        executed = (scenes.mode == 0).nonzero().flatten()
+        if len(executed) < count:
+            raise ConfigError(f"the {split} split of {data.folder} has {len(executed)} records, fewer than {count}")
+        order = torch.randperm(len(executed), generator=torch.Generator().manual_seed(0))
+        scene = scenes[executed[order[:count]].sort().values].to(torch.double)
+        rows = {name: values[scene.id] for name, values in records.items()}
+        return cls(
+            scene, rows["weight"].double(), rows["states"].double(), rows["controls"].double(), rows["modes"] == 2
+        )
+
+    def game(self, factor: float = 1.0) -> GameParameters:
+        """The true games from both starts, with the weight of their pair term multiplied by a factor."""
+        constants = GameConstants()
+        squared = {
+            **dict.fromkeys(("goal", "heading"), constants.terminal),
+            **dict.fromkeys(("acc", "turnr"), constants.effort),
+            "vel": constants.slowness,
+            **dict.fromkeys(("accb", "turnrb", "velb"), 2 * constants.bound),
+        }
+        batch = len(self.weight)
+        assert self.scene.goal_candidates is not None
+        assert self.scene.goal_headings is not None
+        assert self.scene.game_steps is not None
+        start = torch.zeros(batch, 2, 2, int(self.scene.game_steps.max()), 2, dtype=torch.double)
+        start[:, 1, :, :FUTURE] = self.controls[:, 1]
+        return GameParameters(
+            own_weights={name: torch.full((batch, 2, 2), value**0.5).double() for name, value in squared.items()},
+            pair_weights={"clearance": (2 * factor * self.weight).sqrt()[:, None, None].expand(batch, 2, 1)},
+            initial_controls=start,
+            goals=self.scene.goal_candidates[:, None, :, 0].expand(-1, 2, -1, -1),
+            goal_headings=self.scene.goal_headings[:, None, :, 0].expand(-1, 2, -1),
+        )
+
+    @torch.no_grad()
+    def missed(self, solver: Minimiser, energy: Energy, game: GameParameters) -> tuple[Tensor, Tensor]:
+        """SADE [m] of the executed mode of every record, and of the alternative mode of those that have one."""
+        solution = solver(energy, self.scene, game)
+        found = (solution.states[..., :FUTURE, :2] - self.states[..., :2]).norm(dim=-1).mean((2, 3))
+        return found[:, 0], found[self.both, 1]
+
+
+def parts(overrides: Sequence[str]) -> tuple[RPIData, Minimiser, Energy, Calibration]:
+    """The data, and the row's solver, energy and calibration."""
+    settings = read(Settings, compose("train", ["experiment=rpi/v_lstm_epo_game", *overrides]))
+    data, model = assembly.build(settings)
+    if not isinstance(data, RPIData) or not isinstance(model, EPO) or model.calibration is None:
+        raise ConfigError("the benchmark compares with the games that made RPI: choose data=rpi or data=rpi_hard")
+    return data, model.solver, model.energy, model.calibration
+
+
+def measure(split: str, count: int, overrides: Sequence[str]) -> None:
+    """Print a line per factor of the weight, and how well the calibration finds the true weight."""
+    data, solver, energy, calibration = parts(overrides)
+    games = TrueGames.draw(data, split, count)
+    print(
+        f"{count} records of {data.folder.name}, {split}, {int(games.both.sum())} with two modes; mean (largest) SADE [m]"
+    )
+
+    def line(title: str, game: GameParameters) -> None:
+        start = time.process_time()
+        modes = games.missed(solver, energy, game)
+        spent = 1e3 * (time.process_time() - start) / count
+        executed, alternative = (f"{mode.mean():.1e} ({mode.max():.1e})" for mode in modes)
+        print(f"{title:16} executed {executed}  alternative {alternative}  {spent:.1f} ms of CPU per record")
+
+    for factor in FACTORS:
+        line(f"{factor:g} w", games.game(factor))
+    start = time.process_time()
+    calibrated = calibration(solver, energy, games.scene, games.game(FROM))
+    spent = 1e3 * (time.process_time() - start) / count
+    line(f"{FROM:g} w, calibrated", calibrated)
+    found = calibrated.pair_weights["clearance"][:, 0, 0].square() / 2
+    error = (found / games.weight - 1).abs()
+    rank = stats.spearmanr(found.numpy(), games.weight.numpy()).statistic
+    print(
+        f"calibrated w: rank correlation {rank:.4f}, relative error median {error.median():.1e}, largest {error.max():.1e}, "
+        f"{spent:.1f} ms of CPU per record"
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--records", type=positive, default=400)
+    parser.add_argument("overrides", nargs="*", metavar="override")
+    arguments = parser.parse_args(argv)
+    assembly.quiet()
+    torch.set_num_threads(1)
+    try:
+        measure(arguments.split, arguments.records, arguments.overrides)
+    except ConfigError as error:
+        raise SystemExit(f"true_game: {error}") from None
+
+
+if __name__ == "__main__":
+    main()
