@@ -17,6 +17,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -66,32 +67,38 @@ class Calibration:
             return parameters
         past = _at_first_step(scene).to(torch.double)
         game = parameters.map(lambda t: t.double() if t.is_floating_point() else t)
+        # Two copies of every game: one at s, and one beside it for the finite difference. They are solved at once, as modes.
+        copies = dataclasses.replace(game.map(lambda t: torch.cat((t, t), 1)), context=game.context)
         observed = past.future[:, None, :, :, :2]  # type: ignore[index]
         present = scene.agent_mask[:, None, :, None, None]
-        controls = _with_history(past, game.initial_controls)
 
-        def misses(s: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-            """Weighted misses [B, M, R] of the history, and the strategies behind them."""
-            weights = {name: weight * s.exp()[..., None] for name, weight in game.pair_weights.items()}
-            found = minimiser(energy, past, dataclasses.replace(game, pair_weights=weights, initial_controls=start))
+        def misses(s: Tensor, start: Tensor, minimiser: Minimiser) -> tuple[Tensor, Tensor, Tensor]:
+            """Weighted misses [B, M, R] of the history, their derivative by s, and the strategies of both copies."""
+            factor = torch.cat((s, s + _DIFFERENCE), 1).exp()[..., None]
+            weights = {name: weight * factor for name, weight in copies.pair_weights.items()}
+            found = minimiser(energy, past, dataclasses.replace(copies, pair_weights=weights, initial_controls=start))
             missed = found.states[..., :before, :2] - observed
-            return torch.where(present, missed, 0.0).flatten(2) / self.noise, found.controls
+            here, beside = (torch.where(present, missed, 0.0).flatten(2) / self.noise).chunk(2, 1)
+            return here, (beside - here) / _DIFFERENCE, found.controls
 
-        s = observed.new_zeros(controls.shape[:2])
+        games = next(iter(game.pair_weights.values())).shape[1]
+        s = observed.new_zeros(len(observed), games)
         damping = torch.ones_like(s)
-        missed, controls = misses(s, controls)
+        start = _with_history(past, game.initial_controls.shape[3])
+        missed, change, controls = misses(s, start.expand(-1, 2 * games, -1, -1, -1), minimiser)
+        near = minimiser.near_minimum()
         for _ in range(self.steps):
-            moved, _ = misses(s + _DIFFERENCE, controls)
-            change = (moved - missed) / _DIFFERENCE
             slope = (change * missed).sum(-1) + s / self.spread**2
             curvature = change.square().sum(-1) + 1.0 / self.spread**2
             trial = s + (-slope / (damping * curvature)).clamp(-_LARGEST_STEP, _LARGEST_STEP)
-            after, strategies = misses(trial, controls)
-            better = self._cost(after, trial) < self._cost(missed, s)
+            found = misses(trial, controls, near)
+            better = self._cost(found[0], trial) < self._cost(missed, s)
             damping = torch.where(better, (damping / 3.0).clamp_min(1.0), damping * 4.0)
             s = torch.where(better, trial, s)
-            missed = torch.where(better[..., None], after, missed)
-            controls = torch.where(better[..., None, None, None], strategies, controls)
+            missed = torch.where(better[..., None], found[0], missed)
+            change = torch.where(better[..., None], found[1], change)
+            both = torch.cat((better, better), 1)[..., None, None, None]
+            controls = torch.where(both, found[2], controls)
         complete = (scene.history_mask | ~scene.agent_mask[..., None]).all(-1).all(-1)
         factor = torch.where(complete[:, None] & s.isfinite(), s, 0.0).exp()[..., None]
         weights = {name: weight * factor.to(weight.dtype) for name, weight in parameters.pair_weights.items()}
@@ -116,11 +123,10 @@ def _at_first_step(scene: Scene) -> Scene:
     )
 
 
-def _with_history(past: Scene, initial: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "B M N T 2"]:
-    """The observed controls, followed by zeros: the start of the game at the first observed step."""
+def _with_history(past: Scene, ahead: int) -> Float[Tensor, "B 1 N T 2"]:
+    """The observed controls, followed by zeros for the steps after t0: the start of the game at the first observed step."""
     assert past.future is not None
     seen = torch.cat((past.history, past.future), 2)
     change = seen[..., [SPEED, HEADING]].diff(dim=2) / past.dt
     change = torch.where(past.agent_mask[..., None, None], change, 0.0)
-    modes = initial.shape[1]
-    return torch.cat((change[:, None].expand(-1, modes, -1, -1, -1), torch.zeros_like(initial)), 3)
+    return F.pad(change, (0, 0, 0, ahead))[:, None]

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from epo_lightning.backbones.base import Backbone
+from epo_lightning.checks import check_number
 from epo_lightning.decoders.goals import GivenGoals, GoalDecoder, Goals, NoGoals
 from epo_lightning.decoders.motions import Motions
 from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
@@ -74,6 +75,8 @@ class EPO(Forecaster):
             the order of agents.
         initial: ``decoded``, ``zero`` or ``motions``.
         control_scale: initial control at a network output of one.
+        swerve: difference of the modes' initial strategies before training, as a turn rate [rad/s]; see
+            :class:`~epo_lightning.decoders.strategies.InitialStrategies`.
         motions: largest ``acceleration`` [m/s^2] and ``curvature`` [1/m] of initial motions.
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
             the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
@@ -114,6 +117,7 @@ class EPO(Forecaster):
         one_game: bool = False,
         probabilities: str = "linear",
         margin: Mapping[str, float] | None = None,
+        swerve: float = 0.0,
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         _check_needs(energy, task)
@@ -161,6 +165,7 @@ class EPO(Forecaster):
             raise ConfigError(f"forecaster.pair_start must be finite, not {pair_start}")
         if not 0 < control_scale < math.inf:
             raise ConfigError(f"forecaster.control_scale must be positive and finite, not {control_scale}")
+        check_number("forecaster.swerve", swerve, zero=True)
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
         # `solve` runs the minimiser, with the derivative of its solution that the part `backward` defines.
@@ -180,7 +185,7 @@ class EPO(Forecaster):
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs, positive=one_game)
         self.strategies: InitialStrategies | ZeroStrategies | Motions
         if initial == "decoded":
-            self.strategies = InitialStrategies(width, strategies, horizon, control_scale)
+            self.strategies = InitialStrategies(width, strategies, horizon, control_scale, swerve)
         elif initial == "zero":
             self.strategies = ZeroStrategies(strategies, horizon)
         else:

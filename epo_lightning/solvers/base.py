@@ -47,6 +47,10 @@ class Minimiser(ABC):
         """The minimiser to use outside training."""
         return self
 
+    def near_minimum(self) -> Minimiser:
+        """The minimiser to use from initial strategies that are near a minimum; it may take fewer steps."""
+        return self
+
     def strategies(self, modes: int) -> int:
         """Number of initial strategies per agent for M modes."""
         return modes

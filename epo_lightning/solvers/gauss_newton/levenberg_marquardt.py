@@ -91,6 +91,10 @@ class LevenbergMarquardt(Stepwise):
         """The solver to use outside training."""
         return self if self.test_steps is None else self.with_steps(self.test_steps)
 
+    def near_minimum(self) -> LevenbergMarquardt:
+        """The solver without its Gauss-Newton steps, if it has Newton steps, which converge quadratically near a minimum."""
+        return dataclasses.replace(self, steps=0) if self.newton_steps else self
+
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """S steps, and then the Newton steps.
 

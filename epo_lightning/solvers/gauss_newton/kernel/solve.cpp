@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <limits>
 #include <memory>
 
 #include "step.hpp"
@@ -117,8 +118,9 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
         }
 }
 
+/// The plan for the problems first .. last, without those that are marked in `done`.
 template <class T>
-Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last, const T* controls) {
+Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last, const std::vector<char>& done, const T* controls) {
     constexpr int W = Lanes<T>::W;
     const int N = int(game.N);
     Plan plan;
@@ -133,6 +135,7 @@ Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last
             find_contacts<T>(game, arena, problems, controls, touching.data());
         }
         for (int lane = 0; lane < filled; ++lane) {
+            if (done[start + lane - first]) continue;
             uint64_t left = 0;
             for (int i = 0; i < N; ++i) left |= uint64_t(game.present[(start + lane) / game.M * N + i] != 0) << i;
             while (left) {
@@ -245,7 +248,7 @@ class Range {
   public:
     Range(const EpoGame& game, const EpoRun& run, int64_t first, int64_t last)
         : game_(game), run_(run), first_(first), last_(last), row_(game.K * 2), size_(game.N * row_), reused_(game.N + 1),
-          valid_(last - first) {
+          valid_(last - first), done_(last - first, 0) {
         for (int64_t problem = first; problem < last; ++problem) {
             valid_[problem - first] = valid<T>(game, problem);
             run.status[problem] = valid_[problem - first] ? SOLVED : STOPPED;
@@ -263,13 +266,14 @@ class Range {
 
     T* iterate(int64_t index) const { return static_cast<T*>(run_.iterates) + index * run_.iterate_stride; }
 
-    /// Takes one step from `controls` to `next`. `energy` becomes that of `controls`, unless it is null; `status` is raised where a step
-    /// needed more damping or was not possible. `directions` are written as well.
-    StepTape<T> step(const T* controls, T* next, T* directions, T* energy, int64_t* status) {
+    /// Takes one step from `controls` to `next`. Unless they are null, `energy` becomes that of `controls`, and `predicted` its decrease
+    /// according to the quadratic model. `status` is raised where a step needed more damping or was not possible. `directions` are
+    /// written as well.
+    StepTape<T> step(const T* controls, T* next, T* directions, T* energy, T* predicted, int64_t* status) {
         constexpr int W = Lanes<T>::W;
         const bool record = run_.record != 0, has_lines = game_.own[LANE] != nullptr, exact = run_.exact != 0;
         StepTape<T> step;
-        step.plan = make_plan<T>(game_, arena_, first_, last_, controls);
+        step.plan = make_plan<T>(game_, arena_, first_, last_, done_, controls);
         step.factors.resize(game_.N + 1);
         step.nearest.resize(game_.N + 1);
         step.taken = valid_;
@@ -280,6 +284,7 @@ class Range {
             if (groups && record && has_lines) step.nearest[n] = Buffer<T>(groups * Nearest<T>::size(n, game_.K));
         }
         if (energy) std::fill(energy + first_, energy + last_, T(0));
+        if (predicted) std::fill(predicted + first_, predicted + last_, T(0));
         for_each_group<T>(game_, arena_, step.plan, controls, [&](auto& group, int64_t index, int filled) {
             const int n = group.count.agents();
             group.load_parameters();
@@ -291,7 +296,7 @@ class Range {
                 group.template find_nearest<false>(Nearest<T>::at(arena_.take(Nearest<T>::size(n, game_.K)), n, game_.K));
             Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game_.K) : reused_[n].data();
             const auto factors = Factors<T>::at(memory, n, game_.K);
-            Vec<T>*turn = arena_.take(n * game_.K), *thrust = arena_.take(n * game_.K), found;
+            Vec<T>*turn = arena_.take(n * game_.K), *thrust = arena_.take(n * game_.K), found, decrease;
             Vec<T>*given = arena_.take(n), *damping = arena_.take(n), *raised = arena_.take(n);
             for (int i = 0; i < n; ++i) {
                 for (int lane = 0; lane < W; ++lane)
@@ -302,7 +307,7 @@ class Range {
             }
             Mask<T> positive, failed{};
             for (int attempt = 0;; ++attempt) {
-                solve_step(group, exact, damping, factors, turn, thrust, found, positive);
+                solve_step(group, exact, damping, factors, turn, thrust, found, decrease, positive);
                 if (attempt == kRetries || !any<T>(~positive)) break;
                 failed |= ~positive;
                 for (int i = 0; i < n; ++i) {
@@ -315,6 +320,7 @@ class Range {
                 if (failed[lane]) status[problem] = std::max<int64_t>(status[problem], DAMPED);
                 if (!positive[lane]) step.taken[problem - first_] = 0;
                 if (energy) energy[problem] += found[lane];
+                if (predicted) predicted[problem] += positive[lane] ? decrease[lane] : T(INFINITY);
             }
             group.store(turn, thrust, first_lanes(filled), directions);
         });
@@ -342,7 +348,7 @@ class Range {
             std::fill(norm + first_, norm + last_, T(0));
             std::memset(states + first_ * size_ * 2, 0, sizeof(T) * (last_ - first_) * size_ * 2);
         }
-        const Plan plan = make_plan<T>(game_, arena_, first_, last_, controls);
+        const Plan plan = make_plan<T>(game_, arena_, first_, last_, done_, controls);
         for_each_group<T>(game_, arena_, plan, controls, [&](auto& group, int64_t, int filled) {
             const int n = group.n;
             group.load_parameters();
@@ -364,7 +370,7 @@ class Range {
         T *const before = static_cast<T*>(run_.initial_energy), *const after = static_cast<T*>(run_.energy);
         for (int64_t s = 0; s < run_.steps; ++s) {
             T* directions = static_cast<T*>(run_.directions) + (run_.record ? s * game_.B * game_.M * size_ : 0);
-            StepTape<T> taken = step(iterate(s), iterate(s + 1), directions, s == 0 ? before : nullptr, run_.status);
+            StepTape<T> taken = step(iterate(s), iterate(s + 1), directions, s == 0 ? before : nullptr, nullptr, run_.status);
             if (run_.record) tape->steps.push_back(std::move(taken));
         }
         measure(iterate(run_.steps), after, static_cast<T*>(run_.states));
@@ -372,22 +378,26 @@ class Range {
         return run_.record ? std::move(tape) : nullptr;
     }
 
-    /// S steps, each accepted or rejected by every problem. An accepted step lowers the energy and divides the damping by 10; a
-    /// rejected one multiplies it by 10.
+    /// At most S steps, each accepted or rejected by every problem. An accepted step lowers the energy and divides the damping by 10;
+    /// a rejected one multiplies it by 10. A problem is done once a step cannot lower its energy by more than the rounding of it.
     void descend() {
         T *const controls = iterate(0), *const trial = iterate(1), *const damping = static_cast<T*>(run_.damping);
         T *const best = static_cast<T*>(run_.energy), *const before = static_cast<T*>(run_.initial_energy);
-        std::vector<int64_t> tried(last_ - first_);
-        std::vector<T> found(last_ - first_);
+        const int64_t count = last_ - first_;
+        std::vector<int64_t> tried(count);
+        std::vector<T> found(count), predicted(count);
         measure(controls, best, nullptr);
         std::copy(best + first_, best + last_, before + first_);
         for (int64_t s = 0; s < run_.steps; ++s) {
-            for (int64_t problem = first_; problem < last_; ++problem)
-                tried[problem - first_] = valid_[problem - first_] ? SOLVED : STOPPED;
-            step(controls, trial, static_cast<T*>(run_.directions), nullptr, tried.data() - first_);
+            for (int64_t at = 0; at < count; ++at) tried[at] = valid_[at] ? SOLVED : STOPPED;
+            step(controls, trial, static_cast<T*>(run_.directions), nullptr, predicted.data() - first_, tried.data() - first_);
             measure(trial, found.data() - first_, nullptr);
-            for (int64_t problem = first_; problem < last_; ++problem) {
-                const int64_t at = problem - first_;
+            bool all = true;
+            for (int64_t at = 0; at < count; ++at) {
+                const int64_t problem = first_ + at;
+                if (done_[at]) continue;
+                done_[at] = predicted[at] <= std::numeric_limits<T>::epsilon() * best[problem];
+                all &= done_[at] != 0;
                 if (found[at] < best[problem]) {
                     std::copy(trial + problem * size_, trial + (problem + 1) * size_, controls + problem * size_);
                     best[problem] = found[at];
@@ -397,7 +407,9 @@ class Range {
                     damping[problem] = std::min(damping[problem] * T(10), T(kMostDamping));
                 }
             }
+            if (all) break;
         }
+        std::fill(done_.begin(), done_.end(), 0);
         measure(controls, best, static_cast<T*>(run_.states));
         for (int64_t problem = first_; problem < last_; ++problem)
             if (!finite(best[problem])) run_.status[problem] = STOPPED;
@@ -409,7 +421,7 @@ class Range {
     const int64_t first_, last_, row_, size_;
     Arena<T> arena_;
     std::vector<Buffer<T>> reused_;
-    std::vector<char> valid_;
+    std::vector<char> valid_, done_;  // by problem
 };
 
 template <class T>

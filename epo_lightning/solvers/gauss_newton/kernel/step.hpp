@@ -205,13 +205,14 @@ INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* 
 }
 
 /// Computes the damped Gauss-Newton direction (or, if `exact`, the damped Newton direction) of every lane: the changes [n, K] of turn
-/// rates (`turn`) and accelerations (`thrust`). Also writes the factors, the energy, and a mask of the lanes in which the damped matrix is positive definite.
+/// rates (`turn`) and accelerations (`thrust`). Also writes the factors, the energy, its decrease that the damped quadratic model
+/// predicts, and a mask of the lanes in which the damped matrix is positive definite.
 ///
 /// Every agent has its own damping [n]. Infinite damping makes the reciprocal pivots zero, and therefore the direction as well.
 template <class T, int N>
 void solve_step(
     const Group<T, N>& g, bool exact, const Vec<T>* damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust,
-    Vec<T>& energy, Mask<T>& positive) {
+    Vec<T>& energy, Vec<T>& predicted, Mask<T>& positive) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
     Vec<T>*P = g.arena.take(ld * ld), *y = g.arena.take(ld), *h = g.arena.take(g.K * m), *damped = g.arena.take(m);
     Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
@@ -221,7 +222,7 @@ void solve_step(
     // Only if `exact`: the gradient of the energy by a common shift of all later positions of an agent, and y before a state.
     Vec<T>*shift = g.arena.take(m), *before = g.arena.take(m);
     for (int e = 0; e < m; ++e) shift[e] = Vec<T>{};
-    energy = Vec<T>{};
+    energy = predicted = Vec<T>{};
     positive = ~Mask<T>{};
     for (int k = g.K - 1; k >= 0; --k) {
         Vec<T>*L = factors.L + std::size_t(k) * m * m, *G = factors.G + std::size_t(k) * m * ld, *linear = h + k * m;
@@ -243,6 +244,7 @@ void solve_step(
         }
         for (int r = 0; r < m; ++r) linear[r] = costs.pull[r];
         pull_linear(g.count, L, G, g.dt, Z, k == 0, y, linear);
+        for (int r = 0; r < m; ++r) predicted += T(0.5) * linear[r] * linear[r];
         for (int r = 0; r < m; ++r) y[2 * m + r] -= costs.rate_pull[r];
         for (int i = 0; i < n; ++i) {
             const int v = m + 2 * i + 1;
