@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -18,22 +17,14 @@ class InitialStrategies(nn.Module):
         modes: number M of joint modes.
         horizon: number K of future steps.
         scale: control [m/s^2, rad/s] at a network output of one.
-        swerve: turn rate [rad/s] by which the modes differ before training: it is added in the first half of the horizon and
-            subtracted in the second one, from -swerve in the first mode to +swerve in the last. The modes then begin on
-            different sides of the other agents, and the closest-mode loss has a mode for each side.
     """
 
-    def __init__(self, width: int, modes: int, horizon: int, scale: float = 0.3, swerve: float = 0.0) -> None:
+    def __init__(self, width: int, modes: int, horizon: int, scale: float = 0.3) -> None:
         super().__init__()
         if modes < 1:
             raise ValueError(f"modes must be 1 or more, not {modes}")
         self.modes, self.horizon, self.scale = modes, horizon, scale
         self.mlp = MLP(width, 64, modes * horizon * 2, norm="layer")
-        if swerve:
-            turn = swerve * torch.linspace(-1.0, 1.0, modes)[:, None].repeat(1, horizon)
-            turn[:, horizon // 2 :] *= -1.0
-            with torch.no_grad():
-                self.mlp.output.bias.view(modes, horizon, 2)[..., 1] += turn / scale
 
     def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B M N K 2"]:
         """Controls: acceleration [m/s^2] and turn rate [rad/s]."""

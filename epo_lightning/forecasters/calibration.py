@@ -85,8 +85,9 @@ class Calibration:
         s = observed.new_zeros(len(observed), games)
         damping = torch.ones_like(s)
         start = _with_history(past, game.initial_controls.shape[3])
-        missed, change, controls = misses(s, start.expand(-1, 2 * games, -1, -1, -1), minimiser)
-        near = minimiser.near_minimum()
+        descent = minimiser.descent()
+        missed, change, controls = misses(s, start.expand(-1, 2 * games, -1, -1, -1), descent)
+        near = descent.near_minimum()
         for _ in range(self.steps):
             slope = (change * missed).sum(-1) + s / self.spread**2
             curvature = change.square().sum(-1) + 1.0 / self.spread**2

@@ -15,7 +15,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from epo_lightning.backbones.base import Backbone
-from epo_lightning.checks import check_number
 from epo_lightning.decoders.goals import GivenGoals, GoalDecoder, Goals, NoGoals
 from epo_lightning.decoders.motions import Motions
 from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
@@ -75,8 +74,6 @@ class EPO(Forecaster):
             the order of agents.
         initial: ``decoded``, ``zero`` or ``motions``.
         control_scale: initial control at a network output of one.
-        swerve: difference of the modes' initial strategies before training, as a turn rate [rad/s]; see
-            :class:`~epo_lightning.decoders.strategies.InitialStrategies`.
         motions: largest ``acceleration`` [m/s^2] and ``curvature`` [1/m] of initial motions.
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
             the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
@@ -117,7 +114,6 @@ class EPO(Forecaster):
         one_game: bool = False,
         probabilities: str = "linear",
         margin: Mapping[str, float] | None = None,
-        swerve: float = 0.0,
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         _check_needs(energy, task)
@@ -165,7 +161,6 @@ class EPO(Forecaster):
             raise ConfigError(f"forecaster.pair_start must be finite, not {pair_start}")
         if not 0 < control_scale < math.inf:
             raise ConfigError(f"forecaster.control_scale must be positive and finite, not {control_scale}")
-        check_number("forecaster.swerve", swerve, zero=True)
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
         # `solve` runs the minimiser, with the derivative of its solution that the part `backward` defines.
@@ -185,7 +180,7 @@ class EPO(Forecaster):
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs, positive=one_game)
         self.strategies: InitialStrategies | ZeroStrategies | Motions
         if initial == "decoded":
-            self.strategies = InitialStrategies(width, strategies, horizon, control_scale, swerve)
+            self.strategies = InitialStrategies(width, strategies, horizon, control_scale)
         elif initial == "zero":
             self.strategies = ZeroStrategies(strategies, horizon)
         else:
@@ -214,6 +209,8 @@ class EPO(Forecaster):
         parameters = self._infer_game(z, scene, goals, orders)
         if self.calibration is not None and not self.training:
             parameters = self.calibration(self._minimiser, self.energy, game, parameters)
+        if self.one_game:
+            parameters = parameters.for_modes(self.modes)
         solution = self.solve(self._minimiser, self.energy, game, parameters)
         logits = self._mode_logits(z, scene, goals, orders, solution)
         return JointForecast(
@@ -261,7 +258,7 @@ class EPO(Forecaster):
         # Agents without a goal have the position (0, 0) for it: zero goal weights keep it from attracting them.
         for name in self.energy.goal_terms & own_weights.keys():
             own_weights[name] = own_weights[name].where(goals.exist[:, None], 0.0)
-        parameters = GameParameters(
+        return GameParameters(
             own_weights=own_weights,
             pair_weights=self.pair_weights(z),
             initial_controls=F.pad(self.strategies(z, scene), (0, 0, 0, self.game_horizon - self.task.horizon)),
@@ -272,7 +269,6 @@ class EPO(Forecaster):
             goal_headings=goals.headings,
             margins={} if self.margins is None else self.margins(z),
         )
-        return parameters.for_modes(self.modes) if self.one_game else parameters
 
     @property
     def _minimiser(self) -> Minimiser:

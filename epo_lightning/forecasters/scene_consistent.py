@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
-from epo_lightning.checks import check_number
 from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.strategies import InitialStrategies
 from epo_lightning.forecasters.base import Forecaster
@@ -29,7 +28,6 @@ class SceneConsistent(Forecaster):
         modes: number M of joint modes.
         loss_weights: lambda of ``imitation`` and ``probability``.
         control_scale: control at a network output of one.
-        swerve: difference of the modes before training, see :class:`~epo_lightning.decoders.strategies.InitialStrategies`.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
@@ -50,17 +48,15 @@ class SceneConsistent(Forecaster):
         annealing: float = 0.0,
         annealing_steps: int = 2000,
         probabilities: str = "linear",
-        swerve: float = 0.0,
     ) -> None:
         check_probabilities(probabilities)
-        check_number("forecaster.swerve", swerve, zero=True)
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.dynamics = dynamics
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.annealing = losses.Annealing(annealing, annealing_steps)
-        self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale, swerve)
+        self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
         self.probabilities = PROBABILITIES[probabilities](backbone.width, modes, task.horizon, task.scale)
 
     def forward(self, scene: Scene) -> JointForecast:

@@ -47,6 +47,10 @@ class Minimiser(ABC):
         """The minimiser to use outside training."""
         return self
 
+    def descent(self) -> Minimiser:
+        """The minimiser whose solution in each mode lies below that mode's initial strategy; for most, the same."""
+        return self
+
     def near_minimum(self) -> Minimiser:
         """The minimiser to use from initial strategies that are near a minimum; it may take fewer steps."""
         return self
