@@ -16,6 +16,10 @@ class TestCompiledLevenbergMarquardt(TestLevenbergMarquardt):
     config = {**TestLevenbergMarquardt.config, "backend": "auto"}
 
 
+class TestBothSides(SolverSuite):
+    config = {"name": "both_sides"}
+
+
 class TestGradientDescent(SolverSuite):
     config = {"name": "gradient_descent", "steps": 4, "step_size": 0.05}
     converged = {"steps": 200}

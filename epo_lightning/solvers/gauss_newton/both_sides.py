@@ -16,13 +16,14 @@ import dataclasses
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from epo_lightning.checks import check_number
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, Scene, Solution
-from epo_lightning.solvers.base import STATIONARY
+from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 DISTINCT = 0.1
@@ -31,63 +32,90 @@ DISTINCT = 0.1
 
 @register("solver", "both_sides")
 @dataclass(frozen=True)
-class BothSides(LevenbergMarquardt):
-    """Equilibria of one game: the one below the first initial strategy, and those below its reflections.
+class BothSides(Minimiser):
+    """Equilibria of one game: the one below the initial strategy, and those below its reflections.
 
-    The first mode is the solution u from the first initial strategy; the others are ignored. Each further mode is the
-    solution of lowest energy, among those from the reflections, that differs from all modes before; without one, it is the
-    solution of lowest energy. Like that of all Newton steps, the derivative is that of the minima (``backward=implicit``).
+    The first mode is the solution from the initial strategy. Each further mode is the solution of lowest energy, among
+    those from the reflections, that differs from all modes before; without one, it is the solution of lowest energy. All of
+    them are computed by adaptive steps (:class:`~.levenberg_marquardt.LevenbergMarquardt`).
 
     Attributes:
+        steps: number of Gauss-Newton steps.
+        newton_steps: number of steps with the Hessian that follow.
+        damping: lambda > 0 of the first step.
         reflections: numbers gamma, one solution each.
+        backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it supports the game.
+        modes: number M of modes; :meth:`for_modes` sets it.
     """
 
+    needs_from_energy = LevenbergMarquardt.needs_from_energy
     provides = frozenset({STATIONARY})
 
+    steps: int = 10
+    newton_steps: int = 10
+    damping: float = 1.0
     reflections: tuple[float, ...] = (2.0, 2.5)
+    backend: str = "auto"
+    modes: int = 2
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        self.descent()  # checks its settings
         for gamma in self.reflections:
             check_number("solver.reflections", gamma)
 
     def descent(self) -> LevenbergMarquardt:
         """The steps from each initial strategy to the minimum below it."""
-        names = [field.name for field in dataclasses.fields(LevenbergMarquardt)]
-        return LevenbergMarquardt(**{name: getattr(self, name) for name in names})
+        return LevenbergMarquardt(
+            steps=self.steps,
+            step_size=1.0,
+            damping=self.damping,
+            adaptive=True,
+            newton_steps=self.newton_steps,
+            backend=self.backend,
+        )
+
+    def strategies(self, modes: int) -> int:
+        """One initial strategy per agent; the solver finds those of the other modes itself."""
+        return 1
+
+    def games(self, modes: int) -> int:
+        """One game, whose equilibria are the modes."""
+        return 1
 
     def for_modes(self, modes: int) -> BothSides:
-        """This minimiser, if it has enough reflections for M modes.
+        """This minimiser, set up to return M joint modes.
 
         Raises:
-            ConfigError: there are too few.
+            ConfigError: there are too few reflections.
         """
         if modes > 1 + len(self.reflections):
             raise ConfigError(
                 f"solver.reflections has {len(self.reflections)} numbers, but forecaster.modes={modes} needs {modes - 1} or "
                 "more: each gives one solution besides the first"
             )
-        return self
+        return dataclasses.replace(self, modes=modes)
 
+    @torch.no_grad()
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """Minimise, reflect, minimise, and choose.
 
         Raises:
             ValueError: as :meth:`LevenbergMarquardt.run`.
         """
-        modes = parameters.initial_controls.shape[1]
+        descend = self.descent()
         game = dataclasses.replace(parameters.map(lambda tensor: tensor[:, :1]), context=parameters.context)
-        if modes == 1 or not game.pair_weights:
-            return super().__call__(energy, scene, parameters)
-        alone = {name: torch.cat((weight, torch.zeros_like(weight)), 1) for name, weight in game.pair_weights.items()}
+        # The game with and without its interaction, solved at once as two modes.
+        weights = {name: torch.cat((weight, torch.zeros_like(weight)), 1) for name, weight in game.pair_weights.items()}
         start = game.initial_controls.expand(-1, 2, -1, -1, -1)
-        pair = dataclasses.replace(game.for_modes(2), pair_weights=alone, initial_controls=start)
-        found = super().__call__(energy, scene, pair)
-        first, without = found.controls.chunk(2, 1)
+        found = descend(
+            energy, scene, dataclasses.replace(game.for_modes(2), pair_weights=weights, initial_controls=start)
+        )
+        first, alone = found.controls.chunk(2, 1)
         gamma = first.new_tensor(self.reflections)[:, None, None, None]
-        reflected = dataclasses.replace(game, initial_controls=without - gamma * (first - without))
-        others = super().__call__(energy, scene, reflected)
-        return _chosen(_joined(found.map(lambda tensor: tensor[:, :1]), others), modes)
+        others = descend(energy, scene, dataclasses.replace(game, initial_controls=alone - gamma * (first - alone)))
+        solution = _chosen(_joined(found.map(lambda tensor: tensor[:, :1]), others), self.modes)
+        initial = found.initial_energy[:, :1].expand_as(solution.energy)
+        return dataclasses.replace(solution, initial_energy=initial)
 
 
 def _joined(first: Solution, second: Solution) -> Solution:
@@ -105,12 +133,12 @@ def _chosen(found: Solution, modes: int) -> Solution:
     chosen = [torch.zeros_like(energy[:, 0], dtype=torch.long)]
     for _ in range(modes - 1):
         repeated = (repeats & taken[:, None]).any(-1)
-        # Repeated solutions come after all others, and chosen ones after these; NaN comes last of all.
+        # Repeated solutions come after all others, chosen ones after these, and solutions that are not finite last.
         rank = torch.where(energy.isfinite(), repeated.to(energy) + 2 * taken.to(energy), 4.0)
         lowest = rank.amin(1, keepdim=True)
         best = torch.where(rank == lowest, energy.nan_to_num(torch.inf), torch.inf).argmin(1)
         chosen.append(best)
-        taken = taken | torch.nn.functional.one_hot(best, energy.shape[1]).bool()
+        taken = taken | F.one_hot(best, energy.shape[1]).bool()
     rows = torch.arange(len(energy), device=energy.device)[:, None]
     index = torch.stack(chosen, 1)
     return found.map(lambda tensor: tensor[rows, index])
