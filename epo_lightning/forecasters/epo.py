@@ -77,7 +77,8 @@ class EPO(Forecaster):
         motions: largest ``acceleration`` [m/s^2] and ``curvature`` [1/m] of initial motions.
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
             the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
-            (``game_steps``). Initial controls after the first K steps are zero.
+            (``game_steps``). Initial controls after the first K steps are decoded if they are taught through the solution
+            (``backward=unrolled``), and zero otherwise.
         one_game: whether the modes are equilibria of one game, found from M initial strategies; its pair weights are
             positive. Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
@@ -178,9 +179,10 @@ class EPO(Forecaster):
         else:
             self.own_weights = OwnWeights(width, games, own, start)
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs, positive=one_game)
+        taught = self.game_horizon if backward.teaches_start else horizon
         self.strategies: InitialStrategies | ZeroStrategies | Motions
         if initial == "decoded":
-            self.strategies = InitialStrategies(width, strategies, horizon, control_scale)
+            self.strategies = InitialStrategies(width, strategies, taught, control_scale)
         elif initial == "zero":
             self.strategies = ZeroStrategies(strategies, horizon)
         else:
@@ -261,7 +263,7 @@ class EPO(Forecaster):
         return GameParameters(
             own_weights=own_weights,
             pair_weights=self.pair_weights(z),
-            initial_controls=F.pad(self.strategies(z, scene), (0, 0, 0, self.game_horizon - self.task.horizon)),
+            initial_controls=self._to_the_end(self.strategies(z, scene)),
             goals=goals.positions,
             reference=goals.reference,
             context=z if "context" in self.energy.needs else None,
@@ -269,6 +271,10 @@ class EPO(Forecaster):
             goal_headings=goals.headings,
             margins={} if self.margins is None else self.margins(z),
         )
+
+    def _to_the_end(self, controls: Tensor) -> Tensor:
+        """The controls, with zeros after their last step up to the end of the game."""
+        return F.pad(controls, (0, 0, 0, self.game_horizon - controls.shape[3]))
 
     @property
     def _minimiser(self) -> Minimiser:

@@ -163,3 +163,13 @@ def test_calibration_runs_outside_of_training_only(monkeypatch: pytest.MonkeyPat
 def test_invalid_settings_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         built(**changes)
+
+
+def test_initial_controls_after_the_forecast_are_decoded_only_if_they_are_taught() -> None:
+    steps = {"name": "levenberg_marquardt", "steps": 2, "step_size": 1.0, "damping": 1.0}
+    changes = {**GAME, "calibration": None}
+    taught = build_forecaster(model(changes, **{**PARTS, "solver": steps, "backward": {"name": "unrolled"}}))
+    for forecaster, decoded in ((taught, True), (built(calibration=None), False)):
+        game = forecaster.predict(scenes()).parameters
+        assert game is not None
+        assert (game.initial_controls[..., 40:, :] != 0).all() == decoded
