@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import torch
 import torch.nn.functional as F
@@ -24,9 +24,9 @@ from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, Sha
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.forecasters.combination import Combination
+from epo_lightning.forecasters.epo_settings import check_margin, check_motions, check_needs, check_start
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
-from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError, nearest, register
@@ -117,7 +117,7 @@ class EPO(Forecaster):
         margin: Mapping[str, float] | None = None,
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
-        _check_needs(energy, task)
+        check_needs(energy, task)
         self.calibration = None if calibration is None else Calibration(**calibration)  # type: ignore[arg-type]
         self.one_game = one_game
         self.game_horizon = task.horizon if game_horizon is None else game_horizon
@@ -170,8 +170,8 @@ class EPO(Forecaster):
         games, strategies = 1 if one_game else solver.games(modes), solver.strategies(modes)
         width, scale, horizon = backbone.width, task.scale, task.horizon
         own, pair = energy.weighted
-        start = _check_start(own_start, own, energy.own)
-        ranges = {} if motions is None and initial != "motions" else _check_motions(motions)
+        start = check_start(own_start, own, energy.own)
+        ranges = {} if motions is None and initial != "motions" else check_motions(motions)
         # Do not change the order: every module draws its initial weights from the same sequence of random numbers.
         self.own_weights: OwnWeights | SharedWeights
         if own_weights == "shared":
@@ -198,7 +198,7 @@ class EPO(Forecaster):
         self.orders = None if order is None else Orders(width, games, order.symmetric)
         self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, horizon, scale)
         # This network is the last one, so that those of energies without decoded margins draw the same initial weights.
-        limits = _check_margin(margin)
+        limits = check_margin(margin)
         names = energy.decoded_margins
         self.margins = Margins(width, games, names, **limits, symmetric=symmetric_pairs) if names else None
 
@@ -366,79 +366,6 @@ class EPO(Forecaster):
         return self.objective(self._game_of(scene), forecast, self.energy, self.global_step)
 
 
-def _check_needs(energy: Energy, task: Task) -> None:
-    """Refuse an energy that needs fields which the data does not provide.
-
-    Raises:
-        ConfigError: the message names the missing fields.
-    """
-    known = {"size", "context", "order"} | ({"goals", "goal_headings"} if task.candidates else set())
-    lacking = energy.needs - known - ({"reference", "reference_speed"} if task.candidates > 1 else set())
-    if lacking:
-        raise ConfigError(
-            f"features of energy.own need {', '.join(sorted(lacking))}, which this data does not provide: leave the "
-            "features out, or choose data with a map"
-        )
-
-
 def _without_repeats(score: Tensor, modes: Tensor) -> Tensor:
     """Logits [B, M] of modes, -inf for a mode that repeats an earlier one."""
     return torch.where(repeated(modes), -torch.inf, score)
-
-
-def _check_motions(motions: Mapping[str, float] | None) -> dict[str, float]:
-    """Largest acceleration and curvature of initial motions.
-
-    Raises:
-        ConfigError: a missing or unknown name.
-    """
-    known, given = ("acceleration", "curvature"), dict(motions or {})
-    if set(given) != set(known):
-        raise ConfigError(
-            "forecaster.motions must name acceleration [m/s^2] and curvature [1/m] for initial=motions, not "
-            f"{', '.join(sorted(map(str, given))) or 'nothing'}"
-        )
-    return given
-
-
-def _check_margin(margin: Mapping[str, float] | None) -> dict[str, float]:
-    """Limits of decoded margins: ``largest`` and ``start``.
-
-    Raises:
-        ConfigError: an unknown name, or numbers that are not 0 < start < largest.
-    """
-    limits = {"largest": 2.0, "start": 0.5, **(margin or {})}
-    if set(limits) != {"largest", "start"}:
-        raise ConfigError(
-            f"forecaster.margin has the keys largest and start [m], not {', '.join(map(str, margin or ()))}"
-        )
-    if not 0 < limits["start"] < limits["largest"] < math.inf:
-        raise ConfigError(f"forecaster.margin takes 0 < start < largest [m], not {dict(limits)}")
-    return limits
-
-
-def _check_start(
-    start: float | Mapping[str, float], features: Sequence[str], all_features: Sequence[str]
-) -> float | Mapping[str, float]:
-    """The configured ``own_start`` after a check. Names of features that are not in this energy have no effect.
-
-    Args:
-        start: the configured value.
-        features: own terms whose weight is decoded.
-        all_features: all own terms of the energy.
-
-    Raises:
-        ConfigError: an unknown feature, a feature whose weight is fixed, or a weight that is not positive and finite.
-    """
-    named, known = start if isinstance(start, Mapping) else {"all": start}, {"all", *features, *OWN_FEATURES}
-    for name, value in named.items():
-        if name in all_features and name not in features:
-            raise ConfigError(
-                f"forecaster.own_start.{name} has no effect: this energy fixes the weight of {name}; it decodes weights "
-                f"of {', '.join(features) or 'no feature'}"
-            )
-        if name not in known:
-            raise ConfigError(f"unknown feature forecaster.own_start.{name}: {nearest(name, known)}")
-        if not 0 < value < math.inf:
-            raise ConfigError(f"forecaster.own_start must be positive and finite, but {name} would start at {value}")
-    return start
