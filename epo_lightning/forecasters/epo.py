@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from epo_lightning.backbones.base import Backbone
@@ -77,8 +76,7 @@ class EPO(Forecaster):
         motions: largest ``acceleration`` [m/s^2] and ``curvature`` [1/m] of initial motions.
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
             the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
-            (``game_steps``). Initial controls after the first K steps are decoded if they are taught through the solution
-            (``backward=unrolled``), and zero otherwise.
+            (``game_steps``). Initial strategies are decoded up to that number of steps.
         one_game: whether the modes are equilibria of one game, found from M initial strategies; its pair weights are
             positive. Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
@@ -168,7 +166,7 @@ class EPO(Forecaster):
         self.solve, self.objective = backward, objective
         # M games with one initial strategy each, or one game with M; for solvers that choose, one game with C candidates.
         games, strategies = 1 if one_game else solver.games(modes), solver.strategies(modes)
-        width, scale, horizon = backbone.width, task.scale, task.horizon
+        width, scale, horizon = backbone.width, task.scale, self.game_horizon
         own, pair = energy.weighted
         start = check_start(own_start, own, energy.own)
         ranges = {} if motions is None and initial != "motions" else check_motions(motions)
@@ -179,10 +177,9 @@ class EPO(Forecaster):
         else:
             self.own_weights = OwnWeights(width, games, own, start)
         self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs, positive=one_game)
-        taught = self.game_horizon if backward.teaches_start else horizon
         self.strategies: InitialStrategies | ZeroStrategies | Motions
         if initial == "decoded":
-            self.strategies = InitialStrategies(width, strategies, taught, control_scale)
+            self.strategies = InitialStrategies(width, strategies, horizon, control_scale)
         elif initial == "zero":
             self.strategies = ZeroStrategies(strategies, horizon)
         else:
@@ -196,7 +193,7 @@ class EPO(Forecaster):
             self.goals = NoGoals()
         order = energy.pair_order
         self.orders = None if order is None else Orders(width, games, order.symmetric)
-        self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, horizon, scale)
+        self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, task.horizon, scale)
         # This network is the last one, so that those of energies without decoded margins draw the same initial weights.
         limits = check_margin(margin)
         names = energy.decoded_margins
@@ -263,7 +260,7 @@ class EPO(Forecaster):
         return GameParameters(
             own_weights=own_weights,
             pair_weights=self.pair_weights(z),
-            initial_controls=self._to_the_end(self.strategies(z, scene)),
+            initial_controls=self.strategies(z, scene),
             goals=goals.positions,
             reference=goals.reference,
             context=z if "context" in self.energy.needs else None,
@@ -271,10 +268,6 @@ class EPO(Forecaster):
             goal_headings=goals.headings,
             margins={} if self.margins is None else self.margins(z),
         )
-
-    def _to_the_end(self, controls: Tensor) -> Tensor:
-        """The controls, with zeros after their last step up to the end of the game."""
-        return F.pad(controls, (0, 0, 0, self.game_horizon - controls.shape[3]))
 
     @property
     def _minimiser(self) -> Minimiser:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
+from torch import Tensor
+
 from epo_lightning import losses
 from epo_lightning.decoders.orders import order_loss
 from epo_lightning.game.energy import Energy
@@ -21,7 +23,9 @@ class Imitation(Objective):
     Args:
         weights: lambda of ``imitation``, ``goal`` (unused if no goal is decoded), ``probability`` and ``initial``.
             ``initial`` is the imitation loss of the initial strategies; it is used if no gradient reaches them through the
-            solution (``truncated``, ``implicit``). If orders of agents are decoded, ``probability`` is their cross entropy.
+            solution (``truncated``, ``implicit``). For games that go on after the forecast, it includes the mean difference
+            of their later controls from those of the solution, because no data shows these. If orders of agents are decoded,
+            ``probability`` is their cross entropy.
         power: exponent of the distances; the paper's is 1, TGL's 1.05.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
@@ -57,5 +61,17 @@ class Imitation(Objective):
         if starts is not None and starts.requires_grad:
             initial = dataclasses.replace(forecast, states=starts)
             closest = imitation_terms(scene, initial, self.weights, *how)["imitation"][1]
-            terms["initial"] = (self.weights["initial"], closest)
+            terms["initial"] = (self.weights["initial"], closest + _difference_ahead(scene, forecast))
         return terms | goal_term(scene, forecast, self.weights["goal"])
+
+
+def _difference_ahead(scene: Scene, forecast: JointForecast) -> Tensor | float:
+    """Mean difference of initial controls from those of the solution after the forecast; 0 if the game ends with it."""
+    assert forecast.parameters is not None
+    assert forecast.solution is not None
+    first = forecast.states.shape[3]
+    initial = forecast.parameters.initial_controls[..., first:, :]
+    if initial.shape[3] == 0:
+        return 0.0
+    difference = (initial - forecast.solution.controls[..., first:, :].detach()).abs().mean((1, 3, 4))
+    return difference[scene.agent_mask].mean()

@@ -88,7 +88,7 @@ def test_the_forecast_is_the_beginning_of_the_solution_of_the_longer_game() -> N
     assert forecast.controls.shape == (3, 2, 2, 40, 2)
     assert torch.equal(forecast.states, forecast.solution.states[..., :40, :])
     assert forecast.parameters is not None
-    assert (forecast.parameters.initial_controls[..., 40:, :] == 0).all()
+    assert forecast.parameters.initial_controls.shape == (3, 2, 2, 46, 2)
     with torch.no_grad():
         again = forecaster.solver(forecaster.energy, scene, forecast.parameters)
     torch.testing.assert_close(again.states, forecast.solution.states)
@@ -165,11 +165,18 @@ def test_invalid_settings_are_refused(changes: dict[str, Any], message: str) -> 
         built(**changes)
 
 
-def test_initial_controls_after_the_forecast_are_decoded_only_if_they_are_taught() -> None:
-    steps = {"name": "levenberg_marquardt", "steps": 2, "step_size": 1.0, "damping": 1.0}
-    changes = {**GAME, "calibration": None}
-    taught = build_forecaster(model(changes, **{**PARTS, "solver": steps, "backward": {"name": "unrolled"}}))
-    for forecaster, decoded in ((taught, True), (built(calibration=None), False)):
-        game = forecaster.predict(scenes()).parameters
-        assert game is not None
-        assert (game.initial_controls[..., 40:, :] != 0).all() == decoded
+def test_initial_strategies_after_the_forecast_are_taught_by_the_solution() -> None:
+    """No data shows them. The term `initial` includes their difference from the solution's controls."""
+    forecaster, scene = built(calibration=None).train(), scenes()
+    forecast = forecaster(scene)
+    game, solution = forecast.parameters, forecast.solution
+    assert game.initial_controls.shape[3] == 46
+    term = forecaster.losses(scene, forecast)["initial"][1]
+    ahead = (game.initial_controls - solution.controls)[..., 40:, :].abs().mean()
+    same = dataclasses.replace(solution, controls=game.initial_controls.detach())
+    without = forecaster.losses(scene, dataclasses.replace(forecast, solution=same))["initial"][1]
+    assert ahead > 0
+    torch.testing.assert_close(term - without, ahead)
+    term.backward()
+    gradient = forecaster.strategies.mlp.output.bias.grad.view(2, 46, 2)
+    assert (gradient[:, 40:] != 0).any()
