@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import dashboards, epo_layer, extraction, scaling, training_step, true_game
+from benchmarks import dashboards, epo_layer, extraction, figures, scaling, training_step, true_game
 from epo_lightning.data.rpi.scenes import RPIData
 
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
@@ -102,6 +102,14 @@ def test_true_games_are_measured(capsys, tmp_path):
     assert float(lines[0].split("executed ")[1].split()[0]) < 1e-5
     assert "fewer than 4000" in refused(true_game.main, "--records", 4000, *small)
     assert "data=rpi" in refused(true_game.main, "data=drawn")
+
+
+def test_figures_are_drawn_and_wrong_runs_are_one_line(tmp_path):
+    figures.main(["levels", str(tmp_path / "levels.png")])
+    assert (tmp_path / "levels.png").stat().st_size > 10_000
+    assert str(tmp_path) in refused(figures.main, "weights", tmp_path / "weights.png", tmp_path)
+    with pytest.raises(SystemExit):
+        figures.main(["weights", str(tmp_path / "weights.png")])
 
 
 @pytest.mark.parametrize("format_", ["commonroad", "ucy", "exid"])

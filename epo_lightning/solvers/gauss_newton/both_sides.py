@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -55,7 +56,7 @@ class BothSides(Minimiser):
     steps: int = 10
     newton_steps: int = 10
     damping: float = 10.0
-    reflections: tuple[float, ...] = (2.0, 2.5)
+    reflections: Sequence[float] = (2.0, 2.5)
     backend: str = "auto"
     modes: int = 2
 

@@ -1,0 +1,147 @@
+"""Figures of docs/game.md.
+
+    python -m benchmarks.figures levels docs/figures/pair_features.png
+    python -m benchmarks.figures weights docs/figures/inferred_w.png RUN [RUN ...]
+
+`levels` draws the level sets of the pair features. `weights` draws the inferred against the true weights of RPI's games; a
+run is a run folder, or `rpi` for the run that ships with the package.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FuncFormatter
+from torch import Tensor
+
+from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.experiment.opening import open_checkpoint, open_data
+from epo_lightning.experiment.truth import compare, inferred_costs
+from epo_lightning.game.features import PAIR_FEATURES, PairFeature
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.style import MODES, OTHER, save, style
+from epo_lightning.run_folder import RunFolder
+from epo_lightning.schema import read
+
+LENGTH, WIDTH, MARGIN = 4.5, 1.9, 1.0
+"""Size of both vehicles, and the margin of pair features that take one [m]."""
+SPEEDS = (20.0, 15.0)
+"""Speeds [m/s] of the vehicle in the middle and of the other one; both drive to the right."""
+RECORDS = 500
+"""Number of records in a panel of `weights`."""
+
+
+def levels(path: Path) -> None:
+    """Value of every pair feature for a second vehicle with its centre at (x, y); that of the first one is at (0, 0)."""
+    names = list(PAIR_FEATURES)
+    with style():
+        figure = Figure(figsize=(10.0, 1.15 * ((len(names) + 1) // 2)))
+        axes = figure.subplots((len(names) + 1) // 2, 2, sharex=True, sharey=True).flatten()
+        x, y = torch.meshgrid(torch.linspace(-40, 40, 401), torch.linspace(-6, 6, 121), indexing="xy")
+        for axis, name in zip(axes, names, strict=False):
+            value = _value(PAIR_FEATURES[name], x, y)
+            axis.contourf(x, y, value, levels=12, cmap="Blues")
+            axis.contour(x, y, value, levels=[1e-6], colors=MODES[0], linewidths=1.0)
+            axis.add_patch(_body())
+            axis.set_title(f"{name}, up to {value.max():.1f} m")
+            axis.set_aspect("equal")
+        for axis in axes[len(names) :]:
+            axis.set_axis_off()
+        figure.supxlabel("position of the other vehicle along the road [m]")
+        figure.supylabel("across [m]")
+        figure.tight_layout()
+        save(figure, path)
+
+
+def _value(feature: PairFeature, x: Tensor, y: Tensor) -> Tensor:
+    first = torch.stack(
+        (torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x), torch.full_like(x, SPEEDS[0])), -1
+    )
+    second = torch.stack((x, y, torch.zeros_like(x), torch.full_like(x, SPEEDS[1])), -1)
+    if feature.declared:
+        reach = LENGTH + (MARGIN if feature.margin else 0.0)
+        return feature.function((x.square() + y.square()).sqrt(), torch.full_like(x, reach))
+    # One pair per place: functions of states take [pairs, K, 4].
+    first, second = first.reshape(-1, 1, 4), second.reshape(-1, 1, 4)
+    size, margin = torch.tensor([LENGTH, WIDTH]).expand(len(first), 1, 2), torch.full((len(first), 1), MARGIN)
+    arguments = (first, second, size, size) if feature.needs == "size" else (first, second)
+    return feature.function(*arguments, *((margin,) if feature.margin else ())).view_as(x)
+
+
+def _body() -> Rectangle:
+    return Rectangle((-LENGTH / 2, -WIDTH / 2), LENGTH, WIDTH, color=OTHER)
+
+
+def weights(path: Path, runs: Sequence[str]) -> None:
+    """One panel per run: the inferred w of a record, in units of the true cost of controls, against the true w.
+
+    Raises:
+        ConfigError: a run without an inferred game, or on other data than RPI.
+    """
+    with style():
+        figure = Figure(figsize=(3.4 * len(runs), 3.2))
+        axes = figure.subplots(1, len(runs), sharey=True, squeeze=False)[0]
+        for axis, run in zip(axes, runs, strict=True):
+            title, costs = _costs(run)
+            scores = compare(costs)
+            axis.loglog([8, 110], [8, 110], color=OTHER, linewidth=1.0)
+            axis.loglog(costs["true"], costs["pair"], ".", color=MODES[1], markersize=3)
+            axis.set_title(
+                f"{title}\nrank correlation {scores['pair_rank']:.2f}, error {100 * scores['pair_error']:.0f} %"
+            )
+            axis.set_xlabel("true w")
+            for side in (axis.xaxis, axis.yaxis):
+                side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes[0].set_ylabel("inferred w")
+        figure.tight_layout()
+        save(figure, path)
+
+
+@torch.no_grad()
+def _costs(folder: str) -> tuple[str, dict[str, Tensor]]:
+    """Title of a run, and true and inferred costs of random records of its test split."""
+    run = RunFolder.open(folder)
+    settings = read(Settings, run.config())
+    forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings)
+    if not isinstance(data, RPIData):
+        raise ConfigError(f"{folder} was trained on other data than RPI, whose weights are not known")
+    scenes = data.open("test")
+    executed = (scenes.mode == 0).nonzero().flatten()
+    chosen = executed[torch.randperm(len(executed), generator=torch.Generator().manual_seed(0))[:RECORDS]]
+    scene = scenes[chosen]
+    assert scene.id is not None
+    forecast = forecaster.predict(scene)
+    if forecast.parameters is None or not forecast.parameters.pair_weights:
+        raise ConfigError(f"{folder} infers no weight of a pair term")
+    true = data.records("test")["weight"][scene.id].double()
+    costs = inferred_costs(forecast.parameters, forecast.probabilities.argmax(1))
+    return f"{settings.title}, seed {settings.seed}", {"true": true, **costs}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("figure", choices=("levels", "weights"))
+    parser.add_argument("path", type=Path)
+    parser.add_argument("runs", nargs="*")
+    arguments = parser.parse_args(argv)
+    if (arguments.figure == "weights") != bool(arguments.runs):
+        parser.error("`weights` takes run folders, and `levels` takes none")
+    torch.set_num_threads(1)
+    try:
+        if arguments.figure == "levels":
+            levels(arguments.path)
+        else:
+            weights(arguments.path, arguments.runs)
+    except ConfigError as error:
+        raise SystemExit(f"figures: {error}") from None
+
+
+if __name__ == "__main__":
+    main()
