@@ -30,6 +30,8 @@ _DIFFERENCE = 0.05
 """Change of s in the finite difference of the positions."""
 _LARGEST_STEP = 1.0
 """Largest change of s in one step; a factor of e."""
+_CONVERGED = 1e-3
+"""A step of this size or less is the last one."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Calibration:
     """Gauss-Newton steps on the logarithm s of the factor, in float64 and without a gradient.
 
     Attributes:
-        steps: number of steps; zero leaves the pair weights as they are.
+        steps: largest number of steps; zero leaves the pair weights as they are.
         noise: standard deviation [m] of the observed positions.
         spread: standard deviation of s before the history is seen.
     """
@@ -92,6 +94,9 @@ class Calibration:
             slope = (change * missed).sum(-1) + s / self.spread**2
             curvature = change.square().sum(-1) + 1.0 / self.spread**2
             trial = s + (-slope / (damping * curvature)).clamp(-_LARGEST_STEP, _LARGEST_STEP)
+            if ((trial - s).abs() < _CONVERGED).all():
+                s = trial
+                break
             found = misses(trial, controls, near)
             better = self._cost(found[0], trial) < self._cost(missed, s)
             damping = torch.where(better, (damping / 3.0).clamp_min(1.0), damping * 4.0)

@@ -53,7 +53,7 @@ class BothSides(Minimiser):
     needs_from_energy = LevenbergMarquardt.needs_from_energy
     provides = frozenset({STATIONARY})
 
-    steps: int = 10
+    steps: int = 5
     newton_steps: int = 10
     damping: float = 10.0
     reflections: Sequence[float] = (2.0, 2.5)
