@@ -124,7 +124,7 @@ class BackendSuite:
         present = scene.agent_mask[:, None, :, None, None]
         expected = reference(energy, scene, theirs, steps, 0.3, per_sample)
         expected = [torch.where(present, iterate, 0.0) for iterate in expected]
-        states = energy.dynamics.rollout(energy.initial(scene), expected[-1], scene.dt)
+        states = energy.dynamics.rollout(energy.current_states(scene), expected[-1], scene.dt)
         assert (solution.status == Status.SOLVED).all()
         for mine, iterate in zip(solution.iterates, expected, strict=True):
             torch.testing.assert_close(mine, iterate, rtol=0, atol=1e-9)

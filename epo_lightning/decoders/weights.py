@@ -13,8 +13,8 @@ from epo_lightning.decoders.mlp import MLP
 from epo_lightning.game.pairs import pairs
 
 
-def _by_name(weights: Float[Tensor, "B R out"], names: Sequence[str], modes: int) -> dict[str, Float[Tensor, "B M R"]]:
-    per_mode = weights.unflatten(-1, (modes, len(names))).transpose(1, 2)
+def _by_name(weights: Float[Tensor, "B R out"], names: Sequence[str], games: int) -> dict[str, Float[Tensor, "B M R"]]:
+    per_mode = weights.unflatten(-1, (games, len(names))).transpose(1, 2)
     return dict(zip(names, per_mode.unbind(-1), strict=True))
 
 
@@ -27,7 +27,7 @@ class OwnWeights(nn.Module):
 
     Args:
         width: size of the agent features.
-        modes: number M of joint modes.
+        games: number M of games: one per joint mode, or a single one.
         features: names of the own features; without any there is no network.
         start: weights at a network output of zero: one number for all features, or numbers by name (1 for names that are
             missing). The weight is start * (1 + output): features differ in unit and magnitude, and so do their weights.
@@ -36,18 +36,18 @@ class OwnWeights(nn.Module):
     start: Tensor
 
     def __init__(
-        self, width: int, modes: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0
+        self, width: int, games: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0
     ) -> None:
         super().__init__()
-        self.modes, self.features = modes, tuple(features)
-        self.register_buffer("start", torch.tensor(_starts(features, start) * modes), persistent=False)
-        self.mlp = MLP(width, 64, modes * len(self.features), norm="batch") if self.features else None
+        self.games, self.features = games, tuple(features)
+        self.register_buffer("start", torch.tensor(_starts(features, start) * games), persistent=False)
+        self.mlp = MLP(width, 64, games * len(self.features), norm="batch") if self.features else None
 
     def forward(self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> dict[str, Float[Tensor, "B M N"]]:
         """Weights by feature name; ``mask`` marks the agents that exist."""
         if self.mlp is None:
             return {}
-        return _by_name(self.start * (1.0 + self.mlp(z, mask)), self.features, self.modes)
+        return _by_name(self.start * (1.0 + self.mlp(z, mask)), self.features, self.games)
 
 
 class SharedWeights(nn.Module):
@@ -57,23 +57,23 @@ class SharedWeights(nn.Module):
     a single history does not.
 
     Args:
-        modes: number M of games.
+        games: number M of games: one per joint mode, or a single one.
         features: names of the own features.
         start: weights before training, as for :class:`OwnWeights`. The weight is start * exp(learned number).
     """
 
     start: Tensor
 
-    def __init__(self, modes: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0) -> None:
+    def __init__(self, games: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0) -> None:
         super().__init__()
-        self.modes, self.features = modes, tuple(features)
+        self.games, self.features = games, tuple(features)
         self.register_buffer("start", torch.tensor(_starts(features, start)), persistent=False)
         self.logarithms = nn.Parameter(torch.zeros(len(self.features)))
 
     def forward(self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> dict[str, Float[Tensor, "B M N"]]:
         """Weights by feature name."""
         weights = (self.start * self.logarithms.exp()).unbind()
-        shape = len(z), self.modes, z.shape[1]
+        shape = len(z), self.games, z.shape[1]
         return {name: weight.expand(shape) for name, weight in zip(self.features, weights, strict=True)}
 
 
@@ -86,7 +86,7 @@ class PairWeights(nn.Module):
 
     Args:
         width: size of the agent features.
-        modes: number M of joint modes.
+        games: number M of games: one per joint mode, or a single one.
         features: names of the pair features; without any there is no network.
         start: weight at a network output of zero.
         symmetric: whether weights are the same in both orders of the two agents.
@@ -97,16 +97,16 @@ class PairWeights(nn.Module):
     def __init__(
         self,
         width: int,
-        modes: int,
+        games: int,
         features: Sequence[str],
         start: float = 3.0,
         symmetric: bool = False,
         positive: bool = False,
     ) -> None:
         super().__init__()
-        self.modes, self.features, self.start = modes, tuple(features), start
+        self.games, self.features, self.start = games, tuple(features), start
         self.symmetric, self.positive = symmetric, positive
-        self.mlp = MLP(2 * width, 64, modes * len(self.features), norm="layer") if self.features else None
+        self.mlp = MLP(2 * width, 64, games * len(self.features), norm="layer") if self.features else None
 
     def forward(self, z: Float[Tensor, "B N D"]) -> dict[str, Float[Tensor, "B M P"]]:
         """Weights by feature name."""
@@ -117,7 +117,7 @@ class PairWeights(nn.Module):
         if self.symmetric:
             weights = 0.5 * (weights + self.mlp(torch.cat((z[:, second], z[:, first]), -1)))
         weights = self.start * weights.exp() if self.positive else self.start + weights
-        return _by_name(weights, self.features, self.modes)
+        return _by_name(weights, self.features, self.games)
 
 
 class Margins(nn.Module):
@@ -127,7 +127,7 @@ class Margins(nn.Module):
 
     Args:
         width: size of the agent features.
-        modes: number M of joint modes.
+        games: number M of games: one per joint mode, or a single one.
         features: names of the pair features with a margin.
         largest: upper limit of a margin [m].
         start: margin at a network output of zero [m].
@@ -135,10 +135,10 @@ class Margins(nn.Module):
     """
 
     def __init__(
-        self, width: int, modes: int, features: Sequence[str], largest: float, start: float, symmetric: bool = False
+        self, width: int, games: int, features: Sequence[str], largest: float, start: float, symmetric: bool = False
     ) -> None:
         super().__init__()
-        self.outputs = PairWeights(width, modes, features, math.log(start / (largest - start)), symmetric)
+        self.outputs = PairWeights(width, games, features, math.log(start / (largest - start)), symmetric)
         self.largest = largest
 
     def forward(self, z: Float[Tensor, "B N D"]) -> dict[str, Float[Tensor, "B M P"]]:

@@ -300,7 +300,7 @@ class EPO(Forecaster):
         # If gradients reach the initial strategies through the solution (backward=unrolled), the loss term `initial` is not
         # used, so their states are computed without a gradient.
         controls = controls.detach() if self.solve.teaches_start else controls
-        return self.energy.dynamics.rollout(self.energy.initial(scene), controls, scene.dt)
+        return self.energy.dynamics.rollout(self.energy.current_states(scene), controls, scene.dt)
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
         assert forecast.parameters is not None

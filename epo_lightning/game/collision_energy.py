@@ -92,7 +92,7 @@ class CollisionEnergy(NetworkEnergy):
     def network_own(
         self, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B C N K 4"]
     ) -> Float[Tensor, "B C N"]:
-        initial = self.initial(scene)
+        initial = self.current_states(scene)
         seen = motion(states, initial, self.scale)
         before = torch.cat((torch.zeros_like(seen[..., :1, :2]), seen[..., :2]), -2)
         way = length_of(before.diff(dim=-2)).cumsum(-1)

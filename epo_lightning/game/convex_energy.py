@@ -212,7 +212,7 @@ class ConvexEnergy(Energy):
         """
         self.validate(scene, parameters, controls)
         controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
-        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
+        states = self.dynamics.rollout(self.current_states(scene), controls, scene.dt)
         first, second = pairs(controls.shape[2], controls.device)
         of_agents = dict(self._of_agents(scene, parameters, states, controls))
         return of_agents | dict(self._of_pairs(scene, parameters, states[:, :, first], states[:, :, second]))
@@ -246,11 +246,11 @@ class ConvexEnergy(Energy):
         first, second = pairs(agents, controls.device)
         if self.pair and len(first):
             present = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
-            states = self.dynamics.rollout(self.initial(scene), present, scene.dt)
+            states = self.dynamics.rollout(self.current_states(scene), present, scene.dt)
             active = self._short(scene, parameters, states[:, :, first], states[:, :, second]) > 0
             count = torch.where(active, self._order_weight(scene, parameters).square()[..., None], 0.0)
             between = (motions.position.mT * count.transpose(1, 2)[..., None, :]) @ motions.position  # [B, P, M, K, K]
-            heading = self.initial(scene)[:, 0, :, HEADING]
+            heading = self.current_states(scene)[:, 0, :, HEADING]
             assert self.pair_order is not None
             line = self.pair_order.directions(scene)
             ends = [rotate(line, -heading[:, which]) for which in (first, second)]
@@ -291,7 +291,7 @@ class ConvexEnergy(Energy):
     def _of_agents(
         self, scene: Scene, parameters: GameParameters, states: Tensor, controls: Tensor
     ) -> Iterator[tuple[str, Tensor]]:
-        initial, present = self.initial(scene), scene.agent_mask[:, None]
+        initial, present = self.current_states(scene), scene.agent_mask[:, None]
         to_goal = reference_speed = None
         if "goals" in self.needs:
             assert parameters.goals is not None

@@ -147,7 +147,7 @@ class Energy(ABC):
         """The values of all terms by name: [B, M, N] for agents, [B, M, P] for pairs."""
         self.validate(scene, parameters, controls)
         controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
-        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
+        states = self.dynamics.rollout(self.current_states(scene), controls, scene.dt)
         first, second = pairs(controls.shape[2], controls.device)
         return {
             **self.own_terms(scene, parameters, states, controls),
@@ -188,7 +188,7 @@ class Energy(ABC):
         """
         self.validate(scene, parameters, candidates)
         controls = torch.where(scene.agent_mask[:, None, :, None, None], candidates, 0.0)
-        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
+        states = self.dynamics.rollout(self.current_states(scene), controls, scene.dt)
         unary = sum(self.own_terms(scene, parameters, states, controls).values())
         first, second = pairs(controls.shape[2], controls.device)
         batch, count, _, steps, _ = states.shape
@@ -206,8 +206,8 @@ class Energy(ABC):
             parts.append(torch.stack(list(terms.values())).sum(0).unflatten(1, shape[1:3]))
         return unary, torch.cat(parts, 1).permute(0, 3, 1, 2)
 
-    def initial(self, scene: Scene) -> Float[Tensor, "B 1 N 4"]:
-        """The states x_0, zero for absent agents."""
+    def current_states(self, scene: Scene) -> Float[Tensor, "B 1 N 4"]:
+        """The states x_0 at t0, zero for absent agents."""
         return torch.where(scene.agent_mask[..., None], scene.current, 0.0)[:, None]
 
     def size(self, scene: Scene) -> Float[Tensor, "B N 2"]:

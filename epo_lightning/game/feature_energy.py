@@ -181,7 +181,7 @@ class FeatureEnergy(Energy):
     ) -> Iterator[tuple[str, Tensor, Tensor]]:
         """Name, weighted residual and its change along every direction, feature by feature."""
         controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
-        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
+        states = self.dynamics.rollout(self.current_states(scene), controls, scene.dt)
         change = self.dynamics.tangent(states, directions, scene.dt)
         yield from self._of_agents(scene, parameters, (states, controls), (change, directions))
         first, second = pairs(controls.shape[2], controls.device)
@@ -360,7 +360,7 @@ class FeatureEnergy(Energy):
         if "size" in needs:
             wheelbase = WHEELBASE * self.size(scene)[:, None, :, 0]
         return Surroundings(
-            self.initial(scene), scene.dt, goals, line, reference_speed, wheelbase, headings, scene.game_steps
+            self.current_states(scene), scene.dt, goals, line, reference_speed, wheelbase, headings, scene.game_steps
         )
 
     def _followed(self, scene: Scene, parameters: GameParameters) -> tuple[tuple[Tensor, ...], Bool[Tensor, "B M N"]]:

@@ -142,7 +142,7 @@ class NetworkEnergy(nn.Module, Energy):
         """Tables of E_i and E_ij, see :meth:`~epo_lightning.game.energy.Energy.tables`."""
         self.validate(scene, parameters, candidates)
         controls = torch.where(scene.agent_mask[:, None, :, None, None], candidates, 0.0)
-        states = self.dynamics.rollout(self.initial(scene), controls, scene.dt)
+        states = self.dynamics.rollout(self.current_states(scene), controls, scene.dt)
         unary, pair = self.network_tables(scene, parameters, states)
         unary = torch.where(scene.agent_mask[..., None], unary.transpose(1, 2), 0.0)
         pair = torch.where(pair_mask(scene)[..., None, None], pair, 0.0)

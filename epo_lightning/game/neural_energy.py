@@ -83,7 +83,7 @@ class NeuralEnergy(NetworkEnergy):
     def network_own(
         self, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B C N K 4"]
     ) -> Float[Tensor, "B C N"]:
-        features = self.embed(self.context(scene, parameters), states, self.initial(scene))
+        features = self.embed(self.context(scene, parameters), states, self.current_states(scene))
         return self.own_value(features)[..., 0]
 
     def network_pair(
@@ -93,7 +93,7 @@ class NeuralEnergy(NetworkEnergy):
         first: Float[Tensor, "B C P K 4"],
         second: Float[Tensor, "B C P K 4"],
     ) -> Float[Tensor, "B C P"]:
-        context, initial = self.context(scene, parameters), self.initial(scene)
+        context, initial = self.context(scene, parameters), self.current_states(scene)
         ours, theirs = (
             self.embed(context[:, :, members], states, initial[:, :, members])
             for members, states in zip(pairs(context.shape[2], first.device), (first, second), strict=True)
@@ -104,7 +104,7 @@ class NeuralEnergy(NetworkEnergy):
         self, scene: Scene, parameters: GameParameters, states: Float[Tensor, "B C N K 4"]
     ) -> tuple[Float[Tensor, "B C N"], Float[Tensor, "B P C C"]]:
         """E_i and E_ij with every candidate embedded once; only encounters and the last layers are evaluated per pair."""
-        features = self.embed(self.context(scene, parameters), states, self.initial(scene))
+        features = self.embed(self.context(scene, parameters), states, self.current_states(scene))
         first, second = pairs(states.shape[2], states.device)
         ours, theirs, left, right = (
             values[:, :, members].transpose(1, 2) for values in (features, states) for members in (first, second)

@@ -134,7 +134,7 @@ class Implicit(Backward):
             controls, status = implicit.attach(energy, scene, games, solution.controls, exact, backend)
         else:
             controls, status = dense.attach(energy, scene, games, solution.controls, exact)
-        states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
+        states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
         status = torch.maximum(solution.status, status)
         return dataclasses.replace(solution, controls=controls, states=states, status=status)
 

@@ -265,7 +265,7 @@ def test_nash_gaps_are_those_of_another_minimiser(game: str, agents: int) -> Non
     row = Row(agents)
     energy, scene, parameters = of_game(row)
     away = row.controls + SPREAD * torch.randn(row.controls.shape, dtype=torch.float64)
-    states = energy.dynamics.rollout(energy.initial(scene), away, scene.dt)
+    states = energy.dynamics.rollout(energy.current_states(scene), away, scene.dt)
     none = torch.zeros(1, 1, dtype=torch.float64)
     found = report(energy, scene, parameters, Solution(away, states, none, none, none, none.long()))
     joint = away[0, 0].numpy()

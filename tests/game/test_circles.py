@@ -66,7 +66,7 @@ def test_residuals_equal_a_loop_over_circles(stride):
     energy = FeatureEnergy(OWN, ["circles"], pair_stride=stride)
     controls = parameters.initial_controls
     found = energy.residuals(scene, parameters, controls)["circles"]
-    states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)[..., stride - 1 :: stride, :]
+    states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)[..., stride - 1 :: stride, :]
     expected = torch.zeros_like(found)
     for b, m, p, k in torch.cartesian_prod(*(torch.arange(count) for count in found.shape)).tolist():
         i, j = torch.triu_indices(4, 4, 1)[:, p].tolist()

@@ -56,7 +56,7 @@ def collide(first, second, first_size, second_size, shape):
 def test_collisions_equal_a_loop_over_circles(shape, seed):
     torch.manual_seed(seed)
     energy, scene, game = drawn(shape, agents=3, scenes=2)
-    states = energy.dynamics.rollout(energy.initial(scene), game.initial_controls, scene.dt)
+    states = energy.dynamics.rollout(energy.current_states(scene), game.initial_controls, scene.dt)
     terms = energy.terms(scene, game, game.initial_controls)["collision"]
     one_game = dataclasses.replace(game, initial_controls=game.initial_controls[:, :1])
     _, table = energy.tables(scene, one_game, game.initial_controls)
@@ -74,7 +74,7 @@ def test_collisions_equal_a_loop_over_circles(shape, seed):
 def test_collisions_are_the_overlaps_of_the_metric(shape):
     """Discs are the metric's own; rows of circles cover the metric's boxes, so that they miss no overlap."""
     energy, scene, game = drawn(shape, scenes=40)
-    states = energy.dynamics.rollout(energy.initial(scene), game.initial_controls, scene.dt)
+    states = energy.dynamics.rollout(energy.current_states(scene), game.initial_controls, scene.dt)
     found = energy.terms(scene, game, game.initial_controls)["collision"] > 0
     counted = torch.stack(
         [overlapping_pairs(states[:, m], scene.size, scene.agent_mask, shape) for m in range(states.shape[1])], 1

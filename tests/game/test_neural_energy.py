@@ -122,14 +122,14 @@ def test_all_parameters_have_gradients():
 
 def test_pair_terms_are_symmetric():
     energy, scene, game = drawn(agents=2)
-    states = energy.dynamics.rollout(energy.initial(scene), game.initial_controls, scene.dt)
+    states = energy.dynamics.rollout(energy.current_states(scene), game.initial_controls, scene.dt)
     first, second = states[:, :, :1], states[:, :, 1:]
     swapped = dataclasses.replace(scene, history=scene.history.flip(1))
     other = dataclasses.replace(game, context=game.context.flip(1))
     here = energy.pair_terms(scene, game, first, second)["neural_pair"]
     there = energy.pair_terms(swapped, other, second, first)["neural_pair"]
     torch.testing.assert_close(there, here, rtol=0, atol=1e-14)
-    embedded = energy.embed(energy.context(scene, game), states, energy.initial(scene))
+    embedded = energy.embed(energy.context(scene, game), states, energy.current_states(scene))
     ours, theirs = embedded[:, :, :1], embedded[:, :, 1:]
     from_one = energy.interaction(ours, theirs, states.new_zeros(1, 2, 1, 6))
     from_other = energy.interaction(theirs, ours, states.new_zeros(1, 2, 1, 6))

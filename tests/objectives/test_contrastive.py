@@ -37,7 +37,7 @@ def forecast_of(energy, scene, parameters, solver=STILL, probabilities=None):
     return JointForecast(
         states=solution.states,
         probabilities=torch.full((scenes, modes), 1.0 / modes) if probabilities is None else probabilities,
-        initial_states=energy.dynamics.rollout(energy.initial(scene), start, scene.dt),
+        initial_states=energy.dynamics.rollout(energy.current_states(scene), start, scene.dt),
         parameters=parameters,
         solution=solution,
     )

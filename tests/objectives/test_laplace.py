@@ -41,7 +41,7 @@ def forecast_of(energy, scene, parameters, logits=None):
     scenes, modes = parameters.initial_controls.shape[:2]
     logits = torch.zeros(scenes, modes, dtype=torch.float64) if logits is None else logits
     start = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
-    states = energy.dynamics.rollout(energy.initial(scene), start, scene.dt)
+    states = energy.dynamics.rollout(energy.current_states(scene), start, scene.dt)
     return JointForecast(states, logits.softmax(-1), initial_states=states, parameters=parameters)
 
 

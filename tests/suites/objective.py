@@ -51,7 +51,7 @@ class ObjectiveSuite:
         solution = build("solver", self.solver).for_modes(MODES).for_test()(energy, scene, game)
         logits = torch.arange(MODES, dtype=torch.float64).expand(len(scene.history), -1)
         choice = TABLES in build("solver", self.solver).provides
-        starts = energy.dynamics.rollout(energy.initial(scene), game.initial_controls, scene.dt)
+        starts = energy.dynamics.rollout(energy.current_states(scene), game.initial_controls, scene.dt)
         return JointForecast(
             solution.states,
             logits.softmax(1),

@@ -75,7 +75,7 @@ class SolverSuite:
         assert solution.controls.shape == (3, MODES, 3, HORIZON, 2)
         assert solution.status.shape == (3, MODES)
         assert set(solution.status.flatten().tolist()) <= set(Status)
-        states = energy.dynamics.rollout(energy.initial(scene), solution.controls, scene.dt)
+        states = energy.dynamics.rollout(energy.current_states(scene), solution.controls, scene.dt)
         torch.testing.assert_close(solution.states, states)
         torch.testing.assert_close(solution.energy, energy(scene, game.for_modes(MODES), solution.controls))
         if TABLES in self.provides:

@@ -82,7 +82,7 @@ class Candidates(Minimiser):
             scene = scene.to(start.dtype)
         raw = energy.tables(scene, parameters, start)
         controls = torch.where(mask[:, None, :, None, None], start, 0.0)
-        states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
+        states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
 
         unary, pair = assignments.settle(*raw, mask)
         valid = (unary > -torch.inf).flatten(1).all(1) & (pair > -torch.inf).flatten(1).all(1)

@@ -84,7 +84,7 @@ def solve(
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact)
     if call.record:
-        controls, states, *iterates = _Unrolled.apply(call, parameters.initial_controls, *call.inputs)
+        controls, states, *iterates = _Steps.apply(call, parameters.initial_controls, *call.inputs)
     else:
         call.run()
         iterates = list(call.iterates.unbind(0))
@@ -143,7 +143,7 @@ def attach(
     if not call.record:
         call.run()
         return controls, _definite(call)
-    found, status = _Implicit.apply(call, game.initial_controls, *call.inputs)
+    found, status = _Minimum.apply(call, game.initial_controls, *call.inputs)
     return found.to(controls.dtype), status
 
 
@@ -329,7 +329,7 @@ def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:
     return "lane" in energy.own and scene.reference_mask is not None and not scene.reference_mask.all()
 
 
-class _Unrolled(torch.autograd.Function):
+class _Steps(torch.autograd.Function):
     """Autograd function of all steps; returns controls, states and, with ``keep_iterates``, every iterate."""
 
     @staticmethod
@@ -364,7 +364,7 @@ class _Unrolled(torch.autograd.Function):
         return None, bar, *gradients
 
 
-class _Implicit(torch.autograd.Function):
+class _Minimum(torch.autograd.Function):
     """Autograd function of the implicit derivative; returns the given controls and a status."""
 
     @staticmethod

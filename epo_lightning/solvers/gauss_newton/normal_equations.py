@@ -63,7 +63,7 @@ def normal_equations(
         )
     present = by_channel(present)
     controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
-    states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
+    states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
     # The 2 K unit directions of every agent, all of acceleration before all of turn rate.
     unit = torch.eye(2 * steps, dtype=controls.dtype, device=controls.device).view(-1, 2, steps).mT[:, None, None, None]
     directions = unit.expand(-1, *controls.shape)

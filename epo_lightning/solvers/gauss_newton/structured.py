@@ -87,11 +87,12 @@ def solve(
         iterates.append(controls)
     with torch.no_grad():
         last = expand(energy, scene, parameters, controls, not split)
+        # The sum over agents is a running sum, so that absent agents, which come last, change no digit of it.
         gradient_norm = last.gradient.square().flatten(2).sum(-1).cumsum(1)[:, -1].sqrt().view_as(status)
         final_energy = last.value.view_as(status)
     return Solution(
         controls=controls,
-        states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
+        states=energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
         if controls.requires_grad
         else last.at.states,
         initial_energy=final_energy if initial_energy is None else initial_energy,

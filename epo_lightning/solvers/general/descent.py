@@ -95,7 +95,7 @@ def solution(
     """The solution with these controls, and the energies before and after the minimisation."""
     return Solution(
         controls=controls,
-        states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt),
+        states=energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt),
         initial_energy=energies[0],
         energy=energies[1],
         gradient_norm=slope.flatten(2).norm(dim=-1),

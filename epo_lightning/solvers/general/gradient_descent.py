@@ -163,7 +163,7 @@ def descend(
     shortened = torch.where(length < 1.0, Status.DAMPED, Status.SOLVED)
     solution = Solution(
         controls=controls,
-        states=energy.dynamics.rollout(energy.initial(scene), controls, scene.dt),
+        states=energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt),
         initial_energy=initial_energy,
         energy=energies,
         gradient_norm=slope.detach().flatten(2).norm(dim=-1),

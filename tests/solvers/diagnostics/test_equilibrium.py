@@ -57,7 +57,7 @@ KINDS = pytest.mark.parametrize("kind", [lambda energy: energy, Opaque], ids=["f
 
 def forecast_of(energy, scene, parameters, controls, probabilities=None, **solution) -> JointForecast:
     """The forecast of these strategies."""
-    states = energy.dynamics.rollout(energy.initial(scene), controls, scene.dt)
+    states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
     shape = controls.shape[:2]
     value = torch.zeros(shape, dtype=controls.dtype)
     found = Solution(controls, states, value - 7.0, value, value, value.long(), **solution)
@@ -521,7 +521,7 @@ class Downhill(Opaque):
 
     def own_terms(self, scene, parameters, states, controls):
         terms = self.features.own_terms(scene, parameters, states, controls)
-        right = self.initial(scene)[..., 0] > 0
+        right = self.current_states(scene)[..., 0] > 0
         return {**terms, "acc": torch.where(right, -controls[..., 0].sum(-1), terms["acc"])}
 
 

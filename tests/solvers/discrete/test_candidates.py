@@ -89,7 +89,9 @@ def test_modes_are_the_best_joint_strategies(kind):
     torch.testing.assert_close(solution.energy, lowest[:, :4])
     for s, mode in itertools.product(range(2), range(4)):
         assert torch.equal(solution.controls[s, mode], joint[order[s, mode]][s])
-    torch.testing.assert_close(solution.states, ENERGY.dynamics.rollout(ENERGY.initial(scene), solution.controls, 0.1))
+    torch.testing.assert_close(
+        solution.states, ENERGY.dynamics.rollout(ENERGY.current_states(scene), solution.controls, 0.1)
+    )
     assert (solution.initial_energy >= solution.energy[:, :1]).all()
     assert (solution.status == Status.SOLVED).all()
     assert solution.gradient_norm.isnan().all()

@@ -125,7 +125,7 @@ def test_minimum_and_energy_equal_those_of_scipy(minimise, convex):
         solution.gradient_norm, expected[1].detach().flatten(2).norm(dim=-1), rtol=1e-3, atol=1e-12
     )
     torch.testing.assert_close(solution.initial_energy, energy(scene, game, game.initial_controls), rtol=1e-12, atol=0)
-    states = energy.dynamics.rollout(energy.initial(scene), solution.controls, scene.dt)
+    states = energy.dynamics.rollout(energy.current_states(scene), solution.controls, scene.dt)
     assert torch.equal(solution.states, states)
 
 
