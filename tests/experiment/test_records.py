@@ -146,11 +146,12 @@ def test_environment_variables_are_resolved_for_the_configuration_tree_alone(
 def test_recorded_commands_can_be_given_to_a_shell(epo: Epo) -> None:
     titles = (r"title='it\'s'", "title='a \"quote'", 'title="a\'b"', "title='$HOME `x` !'", "title='two\nlines'")
     for number, title in enumerate(titles):
-        assert epo("train", ROW, *TINY, f"run_dir=run{number}", title, "score=test") == 0, title
-        record = RunFolder(Path(f"run{number}")).record
-        words = ["epo", "train", ROW, *TINY, title, "score=test", f"--config-dir={tiny.CONF}"]
+        changes = (title, f"seed={number}", "score=test")
+        assert epo("train", ROW, *TINY, f"run_dir=all/run{number}", *changes) == 0, title
+        record = RunFolder(Path(f"all/run{number}")).record
+        words = ["epo", "train", ROW, *TINY, *changes, f"--config-dir={tiny.CONF}"]
         assert shlex.split(record["command"]) == words
-        assert epo("report", f"runs=run{number}", f"out=report{number}") == 0, title
+    assert epo("report", "runs=all") == 0
     assert epo("train", "-m", ROW, *TINY, titles[0], "seed=0") == 0
     (run,) = Path("runs").rglob("run.json")
     words = shlex.split(RunFolder(run.parent).record["command"])
