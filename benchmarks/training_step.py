@@ -140,8 +140,8 @@ class Step:
         self.clock = Clock()
         self.cut: Cut | None = None
         if isinstance(self.model, EPO):
-            self.cut = Cut(self.model.solve, self.clock)
-            self.model.solve = self.cut  # type: ignore[assignment]
+            self.cut = Cut(self.model.differentiable_solve, self.clock)
+            self.model.differentiable_solve = self.cut  # type: ignore[assignment]
         for name, module in self.model.named_children():
             if not name.endswith("_metrics"):
                 self._time(module, "backbone" if name == "backbone" else "decoders")

@@ -284,8 +284,8 @@ class GameParameters(_Batch):
         context: features z of the agents, for energies that are networks.
         order: +1 or -1 for every pair i < j: the side on which they pass, or the agent that goes first
             (:mod:`~epo_lightning.game.pair_order`). None for energies without orders.
-        goal_headings: heading [rad] wanted at the goal, continuous with the agent's heading (not wrapped); None for energies
-            without a feature of it.
+        goal_headings: heading [rad] wanted at the goal, continuous with the agent's heading (not wrapped); None for scenes
+            without goal headings.
         margins: additional distance [m] that a pair keeps, >= 0, by name of the pair feature.
     """
 

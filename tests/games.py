@@ -276,9 +276,9 @@ def normal_equations(
 ):
     """The model's gradient [B, M, N, K, 2] and matrix [B, M, n, n] in the controls, in the order of ``controls``."""
     model = expand(energy, scene, parameters, controls, every_pair=True, exact=exact)
-    none, steps, agents = controls.new_zeros(model.at.samples), model.at.steps, model.at.agents
+    none, steps, agents = controls.new_zeros(model.at.problems), model.at.steps, model.at.agents
     units = torch.eye(2 * steps * agents, dtype=controls.dtype).view(-1, agents, steps, 2).transpose(-1, -2)
-    columns = [times(model, unit.expand(model.at.samples, -1, -1, -1), none) for unit in units]
+    columns = [times(model, unit.expand(model.at.problems, -1, -1, -1), none) for unit in units]
     matrix = torch.stack([column.transpose(-1, -2).flatten(1) for column in columns], -1)
     shape = *controls.shape[:2], 2 * steps * agents, 2 * steps * agents
     return model.gradient.transpose(-1, -2).reshape(controls.shape), matrix.reshape(shape)

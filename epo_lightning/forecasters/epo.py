@@ -75,8 +75,8 @@ class EPO(Forecaster):
         control_scale: initial control at a network output of one.
         motions: largest ``acceleration`` [m/s^2] and ``curvature`` [1/m] of initial motions.
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
-            the forecast cannot explain agents that act for a later goal. Scenes may end their games earlier
-            (``game_steps``). Initial strategies are decoded up to that number of steps.
+            the forecast cannot explain agents that act for a later goal. With more steps than the forecast, scenes may end
+            their games earlier (``game_steps``). Initial strategies are decoded up to that number of steps.
         one_game: whether the modes are equilibria of one game, found from M initial strategies; its pair weights are
             positive. Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
@@ -162,21 +162,21 @@ class EPO(Forecaster):
             raise ConfigError(f"forecaster.control_scale must be positive and finite, not {control_scale}")
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
-        # `solve` runs the minimiser, with the derivative of its solution that the part `backward` defines.
-        self.solve, self.objective = backward, objective
+        # The part `backward` runs the minimiser and defines the derivative of its solution.
+        self.differentiable_solve, self.objective = backward, objective
         # M games with one initial strategy each, or one game with M; for solvers that choose, one game with C candidates.
         games, strategies = 1 if one_game else solver.games(modes), solver.strategies(modes)
         width, scale, horizon = backbone.width, task.scale, self.game_horizon
-        own, pair = energy.weighted
-        start = check_start(own_start, own, energy.own)
+        own_names, pair_names = energy.weighted
+        start = check_start(own_start, own_names, energy.own)
         ranges = {} if motions is None and initial != "motions" else check_motions(motions)
         # Do not change the order: every module draws its initial weights from the same sequence of random numbers.
         self.own_weights: OwnWeights | SharedWeights
         if own_weights == "shared":
-            self.own_weights = SharedWeights(games, own, start)
+            self.own_weights = SharedWeights(games, own_names, start)
         else:
-            self.own_weights = OwnWeights(width, games, own, start)
-        self.pair_weights = PairWeights(width, games, pair, pair_start, symmetric_pairs, positive=one_game)
+            self.own_weights = OwnWeights(width, games, own_names, start)
+        self.pair_weights = PairWeights(width, games, pair_names, pair_start, symmetric_pairs, positive=one_game)
         self.strategies: InitialStrategies | ZeroStrategies | Motions
         if initial == "decoded":
             self.strategies = InitialStrategies(width, strategies, horizon, control_scale)
@@ -203,14 +203,14 @@ class EPO(Forecaster):
         """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 2."""
         z = self.backbone(scene)
         goals = self.goals(z, scene)
-        game = self._game_of(scene)
+        to_end = self._with_game_end(scene)
         orders = self._decode_orders(z, scene)
         parameters = self._infer_game(z, scene, goals, orders)
         if self.calibration is not None and not self.training:
-            parameters = self.calibration(self._minimiser, self.energy, game, parameters)
+            parameters = self.calibration(self._minimiser, self.energy, to_end, parameters)
         if self.one_game:
             parameters = parameters.for_modes(self.modes)
-        solution = self.solve(self._minimiser, self.energy, game, parameters)
+        solution = self.differentiable_solve(self._minimiser, self.energy, to_end, parameters)
         logits = self._mode_logits(z, scene, goals, orders, solution)
         return JointForecast(
             states=solution.states[..., : self.task.horizon, :],
@@ -225,8 +225,11 @@ class EPO(Forecaster):
             goal_logits=goals.logits,
         )
 
-    def _game_of(self, scene: Scene) -> Scene:
-        """The scene with the end of its game, which is not after ``game_horizon``."""
+    def _with_game_end(self, scene: Scene) -> Scene:
+        """The scene with the end of its game, which is not after ``game_horizon``.
+
+        Without a longer ``game_horizon`` than the forecast, all games end with the forecast.
+        """
         steps = scene.game_steps
         if steps is None:
             return scene
@@ -299,13 +302,13 @@ class EPO(Forecaster):
         controls = parameters.initial_controls[..., : self.task.horizon, :]
         # If gradients reach the initial strategies through the solution (backward=unrolled), the loss term `initial` is not
         # used, so their states are computed without a gradient.
-        controls = controls.detach() if self.solve.teaches_start else controls
+        controls = controls.detach() if self.differentiable_solve.teaches_start else controls
         return self.energy.dynamics.rollout(self.energy.current_states(scene), controls, scene.dt)
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
         assert forecast.parameters is not None
         assert forecast.solution is not None
-        terms = self.energy.terms(self._game_of(scene), forecast.parameters, forecast.solution.controls)
+        terms = self.energy.terms(self._with_game_end(scene), forecast.parameters, forecast.solution.controls)
         return dataclasses.replace(
             forecast,
             own_energy={name: terms[name] for name in self.energy.own},
@@ -321,7 +324,7 @@ class EPO(Forecaster):
         scenes = len(scene.history)
         stride = 1 if cheap else max(1, self._batches * scenes // EXAMINED)
         chosen = torch.arange(0, scenes, stride, device=scene.history.device)
-        report = equilibrium(self.energy, self._game_of(scene)[chosen], forecast[chosen])
+        report = equilibrium(self.energy, self._with_game_end(scene)[chosen], forecast[chosen])
         if report is None:
             return forecast
         if RESIDUALS not in self.energy.offers:
@@ -336,17 +339,17 @@ class EPO(Forecaster):
         None for games without pair terms, for energies with other interaction than named features, and for choices among
         candidates.
         """
-        game = forecast.parameters
+        parameters = forecast.parameters
         if (
-            game is None
-            or not game.pair_weights
+            parameters is None
+            or not parameters.pair_weights
             or FEATURES not in self.energy.offers
             or TABLES in self.solver.provides
         ):
             return None
-        alone = {name: torch.zeros_like(weight) for name, weight in game.pair_weights.items()}
-        parameters = dataclasses.replace(game, pair_weights=alone)
-        solution = self.solve(self._minimiser, self.energy, self._game_of(scene), parameters)
+        alone = {name: torch.zeros_like(weight) for name, weight in parameters.pair_weights.items()}
+        without = dataclasses.replace(parameters, pair_weights=alone)
+        solution = self.differentiable_solve(self._minimiser, self.energy, self._with_game_end(scene), without)
         return solution.states[..., : self.task.horizon, :]
 
     @property
@@ -356,7 +359,7 @@ class EPO(Forecaster):
         return int(sum(counts)) or 1
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
-        return self.objective(self._game_of(scene), forecast, self.energy, self.global_step)
+        return self.objective(self._with_game_end(scene), forecast, self.energy, self.global_step)
 
 
 def _without_repeats(score: Tensor, modes: Tensor) -> Tensor:

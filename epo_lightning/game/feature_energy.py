@@ -40,6 +40,10 @@ class FeatureEnergy(Energy):
     no effect. Because the pair terms are symmetric, a minimum of E is an open-loop Nash equilibrium in which agent i
     minimises its own terms plus the pair terms it takes part in (Theorem 1).
 
+    :meth:`residuals` is the reference. The fast solver evaluates the same features, with their derivatives, in
+    :mod:`epo_lightning.solvers.gauss_newton.expansion`. A feature is *declared* if its source gives its Jacobian in closed
+    form; all built-in own features, ``proximity`` and ``clearance`` are. Automatic differentiation serves the others.
+
     A pair with a weight of exactly zero does not interact: solvers skip it, and because weights enter squared, its weight
     has no gradient. Set weights to zero to define which pairs of a game do not interact.
 

@@ -193,8 +193,9 @@ class RPIData(SceneDataModule):
         """
         names = ("history", "goals", "states", "modes", "phi", "step")
         records = cache.load(self.folder, split, names, self.command, self.config)
+        # The robot crosses the circle at the heading 0 and the pedestrian at phi; `step` is the main game's step at t0.
         phi = records["phi"]
-        records["goal_headings"] = torch.stack((torch.zeros_like(phi), phi), -1)  # both cross the circle, see `game`
+        records["goal_headings"] = torch.stack((torch.zeros_like(phi), phi), -1)
         records["game_steps"] = GameConstants().steps - records["step"]
         return RPIDataset(records, self.targets, self.seed)
 

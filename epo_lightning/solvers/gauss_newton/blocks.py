@@ -27,7 +27,7 @@ _UNKNOWNS = 32
 """Target number of unknowns per block: smaller blocks take more operations, larger ones more arithmetic."""
 _ALIGNED = 16
 """Unknowns are padded to a multiple of this. Libraries round differently for matrices that are not aligned to cache lines,
-and the result of a sample must not depend on its position in a batch."""
+and the result of a problem must not depend on its position in a batch."""
 
 
 def block_bounds(steps: int, agents: int) -> list[tuple[int, int]]:
@@ -110,7 +110,7 @@ def factorise(
 
     Args:
         model: the quadratic model of the energy.
-        damping: lambda of every sample or of every agent, added to the diagonal of the controls.
+        damping: lambda of every problem or of every agent, added to the diagonal of the controls.
         group: the sets of agents.
     """
     parts = _Parts(model, damping, group)
@@ -139,7 +139,7 @@ class _Parts:
         # Absent agents and steps after the end of a game get unit matrices, so that they are regular even without damping.
         control = exact(model.control) + damping.reshape(len(damping), -1, 1, 1)
         present = model.at.present[..., None, None]
-        control = torch.where(present if model.at.active is None else present & model.at.active, control, 1.0)
+        control = torch.where(present if model.at.within_game is None else present & model.at.within_game, control, 1.0)
         moves, node, pull = exact(model.at.moves), exact(model.node), exact(model.position)
         rows = [model.at.dt * moves.flatten(2, 3), control / model.at.dt**2, node, pull]
         sizes = [4, 2, 2, 3]

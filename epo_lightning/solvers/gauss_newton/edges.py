@@ -15,35 +15,35 @@ from epo_lightning.scene import GameParameters, Scene
 
 @dataclass(frozen=True)
 class Edges:
-    """A list of pairs of agents of all samples; agent i of sample s has the number s N + i, pair p the number s P + p.
+    """A list of pairs of agents of all problems; agent i of problem s has the number s N + i, pair p the number s P + p.
 
     Attributes:
         first, second: numbers s N + i and s N + j of the agents.
         pair: number s P + p of the pair.
-        samples, agents: S and N.
+        problems, agents: S and N.
         every: whether these are all pairs, in order.
     """
 
     first: Int[Tensor, " E"]
     second: Int[Tensor, " E"]
     pair: Int[Tensor, " E"]
-    samples: int
+    problems: int
     agents: int
     every: bool
 
     @classmethod
-    def all(cls, samples: int, agents: int, device: torch.device) -> Edges:
-        """Every pair of every sample."""
+    def all(cls, problems: int, agents: int, device: torch.device) -> Edges:
+        """Every pair of every problem."""
         first, second = pairs(agents, device)
-        start = agents * torch.arange(samples, device=device)[:, None]
-        pair = torch.arange(samples * len(first), device=device)
-        return cls((start + first).flatten(), (start + second).flatten(), pair, samples, agents, every=True)
+        start = agents * torch.arange(problems, device=device)[:, None]
+        pair = torch.arange(problems * len(first), device=device)
+        return cls((start + first).flatten(), (start + second).flatten(), pair, problems, agents, every=True)
 
     @classmethod
-    def none(cls, samples: int, agents: int, device: torch.device) -> Edges:
+    def none(cls, problems: int, agents: int, device: torch.device) -> Edges:
         """No pair at all."""
         empty = torch.zeros(0, dtype=torch.long, device=device)
-        return cls(empty, empty, empty, samples, agents, every=False)
+        return cls(empty, empty, empty, problems, agents, every=False)
 
     @classmethod
     def near(
@@ -73,12 +73,12 @@ class Edges:
         if matters.all():
             return cls.all(batch * modes, agents, states.device)
         pair = matters.flatten().nonzero()[:, 0]
-        sample, within = pair // len(first), pair % len(first)
-        start = agents * sample
+        problem, within = pair // len(first), pair % len(first)
+        start = agents * problem
         return cls(start + first[within], start + second[within], pair, batch * modes, agents, every=False)
 
     def of_pairs(self, values: Float[Tensor, " pairs"]) -> Float[Tensor, " E"]:
-        """The values of these edges, from those of all pairs of all samples."""
+        """The values of these edges, from those of all pairs of all problems."""
         return values if self.every else values.index_select(0, self.pair)
 
     def ends(self, values: Float[Tensor, "S N *rest"]) -> tuple[Float[Tensor, "E *rest"], Float[Tensor, "E *rest"]]:
@@ -102,8 +102,8 @@ class Edges:
             return
         numbers = torch.arange(self.agents, device=onto.device)[:, None]
         for index, values in zip(pairs(self.agents, onto.device), (first, second), strict=True):
-            incidence = (index == numbers).to(onto.dtype).expand(self.samples, -1, -1)
-            onto.add_((incidence @ values.reshape(self.samples, incidence.shape[-1], -1)).view_as(onto))
+            incidence = (index == numbers).to(onto.dtype).expand(self.problems, -1, -1)
+            onto.add_((incidence @ values.reshape(self.problems, incidence.shape[-1], -1)).view_as(onto))
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Group:
     """C sets of m agents whose matrices are assembled together.
 
     Attributes:
-        agents: numbers s N + i of the agents; None for all agents of all samples, in order.
+        agents: numbers s N + i of the agents; None for all agents of all problems, in order.
         count, size: C and m.
         edges: indices of the edges within the sets; None for all edges.
         component, first, second: index of the set of each edge, and indices of both agents within the set.
@@ -127,10 +127,10 @@ class Group:
 
     @classmethod
     def whole(cls, edges: Edges) -> Group:
-        """Every sample as one set."""
-        sample = edges.first // max(edges.agents, 1)
-        start = sample * edges.agents
-        return cls(None, edges.samples, edges.agents, None, sample, edges.first - start, edges.second - start)
+        """Every problem as one set."""
+        problem = edges.first // max(edges.agents, 1)
+        start = problem * edges.agents
+        return cls(None, edges.problems, edges.agents, None, problem, edges.first - start, edges.second - start)
 
     def subset(self, chosen: Int[Tensor, " D"]) -> Group:
         """The group of some of these sets."""

@@ -60,13 +60,13 @@ def expand(
     own = {}
     for name, feature in energy.own_features.items():
         if feature.declared:
-            own[name] = _add_own(sums, feature, at.by_sample(energy.own_weight(scene, parameters, name)))
+            own[name] = _add_own(sums, feature, at.by_problem(energy.own_weight(scene, parameters, name)))
         else:
             _add_undeclared(sums, name)
     if not energy.pair or at.agents < 2:
-        edges = Edges.none(at.samples, at.agents, at.u.device)
+        edges = Edges.none(at.problems, at.agents, at.u.device)
     elif every_pair:
-        edges = Edges.all(at.samples, at.agents, at.u.device)
+        edges = Edges.all(at.problems, at.agents, at.u.device)
     else:
         edges = Edges.near(energy, scene, parameters, at.states)
     separation = Separation.of(at, edges) if len(edges.pair) else None
@@ -113,7 +113,7 @@ class _Sums:
 
     Attributes:
         at, exact: as for :func:`expand`.
-        agent_value: own energy of each agent. The energy of all pairs of a sample is added to the sample's first agent.
+        agent_value: own energy of each agent. The energy of all pairs of a problem is added to the problem's first agent.
         control_gradient, node_gradient: gradients by controls and by nodes, without the part that acts through positions
             (``positions``).
         positions: gradient by positions (x, y), then their second derivatives (xx, xy, yy).
@@ -139,7 +139,7 @@ class _Sums:
         """Sums over no feature."""
 
         def zeros(*size: int) -> Tensor:
-            return at.u.new_zeros(at.samples, at.agents, *size)
+            return at.u.new_zeros(at.problems, at.agents, *size)
 
         return cls(at, exact, zeros(), *(zeros(count, at.steps) for count in (2, 2, 5, 2, 2)))
 
@@ -173,8 +173,8 @@ def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]
     at, square = sums.at, weight.square()
     signal = linear_signal(feature, at.u, at.speed, at.dt, channels=-2)
     if feature.needs:
-        signal = signal - at.by_sample(at.around.reference_speed)
-    active = at.active
+        signal = signal - at.by_problem(at.around.reference_speed)
+    active = at.within_game
     if active is not None:
         # Entry l of a rate is that from control l to control l + 1, which must be part of the game.
         active = active[:, :, 0, 1:] if feature.source is Source.RATE else active[:, :, 0]
@@ -202,9 +202,9 @@ def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]
 def _add_steering(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
     at, square = sums.at, weight.square()
     angle, by_turn_rate, by_speed = steering(*at.steered())
-    if at.active is not None:
+    if at.within_game is not None:
         angle, by_turn_rate, by_speed = (
-            part.where(at.active[:, :, 0], 0.0) for part in (angle, by_turn_rate, by_speed)
+            part.where(at.within_game[:, :, 0], 0.0) for part in (angle, by_turn_rate, by_speed)
         )
     scaled = square * angle
     sums.add_value(scaled, angle)
@@ -230,8 +230,8 @@ def _add_lane(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
     nearest, tangent = nearest_point(position, at.around.line)
     offset, tangent = (rows.flatten(0, 1).transpose(-1, -2).contiguous() for rows in (position - nearest, tangent))
     square = weight.square()[..., None]
-    if at.active is not None:
-        offset, square = offset.where(at.active, 0.0), square.where(at.active, 0.0)
+    if at.within_game is not None:
+        offset, square = offset.where(at.within_game, 0.0), square.where(at.within_game, 0.0)
     scaled = square * offset
     sums.positions[:, :, :2] += scaled
     sums.positions[:, :, 2::2] += square
@@ -254,7 +254,7 @@ def _add_goal(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
 
 def _add_heading(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> HeadingTerm:
     at, square = sums.at, weight.square()
-    offset = at.last(at.x[:, :, HEADING, None]) - at.by_sample(at.around.goal_headings)
+    offset = at.last(at.x[:, :, HEADING, None]) - at.by_problem(at.around.goal_headings)
     scaled = square * offset
     at.add_last_(sums.node_gradient[:, :, 1:], scaled)
     at.add_last_(sums.node[:, :, 1:], square)
@@ -302,7 +302,7 @@ def _pair_terms(at: Iterate, edges: Edges, separation: Separation) -> dict[str, 
             by_margin = None
             if name in at.energy.decoded_margins:
                 by_margin = margin_derivatives(feature, separation.distance, reach, d)
-            if at.active is not None:
+            if at.within_game is not None:
                 active = _edge_exists(at, edges, feature, separation.distance.shape[-1])
                 d = d.within(active)
                 by_margin = by_margin and (by_margin[0].where(active, 0.0), by_margin[1].where(active, 0.0))
@@ -362,7 +362,7 @@ def _add_undeclared_pair(sums: _Sums, edges: Edges, feature: PairFeature, name: 
     _add_pair_value(sums, edges, value.square())
     if not sums.exact:
         if sums.blocks is None:
-            sums.blocks = value.new_zeros(at.samples, at.agents, 2 * at.steps, 2 * at.steps)
+            sums.blocks = value.new_zeros(at.problems, at.agents, 2 * at.steps, 2 * at.steps)
         edges.spread_(sums.blocks, *(side @ side.mT for side in jacobians))
         shared = jacobians[0] @ jacobians[1].mT
         sums.pair_blocks = shared if sums.pair_blocks is None else sums.pair_blocks + shared
@@ -370,8 +370,8 @@ def _add_undeclared_pair(sums: _Sums, edges: Edges, feature: PairFeature, name: 
 
 
 def _add_pair_value(sums: _Sums, edges: Edges, value: Float[Tensor, "E L"]) -> None:
-    first_of_sample = edges.first // sums.at.agents * sums.at.agents
-    sums.agent_value.flatten().index_add_(0, first_of_sample, 0.5 * value.sum(-1))
+    first_of_problem = edges.first // sums.at.agents * sums.at.agents
+    sums.agent_value.flatten().index_add_(0, first_of_problem, 0.5 * value.sum(-1))
 
 
 def _set_undeclared_hessian(sums: _Sums, edges: Edges) -> None:
@@ -394,10 +394,10 @@ def _set_undeclared_hessian(sums: _Sums, edges: Edges) -> None:
                 else None
             )
     hessian = torch.stack([torch.zeros_like(controls) if row is None else row for row in rows])
-    hessian = hessian.flatten(1, 2).view(at.agents, at.steps, 2, at.samples, at.agents, at.steps, 2)
+    hessian = hessian.flatten(1, 2).view(at.agents, at.steps, 2, at.problems, at.agents, at.steps, 2)
     at_nodes = at.to_nodes(at.to_nodes(hessian.permute(3, 0, 2, 4, 6, 5, 1)).transpose(-1, -2))  # [S i c j d k l]
     at_nodes = at_nodes.permute(0, 1, 3, 2, 5, 4, 6)
-    at_nodes = at_nodes.reshape(at.samples, at.agents, at.agents, 2 * at.steps, 2 * at.steps)
+    at_nodes = at_nodes.reshape(at.problems, at.agents, at.agents, 2 * at.steps, 2 * at.steps)
     sums.blocks = at_nodes.diagonal(dim1=1, dim2=2).movedim(-1, 1)
     if part.pair:
         rows_of = edges.first * at.agents + edges.second % at.agents

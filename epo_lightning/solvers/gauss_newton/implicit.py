@@ -41,7 +41,7 @@ def attach(
 
     Returns:
         controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H is not positive definite, so that the controls
-        are no minimum; such a sample has a gradient of zero.
+        are no minimum; such a problem has a gradient of zero.
     """
     if (
         choose_backend(backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls))

@@ -7,7 +7,7 @@ left, a position changes as
 
     dp_k = dt sum_{l<k} M_l dz_l,   M_l = [e_l, v_l e'_l]     (explicit Euler; other integrators include l = k).
 
-Arrays are laid out [S, N, component, K] with S = B M samples. Component 0 is speed (of z) or acceleration (of u), component
+Arrays are laid out [S, N, component, K] with S = B M problems. Component 0 is speed (of z) or acceleration (of u), component
 1 is heading or turn rate. (The kernel and `docs/solver.md` have heading first, and their M contains the factor dt.)
 """
 
@@ -43,7 +43,7 @@ class Iterate:
         energy, scene, parameters: the game.
         controls, states: joint strategies and trajectories, as the energy takes them.
         around: inputs of the own features besides the trajectory.
-        u, x: controls and states, by sample.
+        u, x: controls and states, by problem.
         unit, left: unit vectors of the headings, and those to their left.
         moves: M_l, the derivatives of velocities (x, y) by the component speed and by the component heading.
     """
@@ -74,8 +74,8 @@ class Iterate:
         return cls(energy, scene, parameters, controls, states, around, u, x, unit, left, moves)
 
     @property
-    def samples(self) -> int:
-        """Number S = B M of samples."""
+    def problems(self) -> int:
+        """Number S = B M of problems."""
         return len(self.u)
 
     @property
@@ -109,7 +109,7 @@ class Iterate:
         return self.x[:, :, SPEED]
 
     @cached_property
-    def active(self) -> Bool[Tensor, "S 1 1 K"] | None:
+    def within_game(self) -> Bool[Tensor, "S 1 1 K"] | None:
         """Mask of the steps of each game (``scene.game_steps``); None if all games have K steps."""
         if self.around.ends is None:
             return None
@@ -120,7 +120,9 @@ class Iterate:
     def _last(self) -> Bool[Tensor, "S 1 1 K"] | None:
         """Mask of the last step of each game; None if all games have K steps."""
         return (
-            None if self.active is None else self.active & (self.active.cumsum(-1) == self.active.sum(-1, keepdim=True))
+            None
+            if self.within_game is None
+            else self.within_game & (self.within_game.cumsum(-1) == self.within_game.sum(-1, keepdim=True))
         )
 
     def last(self, values: Float[Tensor, "S N C K"]) -> Float[Tensor, "S N C"]:
@@ -137,18 +139,18 @@ class Iterate:
     @property
     def present(self) -> Bool[Tensor, "S N"]:
         """Mask of the present agents."""
-        return self.by_sample(self.scene.agent_mask[:, None])[..., 0]
+        return self.by_problem(self.scene.agent_mask[:, None])[..., 0]
 
-    def by_sample(self, values: Tensor | None) -> Float[Tensor, "S N 1"] | Bool[Tensor, "S N 1"]:
-        """Values [B, 1 or M, N] of agents, by sample."""
+    def by_problem(self, values: Tensor | None) -> Float[Tensor, "S N 1"] | Bool[Tensor, "S N 1"]:
+        """Values [B, 1 or M, N] of agents, by problem."""
         assert values is not None
-        return values.expand(values.shape[0], self.modes, self.agents).reshape(self.samples, self.agents, 1)
+        return values.expand(values.shape[0], self.modes, self.agents).reshape(self.problems, self.agents, 1)
 
     def steered(self) -> tuple[Tensor, Tensor, Tensor]:
         """Turn rates, the speeds before them, and wheelbases: the arguments of a steering angle."""
-        start = self.by_sample(self.around.initial[..., SPEED])
+        start = self.by_problem(self.around.initial[..., SPEED])
         before = torch.cat((start, self.x[:, :, SPEED, :-1]), -1)
-        return self.u[:, :, TURN_RATE], before, self.by_sample(self.around.wheelbase)
+        return self.u[:, :, TURN_RATE], before, self.by_problem(self.around.wheelbase)
 
     def to_nodes(self, covector: Float[Tensor, "*rows K"]) -> Float[Tensor, "*rows K"]:
         """The gradient by the nodes z that follows from a gradient by the controls, because u_l = (z_{l+1} - z_l) / dt."""

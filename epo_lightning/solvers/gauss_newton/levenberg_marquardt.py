@@ -53,7 +53,7 @@ class LevenbergMarquardt(Stepwise):
         step_size: alpha, 0 < alpha <= 1.
         damping: lambda >= 0, added to the diagonal of J^T J.
         keep_iterates: whether the solution carries u_0 .. u_S.
-        adaptive: whether the damping of every sample is adapted: a step that lowers the energy is accepted, and the damping
+        adaptive: whether the damping of every problem is adapted: a step that lowers the energy is accepted, and the damping
             is divided by 10 (down to 1e-7); any other step is rejected, and the damping is multiplied by 10 (up to 1e7).
             These decisions have no gradient.
         test_steps: number of steps outside training; None for the same number.
@@ -102,7 +102,7 @@ class LevenbergMarquardt(Stepwise):
             ValueError: as :meth:`run`, or a gradient is needed through Newton steps.
         """
         if not self.newton_steps:
-            return super().__call__(energy, scene, parameters)
+            return self.run(energy, scene, parameters, self.steps)[0]
         if torch.is_grad_enabled():
             raise ValueError("solver.newton_steps have no derivative: use backward=implicit, truncated or detached")
         first, damping = self.run(energy, scene, parameters, self.steps)
@@ -126,6 +126,9 @@ class LevenbergMarquardt(Stepwise):
         exact: bool = False,
     ) -> tuple[Solution, Tensor]:
         """Take a number of steps, with the Hessian if ``exact``; returns the solution and the damping to continue with.
+
+        Args:
+            memory: the damping with which an earlier call ended; None at the start.
 
         Raises:
             ValueError: scene and parameters do not fit together (the message names the tensor and its expected shape), or
@@ -196,7 +199,7 @@ def _chosen(better: Tensor, trial: Solution, before: Solution, keep_iterates: bo
         initial_energy=before.initial_energy,
         energy=torch.where(better, trial.energy, before.energy),
         gradient_norm=torch.where(better, trial.gradient_norm, before.gradient_norm),
-        # If the matrix of a step cannot be factorised, the step counts as rejected. A sample whose energy is NaN or
+        # If the matrix of a step cannot be factorised, the step counts as rejected. A problem whose energy is NaN or
         # infinite takes no step at all, because no comparison of energies accepts one.
         status=torch.where(before.energy.isfinite(), before.status.maximum(accepted), Status.STOPPED),
         iterates=(*before.iterates, controls) if keep_iterates else before.iterates,

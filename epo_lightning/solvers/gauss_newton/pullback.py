@@ -118,8 +118,8 @@ def _gradients_along_mu(model: QuadraticModel, changes: _Changes) -> _Sums:
     if model.rate is not None:
         rate = -model.rate * (following(mu) - mu) / model.at.dt**2
         control -= rate - torch.nn.functional.pad(rate[..., :-1], (1, 0))
-    samples, agents, _, steps = mu.shape
-    return _Sums(control, node, mu.new_zeros(samples, agents, 3, 2, steps))
+    problems, agents, _, steps = mu.shape
+    return _Sums(control, node, mu.new_zeros(problems, agents, 3, 2, steps))
 
 
 # Each of the following four functions adds the derivatives of one feature that are not in :func:`_gradients_along_mu`. It
@@ -158,7 +158,7 @@ def _pull_steering(model: QuadraticModel, term: SteeringTerm, changes: _Changes,
 
 def _pull_lane(model: QuadraticModel, term: LaneTerm, changes: _Changes, sums: _Sums) -> tuple[Tensor, Tensor]:
     square = term.weight.square()[..., None]
-    active = model.at.active
+    active = model.at.within_game
     along_mu, along_d = changes.positions if active is None else changes.positions.where(active, 0.0)
     ahead = term.offset + along_d
     across = along_mu - term.tangent * (term.tangent * along_mu).sum(2, keepdim=True)
@@ -224,6 +224,6 @@ def _of_all_pairs(model: QuadraticModel, values: Float[Tensor, " E"]) -> Float[T
     """Values of edges as values of all pairs, zero for pairs that are no edge."""
     at, edges = model.at, model.edges
     if not edges.every:
-        rows = values.new_zeros(at.samples * at.agents * (at.agents - 1) // 2)
+        rows = values.new_zeros(at.problems * at.agents * (at.agents - 1) // 2)
         values = rows.index_copy_(0, edges.pair, values)
-    return values.view(at.samples, -1)
+    return values.view(at.problems, -1)

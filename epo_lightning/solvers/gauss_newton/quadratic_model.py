@@ -10,7 +10,7 @@ are first differences of z, their rates second differences, speeds contribute to
 turn rate with the speed before it. The model holds the second derivatives by these quantities;
 :mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and factorises the matrix.
 
-Pairs are a list of E edges between agents. Agent i of sample s has the number s N + i.
+Pairs are a list of E edges between agents. Agent i of problem s has the number s N + i.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class QuadraticModel:
 
     Attributes:
         at: the iterate.
-        value: E(u), by sample.
+        value: E(u), by problem.
         gradient: dE/du.
         control, node: second derivatives by single controls and by single nodes.
         rate: second derivatives by single rates of controls, zero at the last entry (there are K - 1 rates); None if no

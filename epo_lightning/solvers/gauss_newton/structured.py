@@ -1,13 +1,15 @@
-"""Damped Gauss-Newton steps in PyTorch, on any device: the quadratic model of all samples, factorised in blocks.
+"""Damped Gauss-Newton steps in PyTorch, on any device: the quadratic model of all problems, factorised in blocks.
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Read this module in this order: :func:`solve` takes
-the steps, :class:`_Step` is one step with its adjoint, :func:`factorise` prepares the solution for d.
+the steps, :class:`_Step` is one step with its adjoint, :func:`factorise` prepares the solution for d. The matrix is
+factorised in other unknowns than u, the *nodes*: speed and heading after every step (:mod:`.iterate`). Shapes: S problems
+(a scene in a mode), N agents, K steps, E pairs that are evaluated, C sets of agents that are factorised together.
 
-*Splitting.* Agents that are not connected by active pairs are independent. On a CPU every sample is split into the connected
-components of its active pairs, and components of the same size are factorised together. The solution of an agent then
-depends on its component alone, to the last bit, and a scene with few active pairs takes little more time than its agents
-alone. On a GPU, finding the components would make the host wait; there every sample is one matrix, and no operation
-synchronises.
+*Splitting.* Two agents are coupled if a pair feature of theirs is not zero; agents that no such pairs connect are
+independent. On a CPU every problem is split into the connected components of its coupled pairs, and components of the same
+size are factorised together. The solution of an agent then depends on its component alone, to the last bit, and a scene
+with few coupled pairs takes little more time than its agents alone. On a GPU, finding the components would make the host
+wait; there every problem is one matrix, and no operation synchronises.
 
 *Differentiation.* Autograd does not record the factorisation. For a cotangent v of u + alpha d, one more solve with the same
 factor gives mu = (J^T J + lambda I)^-1 alpha v. With the scalar
@@ -68,10 +70,10 @@ def solve(
         energy, scene, parameters: the game, already validated.
         steps: number S of steps.
         step_size: alpha.
-        damping: lambda of every sample, or of every agent; infinite damping keeps the agent's controls exactly.
+        damping: lambda of every problem, or of every agent; infinite damping keeps the agent's controls exactly.
         keep_iterates: whether the solution carries u_0 .. u_S.
         exact: whether the steps use the Hessian (Newton steps); they have no derivative.
-        split: whether samples are split into components; by default, on a CPU.
+        split: whether problems are split into components; by default, on a CPU.
     """
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
     split = controls.device.type == "cpu" if split is None else split
@@ -210,14 +212,14 @@ class _Step(torch.autograd.Function):
 
 @dataclasses.dataclass(frozen=True)
 class Factorisation:
-    """The factorised matrices J^T J + lambda I of all samples.
+    """The factorised matrices J^T J + lambda I of all problems.
 
     Attributes:
         model: the quadratic model.
         groups: the sets of agents that were factorised together.
         factors: the factors of each group.
-        status: a :class:`Status` per sample.
-        held: mask of the agents with infinite damping; None where damping is given per sample.
+        status: a :class:`Status` per problem.
+        held: mask of the agents with infinite damping; None where damping is given per problem.
     """
 
     model: QuadraticModel
@@ -228,12 +230,12 @@ class Factorisation:
 
     def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
         """(J^T J + lambda I)^-1 times a covector of the controls; zero for controls after the end of a game."""
-        active = self.model.at.active
+        active = self.model.at.within_game
         if active is not None:
             right = right.where(active, 0.0)
-        exact = self.model.at.to_nodes(right.to(torch.float64))
-        parts = [f.solve(_gather(group, exact)) for f, group in zip(self.factors, self.groups, strict=True)]
-        solved = self.model.at.to_controls(_scatter(self.groups, parts, exact)).to(right.dtype)
+        covector = self.model.at.to_nodes(right.to(torch.float64))
+        parts = [f.solve(_gather(group, covector)) for f, group in zip(self.factors, self.groups, strict=True)]
+        solved = self.model.at.to_controls(_scatter(self.groups, parts, covector)).to(right.dtype)
         if active is not None:
             solved = solved.where(active, 0.0)
         return solved if self.held is None else torch.where(self.held[..., None, None], 0.0, solved)
@@ -242,7 +244,7 @@ class Factorisation:
 def factorise(
     model: QuadraticModel, damping: Float[Tensor, "S *agents"], split: bool, retry: bool | None = None
 ) -> Factorisation:
-    """Factorise the matrices of all samples; if samples are split, the matrix of each component separately.
+    """Factorise the matrices of all problems; if problems are split, the matrix of each component separately.
 
     With ``retry``, the factorisation of a matrix that is not positive definite is repeated with more and more damping
     (:data:`RETRIES`); the other matrices are not affected. If no attempt succeeds, the status is STOPPED, and the results of
@@ -250,16 +252,16 @@ def factorise(
 
     Args:
         model: the quadratic model of the energy.
-        damping: lambda of every sample, or of every agent.
-        split: whether samples are split into components.
-        retry: whether to try again with more damping; by default, if samples are split.
+        damping: lambda of every problem, or of every agent.
+        split: whether problems are split into components.
+        retry: whether to try again with more damping; by default, if problems are split.
     """
     held = damping.isinf() if damping.dim() == 2 else None
     if held is not None:
         damping = damping.clamp_max(_HOLDING)
     groups = _components(model, held) if split else [Group.whole(model.edges)]
     factors = []
-    status = torch.zeros(model.at.samples, dtype=torch.long, device=damping.device)
+    status = torch.zeros(model.at.problems, dtype=torch.long, device=damping.device)
     for group in groups:
         found, failed = blocks.factorise(model, damping, group)
         outcome = torch.where(failed, Status.STOPPED, Status.SOLVED)
@@ -268,7 +270,7 @@ def factorise(
         factors.append(found)
         if group.agents is None:
             status = outcome
-        else:  # a sample has the worst status of its components
+        else:  # a problem has the worst status of its components
             status = status.scatter_reduce(0, group.agents[:, 0] // model.at.agents, outcome, "amax")
     return Factorisation(model, groups, factors, status, held)
 
@@ -293,9 +295,9 @@ def _retry(
 
 
 def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) -> list[Group]:
-    """The connected components of active pairs in every sample; absent and held agents are in no group."""
+    """The connected components of coupled pairs in every problem; absent and held agents are in no group."""
     edges = model.edges
-    samples, agents = edges.samples, edges.agents
+    problems, agents = edges.problems, edges.agents
     moving = model.at.present.flatten()
     links = model.linked
     if held is not None:  # a pair with a held agent affects only the other agent, so it connects no agents
@@ -309,7 +311,7 @@ def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) 
     if chosen is not None:
         first, second = first[chosen], second[chosen]
     # Label propagation: every agent takes the lowest label among the agents it is connected with.
-    label = torch.arange(samples * agents)
+    label = torch.arange(problems * agents)
     while True:
         lowest = torch.minimum(label[first], label[second])
         lower = label.scatter_reduce(0, first, lowest, "amin").scatter_reduce(0, second, lowest, "amin")
@@ -331,7 +333,7 @@ def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) 
         place[members] = torch.arange(size)
         within = (size_of[first] == size).nonzero()[:, 0]
         one, other = first[within], second[within]
-        whole = size == agents and count == samples
+        whole = size == agents and count == problems
         groups.append(
             Group(
                 None if whole else members,
@@ -352,13 +354,13 @@ def planar(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "S N 2 K"]:
 
 
 def _gather(group: Group, values: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "C n"]:
-    """Vectors of samples in the order of a group's unknowns."""
+    """Vectors of problems in the order of a group's unknowns."""
     by_agent = values if group.agents is None else values.flatten(0, 1)[group.agents]
     return by_agent.permute(0, 3, 2, 1).reshape(group.count, -1)
 
 
 def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tensor, "S N 2 K"]) -> Tensor:
-    """Vectors [C, n] of groups in the layout of samples, zero for agents that are in no group."""
+    """Vectors [C, n] of groups in the layout of problems, zero for agents that are in no group."""
     steps = like.shape[-1]
     rows = torch.zeros_like(like).flatten(0, 1)
     for group, part in zip(groups, parts, strict=True):
