@@ -93,7 +93,7 @@ def weights(path: Path, runs: Sequence[str]) -> None:
             axis.loglog([8, 110], [8, 110], color=OTHER, linewidth=1.0)
             axis.loglog(costs["true"], costs["pair"], ".", color=MODES[1], markersize=3)
             axis.set_title(
-                f"{title}\nrank correlation {scores['pair_rank']:.2f}, error {100 * scores['pair_error']:.0f} %"
+                f"{title}\nrank correlation {scores['pair_rank']:.2f}, error {100 * scores['pair_error']:.2g} %"
             )
             axis.set_xlabel("true w")
             for side in (axis.xaxis, axis.yaxis):
