@@ -104,8 +104,12 @@ def parts(overrides: Sequence[str]) -> tuple[RPIData, Minimiser, Energy, Calibra
     """The data, and the row's solver, energy and calibration."""
     settings = read(Settings, compose("train", ["experiment=rpi/v_lstm_epo_game", *overrides]))
     data, model = assembly.build(settings)
-    if not isinstance(data, RPIData) or not isinstance(model, EPO) or model.calibration is None:
+    if not isinstance(data, RPIData):
         raise ConfigError("the benchmark compares with the games that made RPI: choose data=rpi or data=rpi_hard")
+    if not isinstance(model, EPO) or model.calibration is None or list(model.energy.pair) != ["clearance"]:
+        raise ConfigError(
+            "the benchmark takes the energy and the calibration of rpi/v_lstm_epo_game: leave energy and calibration out"
+        )
     return data, model.solver, model.energy, model.calibration
 
 

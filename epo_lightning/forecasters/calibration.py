@@ -90,15 +90,19 @@ class Calibration:
         descent = minimiser.descent()
         missed, change, controls = misses(s, start.expand(-1, 2 * games, -1, -1, -1), descent)
         near = descent.near_minimum()
+        done = torch.zeros_like(s, dtype=torch.bool)
         for _ in range(self.steps):
             slope = (change * missed).sum(-1) + s / self.spread**2
             curvature = change.square().sum(-1) + 1.0 / self.spread**2
             trial = s + (-slope / (damping * curvature)).clamp(-_LARGEST_STEP, _LARGEST_STEP)
-            if ((trial - s).abs() < _CONVERGED).all():
-                s = trial
+            # A scene ends on its own, so that it does not depend on the other scenes of its batch.
+            small = ~((trial - s).abs() >= _CONVERGED) & ~done
+            s = torch.where(small & trial.isfinite(), trial, s)
+            done = done | small
+            if done.all():
                 break
             found = misses(trial, controls, near)
-            better = self._cost(found[0], trial) < self._cost(missed, s)
+            better = (self._cost(found[0], trial) < self._cost(missed, s)) & ~done
             damping = torch.where(better, (damping / 3.0).clamp_min(1.0), damping * 4.0)
             s = torch.where(better, trial, s)
             missed = torch.where(better[..., None], found[0], missed)

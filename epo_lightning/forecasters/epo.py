@@ -31,7 +31,7 @@ from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
 from epo_lightning.solvers.backward import Backward
-from epo_lightning.solvers.base import TABLES, Minimiser
+from epo_lightning.solvers.base import STATIONARY, TABLES, Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.task import Task
 
@@ -138,6 +138,21 @@ class EPO(Forecaster):
             )
         if initial not in INITIAL:
             raise ConfigError(f"unknown forecaster.initial {initial!r}: {nearest(str(initial), INITIAL)}")
+        if one_game and initial == "zero" and solver.strategies(modes) > 1:
+            raise ConfigError(
+                "all modes would be the same: forecaster.one_game=true gives them one game, and forecaster.initial=zero one "
+                "start. Use solver=both_sides, which finds several equilibria from one start, or initial=decoded"
+            )
+        if calibration is not None and STATIONARY not in solver.provides:
+            raise ConfigError(
+                "forecaster.calibration needs a solver that leads to a minimum, such as both_sides, game or converging; set "
+                "it to null for this one"
+            )
+        if self.game_horizon > task.horizon and not objective.through_solution:
+            raise ConfigError(
+                "a game that goes on after the forecast (forecaster.game_horizon) needs an objective that learns through "
+                "the solution, objective=imitation: the others compare energies of the observed future, which ends earlier"
+            )
         if chooses and initial == "zero":
             raise ConfigError(
                 "the solver chooses among candidates, which forecaster.initial=zero makes all the same: use decoded, which "
@@ -208,7 +223,7 @@ class EPO(Forecaster):
         parameters = self._infer_game(z, scene, goals, orders)
         if self.calibration is not None and not self.training:
             parameters = self.calibration(self._minimiser, self.energy, to_end, parameters)
-        if self.one_game:
+        if TABLES not in self.solver.provides:
             parameters = parameters.for_modes(self.modes)
         solution = self.differentiable_solve(self._minimiser, self.energy, to_end, parameters)
         logits = self._mode_logits(z, scene, goals, orders, solution)
@@ -303,7 +318,8 @@ class EPO(Forecaster):
         # If gradients reach the initial strategies through the solution (backward=unrolled), the loss term `initial` is not
         # used, so their states are computed without a gradient.
         controls = controls.detach() if self.differentiable_solve.teaches_start else controls
-        return self.energy.dynamics.rollout(self.energy.current_states(scene), controls, scene.dt)
+        states = self.energy.dynamics.rollout(self.energy.current_states(scene), controls, scene.dt)
+        return states.expand(-1, self.modes, -1, -1, -1)
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
         assert forecast.parameters is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from epo_lightning import losses
@@ -74,4 +75,4 @@ def _difference_ahead(scene: Scene, forecast: JointForecast) -> Tensor | float:
     if initial.shape[3] == 0:
         return 0.0
     difference = (initial - forecast.solution.controls[..., first:, :].detach()).abs().mean((1, 3, 4))
-    return difference[scene.agent_mask].mean()
+    return torch.where(scene.agent_mask, difference, 0.0).sum() / scene.agent_mask.sum().clamp_min(1)

@@ -90,3 +90,16 @@ def test_no_steps_change_nothing_and_invalid_settings_are_refused() -> None:
     for settings in ({"steps": -1}, {"noise": 0.0}, {"spread": -1.0}):
         with pytest.raises(ConfigError, match=f"calibration.{next(iter(settings))}"):
             Calibration(**settings)
+
+
+def test_a_scene_is_calibrated_as_if_it_were_alone() -> None:
+    """Scenes of a batch converge after different numbers of steps; one never does, because its history is not finite."""
+    true = torch.tensor([2.0, 5.0, 10.0, 4.0], dtype=torch.double)
+    scene, goals = played(true)
+    scene.history[3] = torch.nan
+    inferred = parameters(torch.tensor([0.5, 1.0, 3.0, 1.0]) * true, 2, AHEAD, goals)
+    together = Calibration()(SOLVER, ENERGY, scene, inferred).pair_weights["proximity"]
+    for index in range(4):
+        alone = Calibration()(SOLVER, ENERGY, scene[index], inferred[index]).pair_weights["proximity"]
+        assert torch.equal(alone[0], together[index])
+    assert torch.equal(together[3], inferred.pair_weights["proximity"][3])

@@ -180,3 +180,49 @@ def test_initial_strategies_after_the_forecast_are_taught_by_the_solution() -> N
     term.backward()
     gradient = forecaster.strategies.mlp.output.bias.grad.view(2, 46, 2)
     assert (gradient[:, 40:] != 0).any()
+
+
+BOTH = {"name": "both_sides", "steps": 6, "newton_steps": 4}
+
+
+def test_modes_of_both_sides_have_one_game_and_one_start() -> None:
+    torch.manual_seed(0)
+    forecaster = build_forecaster(
+        model({**GAME, "one_game": False, "initial": "zero"}, **{**PARTS, "solver": BOTH})
+    ).eval()
+    forecast = forecaster.predict(scenes())
+    assert forecast.parameters is not None
+    assert forecast.initial_states is not None
+    assert forecast.initial_states.shape == forecast.states.shape == (3, 2, 2, 40, 4)
+    for weights in forecast.parameters.own_weights.values():
+        assert weights.shape == (3, 2, 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "parts", "message"),
+    [
+        ({"initial": "zero"}, {}, "all modes would be the same"),
+        (
+            {"one_game": False},
+            {"solver": {"name": "enumeration", "candidates": 4}, "backward": {"name": "unrolled"}},
+            "forecaster.calibration needs a solver",
+        ),
+        (
+            {"calibration": None},
+            {
+                "objective": {"name": "laplace", "weights": {"density": 1.0, "initial": 1.0, "goal": 1.0}},
+                "backward": {"name": "detached"},
+            },
+            "objective=imitation",
+        ),
+    ],
+)
+def test_parts_that_do_not_fit_the_game_are_refused(changes, parts, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build_forecaster(model({**GAME, **changes}, **{**PARTS, **parts}))
+
+
+def test_losses_without_agents_are_finite() -> None:
+    forecaster, scene = built(calibration=None).train(), scenes()
+    empty = dataclasses.replace(scene, agent_mask=torch.zeros(3, 2, dtype=torch.bool))
+    assert all(value.isfinite() for _, value in forecaster.losses(empty, forecaster(empty)).values())

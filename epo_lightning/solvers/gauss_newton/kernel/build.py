@@ -80,7 +80,10 @@ def load(path: Path | None = None) -> ctypes.CDLL:
 
 
 def _compiler() -> list[str]:
-    chosen = shlex.split(os.environ.get("CXX", ""))
+    try:
+        chosen = shlex.split(os.environ.get("CXX", ""))
+    except ValueError as error:
+        raise OSError(f"$CXX is {os.environ['CXX']!r}, which is no command: {error}") from None
     return chosen or [_found("c++", "g++", "clang++")]
 
 
@@ -101,11 +104,26 @@ def _run(commands: list[list[str]]) -> None:
 
 
 def _native(compiler: list[str]) -> str:
-    """The best level of instructions that this machine's processor has."""
+    """The best level of instructions that this machine's processor has.
+
+    Raises:
+        OSError: the compiler does not know this machine's processor.
+    """
     asked = [*compiler, "-march=native", "-dM", "-E", "-x", "c++", os.devnull]
     done = subprocess.run(asked, capture_output=True, text=True)
+    if done.returncode != 0:
+        raise OSError(f"{shlex.join(asked)} ended with {done.returncode}")
     defined = {line.split()[1] for line in done.stdout.splitlines() if line.startswith("#define ")}
     return [level for level in _LEVELS if _NEEDED.get(level, set()) <= defined][-1]
+
+
+def _native_level(compiler: list[str]) -> dict[str, list[str]]:
+    """The level to compile for this machine; all of them if the compiler does not know its processor."""
+    try:
+        level = _native(compiler)
+    except OSError:
+        return _LEVELS
+    return {level: _LEVELS[level]}
 
 
 def _serves(target: Path, portable: bool) -> bool:
@@ -139,7 +157,7 @@ def build(target: Path = LIBRARY, portable: bool = False) -> None:
     elif not _x86():
         levels = {"epo_plain": []}
     else:
-        levels = _LEVELS if portable else {(level := _native(compiler)): _LEVELS[level]}
+        levels = _LEVELS if portable else _native_level(compiler)
     options = [*_FLAGS, *(_SANITIZE if sanitized else _FAST)]
     with tempfile.TemporaryDirectory() as folder:
         built = [f"-DHAS_{level.upper()}" for level in levels]

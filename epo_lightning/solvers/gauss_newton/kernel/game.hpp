@@ -26,6 +26,7 @@ constexpr int64_t kMostAgents = 64;         // contacts are a 64-bit mask per ag
 constexpr double kWheelbase = 0.6;          // distance between the axles as a share of a vehicle's length
 constexpr double kSlowestSteering = 1.0;    // [m/s]; at lower speeds, a steering angle is computed with this speed
 constexpr int64_t kRetries = 4;             // number of times that a failed factorisation is repeated with more damping
+constexpr double kLightDamping = 1e3;  // a step with more damping does not show that a minimum has been reached
 constexpr double kLeastDamping = 1e-7, kMostDamping = 1e7;  // range of the adaptive damping
 constexpr double kThreeFrom = 4.0, kFiveFrom = 8.0;  // lengths [m] from which vehicles have three and five circles
 constexpr double kTimeGap = 1.0;            // [s], of headways

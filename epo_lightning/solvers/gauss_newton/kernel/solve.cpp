@@ -396,7 +396,8 @@ class Range {
             for (int64_t at = 0; at < count; ++at) {
                 const int64_t problem = first_ + at;
                 if (done_[at]) continue;
-                done_[at] = predicted[at] <= std::numeric_limits<T>::epsilon() * best[problem];
+                // The decrease is that with damping: only with little of it is a small decrease a sign of a minimum.
+                done_[at] = predicted[at] <= std::numeric_limits<T>::epsilon() * best[problem] && damping[problem] <= T(kLightDamping);
                 all &= done_[at] != 0;
                 if (found[at] < best[problem]) {
                     std::copy(trial + problem * size_, trial + (problem + 1) * size_, controls + problem * size_);
