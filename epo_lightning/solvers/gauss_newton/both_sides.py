@@ -122,8 +122,14 @@ class BothSides(Minimiser):
 
 def _joined(first: Solution, second: Solution) -> Solution:
     """The modes of both solutions."""
-    names = ("controls", "states", "initial_energy", "energy", "gradient_norm", "status")
-    return Solution(**{name: torch.cat((getattr(first, name), getattr(second, name)), 1) for name in names})
+    return Solution(
+        controls=torch.cat((first.controls, second.controls), 1),
+        states=torch.cat((first.states, second.states), 1),
+        initial_energy=torch.cat((first.initial_energy, second.initial_energy), 1),
+        energy=torch.cat((first.energy, second.energy), 1),
+        gradient_norm=torch.cat((first.gradient_norm, second.gradient_norm), 1),
+        status=torch.cat((first.status, second.status), 1),
+    )
 
 
 def _chosen(found: Solution, modes: int) -> Solution:

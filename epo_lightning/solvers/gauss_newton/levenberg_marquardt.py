@@ -105,6 +105,8 @@ class LevenbergMarquardt(Stepwise):
             return self.run(energy, scene, parameters, self.steps)[0]
         if torch.is_grad_enabled():
             raise ValueError("solver.newton_steps have no derivative: use backward=implicit, truncated or detached")
+        if not self.steps:
+            return self.run(energy, scene, parameters, self.newton_steps, exact=True)[0]
         first, damping = self.run(energy, scene, parameters, self.steps)
         onward = dataclasses.replace(parameters, initial_controls=first.controls)
         last, _ = self.run(energy, scene, onward, self.newton_steps, damping, exact=True)
