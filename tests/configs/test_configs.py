@@ -98,6 +98,7 @@ def test_data_sets_can_be_built_from_their_configuration(data: str) -> None:
 @pytest.mark.parametrize("forecaster", names(CONF / "forecaster"))
 def test_backbones_and_forecasters_can_be_built_for_highways(backbone: str, forecaster: str) -> None:
     words = ["experiment=rpi/v_lstm", "energy=exid", f"backbone={backbone}", f"forecaster={forecaster}"]
+    words += ["solver=both_sides", "backward=implicit"] if forecaster == "epo_game" else []
     settings = read(Settings, compose("train", words))
     data = SimpleNamespace(task=Task(20, 0.2, shape="box", candidates=60, map=True))
     built = build_forecaster(assembly.describe_model(settings, data))

@@ -19,14 +19,14 @@ OPTIONS = {
     "energy": ("rpi", "augmented_rpi", "neural", "collision", "convex"),
     "solver": (
         *("levenberg_marquardt", "gradient_descent", "newton", "lbfgs", "langevin"),
-        *("enumeration", "sum_product"),
+        *("both_sides", "enumeration", "sum_product"),
     ),
     "backward": ("unrolled", "truncated", "implicit", "implicit backward.hessian=gauss_newton", "detached"),
     "objective": ("imitation", "contrastive", "laplace", "conditional"),
 }
 DIFFERENTIABLE = ("rpi", "augmented_rpi", "neural", "convex")
 STEPS = ("levenberg_marquardt", "gradient_descent")
-MINIMA = (*STEPS, "newton", "lbfgs")
+MINIMA = (*STEPS, "newton", "lbfgs", "both_sides")
 TABLES = ("enumeration", "sum_product")
 
 
@@ -48,7 +48,7 @@ def section(kind: str, option: str) -> dict[str, Any]:
 
 def works(energy: str, solver: str, backward: str, objective: str) -> bool:
     """Table 1 and its empty cells, written out once more."""
-    if solver == "levenberg_marquardt" and energy != "rpi":
+    if solver in ("levenberg_marquardt", "both_sides") and energy != "rpi":
         return False  # knows the structure of features alone
     if solver not in TABLES and energy not in DIFFERENTIABLE:
         return False
