@@ -1,4 +1,4 @@
-# make run         from a bare machine to a first table with pictures: nine minutes on 2 idle cores, installation included
+# make run         from a bare machine to a first table with pictures: eight minutes on 2 idle cores, installation included
 # make install     the package and its command `epo` in .venv (`make run` does it)
 # make test        install everything and run the tests      make test-slow   the tests that take minutes
 # make lint        check style and types
