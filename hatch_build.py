@@ -6,7 +6,6 @@ A machine without a C++ compiler gets a package without the kernel, which says s
 from __future__ import annotations
 
 import importlib.util
-import os
 import sysconfig
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ class KernelHook(BuildHookInterface):
         spec.loader.exec_module(kernel)  # by path: importing the package would need PyTorch
         try:
             # An editable installation stays on this machine; a wheel goes to others.
-            kernel.build(portable=version != "editable" or os.environ.get("EPO_PORTABLE") == "1")
+            kernel.build(portable=version != "editable")
         except OSError as error:
             self.app.display_warning(f"the compiled EPO layer was not built, plain PyTorch will do its work: {error}")
             return

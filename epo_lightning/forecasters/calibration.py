@@ -3,7 +3,7 @@
 The agents played the game before t0 as well. A game that is posed at the first observed state, with the inferred weights,
 therefore has to lead through the observed history. How much it misses tells how far the pair weights are off. This is an
 inverse game (Peters et al., "Inferring objectives in continuous dynamic games from noise-corrupted partial state
-observations", RSS 2021) with one unknown per joint mode: the logarithm s of a factor of all pair weights, which minimises
+observations", RSS 2021) with one unknown per game: the logarithm s of a factor of all pair weights, which minimises
 
     |x(s) - observed|^2 / noise^2 + s^2 / spread^2
 

@@ -77,7 +77,7 @@ class EPO(Forecaster):
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
             the forecast cannot explain agents that act for a later goal. With more steps than the forecast, scenes may end
             their games earlier (``game_steps``). Initial strategies are decoded up to that number of steps.
-        one_game: whether the modes are equilibria of one game, found from M initial strategies; its pair weights are
+        one_game: whether the modes are equilibria of one game, found from the initial strategies; its pair weights are
             positive. Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
         calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which corrects the inferred

@@ -97,7 +97,8 @@ def test_true_games_are_measured(capsys, tmp_path):
     generate = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None)
     generate.generate(workers=1, progress=False)
     true_game.main(["--records", "4", *small])
-    lines = capsys.readouterr().out.splitlines()[-8:]
+    lines = capsys.readouterr().out.splitlines()[-9:]
+    assert lines[6].startswith("alternative modes missed by more than 1 mm with the true w: 0 of ")
     assert [line.split(" w")[0] for line in lines[:6]] == ["1", "0.85", "1.15", "0.5", "2", "0"]
     assert float(lines[0].split("executed ")[1].split()[0]) < 1e-5
     assert "fewer than 4000" in refused(true_game.main, "--records", 4000, *small)

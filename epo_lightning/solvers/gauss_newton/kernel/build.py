@@ -103,26 +103,14 @@ def _run(commands: list[list[str]]) -> None:
             raise OSError(f"{shlex.join(command)} ended with {process.returncode}\n{words[-2000:]}")
 
 
-def _native(compiler: list[str]) -> str:
-    """The best level of instructions that this machine's processor has.
-
-    Raises:
-        OSError: the compiler does not know this machine's processor.
-    """
+def _native(compiler: list[str]) -> dict[str, list[str]]:
+    """The best level that this machine's processor has; all levels if the compiler does not know the processor."""
     asked = [*compiler, "-march=native", "-dM", "-E", "-x", "c++", os.devnull]
     done = subprocess.run(asked, capture_output=True, text=True)
     if done.returncode != 0:
-        raise OSError(f"{shlex.join(asked)} ended with {done.returncode}")
-    defined = {line.split()[1] for line in done.stdout.splitlines() if line.startswith("#define ")}
-    return [level for level in _LEVELS if _NEEDED.get(level, set()) <= defined][-1]
-
-
-def _native_level(compiler: list[str]) -> dict[str, list[str]]:
-    """The level to compile for this machine; all of them if the compiler does not know its processor."""
-    try:
-        level = _native(compiler)
-    except OSError:
         return _LEVELS
+    defined = {line.split()[1] for line in done.stdout.splitlines() if line.startswith("#define ")}
+    level = [level for level in _LEVELS if _NEEDED.get(level, set()) <= defined][-1]
     return {level: _LEVELS[level]}
 
 
@@ -143,12 +131,14 @@ def build(target: Path = LIBRARY, portable: bool = False) -> None:
 
     Args:
         target: :data:`LIBRARY`, or :data:`SANITIZED` for one with sanitizers.
-        portable: whether the library has all levels of instructions, or only the best one of this machine.
+        portable: whether the library has all levels of instructions, or only the best one of this machine; true if the
+            environment says EPO_PORTABLE=1.
 
     Raises:
         OSError: there is no compiler, or it fails; the message holds its output.
     """
     sanitized = target == SANITIZED
+    portable = portable or os.environ.get("EPO_PORTABLE") == "1"
     if not sanitized and _serves(target, portable):
         return  # a missing or stale one is replaced once the new one has been built
     compiler = [_found("clang++")] if sanitized else _compiler()
@@ -157,7 +147,7 @@ def build(target: Path = LIBRARY, portable: bool = False) -> None:
     elif not _x86():
         levels = {"epo_plain": []}
     else:
-        levels = _LEVELS if portable else _native_level(compiler)
+        levels = _LEVELS if portable else _native(compiler)
     options = [*_FLAGS, *(_SANITIZE if sanitized else _FAST)]
     with tempfile.TemporaryDirectory() as folder:
         built = [f"-DHAS_{level.upper()}" for level in levels]
@@ -179,8 +169,7 @@ def build(target: Path = LIBRARY, portable: bool = False) -> None:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    everywhere = os.environ.get("EPO_PORTABLE") == "1"
-    parser.add_argument("--portable", action="store_true", default=everywhere, help="build for every processor")
+    parser.add_argument("--portable", action="store_true", help="build for every processor, not only for this one")
     parser.add_argument("--sanitize", action="store_true", help=f"build {SANITIZED.name}, with ASan and UBSan")
     arguments = parser.parse_args()
     target = SANITIZED if arguments.sanitize else LIBRARY
