@@ -52,6 +52,8 @@ class PolylineBackbone(Backbone):
             raise ValueError(
                 f"scale, the unit [m] of positions at the network's inputs, must be positive, not {self.scale}"
             )
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout, the share of features that is left out, must be in [0, 1), not {self.dropout}")
         history = self.history_encoder()
         lanes = LanePolylines(self.lane_width, self.lane_depth, self.scale) if self.map_input else None
         self.history = history

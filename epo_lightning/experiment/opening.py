@@ -8,6 +8,7 @@ from typing import Any
 import epo_lightning
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 
@@ -49,16 +50,23 @@ def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None)
 
 
 def refuse_changed(run: RunFolder, digest: str) -> None:
-    """Refuse to continue or score a run with other data than it began with.
+    """Refuse to continue or score a run with other data or other settings than it began with.
 
     Raises:
-        ConfigError: the data has another digest now.
+        ConfigError: the data has another digest now, or config.yaml describes another run than run.json.
     """
-    began_with = run.record.get("data_digest")
+    record = run.record
+    began_with = record.get("data_digest")
     if began_with != digest:
         raise ConfigError(
             f"the data of {run.path} has changed since the run began (digest {began_with}, now {digest}): "
             "restore the data of that digest, or train a new run"
+        )
+    found = identity(run.config(), digest)
+    if found != record.get("identity", found):
+        raise ConfigError(
+            f"{run.config_file} was changed since the run began: it describes the run {found}, and run.json the run "
+            f"{record['identity']}. Restore the file, or train a new run with the changed settings"
         )
 
 

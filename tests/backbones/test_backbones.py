@@ -69,7 +69,7 @@ def test_features_depend_on_positions_relative_to_the_scale(name):
     ("changes", "message"),
     [
         ({"scale": 0.0}, "scale, the unit .* must be positive, not 0.0"),
-        ({"dropout": 1.5}, "dropout probability has to be between 0 and 1"),
+        *(({"dropout": share}, r"dropout, .*, must be in \[0, 1\)") for share in (-0.1, 1.0, 1.5)),
         ({"lane_depth": 0}, "lane_depth must be 1 or more"),
         ({"name": "hivt_m", "history_heads": 5}, r"must be a multiple of twice the number of heads \(5\)"),
         ({"name": "hivt_m", "history_depth": 0}, "history_depth must be 1 or more"),

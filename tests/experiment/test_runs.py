@@ -145,6 +145,22 @@ def test_another_configuration_does_not_continue_a_run(epo: Epo, refused: Callab
     assert "data" in refused("train", "resume=run")
 
 
+def test_a_changed_config_file_is_refused(epo: Epo, refused: Callable[..., str]) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run") == 0
+    file = Path("run/config.yaml")
+    text = file.read_text()
+    file.write_text(text.replace("goal: energy", "goal: all"))
+    assert file.read_text() != text
+    RunFolder(Path("run")).update(status="training")
+    assert "run/config.yaml was changed since the run began" in refused("train", "resume=run")
+    RunFolder(Path("run")).update(status="finished")
+    file.write_text(text.replace("seed: 0", "seed: 1"))
+    assert "was changed since the run began" in refused("evaluate", "run=run")
+    assert "was changed since the run began" in refused("predict", "run=run", "out=out")
+    file.write_text(text)
+    assert epo("evaluate", "run=run") == 0
+
+
 def test_checkpoints_that_do_not_fit_are_refused(epo: Epo, refused: Callable[..., str]) -> None:
     assert epo("train", ROW, *TINY, "run_dir=sc") == 0
     assert epo("train", "experiment=rpi/v_lstm", *TINY, "run_dir=marginal") == 0

@@ -143,6 +143,11 @@ class RecordedData(SceneDataModule):
             chosen = set(draw.permutation(groups)[: max(1, round(self.test_share * len(groups)))].tolist())
         else:
             chosen = set(self.test)
+            if not chosen:
+                raise ConfigError(
+                    f"data.test is empty: name one or more of the groups {', '.join(groups)}, or set it to null, which draws "
+                    "data.test_share of them"
+                )
             for group in sorted(chosen - set(groups)):
                 raise ConfigError(
                     f"data.test names the group {group!r}, which no recording has: {nearest(group, groups)}"

@@ -31,11 +31,9 @@ from torch import Tensor
 from epo_lightning.game.energy import FEATURES, GRADIENT, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.pairs import pairs
-from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scene, Solution, Status, Tables
+from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scene, Solution, Tables
 from epo_lightning.solvers.diagnostics import quasi_newton
-from epo_lightning.solvers.gauss_newton import structured
-from epo_lightning.solvers.gauss_newton.expansion import expand
-from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LEAST_DAMPING, MOST_DAMPING, Backend, choose_backend
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LEAST_DAMPING, MOST_DAMPING, choose_backend
 
 _GAUSS_NEWTON, _NEWTON = 20, 60
 """Largest numbers of steps. Gauss-Newton steps are cheap; Newton steps converge where residuals stay large."""
@@ -151,7 +149,7 @@ def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent:
     here = solve(energy, scene, game, 0, 1.0, damping, False, False)
     controls, value = here.controls.clone(), here.energy.clone()
     left = value[:, 0].isfinite().nonzero()[:, 0]
-    for step, count in ((_gauss_newton, _GAUSS_NEWTON), (_newton, _NEWTON)):
+    for exact, count in ((False, _GAUSS_NEWTON), (True, _NEWTON)):
         some, these = scene[left], game[left]
         for _ in range(count):
             if not len(left):
@@ -159,7 +157,8 @@ def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent:
             now, before = damping[left], value[left]
             these = dataclasses.replace(these, initial_controls=controls[left])
             of_agents = now if held is None else torch.where(held[left], torch.inf, now[..., None])
-            trial, after = step(solve, energy, some, these, of_agents)
+            there = solve(energy, some, these, 1, 1.0, of_agents, False, exact)
+            trial, after = there.controls, there.energy
             better, tiny = after < before, (after - before).abs() <= _TOLERANCE * before
             controls[left] = torch.where(better[..., None, None, None], trial, these.initial_controls)
             value[left] = torch.where(better, after, before)
@@ -170,28 +169,6 @@ def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent:
                 on = (~arrived).nonzero()[:, 0]
                 left, some, these = left[on], some[on], these[on]
     return Descent(here.energy[:, 0], value[:, 0], controls, here.gradient_norm[:, 0], value[:, 0].isfinite())
-
-
-def _gauss_newton(
-    solve: Backend, energy: FeatureEnergy, scene: Scene, game: GameParameters, damping: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Controls and energy after a damped Gauss-Newton step."""
-    there = solve(energy, scene, game, 1, 1.0, damping, False, False)
-    return there.controls, there.energy
-
-
-def _newton(
-    solve: Backend, energy: FeatureEnergy, scene: Scene, game: GameParameters, damping: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Controls and energy after a damped Newton step; the energy is infinite where the Hessian is not positive definite."""
-    controls = game.initial_controls
-    split = controls.device.type == "cpu"
-    model = expand(energy, scene, game, controls, not split, exact=True)
-    factors = structured.factorise(model, damping.flatten(0, 1), split, retry=False)
-    moved = controls + factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
-    there = solve(energy, scene, dataclasses.replace(game, initial_controls=moved), 0, 1.0, damping, False, False)
-    failed = (factors.status == Status.STOPPED).view(there.energy.shape)
-    return there.controls, torch.where(failed, torch.inf, there.energy)
 
 
 def _descend_any(energy: Energy, scene: Scene, game: GameParameters, agent: Int[Tensor, " W"] | None) -> Descent:

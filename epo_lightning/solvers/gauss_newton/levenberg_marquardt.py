@@ -32,6 +32,7 @@ Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bo
 An agent with infinite damping keeps its controls exactly; its trajectory is then a constant for the other agents."""
 
 BACKENDS = ("auto", "pytorch", "compiled")
+LARGEST_DAMPING = 1e30
 
 
 @register("solver", "levenberg_marquardt")
@@ -84,6 +85,11 @@ class LevenbergMarquardt(Stepwise):
         if not is_number(self.step_size) or not 0 < self.step_size <= 1:
             raise ConfigError(f"solver.step_size must be a number in (0, 1], not {self.step_size!r}")
         check_number("solver.damping", self.damping, zero=True)
+        if self.damping > LARGEST_DAMPING:
+            raise ConfigError(
+                f"solver.damping must be {LARGEST_DAMPING:g} or less, not {self.damping:g}: its products leave the range of "
+                "single precision"
+            )
         if self.backend not in BACKENDS:
             raise ConfigError(f"unknown solver.backend {self.backend!r}: {nearest(str(self.backend), BACKENDS)}")
 

@@ -112,6 +112,7 @@ def test_many_steps_reach_an_equilibrium():
         ({"damping": -1.0}, "solver.damping"),
         ({"damping": float("nan")}, "solver.damping must be a number, 0 or more, and finite, not nan"),
         ({"damping": float("inf")}, "solver.damping"),
+        ({"damping": 1e308}, r"solver.damping must be 1e\+30 or less"),
         ({"test_steps": -1}, "solver.test_steps"),
         ({"backend": "cuda"}, "unknown solver.backend"),
     ],
