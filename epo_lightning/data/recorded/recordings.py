@@ -145,8 +145,8 @@ class RecordedData(SceneDataModule):
             chosen = set(self.test)
             if not chosen:
                 raise ConfigError(
-                    f"data.test is empty: name one or more of the groups {', '.join(groups)}, or set it to null, which draws "
-                    "data.test_share of them"
+                    f"data.test is empty: name one or more of the groups {', '.join(groups)}, or set it to null, which "
+                    "draws data.test_share of them"
                 )
             for group in sorted(chosen - set(groups)):
                 raise ConfigError(

@@ -201,7 +201,7 @@ def test_missing_data_and_misspelt_keys_name_the_remedy(folder, tmp_path):
         _ = RecordedData("roads", "roads", str(tmp_path / "nowhere"), WINDOWS).config
     with pytest.raises(ConfigError, match=r"which no recording has: .*known: a, b, c"):
         data(folder, test=["d"]).generate(progress=False)
-    with pytest.raises(ConfigError, match="data.test is empty: name one or more of the groups a, b, c"):
+    with pytest.raises(ConfigError, match=r"data\.test is empty: name one or more of the groups a, b, c"):
         data(folder, test=[]).generate(progress=False)
     with pytest.raises(ConfigError, match="no recording is left for train, val"):
         data(folder, test=["a", "b", "c"]).generate(progress=False)
