@@ -14,7 +14,7 @@ from epo_lightning.run_folder import read_json
 
 FOLDER = tree() / "conf" / "experiment"
 EXPERIMENTS = sorted(str(file.relative_to(FOLDER).with_suffix("")) for file in FOLDER.rglob("*.yaml"))
-LIKE = {"rpi": "rpi", "ucy": "pedestrians"}
+LIKE = {"rpi": "rpi", "ucy": "pedestrians", "dut": "pedestrians"}
 """Kind of scenes by folder of experiments; other folders have highway scenes."""
 WORDS = ("data=drawn", "data.scenes=16", "data.batch_size=4", "budget=smoke", "callbacks.progress=none")
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import shlex
 import shutil
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ class RecordedData(SceneDataModule):
     Args:
         dataset: name of the data in tables and in the cache.
         format: name of a registered recording format.
+        options: options of the format, such as the frame rate of its files; null for none.
         folder: folder of the recordings, or of a data set that was extracted from them. If it does not exist, the cache is
             searched for a data set that was extracted with these settings.
         windows: selection of the windows that become scenes, fields of
@@ -81,10 +83,12 @@ class RecordedData(SceneDataModule):
         seed: int = 0,
         batch_size: int = 32,
         share: float = 1.0,
+        options: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(batch_size, seed, share)
         self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
-        self.list_sources = lookup("format", format)
+        self.options = dict(options or {})
+        self.list_sources = _with_options(format, self.options)
         self.windows = read(WindowConfig, windows, "data.windows")
         self.num_agents = self.windows.agents
         if self.windows.lane_change and not map:
@@ -220,6 +224,8 @@ class RecordedData(SceneDataModule):
             "format": self.format,
             "windows": dataclasses.asdict(self.windows),
             "map": self.task.map,
+            # Data sets without options keep the names that they had before formats had any.
+            **({"options": self.options} if self.options else {}),
         }
 
     def _config_of(self, sources: Sequence[RecordingSource], identity: Any) -> dict[str, Any]:
@@ -346,6 +352,20 @@ class RecordedData(SceneDataModule):
         tables = cache.load(self.folder, split, command=self.command, config=self.config)
         shape = None if split == "train" else self.task.shape
         return RecordedScenes(tables, self.task.dt, self.frame, self.report()["recordings"][split], shape)
+
+
+def _with_options(format: str, options: Mapping[str, Any]) -> Callable[[Path], list[RecordingSource]]:
+    """The function that lists the recordings of a format, with the options of the format.
+
+    Raises:
+        ConfigError: an unknown format, or an option that it does not have.
+    """
+    list_sources = lookup("format", format)
+    known = list(inspect.signature(list_sources).parameters)[1:]
+    for name in options:
+        if name not in known:
+            raise ConfigError(f"unknown key data.options.{name} for format {format!r}: {nearest(name, known)}")
+    return partial(list_sources, **options)
 
 
 def _absent() -> Recording:

@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 import shapely
-from jaxtyping import Float, Int
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats import lanelet2
@@ -31,13 +30,14 @@ from epo_lightning.data.recorded.formats.exid_tables import (
     raise_first,
     read_table,
 )
+from epo_lightning.data.recorded.formats.motion import check_motion, unwrapped
+from epo_lightning.data.recorded.kinds import completed_sizes, kinds_of
 from epo_lightning.data.recorded.lanes import LaneGraph
 from epo_lightning.data.recorded.tracks import FASTEST, Recording, RecordingSource, TrackTable
 from epo_lightning.registry import register
-from epo_lightning.scene import KINDS
 
-TYPICAL = {"motorcycle": (2.2, 0.9), "bicycle": (1.8, 0.7), "pedestrian": (0.5, 0.5)}
-"""Length and width [m] of agents whose size is not annotated (0, 0)."""
+SIZELESS = ("motorcycle", "bicycle", "pedestrian")
+"""Kinds of agents whose size may not be annotated (0, 0)."""
 LATEST = 10**9
 """Largest frame number."""
 ZONE = 32
@@ -204,6 +204,10 @@ def _tracks(setting: _Setting, files: _Files, dropped: Counter[str]) -> TrackTab
         ~(np.abs(heading) <= 360.0),
         lambda row: f"heading is {heading[row]}; degrees from 0 to 360 were expected",
     )
+    unknown: Counter[str] = Counter()
+    kind = kinds_of(meta["class"], unknown)
+    size = completed_sizes(meta.select("length", "width").to_numpy(), kind, dropped, of=SIZELESS)
+    dropped.update(unknown)
     order = np.argsort(agent, kind="stable")
     rows, agent = rows[order], agent[order]
     tracks = TrackTable(
@@ -211,42 +215,14 @@ def _tracks(setting: _Setting, files: _Files, dropped: Counter[str]) -> TrackTab
         agent=agent,
         frame=rows["frame"].to_numpy(),
         position=rows.select("xCenter", "yCenter").to_numpy(),
-        heading=_unwrapped(np.deg2rad(rows["heading"].to_numpy()), agent),
+        heading=unwrapped(np.deg2rad(rows["heading"].to_numpy()), agent),
         velocity=rows.select("xVelocity", "yVelocity").to_numpy(),
         ids=ids,
-        size=_sizes(meta, dropped),
-        kind=_kinds(meta, dropped),
+        size=size,
+        kind=kind,
     ).check(files.tracks)
     _check_frames(tracks, meta, files, dropped)
     return tracks
-
-
-def _unwrapped(heading: Float[np.ndarray, " T"], agent: Int[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
-    """Headings without jumps of a turn within a track; the first heading of each track is kept."""
-    step = np.diff(heading, prepend=heading[:1])
-    turns = -np.round(step / (2 * np.pi))
-    first = np.flatnonzero(np.diff(agent, prepend=-1))
-    turns[first] = 0.0
-    turns = turns.cumsum()
-    return heading + 2 * np.pi * (turns - np.repeat(turns[first], np.diff(np.append(first, len(agent)))))
-
-
-def _kinds(meta: pl.DataFrame, dropped: Counter[str]) -> Int[np.ndarray, " A"]:
-    number = {kind: index for index, kind in enumerate(KINDS)}
-    kinds = [number.get(name.strip().lower(), -1) for name in meta["class"]]
-    if unknown := kinds.count(-1):
-        dropped["agents of a class that is unknown, taken as 'other'"] = unknown
-    return np.array([number["other"] if kind < 0 else kind for kind in kinds])
-
-
-def _sizes(meta: pl.DataFrame, dropped: Counter[str]) -> Float[np.ndarray, "A 2"]:
-    size = meta.select("length", "width").to_numpy(writable=True)
-    for kind, typical in TYPICAL.items():
-        without = (size == 0).all(1) & (meta["class"].str.strip_chars().str.to_lowercase() == kind).to_numpy()
-        size[without] = typical
-        if without.any():
-            dropped[f"{kind}s without a size, taken as {typical[0]} x {typical[1]} m"] = int(without.sum())
-    return size
 
 
 def _check_frames(table: TrackTable, meta: pl.DataFrame, files: _Files, dropped: Counter[str]) -> None:
@@ -277,36 +253,12 @@ def _check_motion(table: TrackTable, setting: _Setting, files: _Files) -> None:
             f"frame {table.frame.max()} lies after the duration of {setting.duration} s at the frameRate of "
             f"{setting.rate} Hz in {files.recording_meta.name}: is one of them wrong?",
         )
-    within = np.flatnonzero(np.diff(table.agent) == 0)
-    elapsed = np.diff(table.frame)[within] / setting.rate
-    travelled = np.linalg.norm(table.position[within + 1] - table.position[within], axis=1) / elapsed
-    speed = np.linalg.norm(table.velocity, axis=1)
-    if (jumps := travelled > FASTEST).any():
-        row = within[jumps][0]
-        raise RecordingError(
-            files.tracks,
-            f"track {table.ids[table.agent[row]]} jumps from {table.position[row].tolist()} to "
-            f"{table.position[row + 1].tolist()} m after its frame {table.frame[row]}: vehicles stay below {FASTEST:g} m/s",
-        )
-    stated = 0.5 * (speed[within] + speed[within + 1])
-    moving = np.maximum(travelled, stated) > 2.0
-    ratio = float(np.median(travelled[moving] / np.maximum(stated[moving], 1e-3))) if moving.any() else 1.0
-    if not 0.8 < ratio < 1.25:
-        raise RecordingError(
-            files.tracks,
-            f"positions move {ratio:.3g} times as fast as xVelocity and yVelocity say: they were expected in m and m/s, at "
-            f"the frameRate of {setting.rate:g} Hz in {files.recording_meta.name}",
-        )
-    fast = speed > 5.0
-    if fast.any():
-        course = np.arctan2(table.velocity[fast, 1], table.velocity[fast, 0])
-        aside = float(np.median(np.abs((table.heading[fast] - course + np.pi) % (2 * np.pi) - np.pi)))
-        if aside > np.pi / 4:
-            raise RecordingError(
-                files.tracks,
-                f"headings differ by {np.rad2deg(aside):.0f} degrees from the directions of motion: degrees "
-                "counter-clockwise from x were expected",
-            )
+    check_motion(
+        table,
+        files.tracks,
+        "xVelocity and yVelocity",
+        f"the frameRate of {setting.rate:g} Hz in {files.recording_meta.name}",
+    )
 
 
 def _check_fit(table: TrackTable, lanes: LaneGraph, files: _Files) -> None:

@@ -10,8 +10,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from epo_lightning.data.recorded.formats.motion import direction_of_motion
 from epo_lightning.data.recorded.tracks import Recording, RecordingError, RecordingSource, TrackTable
 from epo_lightning.registry import register
 from epo_lightning.scene import KINDS
@@ -68,7 +69,7 @@ def _read_recording(path: Path, name: str) -> Recording:
         agent=agent,
         frame=frame // step,
         position=table[:, [2, 4]],
-        heading=_heading(agent, velocity),
+        heading=direction_of_motion(agent, velocity),
         velocity=velocity,
         ids=ids,
         size=np.full((len(ids), 2), DIAMETER),
@@ -108,12 +109,3 @@ def _number(cell: str) -> float:
         return np.nan if "_" in cell else float(cell)
     except ValueError:
         return np.nan
-
-
-def _heading(agent: Int[np.ndarray, " T"], velocity: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, " T"]:
-    """Headings [rad]: the direction of motion; a standing agent keeps its last direction (zero before its first motion)."""
-    moving = (velocity != 0).any(axis=1)
-    rows = np.arange(len(agent))
-    before = np.maximum.accumulate(np.where(moving, rows, 0))
-    known = moving[before] & (agent[before] == agent)
-    return np.where(known, np.arctan2(velocity[before, 1], velocity[before, 0]), 0.0)

@@ -1,0 +1,101 @@
+"""Headings from velocities, and checks that positions, velocities and headings agree in rate, unit and sign."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.tracks import FASTEST, TrackTable
+
+
+def unwrapped(heading: Float[np.ndarray, " T"], agent: Int[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
+    """Headings [rad] without jumps of a turn within a track; the first heading of each track is kept."""
+    step = np.diff(heading, prepend=heading[:1])
+    turns = -np.round(step / (2 * np.pi))
+    first = np.flatnonzero(np.diff(agent, prepend=-1))
+    turns[first] = 0.0
+    turns = turns.cumsum()
+    return heading + 2 * np.pi * (turns - np.repeat(turns[first], np.diff(np.append(first, len(agent)))))
+
+
+def direction_of_motion(
+    agent: Int[np.ndarray, " T"], velocity: Float[np.ndarray, "T 2"], slowest: float = 0.0
+) -> Float[np.ndarray, " T"]:
+    """Headings [rad] of agents whose heading is not recorded: the direction of motion.
+
+    An agent that is not faster than ``slowest`` keeps its last direction, because the direction of a small velocity is
+    noise. Before it first exceeds ``slowest``, its direction is that of its first velocity: later ones would be the future.
+
+    Args:
+        agent: index of each row's agent; rows are sorted by agent and time.
+        velocity: components along x and y [m/s].
+        slowest: speed [m/s] above which an agent moves.
+    """
+    moving = np.hypot(velocity[:, 0], velocity[:, 1]) > slowest
+    rows = np.arange(len(agent))
+    first = np.maximum.accumulate(np.where(np.diff(agent, prepend=-1) != 0, rows, 0))
+    before = np.maximum.accumulate(np.where(moving, rows, 0))
+    known = moving[before] & (before >= first)
+    row = np.where(known, before, first)
+    heading: Float[np.ndarray, " T"] = np.arctan2(velocity[row, 1], velocity[row, 0])
+    return np.where(velocity[row].any(axis=1), heading, 0.0)
+
+
+def check_motion(
+    table: TrackTable,
+    path: Path | str,
+    velocity: str,
+    rate: str,
+    moving: float = 2.0,
+    fast: float = 5.0,
+    fastest: float = FASTEST,
+    unit: str = "degrees",
+) -> None:
+    """Check that positions, velocities and headings of a recording agree.
+
+    Args:
+        table: tracks of all agents.
+        path: path of the file, for error messages.
+        velocity: names of the columns of velocities, for error messages.
+        rate: name of the frame rate and its file, for error messages.
+        moving: speed [m/s] above which displacements are compared with velocities.
+        fast: speed [m/s] above which headings are compared with directions of motion.
+        fastest: speed [m/s] that no agent reaches.
+        unit: unit of headings in the file, for error messages.
+
+    Raises:
+        RecordingError: an agent jumps, displacements and velocities differ by a factor, or headings do not point along the
+            directions of motion.
+    """
+    within = np.flatnonzero(np.diff(table.agent) == 0)
+    elapsed = np.diff(table.frame)[within] / table.rate
+    travelled = np.linalg.norm(table.position[within + 1] - table.position[within], axis=1) / elapsed
+    speed = np.linalg.norm(table.velocity, axis=1)
+    if (jumps := travelled > fastest).any():
+        row = within[jumps][0]
+        raise RecordingError(
+            path,
+            f"track {table.ids[table.agent[row]]} jumps from {table.position[row].tolist()} to "
+            f"{table.position[row + 1].tolist()} m after its frame {table.frame[row]}: vehicles stay below {fastest:g} m/s",
+        )
+    stated = 0.5 * (speed[within] + speed[within + 1])
+    faster = np.maximum(travelled, stated) > moving
+    ratio = float(np.median(travelled[faster] / np.maximum(stated[faster], 1e-3))) if faster.any() else 1.0
+    if not 0.8 < ratio < 1.25:
+        raise RecordingError(
+            path,
+            f"positions move {ratio:.3g} times as fast as {velocity} say: they were expected in m and m/s, at {rate}",
+        )
+    rows = speed > fast
+    if rows.any():
+        course = np.arctan2(table.velocity[rows, 1], table.velocity[rows, 0])
+        aside = float(np.median(np.abs((table.heading[rows] - course + np.pi) % (2 * np.pi) - np.pi)))
+        if aside > np.pi / 4:
+            raise RecordingError(
+                path,
+                f"headings differ by {np.rad2deg(aside):.0f} degrees from the directions of motion: "
+                f"{unit} counter-clockwise from x were expected",
+            )
