@@ -52,12 +52,12 @@ class Annealing:
 
         -T log mean_m exp(-h(d_m) / T),    h(d) = sqrt(d^2 + T^2) - T,
 
-    so every mode gets the share softmin(h(d) / T) of the gradient: at a high temperature every mode the same, and less and
-    less the farther ones as the temperature falls. At the end the closest one gets everything. This is the loss of Xu et al.
+    so every mode gets the share softmin(h(d) / T) of the gradient: at a high temperature all shares are equal; as it falls,
+    those of farther modes shrink, and in the end the closest mode has all of it. This is the loss of Xu et al.
     (Annealed Winner-Takes-All for Motion Forecasting, arXiv 2409.11172), whose temperatures start at about 10 and fall by a
     factor of 0.834 per epoch, with two differences. The fall is geometric too, but counted in optimisation steps. And h,
-    which is quadratic below T and nearly d far above it, takes the place of d: modes that lie on the likeliest of two
-    alternatives would otherwise be held there by a pull that does not fade with the distance, and would hardly part.
+    which is quadratic below T and nearly d far above it, takes the place of d: with d itself, a mode at the likelier of two
+    alternatives would be pulled to it equally hard however close it is, and would not leave.
 
     Attributes:
         temperature: T [m] at the first step; 0 is the paper's loss. Useful values are below half the distance between

@@ -6,7 +6,7 @@
         config.yaml            the resolved configuration: all that is needed to continue or evaluate the run
         run.json               record: title, experiment, budget, seed, data digest, versions, parameters, status;
                                `identity`, a hash of everything that decides on the result; `row`, the same without seed
-        checkpoints/best.ckpt  the epoch with the smallest validation minSADE
+        checkpoints/best.ckpt  the epoch with the smallest `callbacks.monitor` (validation minSADE)
         checkpoints/last.ckpt  the last finished epoch, with everything that continuing needs
         logs/                  metrics.csv: what was logged while training; TensorBoard's and W&B's files lie beside it
         metrics.json           scores on the test split, written by ``evaluate`` ({"split", "data", "checkpoint", "metrics"})

@@ -1,6 +1,6 @@
 """Data classes of the project: the observed scene, the inferred game, its solution and the forecast.
 
-The letters in shapes mean the same everywhere but in ``solvers/gauss_newton``, which states its own:
+The letters in shapes mean the same everywhere. ``solvers/gauss_newton`` states the few that it uses otherwise:
 
 ====  ==========================  ======  ================================================================
 B     scenes in a batch           P       pairs of agents i < j, P = N (N - 1) / 2
@@ -133,7 +133,7 @@ class Scene(_Batch):
         goal_headings: heading [rad] that an agent wants at each goal candidate, continuous with the agent's heading: it is
             not wrapped to (-pi, pi], so a difference of 2 pi is a full turn.
         game_steps: number of steps from t0 to the end of each scene's game. Controls after the end have no cost and no
-            effect. A forecaster with a shorter horizon cuts its game there. None if all games end with the last control.
+            effect. A forecaster ends longer games at its own `game_horizon`. None if all games end with the last control.
 
     Raises:
         TypeError: a field that is not a tensor (numpy arrays included), or a time step that is not a number.

@@ -262,12 +262,12 @@ def times(model, change, damping):
         model.edges.spread_(force, by_second, by_first)
     node += (model.at.moves * model.at.to_velocities(force)[:, :, None]).sum(3)
     flat = nodes.flatten(2)[..., None]
-    if model.blocks is not None:
-        node += (model.blocks @ flat).view_as(node)
-    if model.pair_blocks is not None:
+    if model.own_dense is not None:
+        node += (model.own_dense @ flat).view_as(node)
+    if model.pair_dense is not None:
         first, second = model.edges.ends(flat)
-        by_second, by_first = model.pair_blocks @ second, model.pair_blocks.mT @ first
-        model.edges.spread_(node, *(part.view(-1, 2, model.at.steps) for part in (by_second, by_first)))
+        by_second, by_first = model.pair_dense @ second, model.pair_dense.mT @ first
+        model.edges.spread_(node, *(part.view(-1, 2, model.at.horizon) for part in (by_second, by_first)))
     return control + model.at.dt * node.flip(-1).cumsum(-1).flip(-1)
 
 
@@ -276,7 +276,7 @@ def normal_equations(
 ):
     """The model's gradient [B, M, N, K, 2] and matrix [B, M, n, n] in the controls, in the order of ``controls``."""
     model = expand(energy, scene, parameters, controls, every_pair=True, exact=exact)
-    none, steps, agents = controls.new_zeros(model.at.problems), model.at.steps, model.at.agents
+    none, steps, agents = controls.new_zeros(model.at.problems), model.at.horizon, model.at.agents
     units = torch.eye(2 * steps * agents, dtype=controls.dtype).view(-1, agents, steps, 2).transpose(-1, -2)
     columns = [times(model, unit.expand(model.at.problems, -1, -1, -1), none) for unit in units]
     matrix = torch.stack([column.transpose(-1, -2).flatten(1) for column in columns], -1)

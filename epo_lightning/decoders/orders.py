@@ -39,16 +39,16 @@ class Orders(nn.Module):
 
     Args:
         width: size of the agent features.
-        modes: number M of joint modes.
+        games: number M of games, one for each order.
         symmetric: whether the order keeps its sign when the two agents are swapped
             (:attr:`~epo_lightning.game.pair_order.PairOrder.symmetric`).
     """
 
-    def __init__(self, width: int, modes: int, symmetric: bool = False) -> None:
+    def __init__(self, width: int, games: int, symmetric: bool = False) -> None:
         super().__init__()
-        if modes < 1:
-            raise ValueError(f"modes must be 1 or more, not {modes}")
-        self.modes, self.symmetric = modes, symmetric
+        if games < 1:
+            raise ValueError(f"the number of games must be 1 or more, not {games}")
+        self.games, self.symmetric = games, symmetric
         self.mlp = MLP(2 * width, 64, 1, norm="layer", bias=symmetric)  # the difference cancels a bias
 
     def forward(
@@ -68,7 +68,7 @@ class Orders(nn.Module):
         back = self.mlp(torch.cat((z[:, second], z[:, first]), -1))[..., 0]
         matter = matter & mask[:, first] & mask[:, second]
         logits = torch.where(matter, forth + back if self.symmetric else forth - back, 0.0)
-        order = most_likely(logits, matter, self.modes)
+        order = most_likely(logits, matter, self.games)
         log_probability = torch.where(matter[:, None], F.logsigmoid(order * logits[:, None]), 0.0).sum(-1)
         return DecodedOrders(order, log_probability, logits)
 

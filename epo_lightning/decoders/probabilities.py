@@ -18,8 +18,9 @@ class SceneProbabilities(nn.Module):
     same block for every agent, so its result is a sum over agents and works for any number and order of agents and any
     padding. Inputs are future positions relative to the agent's current position, without a gradient.
 
-    The sum comes before the first nonlinearity, so the logits depend on the sum of all displacements only: "both agents pass
-    on the left" and "both pass on the right" have the same probability. :class:`PairwiseProbabilities` tells them apart.
+    The sum comes before the first nonlinearity, so of the motions the logits see only the sum of all displacements: "both
+    agents pass on the left" and "both pass on the right" have the same probability. :class:`PairwiseProbabilities` tells
+    them apart.
 
     Args:
         width: size of the agent features.

@@ -26,7 +26,7 @@ class Attention(nn.Module):
         self.scale = 1.0 / math.sqrt(width)
 
     def forward(
-        self, features: Float[Tensor, "B N D"], sources: Float[Tensor, "B S D"], mask: Bool[Tensor, "B S"]
+        self, features: Float[Tensor, "B N D"], sources: Float[Tensor, "B sources D"], mask: Bool[Tensor, "B sources"]
     ) -> Float[Tensor, "B N D"]:
         """Features after attention to the sources where ``mask`` is True; unchanged in scenes without any source."""
         scores = self.query(features) @ self.key(sources).mT * self.scale

@@ -1,4 +1,4 @@
-"""Verbs of the command line: each function reads the settings, calls the module that does the work, and prints the outcome.
+"""Verbs of the command line: each function calls the module that does the work, and prints the outcome.
 
 ``train_and_print`` calls :func:`.train.train`, ``evaluate_and_print`` calls :func:`.evaluate.evaluate`, and so on.
 """

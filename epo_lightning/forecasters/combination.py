@@ -79,7 +79,7 @@ class Combination:
         for kind in KINDS:
             for name, part in parts(kind).items():
                 if name != self.names[kind]:
-                    # What a derivative needs may depend on its settings, so an instance is required; all settings have
+                    # Only the needs of a derivative depend on its settings, so it has to be an instance; all settings have
                     # defaults.
                     changed = part() if kind == "backward" else part
                     word = f"an energy named {name}" if kind == "energy" else f"{kind}={name}"

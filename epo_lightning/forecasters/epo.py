@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from epo_lightning.backbones.base import Backbone
+from epo_lightning.checks import check_number
 from epo_lightning.decoders.goals import GivenGoals, GoalDecoder, Goals, NoGoals
 from epo_lightning.decoders.motions import Motions
 from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
@@ -23,23 +24,28 @@ from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, Sha
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.forecasters.combination import Combination
-from epo_lightning.forecasters.epo_settings import check_margin, check_motions, check_needs, check_start
-from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.forecasters.epo_settings import (
+    OWN_WEIGHTS,
+    check_calibration,
+    check_choice,
+    check_decodes_probabilities,
+    check_horizon,
+    check_initial,
+    check_margin,
+    check_modes,
+    check_motions,
+    check_needs,
+    check_start,
+)
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
 from epo_lightning.solvers.backward import Backward
-from epo_lightning.solvers.base import STATIONARY, TABLES, Minimiser
+from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.task import Task
-
-OWN_WEIGHTS = ("decoded", "shared")
-"""Sources of the weights of own features: decoded for each agent, or one learned number per feature for all."""
-INITIAL = ("decoded", "zero", "motions")
-"""Sources of the initial strategies: decoded by the network, controls of zero (the paper's ablation "no init"), or a mixture
-of motions of the unicycle. For solvers that choose among candidates, these strategies are the candidates."""
 
 EXAMINED = 512
 """Number of test scenes, spread evenly, in which the Nash gap is measured if this is slow.
@@ -119,65 +125,22 @@ class EPO(Forecaster):
         self.calibration = None if calibration is None else Calibration(**calibration)  # type: ignore[arg-type]
         self.one_game = one_game
         self.game_horizon = task.horizon if game_horizon is None else game_horizon
-        if self.game_horizon < task.horizon:
-            raise ConfigError(
-                f"forecaster.game_horizon must be {task.horizon} or more, the steps of the forecast, not {game_horizon}"
-            )
-        energy.check_horizon(self.game_horizon)
-        chooses = TABLES in solver.provides
-        if modes < 1:
-            raise ConfigError(f"forecaster.modes must be 1 or more, not {modes}")
-        if own_weights not in OWN_WEIGHTS:
-            raise ConfigError(
-                f"unknown forecaster.own_weights {own_weights!r}: {nearest(str(own_weights), OWN_WEIGHTS)}"
-            )
-        if one_game and (chooses or energy.pair_order is not None):
-            raise ConfigError(
-                "forecaster.one_game=true needs a solver that begins at initial strategies, and an energy without orders of "
-                "pairs: choices among candidates and orders are modes of one game already"
-            )
-        if initial not in INITIAL:
-            raise ConfigError(f"unknown forecaster.initial {initial!r}: {nearest(str(initial), INITIAL)}")
-        if one_game and initial == "zero" and solver.strategies(modes) > 1:
-            raise ConfigError(
-                "all modes would be the same: forecaster.one_game=true gives them one game, and forecaster.initial=zero one "
-                "start. Use solver=both_sides, which finds several equilibria from one start, or initial=decoded"
-            )
-        if calibration is not None and STATIONARY not in solver.provides:
-            raise ConfigError(
-                "forecaster.calibration needs a solver that leads to a minimum, such as both_sides, game or converging; set "
-                "it to null for this one"
-            )
-        if self.game_horizon > task.horizon and not objective.through_solution:
-            raise ConfigError(
-                "a game that goes on after the forecast (forecaster.game_horizon) needs an objective that learns through "
-                "the solution, objective=imitation: the others compare energies of the observed future, which ends earlier"
-            )
-        if chooses and initial == "zero":
-            raise ConfigError(
-                "the solver chooses among candidates, which forecaster.initial=zero makes all the same: use decoded, which "
-                "learns them, or motions"
-            )
-        if initial == "motions" and not isinstance(energy.dynamics, Unicycle):
-            raise ConfigError(
-                f"forecaster.initial=motions needs dynamics=unicycle, not {type(energy.dynamics).__name__}: "
-                "the motions are those of a unicycle; choose decoded or zero"
-            )
-        check_probabilities(probabilities)
+        check_horizon(self.game_horizon, energy, objective, task)
+        check_modes(modes, one_game, energy, solver)
+        check_initial(initial, modes, one_game, energy, solver)
+        check_choice("own_weights", own_weights, OWN_WEIGHTS)
+        check_calibration(calibration, solver)
         # The network decodes probabilities where neither energies of choices nor orders define them.
-        defined = chooses or energy.pair_order is not None
-        if defined and probabilities != "linear":
-            raise ConfigError(
-                f"forecaster.probabilities={probabilities} has no effect here, because the "
-                f"{'energies of choices' if chooses else 'orders of agents'} define the probabilities: leave it out"
-            )
+        defined = TABLES in solver.provides or energy.pair_order is not None
+        check_probabilities(probabilities)
+        check_decodes_probabilities(probabilities, energy, solver)
         if not math.isfinite(pair_start):
             raise ConfigError(f"forecaster.pair_start must be finite, not {pair_start}")
-        if not 0 < control_scale < math.inf:
-            raise ConfigError(f"forecaster.control_scale must be positive and finite, not {control_scale}")
+        check_number("forecaster.control_scale", control_scale)
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
-        # The part `backward` runs the minimiser and defines the derivative of its solution.
+        # The part `backward` runs the minimiser and defines the derivative of its solution. (A LightningModule has a method
+        # of that name.)
         self.differentiable_solve, self.objective = backward, objective
         # M games with one initial strategy each, or one game with M; for solvers that choose, one game with C candidates.
         games, strategies = 1 if one_game else solver.games(modes), solver.strategies(modes)
@@ -209,7 +172,7 @@ class EPO(Forecaster):
         order = energy.pair_order
         self.orders = None if order is None else Orders(width, games, order.symmetric)
         self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, task.horizon, scale)
-        # This network is the last one, so that those of energies without decoded margins draw the same initial weights.
+        # Built last: a decoder of margins must not change the initial weights of the networks above.
         limits = check_margin(margin)
         names = energy.decoded_margins
         self.margins = Margins(width, games, names, **limits, symmetric=symmetric_pairs) if names else None
@@ -218,14 +181,14 @@ class EPO(Forecaster):
         """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 2."""
         z = self.backbone(scene)
         goals = self.goals(z, scene)
-        to_end = self._with_game_end(scene)
+        solved_scene = self._with_game_end(scene)
         orders = self._decode_orders(z, scene)
         parameters = self._infer_game(z, scene, goals, orders)
         if self.calibration is not None and not self.training:
-            parameters = self.calibration(self._minimiser, self.energy, to_end, parameters)
+            parameters = self.calibration(self._minimiser, self.energy, solved_scene, parameters)
         if TABLES not in self.solver.provides:
             parameters = parameters.for_modes(self.modes)
-        solution = self.differentiable_solve(self._minimiser, self.energy, to_end, parameters)
+        solution = self.differentiable_solve(self._minimiser, self.energy, solved_scene, parameters)
         logits = self._mode_logits(z, scene, goals, orders, solution)
         return JointForecast(
             states=solution.states[..., : self.task.horizon, :],
@@ -241,10 +204,7 @@ class EPO(Forecaster):
         )
 
     def _with_game_end(self, scene: Scene) -> Scene:
-        """The scene with the end of its game, which is not after ``game_horizon``.
-
-        Without a longer ``game_horizon`` than the forecast, all games end with the forecast.
-        """
+        """The scene as the solver sees it: games end at ``game_horizon`` at the latest, or all with the forecast (None)."""
         steps = scene.game_steps
         if steps is None:
             return scene

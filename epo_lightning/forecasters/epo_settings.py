@@ -1,14 +1,23 @@
-"""Checks of the settings of an EPO forecaster."""
+"""Checks of the settings of an EPO forecaster: every error names the key and the changes that would work."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 
+from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.features import OWN_FEATURES
+from epo_lightning.objectives.base import Objective
 from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.solvers.base import STATIONARY, TABLES, Minimiser
 from epo_lightning.task import Task
+
+OWN_WEIGHTS = ("decoded", "shared")
+"""Sources of the weights of own features: decoded for each agent, or one learned number per feature for all."""
+INITIAL = ("decoded", "zero", "motions")
+"""Sources of the initial strategies: decoded by the network, controls of zero (the paper's ablation "no init"), or a mixture
+of motions of the unicycle. For solvers that choose among candidates, these strategies are the candidates."""
 
 
 def check_needs(energy: Energy, task: Task) -> None:
@@ -23,6 +32,100 @@ def check_needs(energy: Energy, task: Task) -> None:
         raise ConfigError(
             f"features of energy.own need {', '.join(sorted(lacking))}, which this data does not provide: leave the "
             "features out, or choose data with a map"
+        )
+
+
+def check_choice(name: str, value: str, known: Sequence[str]) -> None:
+    """Refuse a name that ``forecaster.<name>`` does not know.
+
+    Raises:
+        ConfigError: the message names the nearest known one.
+    """
+    if value not in known:
+        raise ConfigError(f"unknown forecaster.{name} {value!r}: {nearest(str(value), known)}")
+
+
+def check_horizon(game_horizon: int, energy: Energy, objective: Objective, task: Task) -> None:
+    """Refuse a game that ends before the forecast, and objectives that cannot learn from a game that goes on after it.
+
+    Raises:
+        ConfigError: see above, or the energy cannot be evaluated over so few steps.
+    """
+    if game_horizon < task.horizon:
+        raise ConfigError(
+            f"forecaster.game_horizon must be {task.horizon} or more, the steps of the forecast, not {game_horizon}"
+        )
+    energy.check_horizon(game_horizon)
+    if game_horizon > task.horizon and not objective.through_solution:
+        raise ConfigError(
+            "a game that goes on after the forecast (forecaster.game_horizon) needs an objective that learns through "
+            "the solution, objective=imitation: the others compare energies of the observed future, which ends earlier"
+        )
+
+
+def check_modes(modes: int, one_game: bool, energy: Energy, solver: Minimiser) -> None:
+    """Refuse a number of modes below one, and one game for all modes where the modes are choices or orders.
+
+    Raises:
+        ConfigError: see above.
+    """
+    if modes < 1:
+        raise ConfigError(f"forecaster.modes must be 1 or more, not {modes}")
+    if one_game and (TABLES in solver.provides or energy.pair_order is not None):
+        raise ConfigError(
+            "forecaster.one_game=true needs a solver that begins at initial strategies, and an energy without orders of "
+            "pairs: choices among candidates and orders are modes of one game already"
+        )
+
+
+def check_initial(initial: str, modes: int, one_game: bool, energy: Energy, solver: Minimiser) -> None:
+    """Refuse initial strategies with which the modes or the candidates would all be the same, and unknown ones.
+
+    Raises:
+        ConfigError: see above, or motions of another model than the unicycle.
+    """
+    check_choice("initial", initial, INITIAL)
+    if one_game and initial == "zero" and solver.strategies(modes) > 1:
+        raise ConfigError(
+            "all modes would be the same: forecaster.one_game=true gives them one game, and forecaster.initial=zero one "
+            "start. Use solver=both_sides, which finds several equilibria from one start, or initial=decoded"
+        )
+    if TABLES in solver.provides and initial == "zero":
+        raise ConfigError(
+            "the solver chooses among candidates, which forecaster.initial=zero makes all the same: use decoded, which "
+            "learns them, or motions"
+        )
+    if initial == "motions" and not isinstance(energy.dynamics, Unicycle):
+        raise ConfigError(
+            f"forecaster.initial=motions needs dynamics=unicycle, not {type(energy.dynamics).__name__}: "
+            "the motions are those of a unicycle; choose decoded or zero"
+        )
+
+
+def check_calibration(calibration: Mapping[str, float] | None, solver: Minimiser) -> None:
+    """Refuse a calibration with a solver that does not lead to a minimum.
+
+    Raises:
+        ConfigError: see above.
+    """
+    if calibration is not None and STATIONARY not in solver.provides:
+        raise ConfigError(
+            "forecaster.calibration needs a solver that leads to a minimum, such as both_sides, game or converging; set "
+            "it to null for this one"
+        )
+
+
+def check_decodes_probabilities(probabilities: str, energy: Energy, solver: Minimiser) -> None:
+    """Refuse a decoder of probabilities where energies of choices or orders of agents define them.
+
+    Raises:
+        ConfigError: see above.
+    """
+    chooses = TABLES in solver.provides
+    if probabilities != "linear" and (chooses or energy.pair_order is not None):
+        raise ConfigError(
+            f"forecaster.probabilities={probabilities} has no effect here, because the "
+            f"{'energies of choices' if chooses else 'orders of agents'} define the probabilities: leave it out"
         )
 
 

@@ -43,9 +43,9 @@ class Dynamics(Protocol):
         ...
 
     def tangent(
-        self, states: Float[Tensor, "*batch K 4"], direction: Float[Tensor, "D *batch K 2"], dt: float
-    ) -> Float[Tensor, "D *batch K 4"]:
-        """The change of the states of :meth:`rollout` along D directions of the controls."""
+        self, states: Float[Tensor, "*batch K 4"], direction: Float[Tensor, "directions *batch K 2"], dt: float
+    ) -> Float[Tensor, "directions *batch K 4"]:
+        """The change of the states of :meth:`rollout` along the directions of the controls."""
         ...
 
 
@@ -86,9 +86,9 @@ class Unicycle:
         return torch.cat((position, heading[..., None], speed[..., None]), -1)
 
     def tangent(
-        self, states: Float[Tensor, "*batch K 4"], direction: Float[Tensor, "D *batch K 2"], dt: float
-    ) -> Float[Tensor, "D *batch K 4"]:
-        """The change of the states of :meth:`rollout` along D directions of the controls."""
+        self, states: Float[Tensor, "*batch K 4"], direction: Float[Tensor, "directions *batch K 2"], dt: float
+    ) -> Float[Tensor, "directions *batch K 4"]:
+        """The change of the states of :meth:`rollout` along the directions of the controls."""
         scan = dt * direction.cumsum(-2)
         by_heading, by_speed = scan[..., TURN_RATE, None], scan[..., ACCELERATION, None]
         ahead = _direction(states[..., HEADING])

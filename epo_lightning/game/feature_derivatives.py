@@ -1,6 +1,6 @@
 """Derivatives of named features: signals, their Jacobian along directions, and elementwise first and second derivatives.
 
-A declared feature is c(z(u)) with a signal z whose Jacobian is known in closed form (:func:`signal_and_change`) and an
+A declared feature is c(s(u)) with a signal s whose Jacobian is known in closed form (:func:`signal_and_change`) and an
 elementwise function c (:func:`own_derivatives`, :func:`pair_derivatives`). An undeclared feature is any differentiable
 function of the trajectory and is differentiated by forward-mode automatic differentiation (:func:`undeclared_change`).
 """
@@ -22,12 +22,12 @@ from epo_lightning.scene import HEADING, SPEED, TURN_RATE
 
 
 class Derivatives(NamedTuple):
-    """An elementwise function c(z) and its derivatives, entry by entry.
+    """An elementwise function c(s) and its derivatives, entry by entry.
 
     Attributes:
-        value: c(z).
-        first: dc/dz; None where it is 1 everywhere.
-        second: d2c/dz2; None where it is 0 everywhere, or was not asked for.
+        value: c(s).
+        first: dc/ds; None where it is 1 everywhere.
+        second: d2c/ds2; None where it is 0 everywhere, or was not asked for.
     """
 
     value: Tensor
@@ -50,11 +50,11 @@ def differentiate(function: Callable[..., Tensor], value: Tensor, *others: Tenso
     """
 
     def first(argument: Tensor) -> Tensor:
-        return _jvp(lambda z: function(z, *others), argument)[1]
+        return _jvp(lambda s: function(s, *others), argument)[1]
 
     if second:
         return Derivatives(function(value, *others), *_jvp(first, value))
-    return Derivatives(*_jvp(lambda z: function(z, *others), value))
+    return Derivatives(*_jvp(lambda s: function(s, *others), value))
 
 
 def _jvp(function: Callable[[Tensor], Tensor], value: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,7 +65,7 @@ def _jvp(function: Callable[[Tensor], Tensor], value: Tensor) -> tuple[Tensor, T
 def own_derivatives(
     feature: OwnFeature, signal: Float[Tensor, "*shape"], bounds: Mapping[str, Sequence[float]], second: bool = False
 ) -> Derivatives:
-    """A declared own feature c(z) of its signal z, with its derivatives.
+    """A declared own feature c(s) of its signal s, with its derivatives.
 
     Args:
         feature, signal: the feature, and the values z.
@@ -88,16 +88,16 @@ def pair_derivatives(feature: PairFeature, distance: Tensor, reach: Tensor, seco
 
 
 def margin_derivatives(
-    feature: PairFeature, distance: Tensor, reach: Tensor, d: Derivatives
+    feature: PairFeature, distance: Tensor, reach: Tensor, c: Derivatives
 ) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-    """Derivatives by the margin, a part of the reach: of a declared pair feature ``d``, and of its slope ``d.first``."""
+    """Derivatives, by the margin (a part of the reach), of a declared pair feature c and of its slope dc/ds."""
     if feature.function is overlap:
-        assert d.first is not None
-        return -d.first, torch.zeros_like(d.first)
+        assert c.first is not None
+        return -c.first, torch.zeros_like(c.first)
     reach = reach.expand_as(distance).contiguous()
 
     def by_distance(reach: Tensor) -> Tensor:
-        return _jvp(lambda z: feature.function(z, reach), distance)[1]
+        return _jvp(lambda s: feature.function(s, reach), distance)[1]
 
     return _jvp(lambda reach: feature.function(distance, reach), reach)[1], _jvp(by_distance, reach)[1]
 

@@ -322,8 +322,9 @@ class FeatureEnergy(Energy):
     def finite(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
         """Mask of the games whose inputs are finite.
 
-        It checks only inputs whose NaN or infinity may have no effect on the solution: weights of pairs that never touch,
-        positions of agents that no feature uses, and points of reference lines that are never the nearest.
+        Only inputs whose NaN or infinity may have no effect on the solution are checked: weights of pairs that never touch,
+        positions of agents that no feature uses, and points of reference lines that are never the nearest. The NaN of any
+        other input reaches the controls and is seen there.
         """
         present = scene.agent_mask
         finite = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)

@@ -1,4 +1,5 @@
-"""The interface of objectives: the training losses of a forecaster's network (the paper's Table 1, column 3)."""
+"""The interface of objectives: the training losses of a forecaster's network (Table 1, column 3: imitation, which learns
+through the solution, and conditional density estimation, CDE)."""
 
 from __future__ import annotations
 

@@ -1,12 +1,13 @@
-"""Derivatives of solutions: how gradients are backpropagated through the solution of a game (Table 1, column 3).
+"""Derivatives of solutions: how gradients are backpropagated through the solution of a game (Table 1, column 3:
+unrolling, UN, and the implicit function theorem, IFT).
 
 - ``unrolled`` (the paper's): through all S steps of the computation, also to the initial strategies.
 - ``truncated``: through the last few steps; the iterate at which they start is held constant.
 - ``implicit``: the derivative of the minimum that the steps approach (implicit function theorem), independent of the path.
-  It is correct only if the solution is a minimum, so use many steps. A sample whose Hessian is not positive definite is
-  not a minimum: its gradient is zero and its status STOPPED. If most of the solutions of a batch are not minima, a warning
-  is given once. Scaling all weights of a game by the same factor does not move the minimum, so w . dL/dw = 0: the overall
-  scale of the weights is not learned and drifts. Fix one weight, or normalise the weights.
+  It is correct only if the solution is a minimum, so use many steps. A problem (scene and mode) whose Hessian is not
+  positive definite is not at a minimum: its gradient is zero and its status STOPPED. If most of the solutions of a batch are
+  not minima, a warning is given once. Scaling all weights of a game by the same factor does not move the minimum, so
+  w . dL/dw = 0: the overall scale of the weights is not learned and drifts. Fix one weight, or normalise the weights.
 - ``detached``: no derivative, for objectives that compare energies instead of solutions.
 """
 
@@ -95,7 +96,7 @@ class Truncated(Backward):
         return dataclasses.replace(
             last,
             initial_energy=first.initial_energy,
-            # A sample that was STOPPED at first but moved later is reported as DAMPED.
+            # A problem that was STOPPED at first but moved later is reported as DAMPED.
             status=torch.maximum(first.status.clamp_max(Status.DAMPED), last.status),
             iterates=(*first.iterates, *last.iterates[1:]) if first.iterates and last.iterates else None,
         )

@@ -48,7 +48,7 @@ class Minimiser(ABC):
         return self
 
     def descent(self) -> Minimiser:
-        """The minimiser whose solution in each mode lies below that mode's initial strategy; for most, the same."""
+        """A minimiser that, in each mode, descends from that mode's initial strategy; most minimisers do so already."""
         return self
 
     def near_minimum(self) -> Minimiser:

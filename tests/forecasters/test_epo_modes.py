@@ -148,7 +148,10 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
         {"motions": {"acceleration": 1.0, "curvature": 1.0, "jerk": 1.0}},
         r"forecaster\.motions must name acceleration .* and curvature .* not acceleration, curvature, jerk$",
     ),
-    *(("rpi_epo", {"control_scale": wrong}, "control_scale must be positive") for wrong in (0.0, -1.0, float("inf"))),
+    *(
+        ("rpi_epo", {"control_scale": wrong}, "control_scale must be a number, positive")
+        for wrong in (0.0, -1.0, float("inf"))
+    ),
 ]
 
 

@@ -143,7 +143,7 @@ class RPIData(SceneDataModule):
 
     @property
     def digest(self) -> str:
-        """Hash of everything that a run's data depends on: the data set and the selection of its modes."""
+        """Hash of the data set and the selection of its modes."""
         return cache.digest({"set": self.config, "targets": self.targets})[:16]
 
     @property

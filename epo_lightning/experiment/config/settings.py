@@ -180,7 +180,7 @@ class Settings:
     callbacks: CallbackSettings
     logger: LoggerSettings
     budget: BudgetSettings
-    task: str = ""
+    task: str = ""  # name of the group in conf/task, for readers of a run; sizes come from `data.task`
     title: str = "untitled"
     goal: Literal["energy", "all"] = "energy"
     seed: int = 0
@@ -237,8 +237,8 @@ class EvaluateSettings:
     def __post_init__(self) -> None:
         if (self.run is None) == (self.runs is None):
             raise ConfigError("choose what to evaluate: run=<run folder>, or runs=<folder> for all runs below it")
-        if self.batch_size < 1:
-            raise ConfigError(f"batch_size must be 1 or more, not {self.batch_size}")
+        if self.batch_size < 2:
+            raise ConfigError(f"batch_size must be 2 or more, not {self.batch_size}")
 
 
 @dataclass(frozen=True)

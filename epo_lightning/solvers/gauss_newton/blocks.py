@@ -7,7 +7,7 @@ nodes s and s - 1 (a difference of nodes is a control, and a difference of contr
 
     L L^T = H_ZZ,   G = L^-1 H_Zx,   P = H_xx - G^T G,
 
-where P is the cost-to-go, which is added to the costs of the block before. Blocks of about forty unknowns need few and large
+where P is the cost-to-go, which is added to the costs of the block before. Blocks of 32 unknowns or more need few and large
 operations; the total cost is O(K N^3).
 """
 
@@ -67,7 +67,7 @@ class Factors:
             if mine.gain is not None and theirs.gain is not None:
                 mine.gain[where[chosen]] = theirs.gain[chosen]
 
-    def solve(self, right: Float[Tensor, "C N"]) -> Float[Tensor, "C N"]:
+    def solve(self, right: Float[Tensor, "C n"]) -> Float[Tensor, "C n"]:
         """(J^T J + lambda I)^-1 times a covector of all nodes, in the order node, component, agent."""
         width = self.blocks[0].moves.shape[-1]
         parts = list(right[..., None].split([block.unknowns for block in self.blocks], 1))
@@ -118,8 +118,8 @@ def factorise(
     blocks: list[Block] = []
     cost: Tensor | None = None
     # Undeclared features may couple any two steps, so that all nodes are one block.
-    whole = model.blocks is not None or model.pair_blocks is not None
-    for start, end in reversed([(0, model.at.steps)] if whole else block_bounds(model.at.steps, group.size)):
+    whole = model.own_dense is not None or model.pair_dense is not None
+    for start, end in reversed([(0, model.at.horizon)] if whole else block_bounds(model.at.horizon, group.size)):
         block, cost, info = parts.eliminate(start, end, cost)
         blocks.insert(0, block)
         failed |= info != 0
@@ -133,33 +133,33 @@ class _Parts:
         self.model, self.group, self.size = model, group, group.size
 
         # Double precision is needed: rates of controls enter the nodes divided by dt^4.
-        def exact(values: Tensor) -> Tensor:
+        def double(values: Tensor) -> Tensor:
             return values.to(torch.float64)
 
         # Absent agents and steps after the end of a game get unit matrices, so that they are regular even without damping.
-        control = exact(model.control) + damping.reshape(len(damping), -1, 1, 1)
+        control = double(model.control) + damping.reshape(len(damping), -1, 1, 1)
         present = model.at.present[..., None, None]
         control = torch.where(present if model.at.within_game is None else present & model.at.within_game, control, 1.0)
-        moves, node, pull = exact(model.at.moves), exact(model.node), exact(model.position)
+        moves, node, pull = double(model.at.moves), double(model.node), double(model.position)
         rows = [model.at.dt * moves.flatten(2, 3), control / model.at.dt**2, node, pull]
         sizes = [4, 2, 2, 3]
         for optional, scale in ((model.rate, model.at.dt**-4), (model.cross, 1.0)):
             if optional is not None:
-                rows.append(exact(optional) * scale)
+                rows.append(double(optional) * scale)
             sizes.append(2 * (optional is not None))
         packed = torch.cat(rows, 2).flatten(0, 1)
         if group.agents is not None:
             packed = packed.index_select(0, group.agents.flatten())
         packed = (
-            packed.view(group.count, group.size, -1, model.at.steps).permute(0, 3, 2, 1).contiguous()
+            packed.view(group.count, group.size, -1, model.at.horizon).permute(0, 3, 2, 1).contiguous()
         )  # [C, K, f, m]
         moves, self.control, self.node, pull, self.rate, self.cross = packed.split(sizes, 2)
         self.moves = moves.unflatten(2, (2, 2))  # [C, K, component, axis, m]
         # Stiffness of the positions, [C, K, axis m, axis m].
-        shared = None if model.pair_position is None else exact(model.pair_position)
+        shared = None if model.pair_position is None else double(model.pair_position)
         xx, xy, yy = group.coupled(pull.transpose(1, 2), shared).movedim(3, 1).unbind(2)  # [C, K, m, m]
         self.position = torch.stack((torch.stack((xx, xy), -2), torch.stack((xy, yy), -2)), 2).view(
-            group.count, model.at.steps, 2 * group.size, 2 * group.size
+            group.count, model.at.horizon, 2 * group.size, 2 * group.size
         )
 
     def eliminate(self, start: int, end: int, cost: Tensor | None) -> tuple[Block, Tensor | None, Tensor]:
@@ -210,7 +210,7 @@ class _Parts:
             by_node = apart.view(batch, count, width, width)
             at_node = by_node @ (self.position[:, start:end] @ by_node.mT)
             diagonal -= beta * (1.0 - beta) * at_node.permute(0, 2, 3, 1)
-        if start == 0 and end == self.model.at.steps:
+        if start == 0 and end == self.model.at.horizon:
             self._add_undeclared(nodes)
         info = torch.empty(batch, dtype=torch.int32, device=matrix.device)
         torch.linalg.cholesky_ex(matrix, out=(matrix, info))
@@ -281,15 +281,15 @@ class _Parts:
 
     def _add_undeclared(self, matrix: Tensor) -> None:
         """Add the dense stiffness of undeclared features to the matrix of all nodes."""
-        steps, size = self.model.at.steps, self.size
+        steps, size = self.model.at.horizon, self.size
         nodes = matrix.unflatten(1, (steps, 2, size)).unflatten(4, (steps, 2, size))
-        if self.model.blocks is not None:
-            blocks = self.model.blocks
+        if self.model.own_dense is not None:
+            blocks = self.model.own_dense
             blocks = blocks if self.group.agents is None else blocks.flatten(0, 1)[self.group.agents]
             blocks = blocks.view(-1, size, 2, steps, 2, steps)
             nodes.diagonal(dim1=3, dim2=6).add_(blocks.permute(0, 3, 2, 5, 4, 1))
-        if self.model.pair_blocks is not None:
-            shared = self.group.of_edges(self.model.pair_blocks).to(matrix.dtype).view(-1, 2, steps, 2, steps)
+        if self.model.pair_dense is not None:
+            shared = self.group.of_edges(self.model.pair_dense).to(matrix.dtype).view(-1, 2, steps, 2, steps)
             of = self.group
             nodes[of.component, :, :, of.second, :, :, of.first] += shared.permute(0, 4, 3, 2, 1)
             nodes[of.component, :, :, of.first, :, :, of.second] += shared.permute(0, 2, 1, 4, 3)

@@ -254,8 +254,8 @@ class _Call:
         """Allocate what the kernel writes: results, and iterates and directions of all steps if they are recorded."""
         controls, shape = self.controls, self.controls.shape
         stacked = self.record or self.keep_iterates
-        kept = self.steps + 1 if stacked else 1 + self.adaptive  # adaptive: the best iterate and the trial
-        self.iterates = controls.new_empty((kept, *shape))
+        slots = self.steps + 1 if stacked else 1 + self.adaptive  # adaptive: the best iterate and the trial
+        self.iterates = controls.new_empty((slots, *shape))
         self.directions = controls.new_empty((max(self.steps, 1) if self.record else 1, *shape))
         self.states: Tensor | None = controls.new_empty((*shape[:-1], 4))
         self.initial_energy, self.energy, self.gradient_norm = controls.new_empty((3, *shape[:2])).unbind(0)

@@ -1,4 +1,7 @@
-"""Expansion of an energy to second order around joint strategies: the contributions of every feature to the model."""
+"""Expansion of an energy to second order around joint strategies: the contributions of every feature to the model.
+
+Read :mod:`.iterate` (the unknowns, called nodes) and :class:`.quadratic_model.QuadraticModel` (what is added up) first.
+"""
 
 from __future__ import annotations
 
@@ -36,6 +39,9 @@ from epo_lightning.solvers.gauss_newton.quadratic_model import (
     SignalTerm,
     SteeringTerm,
 )
+
+XX_YY = slice(2, None, 2)
+"""Entries xx and yy among the five of :attr:`_Sums.positions`: x, y, xx, xy, yy."""
 
 
 @torch.no_grad()
@@ -96,11 +102,11 @@ def expand(
         node=sums.node,
         cross=sums.cross,
         position=sums.positions[:, :, 2:],
-        blocks=sums.blocks,
+        own_dense=sums.own_dense,
         edges=edges,
         linked=linked,
         pair_position=sums.pair_position,
-        pair_blocks=sums.pair_blocks,
+        pair_dense=sums.pair_dense,
         own=own,
         pair=pair,
         separation=separation,
@@ -117,7 +123,7 @@ class _Sums:
         control_gradient, node_gradient: gradients by controls and by nodes, without the part that acts through positions
             (``positions``).
         positions: gradient by positions (x, y), then their second derivatives (xx, xy, yy).
-        control, rate, node, cross, blocks, pair_position, pair_blocks: see :class:`QuadraticModel`.
+        control, rate, node, cross, own_dense, pair_position, pair_dense: see :class:`QuadraticModel`.
     """
 
     at: Iterate
@@ -130,18 +136,27 @@ class _Sums:
     node: Tensor
     rate: Tensor | None = None
     cross: Tensor | None = None
-    blocks: Tensor | None = None
+    own_dense: Tensor | None = None
     pair_position: Tensor | None = None
-    pair_blocks: Tensor | None = None
+    pair_dense: Tensor | None = None
 
     @classmethod
     def zeros(cls, at: Iterate, exact: bool) -> _Sums:
         """Sums over no feature."""
 
-        def zeros(*size: int) -> Tensor:
-            return at.u.new_zeros(at.problems, at.agents, *size)
+        def zeros(components: int) -> Tensor:
+            return at.u.new_zeros(at.problems, at.agents, components, at.horizon)
 
-        return cls(at, exact, zeros(), *(zeros(count, at.steps) for count in (2, 2, 5, 2, 2)))
+        return cls(
+            at,
+            exact,
+            agent_value=at.u.new_zeros(at.problems, at.agents),
+            control_gradient=zeros(2),
+            node_gradient=zeros(2),
+            positions=zeros(5),
+            control=zeros(2),
+            node=zeros(2),
+        )
 
     def crossed(self) -> Tensor:
         """The array ``cross``, allocated at first use."""
@@ -234,7 +249,7 @@ def _add_lane(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
         offset, square = offset.where(at.within_game, 0.0), square.where(at.within_game, 0.0)
     scaled = square * offset
     sums.positions[:, :, :2] += scaled
-    sums.positions[:, :, 2::2] += square
+    sums.positions[:, :, XX_YY] += square
     if sums.exact:
         sums.positions[:, :, 2:] -= square * _outer(tangent, 2)
     sums.add_value(scaled, offset)
@@ -247,7 +262,7 @@ def _add_goal(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
     offset = at.last(at.x[:, :, :2]) - at.around.goals.flatten(0, 1)
     scaled = square * offset
     at.add_last_(sums.positions[:, :, :2], scaled)
-    at.add_last_(sums.positions[:, :, 2::2], square)
+    at.add_last_(sums.positions[:, :, XX_YY], square)
     sums.add_value(scaled, offset)
     return GoalTerm(weight, offset)
 
@@ -274,7 +289,7 @@ def _add_undeclared(sums: _Sums, name: str) -> None:
     sums.node_gradient += (jacobian @ value[..., None]).view_as(sums.node_gradient)
     if not sums.exact:
         block = jacobian @ jacobian.mT
-        sums.blocks = block if sums.blocks is None else sums.blocks + block
+        sums.own_dense = block if sums.own_dense is None else sums.own_dense + block
 
 
 def _by_edge(at: Iterate, edges: Edges, values: Float[Tensor, "B _ P"]) -> Float[Tensor, "E 1"]:
@@ -298,15 +313,15 @@ def _pair_terms(at: Iterate, edges: Edges, separation: Separation) -> dict[str, 
     for name, feature in at.energy.pair_features.items():
         if feature.declared:
             reach = _by_edge(at, edges, at.energy.reach(at.scene, at.parameters, name))
-            d = pair_derivatives(feature, separation.distance, reach, second=True)
+            c = pair_derivatives(feature, separation.distance, reach, second=True)
             by_margin = None
             if name in at.energy.decoded_margins:
-                by_margin = margin_derivatives(feature, separation.distance, reach, d)
+                by_margin = margin_derivatives(feature, separation.distance, reach, c)
             if at.within_game is not None:
                 active = _edge_exists(at, edges, feature, separation.distance.shape[-1])
-                d = d.within(active)
+                c = c.within(active)
                 by_margin = by_margin and (by_margin[0].where(active, 0.0), by_margin[1].where(active, 0.0))
-            terms[name] = PairTerm(_edge_weight(at, edges, name), d, by_margin)
+            terms[name] = PairTerm(_edge_weight(at, edges, name), c, by_margin)
     return terms
 
 
@@ -316,15 +331,15 @@ def _add_pairs(sums: _Sums, edges: Edges, separation: Separation, terms: dict[st
     by_distance = torch.zeros_like(separation.distance)
     curvature, value = torch.zeros_like(by_distance), torch.zeros_like(by_distance)
     for term in terms.values():
-        d = term.d
-        assert d.first is not None
+        c = term.c
+        assert c.first is not None
         square = term.weight.square()
-        scaled = square * d.value
-        value += scaled * d.value
-        if sums.exact and d.second is not None:
-            curvature += scaled * d.second
-        by_distance += scaled * d.first
-        curvature += square * d.first.square()
+        scaled = square * c.value
+        value += scaled * c.value
+        if sums.exact and c.second is not None:
+            curvature += scaled * c.second
+        by_distance += scaled * c.first
+        curvature += square * c.first.square()
     gradient = by_distance[:, None] * normal
     position = curvature[:, None] * _outer(normal, 1)
     if sums.exact:
@@ -358,18 +373,19 @@ def _add_undeclared_pair(sums: _Sums, edges: Edges, feature: PairFeature, name: 
     value, by_first, by_second = (weight * torch.where(exists, part, 0.0) for part in found)
     jacobians = by_first.permute(1, 0, 2), by_second.permute(1, 0, 2)  # [E, 2 K, R]
     gradients = (side @ value[..., None] for side in jacobians)
-    edges.spread_(sums.node_gradient, *(part.view(-1, 2, at.steps) for part in gradients))
+    edges.spread_(sums.node_gradient, *(part.view(-1, 2, at.horizon) for part in gradients))
     _add_pair_value(sums, edges, value.square())
     if not sums.exact:
-        if sums.blocks is None:
-            sums.blocks = value.new_zeros(at.problems, at.agents, 2 * at.steps, 2 * at.steps)
-        edges.spread_(sums.blocks, *(side @ side.mT for side in jacobians))
+        if sums.own_dense is None:
+            sums.own_dense = value.new_zeros(at.problems, at.agents, 2 * at.horizon, 2 * at.horizon)
+        edges.spread_(sums.own_dense, *(side @ side.mT for side in jacobians))
         shared = jacobians[0] @ jacobians[1].mT
-        sums.pair_blocks = shared if sums.pair_blocks is None else sums.pair_blocks + shared
+        sums.pair_dense = shared if sums.pair_dense is None else sums.pair_dense + shared
     return ((by_first != 0) & exists).any(-1).any(0)
 
 
 def _add_pair_value(sums: _Sums, edges: Edges, value: Float[Tensor, "E L"]) -> None:
+    """Add the energies of pairs, 1/2 w^2 c^2, with ``value`` = w^2 c^2."""
     first_of_problem = edges.first // sums.at.agents * sums.at.agents
     sums.agent_value.flatten().index_add_(0, first_of_problem, 0.5 * value.sum(-1))
 
@@ -394,14 +410,14 @@ def _set_undeclared_hessian(sums: _Sums, edges: Edges) -> None:
                 else None
             )
     hessian = torch.stack([torch.zeros_like(controls) if row is None else row for row in rows])
-    hessian = hessian.flatten(1, 2).view(at.agents, at.steps, 2, at.problems, at.agents, at.steps, 2)
+    hessian = hessian.flatten(1, 2).view(at.agents, at.horizon, 2, at.problems, at.agents, at.horizon, 2)
     at_nodes = at.to_nodes(at.to_nodes(hessian.permute(3, 0, 2, 4, 6, 5, 1)).transpose(-1, -2))  # [S i c j d k l]
     at_nodes = at_nodes.permute(0, 1, 3, 2, 5, 4, 6)
-    at_nodes = at_nodes.reshape(at.problems, at.agents, at.agents, 2 * at.steps, 2 * at.steps)
-    sums.blocks = at_nodes.diagonal(dim1=1, dim2=2).movedim(-1, 1)
+    at_nodes = at_nodes.reshape(at.problems, at.agents, at.agents, 2 * at.horizon, 2 * at.horizon)
+    sums.own_dense = at_nodes.diagonal(dim1=1, dim2=2).movedim(-1, 1)
     if part.pair:
         rows_of = edges.first * at.agents + edges.second % at.agents
-        sums.pair_blocks = at_nodes.flatten(0, 2)[rows_of]
+        sums.pair_dense = at_nodes.flatten(0, 2)[rows_of]
 
 
 def _outer(vector: Tensor, dim: int) -> Tensor:

@@ -50,7 +50,7 @@ def attach(
         return compiled.attach(energy, scene, parameters, controls, exact)
     none = controls.new_zeros(controls.shape[:2]).flatten()
     game = Game(energy, scene, parameters, 1.0, none, controls.device.type == "cpu")
-    found, status = _Attach.apply(game, exact, controls, *game.tensors(parameters))
+    found, status = _Attach.apply(game, exact, controls, *game.tensors())
     return found, status
 
 

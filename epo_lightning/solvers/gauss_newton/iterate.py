@@ -84,8 +84,8 @@ class Iterate:
         return self.u.shape[1]
 
     @property
-    def steps(self) -> int:
-        """Number K of steps."""
+    def horizon(self) -> int:
+        """Number K of steps of the game."""
         return self.u.shape[3]
 
     @property
@@ -114,7 +114,7 @@ class Iterate:
         if self.around.ends is None:
             return None
         ends = self.around.ends.repeat_interleave(self.modes)[:, None, None, None]
-        return torch.arange(self.steps, device=ends.device) < ends
+        return torch.arange(self.horizon, device=ends.device) < ends
 
     @cached_property
     def _last(self) -> Bool[Tensor, "S 1 1 K"] | None:
@@ -125,11 +125,11 @@ class Iterate:
             else self.within_game & (self.within_game.cumsum(-1) == self.within_game.sum(-1, keepdim=True))
         )
 
-    def last(self, values: Float[Tensor, "S N C K"]) -> Float[Tensor, "S N C"]:
+    def last(self, values: Float[Tensor, "S N c K"]) -> Float[Tensor, "S N c"]:
         """The entries of the last step of every game."""
         return values[..., -1] if self._last is None else values.where(self._last, 0.0).sum(-1)
 
-    def add_last_(self, onto: Float[Tensor, "S N C K"], values: Float[Tensor, "S N #C"]) -> None:
+    def add_last_(self, onto: Float[Tensor, "S N c K"], values: Float[Tensor, "S N #c"]) -> None:
         """Add values to the entries of the last step of every game, in place."""
         if self._last is None:
             onto[..., -1] += values
@@ -178,8 +178,8 @@ class Iterate:
 
     def node_directions(self) -> Float[Tensor, "D B M N K 2"]:
         """The D = 2 K changes of controls that each move a single entry of z: all speeds first, then all headings."""
-        unit = torch.eye(2 * self.steps, dtype=self.u.dtype, device=self.u.device)
-        unit = self.to_controls(unit.view(-1, 1, 1, 1, 2, self.steps)).transpose(-1, -2)
+        unit = torch.eye(2 * self.horizon, dtype=self.u.dtype, device=self.u.device)
+        unit = self.to_controls(unit.view(-1, 1, 1, 1, 2, self.horizon)).transpose(-1, -2)
         return unit.expand(-1, *self.controls.shape)
 
     def at_every_step(self, values: Float[Tensor, "E c L"]) -> Float[Tensor, "E c K"]:
@@ -187,6 +187,6 @@ class Iterate:
         stride = self.energy.pair_stride
         if stride == 1:
             return values
-        every = values.new_zeros(*values.shape[:2], self.steps)
+        every = values.new_zeros(*values.shape[:2], self.horizon)
         every[..., stride - 1 :: stride] = values
         return every

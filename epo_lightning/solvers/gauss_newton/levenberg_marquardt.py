@@ -1,10 +1,10 @@
 """The energy-based potential game layer (Section 4.3): S damped Gauss-Newton steps, differentiable.
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
-modes are solved at once and independently of each other. If the factorisation of a problem (one scene and mode)
-fails, it keeps its last good iterate; on a CPU, it is first tried again with more damping. Two backends compute the steps
-(:mod:`~epo_lightning.solvers.gauss_newton.compiled` and :mod:`~epo_lightning.solvers.gauss_newton.structured`); this module
-chooses the backend and, with adaptive damping, accepts or rejects steps.
+modes are solved at once and independently of each other. If a matrix cannot be factorised, its problem (one scene
+and mode) keeps its last good iterate; on a CPU, the factorisation is first repeated with more damping. Two backends compute
+the steps (:mod:`~epo_lightning.solvers.gauss_newton.compiled` and :mod:`~epo_lightning.solvers.gauss_newton.structured`);
+this module chooses the backend and, with adaptive damping, accepts or rejects steps.
 """
 
 from __future__ import annotations

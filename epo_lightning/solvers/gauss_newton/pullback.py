@@ -5,7 +5,7 @@ For constant changes mu (``adjoint``) and d (``step``) of the controls, the grad
     phi(u, p) = -<J mu, r + J d>
 
 by the controls u and by the weights and goals p. The quadratic model holds the first and second derivatives of every
-residual r = w c(z(u)). The derivatives of phi by controls, nodes and positions are summed over the features, and at the end
+residual r = w c(s(u)). The derivatives of phi by controls, nodes and positions are summed over the features, and at the end
 they are backpropagated to the controls, as for the gradient of an energy.
 """
 
@@ -196,7 +196,7 @@ def _pull_pairs(
     along_mu, along_d = closing.unbind(1)
     outward, with_mu, with_d = (torch.zeros_like(separation.distance) for _ in range(3))
     for name, term in model.pair.items():
-        value, first, second = term.d
+        value, first, second = term.c
         assert first is not None
         square = term.weight.square()
         ahead = value + first * along_d
@@ -215,7 +215,7 @@ def _pull_pairs(
     turning = (apart - closing[:, :, None] * normal[:, None]) * separation.inverse[:, None, None]
     gradient = outward[:, None] * normal + with_mu[:, None] * turning[:, 0] + with_d[:, None] * turning[:, 1]
     gradient = torch.stack((gradient, with_mu[:, None] * normal, with_d[:, None] * normal), 1)
-    gradient = at.at_every_step(gradient.flatten(1, 2)).view(-1, 3, 2, at.steps)
+    gradient = at.at_every_step(gradient.flatten(1, 2)).view(-1, 3, 2, at.horizon)
     edges.spread_(sums.positions, gradient, -gradient)
     return by_weight, by_margin
 

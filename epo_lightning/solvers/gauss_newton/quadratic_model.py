@@ -29,7 +29,7 @@ from epo_lightning.solvers.gauss_newton.iterate import Iterate
 
 @dataclass(frozen=True)
 class SignalTerm:
-    """A feature of a control, its rate or the speed: c(z) with derivatives."""
+    """A feature of a control, its rate or the speed: c(s) with derivatives."""
 
     feature: OwnFeature
     weight: Float[Tensor, "S N 1"]
@@ -76,10 +76,10 @@ OwnTerm = SignalTerm | SteeringTerm | LaneTerm | GoalTerm | HeadingTerm
 
 @dataclass(frozen=True)
 class PairTerm:
-    """A feature of the distance, d(|p_i - p_j|), with derivatives; those of d and d' by the margin where it is decoded."""
+    """A feature of the distance, c(|p_i - p_j|), with derivatives; those of c and c' by the margin where it is decoded."""
 
     weight: Float[Tensor, "E 1"]
-    d: Derivatives
+    c: Derivatives
     by_margin: tuple[Float[Tensor, "E L"], Float[Tensor, "E L"]] | None = None
 
 
@@ -123,11 +123,12 @@ class QuadraticModel:
         cross: second derivatives by the speed of a node and a heading, that of the same node or of the next; None if it
             is zero.
         position: second derivatives by the positions: xx, xy and yy.
-        blocks: all second derivatives of undeclared own features by the nodes; None without.
+        own_dense: all second derivatives of undeclared own features by the nodes; None without.
         edges: the pairs that were evaluated.
         linked: the edges whose two agents are coupled.
-        pair_position: xx, xy and yy that an edge adds to both agents, and subtracts between them; None without.
-        pair_blocks: second derivatives of undeclared pair features by the nodes of both agents; None without.
+        pair_position: xx, xy and yy of an edge: added to the blocks of both agents, subtracted from the block between them;
+            None without edges.
+        pair_dense: second derivatives of undeclared pair features by the nodes of both agents; None without.
         own: declared own features by name.
         pair: declared pair features by name.
         separation: distances of the edges; None without edges.
@@ -141,11 +142,11 @@ class QuadraticModel:
     node: Float[Tensor, "S N 2 K"]
     cross: Float[Tensor, "S N 2 K"] | None
     position: Float[Tensor, "S N 3 K"]
-    blocks: Float[Tensor, "S N D D"] | None
+    own_dense: Float[Tensor, "S N D D"] | None
     edges: Edges
     linked: Bool[Tensor, " E"]
     pair_position: Float[Tensor, "E 3 K"] | None
-    pair_blocks: Float[Tensor, "E D D"] | None
+    pair_dense: Float[Tensor, "E D D"] | None
     own: dict[str, OwnTerm]
     pair: dict[str, PairTerm]
     separation: Separation | None

@@ -68,7 +68,7 @@ def solve(
 
     Args:
         energy, scene, parameters: the game, already validated.
-        steps: number S of steps.
+        steps: number of optimisation steps.
         step_size: alpha.
         damping: lambda of every problem, or of every agent; infinite damping keeps the agent's controls exactly.
         keep_iterates: whether the solution carries u_0 .. u_S.
@@ -78,7 +78,7 @@ def solve(
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
     split = controls.device.type == "cpu" if split is None else split
     game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(0, 1), split, exact)
-    tensors = game.tensors(parameters)
+    tensors = game.tensors()
     status = torch.where(game.finite, Status.SOLVED, Status.STOPPED)
     iterates = [controls]
     initial_energy = None
@@ -89,7 +89,7 @@ def solve(
         iterates.append(controls)
     with torch.no_grad():
         last = expand(energy, scene, parameters, controls, not split)
-        # The sum over agents is a running sum, so that absent agents, which come last, change no digit of it.
+        # A running sum over the agents, to which absent agents add an exact zero.
         gradient_norm = last.gradient.square().flatten(2).sum(-1).cumsum(1)[:, -1].sqrt().view_as(status)
         final_energy = last.value.view_as(status)
     return Solution(
@@ -122,8 +122,9 @@ class Game:
         """Mask of the games with finite inputs (:meth:`~epo_lightning.game.feature_energy.FeatureEnergy.finite`)."""
         return self.energy.finite(self.scene, self.parameters)
 
-    def tensors(self, parameters: GameParameters) -> list[Tensor]:
+    def tensors(self) -> list[Tensor]:
         """The tensors of a game that have a gradient: weights, margins, and goals and goal headings if they are needed."""
+        parameters = self.parameters
         tensors = [parameters.own_weights[name] for name in self.energy.own]
         tensors += [parameters.pair_weights[name] for name in self.energy.pair]
         tensors += [parameters.margins[name] for name in self.energy.decoded_margins]
@@ -181,28 +182,28 @@ class _Step(torch.autograd.Function):
     def forward(ctx: Any, game: Game, controls: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parameters = game.with_tensors(tensors)
         model = expand(game.energy, game.scene, parameters, controls, not game.split, game.exact)
-        factors = factorise(model, game.damping, game.split)
-        step = factors.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
-        status = factors.status.view(controls.shape[:2])
+        factorised = factorise(model, game.damping, game.split)
+        step = factorised.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
+        status = factorised.status.view(controls.shape[:2])
         moved = controls + game.step_size * step
         solved = game.finite & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
-        moves = solved[..., None, None, None]
+        accepted = solved[..., None, None, None]
         status = torch.where(solved, status, Status.STOPPED)
         value = model.value.view(controls.shape[:2])
         if any(ctx.needs_input_grad):
-            ctx.game, ctx.factors = game, factors
-            ctx.save_for_backward(torch.where(moves, step, 0.0), solved, *tensors)
+            ctx.game, ctx.factorised = game, factorised
+            ctx.save_for_backward(torch.where(accepted, step, 0.0), solved, *tensors)
         ctx.mark_non_differentiable(status, value)
-        return torch.where(moves, moved, controls), status, value
+        return torch.where(accepted, moved, controls), status, value
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        game, factors = ctx.game, ctx.factors
-        model = factors.model
+        game, factorised = ctx.game, ctx.factorised
+        model = factorised.model
         step, solved, *tensors = ctx.saved_tensors
         shape = cotangent.shape
-        adjoint = factors.solve(game.step_size * planar(cotangent))
+        adjoint = factorised.solve(game.step_size * planar(cotangent))
         adjoint = torch.where(solved.flatten()[:, None, None, None], adjoint, 0.0)
         by_controls, by = game.gradient_of_phi(model, tensors, adjoint, planar(step))
         by_controls = torch.where(solved[..., None, None, None], by_controls, 0.0)
