@@ -8,7 +8,6 @@ Times are CPU seconds of one core. Reading, extraction and loading are measured 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,7 +18,8 @@ import torch
 
 from benchmarks.measure import positive
 from epo_lightning.data.recorded.scenes import RecordedScenes
-from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, extract, joined
+from epo_lightning.data.recorded.tables import joined
+from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.registry import ConfigError, lookup
 
 Result = TypeVar("Result")
@@ -52,10 +52,7 @@ def measure(folder: Path, format_: str, recordings: int, batches: int) -> None:
     if not extracted:
         raise ConfigError(f"the first {len(read)} recordings in {folder} hold no scene: measure more with --recordings")
     scenes = joined(extracted)
-    tables = {
-        field.name: torch.from_numpy(np.ascontiguousarray(getattr(scenes, field.name)))
-        for field in dataclasses.fields(SceneTables)
-    }
+    tables = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in scenes.columns().items()}
     for frame in ("fixed", "aligned"):
         data = RecordedScenes(tables, config.dt, frame, [recording.name for recording in read])
         order = torch.randint(0, len(data), (batches, 32))

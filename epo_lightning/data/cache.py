@@ -131,7 +131,11 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def write(
-    folder: Path, splits: Mapping[str, Mapping[str, Tensor]], config: Mapping[str, Any], report: Mapping[str, Any]
+    folder: Path,
+    splits: Mapping[str, Mapping[str, Tensor]],
+    config: Mapping[str, Any],
+    report: Mapping[str, Any],
+    texts: Mapping[str, str] | None = None,
 ) -> Path:
     """Write a data set, unless it exists already. The caller holds the lock of the folder, see :func:`locked`.
 
@@ -140,6 +144,7 @@ def write(
         splits: tensors by name for every split; the first dimension is the record.
         config: plain values from which the data set was made.
         report: plain values that describe it.
+        texts: further files for people, by name; they are not checked when the data set is read.
 
     Raises:
         CacheError: the folder exists, but holds a broken data set or one of another configuration.
@@ -169,6 +174,8 @@ def write(
                 "packages": versions(),
                 "report": report,
             }
+            for name, text in (texts or {}).items():
+                (work / name).write_text(text)
             (work / MANIFEST).write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
             work.replace(folder)
         finally:

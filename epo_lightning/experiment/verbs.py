@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from epo_lightning.experiment.config.settings import (
     ReportSettings,
     measures,
 )
+from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import check_part, read
 
@@ -48,9 +50,22 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     from epo_lightning.experiment.config.sources import HIGHWAYS
 
     data = assembly.build_data(settings.data)
-    folder = data.generate(workers=settings.workers, progress=settings.progress)
+    strict = {}
+    if settings.strict:
+        if "strict" not in inspect.signature(data.generate).parameters:
+            raise ConfigError(
+                f"strict=true refuses recordings that cannot be read, and data={settings.data['name']} has no recordings: "
+                "leave it out"
+            )
+        strict = {"strict": True}
+    folder = data.generate(workers=settings.workers, progress=settings.progress, **strict)
     print(f"\ndata in {folder}, digest {data.digest}")
-    _print_report(data.report())
+    report = data.report()
+    _print_report(report)
+    lines = data.per_recording() if hasattr(data, "per_recording") else []
+    print("\n".join(["", *lines] if lines else []))
+    for name, problem in report.get("skipped", {}).items():
+        print(f"left out: {name}: {problem}")
     dataset = settings.data.get("dataset", "rpi")
     row = f"{dataset}/v_lstm_epo"
     kept = [word for word in overrides if word.startswith(("data=", "data.", "--config-dir="))]
@@ -122,9 +137,10 @@ def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
 
 
 def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
-    splits = [name for name in ("train", "val", "test") if isinstance(report.get(name), dict)]
-    if "recordings" in report and splits:
-        _print_windows(report, splits)
+    if "recordings" in report:
+        from epo_lightning.data.recorded import summary
+
+        print("\n".join(summary.by_split(report)))
         return
     for key, value in report.items():
         if isinstance(value, dict):
@@ -137,27 +153,6 @@ def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
             print(f"{indent}{key:<34} {shown}")
         else:
             print(f"{indent}{key:<34} {value}")
-
-
-def _print_windows(report: dict[str, Any], splits: list[str]) -> None:
-    """Print a table of recorded data: recordings, windows, dropped windows by reason and scenes of every split."""
-    names = {name: None for split in splits for name in report[split]}
-    counts = [name for name in names if isinstance(report[splits[0]].get(name, 0), int)]
-    lost = sorted((name for name in counts if name not in ("windows", "scenes")), key=str)
-    left = [name for name in names if name not in counts]
-    print(f"  {'':<64}" + "".join(f"{split:>18}" for split in splits))
-    print(f"  {'recordings':<64}" + "".join(f"{len(report['recordings'][split]):>18}" for split in splits))
-    for name in ("windows", *lost, "scenes", *left):
-        values = [report[split].get(name, 0) for split in splits]
-        if any(values):
-            shown = ("less: " if name in lost else "") + name
-            print(f"  {shown:<64}" + "".join(f"{_number(value):>18}" for value in values))
-
-
-def _number(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(_number, value))
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 RUN: dict[str, Callable[[dict[str, Any], Sequence[str]], Any]] = {

@@ -10,6 +10,9 @@ from jaxtyping import Float, Int
 from epo_lightning.data.recorded.tracks import TrackTable
 from epo_lightning.registry import ConfigError
 
+TOO_SHORT = "in a track shorter than a window"
+"""Name of a count: windows whose agent is observed in a stretch that is shorter than a window."""
+
 
 @dataclass(frozen=True)
 class Stretches:
@@ -47,7 +50,7 @@ class Stretches:
 
 
 def stretches(
-    tracks: TrackTable, dt: float, smoothing: float | None, shortest: int
+    tracks: TrackTable, dt: float, smoothing: float | None, shortest: int, every: int = 1
 ) -> tuple[Stretches, dict[str, int]]:
     """Stretches of a recording, resampled to the clock.
 
@@ -57,9 +60,11 @@ def stretches(
         smoothing: length [s] of the window in which a parabola is fitted to positions and headings; None for data that
             are smooth already.
         shortest: smallest number of steps of a stretch; shorter ones are left out.
+        every: steps between two windows.
 
     Returns:
-        the stretches, and the numbers of stretches that were interrupted or left out, by reason.
+        the stretches, the numbers of stretches that were interrupted or left out, by reason, and under ``TOO_SHORT`` the
+        number of windows in those that were left out.
 
     Raises:
         ConfigError: the clock is faster than the recording.
@@ -82,6 +87,7 @@ def stretches(
     count = last - first + 1
     long = (count >= shortest) & (length >= window)
     dropped["tracks shorter than a window"] = int((~long).sum())
+    dropped[TOO_SHORT] = int(np.maximum(last // every - (first - 1) // every, 0)[~long].sum())
     begin, length, first, count = begin[long], length[long], first[long], count[long]
 
     kept = np.repeat(begin - np.append(0, length.cumsum()[:-1]), length) + np.arange(length.sum())

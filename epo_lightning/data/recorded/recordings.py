@@ -19,13 +19,17 @@ import torch
 from torch import Tensor
 
 from epo_lightning.data import cache
-from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
-from epo_lightning.data.recorded.extraction import extract_to_file, is_complete, read_tables
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded import summary
+from epo_lightning.data.recorded.duplicates import Drives, used_once
+from epo_lightning.data.recorded.extraction import Extracted, extract_to_file, is_complete, read_extracted
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
+from epo_lightning.data.recorded.splits import UNITS, SplitRule
+from epo_lightning.data.recorded.tables import SceneTables, joined, selected
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
-from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, joined
+from epo_lightning.data.recorded.windows import WindowConfig
 from epo_lightning.data.workers import Report, finished
 from epo_lightning.metrics.functional.interaction import SUBSETS
 from epo_lightning.registry import ConfigError, lookup, nearest, register
@@ -36,7 +40,7 @@ VERSION = 2
 """Version of the extraction: raised whenever the same recordings would give other scenes."""
 PIECE, PIECES = 1 << 14, 64
 """Size [bytes] and number of the pieces of a file that enter its checksum; files up to 1 MB are covered completely."""
-UNITS = ("recording", "group")
+DUPLICATES = ("keep", "once")
 
 
 @register("data", "recordings")
@@ -63,6 +67,8 @@ class RecordedData(SceneDataModule):
         seed: seed of the random splits, and of the order of batches unless a run sets its own.
         batch_size: scenes per batch.
         share: share of the scenes of every split that is used, drawn once.
+        duplicates: ``once`` to use the same vehicles at the same moments once where recordings overlap, within a split and
+            across splits (:mod:`~epo_lightning.data.recorded.duplicates`); ``keep`` to use every recording as it is.
     """
 
     def __init__(
@@ -84,6 +90,7 @@ class RecordedData(SceneDataModule):
         batch_size: int = 32,
         share: float = 1.0,
         options: Mapping[str, Any] | None = None,
+        duplicates: str = "keep",
     ) -> None:
         super().__init__(batch_size, seed, share)
         self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
@@ -93,7 +100,6 @@ class RecordedData(SceneDataModule):
         self.num_agents = self.windows.agents
         if self.windows.lane_change and not map:
             raise ConfigError("data.windows.lane_change asks for lanes, but data.map is false: set it to false as well")
-        self.test = None if test is None else [str(group) for group in test]
         for name, share in (("test_share", test_share), ("val_share", val_share)):
             if not 0 < share < 1:
                 raise ConfigError(f"data.{name} must be a share between 0 and 1, not {share}")
@@ -101,10 +107,13 @@ class RecordedData(SceneDataModule):
             ("frame", frame, FRAMES),
             ("val_by", val_by, UNITS),
             ("shape", shape, ("box", "disc")),
+            ("duplicates", duplicates, DUPLICATES),
         ):
             if value not in known:
                 raise ConfigError(f"unknown data.{name} {value!r}: {nearest(str(value), known)}")
-        self.test_share, self.val_share, self.val_by = test_share, val_share, val_by
+        groups = None if test is None else tuple(str(group) for group in test)
+        self.rule = SplitRule(groups, test_share, val_share, val_by, seed)
+        self.duplicates = duplicates
         if not 0 < scale < np.inf:
             raise ConfigError(
                 f"data.scale must be positive, not {scale}: the length [m] that corresponds to 1 in the inputs of a network"
@@ -141,37 +150,7 @@ class RecordedData(SceneDataModule):
         Raises:
             ConfigError: ``test`` names a group that does not exist, or there are too few recordings for three splits.
         """
-        draw = np.random.default_rng([self.seed, 4])
-        groups = sorted({source.group for source in sources})
-        if self.test is None:
-            chosen = set(draw.permutation(groups)[: max(1, round(self.test_share * len(groups)))].tolist())
-        else:
-            chosen = set(self.test)
-            if not chosen:
-                raise ConfigError(
-                    f"data.test is empty: name one or more of the groups {', '.join(groups)}, or set it to null, which "
-                    "draws data.test_share of them"
-                )
-            for group in sorted(chosen - set(groups)):
-                raise ConfigError(
-                    f"data.test names the group {group!r}, which no recording has: {nearest(group, groups)}"
-                )
-        rest = [source for source in sources if source.group not in chosen]
-        unit = "name" if self.val_by == "recording" else "group"
-        units = sorted({getattr(source, unit) for source in rest})
-        held = set(draw.permutation(units)[: max(1, round(self.val_share * len(units)))].tolist())
-        found = {
-            "train": [source for source in rest if getattr(source, unit) not in held],
-            "val": [source for source in rest if getattr(source, unit) in held],
-            "test": [source for source in sources if source.group in chosen],
-        }
-        empty = [split for split in SPLITS if not found[split]]
-        if empty:
-            raise ConfigError(
-                f"{len(sources)} recording(s) in {len(groups)} group(s) are too few: no recording is left for "
-                f"{', '.join(empty)}; each of the three splits needs recordings of its own"
-            )
-        return found
+        return self.rule.checked(sources)
 
     def identity(self, sources: Sequence[RecordingSource]) -> Any:
         """Plain values that identify the recordings: names, groups, and names, sizes and checksums of all files."""
@@ -214,7 +193,17 @@ class RecordedData(SceneDataModule):
             )
             return config
         sources = self.sources()
-        return self._config_of(sources, self.identity(sources))
+        whole = self._config_of(sources, self.identity(sources))
+        made = self.root / self._name(whole)
+        without = None if made.exists() else self._without_broken(whole["recordings"])
+        if without is None:
+            return whole
+        warnings.warn(
+            f"{len(without['skipped'])} of {len(sources)} recordings in {home} could not be read when the data set was "
+            f"extracted, and are left out: {', '.join(name for name, *_ in without['skipped'])}; mend or remove them",
+            stacklevel=2,
+        )
+        return without
 
     def _settings(self) -> dict[str, Any]:
         """The part of the data set's configuration that does not depend on the recordings."""
@@ -226,11 +215,22 @@ class RecordedData(SceneDataModule):
             "map": self.task.map,
             # Data sets without options keep the names that they had before formats had any.
             **({"options": self.options} if self.options else {}),
+            # A default is no part of the configuration, so that data sets of older versions keep theirs.
+            **({} if self.duplicates == "keep" else {"duplicates": self.duplicates}),
         }
 
-    def _config_of(self, sources: Sequence[RecordingSource], identity: Any) -> dict[str, Any]:
+    def _config_of(self, sources: Sequence[RecordingSource], identity: Any, skipped: Any = ()) -> dict[str, Any]:
+        """The configuration of a data set from ``sources``; ``skipped`` identifies recordings that could not be read."""
         splits = {split: [source.name for source in held] for split, held in self.splits(sources).items()}
-        return {**self._settings(), "recordings": identity, "splits": splits}
+        config = {**self._settings(), "recordings": identity, "splits": splits}
+        return {**config, "skipped": list(skipped)} if skipped else config
+
+    def _without_broken(self, identity: Any) -> dict[str, Any] | None:
+        """The configuration of a data set that was extracted from exactly these files, some of which could not be read."""
+        for _, config in self._extracted():
+            if config.get("skipped") and sorted([*config["recordings"], *config["skipped"]]) == sorted(identity):
+                return config
+        return None
 
     def _extracted(self) -> list[tuple[Path, dict[str, Any]]]:
         """Data sets in the cache that were extracted with these settings, and their configurations."""
@@ -242,7 +242,7 @@ class RecordedData(SceneDataModule):
         """Whether these settings, applied to the recordings that ``config`` names, give exactly ``config``."""
         try:
             sources = [RecordingSource(name, group, (), _absent) for name, group, _ in config["recordings"]]
-            return self._config_of(sources, config["recordings"]) == config
+            return self._config_of(sources, config["recordings"], config.get("skipped", ())) == config
         except (ConfigError, KeyError, TypeError, ValueError):
             return False
 
@@ -251,7 +251,10 @@ class RecordedData(SceneDataModule):
         """Folder of the data set, whether or not it exists."""
         if cache.is_set(self.folder_of_recordings):
             return self.folder_of_recordings
-        return self.root / f"{self.dataset_name}-{cache.digest(self.config)[:12]}"
+        return self.root / self._name(self.config)
+
+    def _name(self, config: Mapping[str, Any]) -> str:
+        return f"{self.dataset_name}-{cache.digest(config)[:12]}"
 
     @property
     def digest(self) -> str:
@@ -266,18 +269,30 @@ class RecordedData(SceneDataModule):
             words.append(f"data.root={self.root}")
         return shlex.join(["epo", "generate", *words])
 
-    def generate(self, workers: int | None = None, progress: bool = True) -> Path:
+    def generate(self, workers: int | None = None, progress: bool = True, strict: bool = False) -> Path:
         """Extract the scenes unless that was done before, and return the folder of the data set.
 
         Args:
             workers: processes; None for one per core. The bytes do not depend on it.
             progress: whether to report progress.
+            strict: whether a recording that cannot be read is an error. Otherwise it is left out and reported, and the data
+                set is not that of the whole folder: its configuration names the recordings that were left out.
 
         Raises:
-            ConfigError: a recording that cannot be read, a split without scenes, or a killed worker.
+            ConfigError: a recording that cannot be read if ``strict``, no recording that can be read, a split without
+                scenes, or a killed worker.
             OSError: the disk is full or read-only.
         """
-        if not cache.make_once(self.folder, lambda: self._make(self.folder, workers, progress)):
+
+        def make() -> None:
+            # Another process may have extracted the readable ones of these recordings in the meantime.
+            self.__dict__.pop("config", None)
+            if strict or not self.folder.exists():
+                self._make(workers, progress, strict)
+
+        if strict and self.config.get("skipped"):
+            make()  # a recording that still cannot be read is an error
+        elif not cache.make_once(self.folder, make):
             cache.verify(self.folder, self.command, self.config)
         return self.folder
 
@@ -285,16 +300,18 @@ class RecordedData(SceneDataModule):
         """The recordings that scenes are extracted from."""
         return self.sources()
 
-    def _make(self, folder: Path, workers: int | None, progress: bool) -> None:
+    def _make(self, workers: int | None, progress: bool, strict: bool) -> None:
         """Extract each recording into a file of its own, then gather the files of each split."""
-        work = folder.with_name(f".{folder.name}-parts")
+        recordings = {source.name: source for source in self.recordings()}
+        identity = self.identity(list(recordings.values()))
+        config = self._config_of(list(recordings.values()), identity)
+        work = self.root / f".{self._name(config)}-parts"
         with cache.writing(work):
             work.mkdir(parents=True, exist_ok=True)
-        recordings = {source.name: source for source in self.recordings()}
-        splits = self.splits(list(recordings.values()))
         files = {name: work / f"{number:04d}.safetensors" for number, name in enumerate(recordings)}
+        once = self.duplicates == "once"
         tasks = [
-            (source, self.windows, self.task.map, files[name])
+            (source, self.windows, self.task.map, files[name], strict, once)
             for name, source in recordings.items()
             if not is_complete(files[name])
         ]
@@ -302,37 +319,81 @@ class RecordedData(SceneDataModule):
         report = Report(tasks, lambda task: task[0].name, "recording", "extracting", "extracted", before, progress)
         for _ in finished(extract_to_file, tasks, workers, report, f"finished recordings are kept in {work}"):
             pass
-        tensors, about = {}, {}
-        for split in SPLITS:
-            tensors[split], about[split] = self._gather(split, [files[source.name] for source in splits[split]])
-        names = {split: [source.name for source in splits[split]] for split in SPLITS}
-        cache.write(folder, tensors, self.config, {**about, "recordings": names})
+        extracted = {name: read_extracted(file) for name, file in files.items()}
+        problems = {name: part.problem for name, part in extracted.items() if part.problem is not None}
+        used = [source for name, source in recordings.items() if name not in problems]
+        if not used:
+            raise RecordingError(
+                self.folder_of_recordings, f"no recording can be read; the first one: {next(iter(problems.values()))}"
+            )
+        if problems:
+            known = dict(zip(recordings, identity, strict=True))
+            config = self._config_of(
+                used, [known[source.name] for source in used], [known[name] for name in sorted(problems)]
+            )
+        self.__dict__["config"] = config
+        self._write(list(recordings.values()), used, extracted, problems)
         shutil.rmtree(work, ignore_errors=True)
 
-    def _gather(self, split: str, files: Sequence[Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _write(
+        self,
+        sources: Sequence[RecordingSource],
+        used: Sequence[RecordingSource],
+        extracted: Mapping[str, Extracted],
+        problems: Mapping[str, str],
+    ) -> None:
+        """Gather the scenes of every split and write the data set."""
+        splits = self.splits(used)
+        names = {split: [source.name for source in held] for split, held in splits.items()}
+        tables = {source.name: extracted[source.name].tables for source in used}
+        counts = {source.name: Counter(extracted[source.name].counts) for source in used}
+        if self.duplicates == "once":
+            drives = {source.name: Drives.of(extracted[source.name].raw) for source in used}
+            kept, less = used_once(names, tables, drives, self.windows)
+            for name, mask in kept.items():
+                found = tables[name]
+                assert found is not None
+                tables[name] = selected(found, mask)
+                counts[name] += less[name]
+                counts[name]["scenes"] = int(mask.sum())
+        self.rule.refuse_empty(self.dataset_name, used, splits, counts)
+        tensors, about = {}, {}
+        for split in splits:
+            tensors[split], about[split] = self._gather(names[split], tables, counts, extracted)
+        rows = summary.rows_of(sources, splits, extracted, counts)
+        report = {**about, "recordings": names, **({"skipped": dict(problems)} if problems else {})}
+        cache.write(self.folder, tensors, self.config, report, {summary.FILE: summary.to_csv(rows)})
+
+    def _gather(
+        self,
+        names: Sequence[str],
+        tables: Mapping[str, SceneTables | None],
+        counts: Mapping[str, Mapping[str, int]],
+        extracted: Mapping[str, Extracted],
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The scenes of a split, and a report about them."""
-        counts: Counter[str] = Counter()
-        tables = []
-        for file in files:
-            columns, counted = read_tables(file)
-            counts.update(counted)
-            # A recording without scenes still has its place in the order of recordings.
-            tables.append(SceneTables(**columns) if columns else None)
-        full = [found for found in tables if found is not None]
-        if not full:
-            gone = ", ".join(f"{reason}: {count}" for reason, count in counts.items() if count) or "no window at all"
-            raise ConfigError(
-                f"the split {split!r} of {self.dataset_name} has no scene ({gone}): relax data.windows, or add "
-                "recordings to the split"
-            )
+        total: Counter[str] = Counter()
+        for name in names:
+            total.update(counts[name])
+        full = [found for found in (tables[name] for name in names) if found is not None]
         whole = joined(full)
-        index = np.array([number for number, found in enumerate(tables) if found is not None])
-        columns = {field.name: getattr(whole, field.name) for field in dataclasses.fields(SceneTables)}
-        origin = np.zeros((len(files), 2))
+        # A recording without scenes still has its place in the order of recordings.
+        index = np.array([number for number, name in enumerate(names) if tables[name] is not None])
+        columns = whole.columns()
+        origin = np.zeros((len(names), 2))
         origin[index] = whole.origin
         columns["recording"], columns["origin"] = index[whole.recording].astype(np.int32), origin
         tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in columns.items()}
-        return tensors, {**dict(counts), **_describe(whole)}
+        about = {**summary.by_unit(total), **summary.describe(whole)}
+        moving = sum(extracted[name].about.get("moving agents", 0) for name in names)
+        if moving:
+            far = sum(extracted[name].about.get("ends far from lanes", 0) for name in names) / moving
+            about["moving agents that end over 10 m from all lanes given"] = far
+        return tensors, about
+
+    def per_recording(self) -> list[str]:
+        """Lines of a table of what became of each recording; empty for data sets of older versions."""
+        return summary.per_recording(self.folder)
 
     def report(self) -> dict[str, Any]:
         """The report that was written with the data set.
@@ -380,21 +441,3 @@ def _fingerprint(file: Path) -> list[Any]:
             content.seek(place)
             checksum = zlib.crc32(content.read(PIECE), checksum)
     return [file.name, size, checksum]
-
-
-def _describe(scenes: SceneTables) -> dict[str, Any]:
-    """Statistics of the scenes of a split, for the report."""
-    speed = scenes.history[:, -1, 3]
-    found: dict[str, Any] = {
-        "agents per scene": float((scenes.agents >= 0).sum(1).mean()),
-        "speed [m/s], 5th and 95th percentile": [float(value) for value in np.percentile(speed, [5, 95])],
-    }
-    ends = scenes.future_mask[:, -1]
-    if scenes.candidates.shape[1] and ends.any():
-        way = scenes.candidates[ends] - scenes.future[ends, -1, None, :2]
-        nearest_goal = np.linalg.norm(way, axis=-1).min(1)
-        found["way to the nearest goal candidate [m], mean and 95th percentile"] = [
-            float(nearest_goal.mean()),
-            float(np.percentile(nearest_goal, 95)),
-        ]
-    return found

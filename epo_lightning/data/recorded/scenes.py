@@ -26,7 +26,7 @@ class RecordedScenes:
     """Scenes of one split of a recorded data set.
 
     Args:
-        tables: the columns of an :class:`~epo_lightning.data.recorded.windows.SceneTables`.
+        tables: the columns of an :class:`~epo_lightning.data.recorded.tables.SceneTables`.
         dt: time step [s].
         frame: ``fixed`` (axes of the recording) or ``aligned`` (x along the agents' mean heading).
         names: names of the recordings.

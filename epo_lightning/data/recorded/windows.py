@@ -2,23 +2,25 @@
 
 A window is a moment of a recording (t0) with a focal agent and its neighbours. Windows that pass all filters become scenes.
 Scenes share agents: a vehicle at one moment may be the centre of one scene and a neighbour in others. Its data are stored
-once, in a table of agents; a scene is a row of indices into that table. :class:`SceneTables` holds both, in coordinates
-relative to an origin of the recording.
+once, in a table of agents; a scene is a row of indices into that table.
+:class:`~epo_lightning.data.recorded.tables.SceneTables` holds both, in coordinates relative to an origin of the recording.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.clock import Stretches, stretches
+from epo_lightning.data.recorded.clock import TOO_SHORT, Stretches, stretches
 from epo_lightning.data.recorded.lanes import Located, lane_changes
 from epo_lightning.data.recorded.routes import Routes, pieces
+from epo_lightning.data.recorded.surroundings import nearest_pieces
+from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.tracks import Recording
 from epo_lightning.registry import ConfigError
 
@@ -30,6 +32,10 @@ AGREE = 0.2
 """Smallest length of the mean of the agents' unit directions; below it, they have no common direction."""
 MOST_AGENTS, LONGEST_SMOOTHING = 32, 10.0
 """Largest number of agents of a scene, and largest length [s] of the smoothing window."""
+MOMENTS, AT_ENDS = "agents at steps of the clock", "near the beginning or end of a track"
+"""Names of counts: possible windows, one per agent and step, and those whose agent is not observed in the whole window."""
+REASONS = ("too few agents around", "the same agents twice", "no lane change", "an agent on no lane")
+"""Reasons for which windows are left out, in the order of the filters."""
 CHUNK = 4_000_000
 """Largest number of distances between agents that are computed at once, to bound the memory."""
 
@@ -96,73 +102,13 @@ class WindowConfig:
             )
 
 
-@dataclass(frozen=True)
-class SceneTables:
-    """The scenes of one or more recordings, as columns.
-
-    Attributes, by agent (A rows):
-        history, history_mask, future, future_mask: states x, y [m], heading [rad], speed [m/s].
-        size: length and width [m].
-        kind: an index into :data:`~epo_lightning.scene.KINDS`.
-        track: identifier of the agent in the recording.
-        candidates, references, reference_speed: goal candidates and reference lines; empty without a map.
-    Attributes, by lane polyline (T rows):
-        polylines: points of the map's polylines.
-    Attributes, by scene (S rows):
-        agents: rows of the scene's agents, -1 for none.
-        lanes: rows of its polylines, -1 for none.
-        centre: mean position of its agents, the origin of its frame [m].
-        direction: mean heading of its agents [rad].
-        recording: index of its recording.
-        frame: the recording's frame number at t0.
-    Attributes, by recording:
-        origin: offset that was subtracted from all coordinates of the recording [m].
-    """
-
-    history: Float[np.ndarray, "A H 4"]
-    history_mask: Bool[np.ndarray, "A H"]
-    future: Float[np.ndarray, "A K 4"]
-    future_mask: Bool[np.ndarray, "A K"]
-    size: Float[np.ndarray, "A 2"]
-    kind: Int[np.ndarray, " A"]
-    track: Int[np.ndarray, " A"]
-    candidates: Float[np.ndarray, "A G 2"]
-    references: Float[np.ndarray, "A R Q 2"]
-    reference_speed: Float[np.ndarray, " A"]
-    polylines: Float[np.ndarray, "T V+1 2"]
-    agents: Int[np.ndarray, "S N"]
-    lanes: Int[np.ndarray, "S L"]
-    centre: Float[np.ndarray, "S 2"]
-    direction: Float[np.ndarray, " S"]
-    recording: Int[np.ndarray, " S"]
-    frame: Int[np.ndarray, " S"]
-    origin: Float[np.ndarray, "O 2"]
-
-    def __len__(self) -> int:
-        return len(self.agents)
-
-
-INDEX_OF = {"agents": "history", "lanes": "polylines", "recording": "origin"}
-"""Fields that hold row indices, and the fields that these index."""
-
-
-def joined(parts: list[SceneTables]) -> SceneTables:
-    """The concatenation of several tables, with all row indices adjusted."""
-    columns: dict[str, np.ndarray] = {}
-    for field in fields(SceneTables):
-        values = [getattr(part, field.name) for part in parts]
-        if field.name in INDEX_OF:
-            before = np.cumsum([0, *(len(getattr(part, INDEX_OF[field.name])) for part in parts)])
-            values = [np.where(value < 0, -1, value + offset) for value, offset in zip(values, before, strict=False)]
-        columns[field.name] = np.concatenate(values)
-    return SceneTables(**columns)
-
-
 def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | None, dict[str, int]]:
     """The scenes of a recording.
 
     Returns:
-        the scenes, None if there are none; and the number of windows, with the numbers that were left out by reason.
+        the scenes, None if there are none; and the number of windows, with the numbers that were left out by reason. A
+        window is an agent at a step of the clock: ``MOMENTS`` of them are possible, ``windows`` are observed completely, and
+        ``scenes`` are left after the ``REASONS``. Other entries count items that a reader left out, and gaps in tracks.
 
     Raises:
         ConfigError: the settings need lanes, which the recording lacks, or the clock is faster than the recording.
@@ -173,10 +119,14 @@ def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | N
         )
     counts: Counter[str] = Counter(recording.dropped)
     shortest = config.history + config.horizon if config.complete else 2
-    clock, left_out = stretches(recording.tracks, config.dt, config.smoothing, shortest)
+    clock, left_out = stretches(recording.tracks, config.dt, config.smoothing, shortest, config.every)
     counts.update(left_out)
+    last = clock.first + clock.count - 1
+    observed = int((last // config.every - (clock.first - 1) // config.every).sum())
+    counts[MOMENTS] = observed + counts[TOO_SHORT]
     located, changes = _on_lanes(clock, recording)
     moments, members = _choose(clock, changes, config, counts)
+    counts[AT_ENDS] = observed - counts["windows"]
     if recording.lanes is not None:
         off = ((located.lane[_rows(clock, moments, members)] < 0) & (members >= 0)).any(1)
         counts["an agent on no lane"] = int(off.sum())
@@ -338,23 +288,10 @@ def _assemble(
         reference_speed=speed.astype(np.float32),
         polylines=polylines - origin,
         agents=place.astype(np.int32),
-        lanes=_nearest(polylines, centre, config.lanes),
+        lanes=nearest_pieces(polylines, centre, config.lanes),
         centre=centre - origin,
         direction=direction,
         recording=np.zeros(len(moments), dtype=np.int32),
         frame=np.round(moments * config.dt * recording.tracks.rate).astype(np.int64),
         origin=origin[None],
     )
-
-
-def _nearest(polylines: np.ndarray, centre: np.ndarray, most: int) -> Int[np.ndarray, "S L"]:
-    """Indices of the polylines whose middles are nearest to each centre, nearest first; padded with -1."""
-    found = np.full((len(centre), most), -1, dtype=np.int32)
-    if len(polylines):
-        middle = polylines[:, polylines.shape[1] // 2]
-        kept = min(most, len(middle))
-        for chunk in range(0, len(centre), 4096):
-            rows = slice(chunk, chunk + 4096)
-            distance = ((centre[rows, None] - middle) ** 2).sum(-1)
-            found[rows, :kept] = np.argsort(distance, axis=1, kind="stable")[:, :kept]
-    return found

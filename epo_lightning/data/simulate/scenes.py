@@ -98,8 +98,11 @@ class SimulatedHighway(RecordedData):
         """Configuration of the simulation: the same configuration makes the same recordings."""
         return self.simulation
 
-    def generate(self, workers: int | None = None, progress: bool = True) -> Path:
-        """Simulate the recordings and extract the scenes, unless that was done before, and return the data set's folder."""
+    def generate(self, workers: int | None = None, progress: bool = True, strict: bool = True) -> Path:
+        """Simulate the recordings and extract the scenes, unless that was done before, and return the data set's folder.
+
+        A simulated recording that cannot be read is always an error, whatever ``strict`` is.
+        """
         if not self.folder.exists():
             simulate.make_recordings(self.folder_of_recordings, self.simulation, workers, progress)
-        return super().generate(workers, progress)
+        return super().generate(workers, progress, strict=True)

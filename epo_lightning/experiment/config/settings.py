@@ -216,6 +216,7 @@ class GenerateSettings:
     data: Mapping[str, Any]
     workers: int | None = None
     progress: bool = True
+    strict: bool = False
 
     def __post_init__(self) -> None:
         if self.workers is not None and not 1 <= self.workers <= MOST_PROCESSES:

@@ -122,7 +122,7 @@ def test_extraction_continues_after_an_error(folder, tmp_path):
     (folder / "stop").touch()
     READ.clear()
     with pytest.raises(ConfigError, match="the disk is full"):
-        again.generate(workers=1, progress=False)
+        again.generate(workers=1, progress=False, strict=True)
     before = len(READ)
     (folder / "stop").unlink()
     two = again.generate(workers=1, progress=False)
@@ -279,4 +279,4 @@ def test_a_broken_file_is_named_by_the_worker_that_reads_it(tmp_path):
         tmp_path / "crowds", format="ucy", map=False, windows={"dt": 0.4, "lane_change": False}, test=["place-0"]
     )
     with pytest.raises(RecordingError, match=r"place-3/obsmat\.txt, row 1: y is 'zero'; a finite number"):
-        module.generate(workers=2, progress=False)
+        module.generate(workers=2, progress=False, strict=True)

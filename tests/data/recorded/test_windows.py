@@ -13,16 +13,18 @@ from hypothesis import strategies as st
 from metrics.slow_interaction import interact
 
 from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.clock import TOO_SHORT
 from epo_lightning.data.recorded.lanes import lane_changes
 from epo_lightning.data.recorded.scenes import RecordedScenes
-from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, extract, joined
+from epo_lightning.data.recorded.tables import SceneTables, joined
+from epo_lightning.data.recorded.windows import AT_ENDS, MOMENTS, WindowConfig, extract
 from epo_lightning.registry import ConfigError
 
 from .roads import FOUR, WIDTH, curve, recording
 
 
 def tables(scenes: SceneTables) -> dict[str, torch.Tensor]:
-    return {f.name: torch.from_numpy(np.ascontiguousarray(getattr(scenes, f.name))) for f in dataclasses.fields(scenes)}
+    return {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in scenes.columns().items()}
 
 
 def scenes_of(of, config=WindowConfig(), frame="fixed"):  # noqa: B008 - frozen
@@ -109,6 +111,12 @@ def test_windows_equal_those_of_a_plain_loop(seed, config):
         if reason in counts
     )
     assert counts["windows"] == counts["scenes"] + dropped
+    # Every agent at every step of the clock is a window, or is counted under one reason.
+    step = round(config.dt * of.tracks.rate)
+    assert counts[MOMENTS] == sum(
+        1 for frame in of.tracks.frame if frame % step == 0 and frame // step % config.every == 0
+    )
+    assert counts[MOMENTS] == counts["windows"] + counts.get(TOO_SHORT, 0) + counts[AT_ENDS]
 
 
 @pytest.mark.parametrize("rate", [25.0, 10.0])

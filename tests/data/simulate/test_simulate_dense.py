@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from epo_lightning.data.recorded.scenes import RecordedScenes
-from epo_lightning.data.recorded.windows import SceneTables, WindowConfig, extract
+from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.data.simulate import recording, traffic
 from epo_lightning.data.simulate.generate import map_path
 from epo_lightning.data.simulate.lanelets import write_map
@@ -92,10 +92,7 @@ def test_a_fifth_of_dense_traffic_is_interactive(tmp_path: Path, monkeypatch: py
         (source,) = lookup("format", "exid")(tmp_path / name / "set")
         found, _ = extract(source.read(), WindowConfig())
         assert found is not None
-        columns = {
-            f.name: torch.from_numpy(np.ascontiguousarray(getattr(found, f.name)))
-            for f in dataclasses.fields(SceneTables)
-        }
+        columns = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in found.columns().items()}
         scenes = RecordedScenes(columns, 0.2, "aligned", [source.name], "box")
         subset = scenes[torch.arange(len(scenes))].subset
         assert subset is not None

@@ -1,0 +1,55 @@
+"""Lane polylines around scenes: the pieces that a network gets, and how much of the road they leave out."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from epo_lightning.data.recorded.tables import SceneTables
+
+FAR = 10.0
+"""Distance [m] from the nearest given lane point beyond which an agent's end counts as far from all lanes."""
+MOVING = 1.0
+"""Displacement [m] within the horizon above which an agent counts as moving."""
+CHUNK = 4096
+"""Number of scenes whose distances are computed at once, to bound the memory."""
+
+
+def nearest_pieces(
+    polylines: Float[np.ndarray, "T V+1 2"], centre: Float[np.ndarray, "S 2"], most: int
+) -> Int[np.ndarray, "S L"]:
+    """Indices of the polylines whose middles are nearest to each centre, nearest first; padded with -1."""
+    found = np.full((len(centre), most), -1, dtype=np.int32)
+    if len(polylines):
+        middle = polylines[:, polylines.shape[1] // 2]
+        kept = min(most, len(middle))
+        for chunk in range(0, len(centre), CHUNK):
+            rows = slice(chunk, chunk + CHUNK)
+            distance = ((centre[rows, None] - middle) ** 2).sum(-1)
+            found[rows, :kept] = np.argsort(distance, axis=1, kind="stable")[:, :kept]
+    return found
+
+
+def far_from_lanes(scenes: SceneTables) -> tuple[int, int]:
+    """Numbers of moving agents that end farther than ``FAR`` from every lane point of their scene, and of all moving agents.
+
+    An agent counts once per scene. Without a map, and for agents whose end is not observed, there is nothing to count.
+    """
+    if not len(scenes.polylines):
+        return 0, 0
+    end = scenes.future[:, -1, :2]
+    moving = scenes.future_mask[:, -1] & (np.linalg.norm(end - scenes.history[:, -1, :2], axis=1) > MOVING)
+    far = total = 0
+    chunk = max(1, CHUNK // 8)
+    for start in range(0, len(scenes), chunk):
+        members, lanes = scenes.agents[start : start + chunk], scenes.lanes[start : start + chunk]
+        lanes = lanes[:, (lanes >= 0).any(0)]
+        counted = (members >= 0) & moving[members]
+        points = np.where((lanes >= 0)[..., None, None], scenes.polylines[lanes], np.inf).reshape(len(lanes), -1, 2)
+        nearest = np.full(members.shape, np.inf)
+        for agent in range(members.shape[1]):  # one agent at a time bounds the memory
+            way = points - end[members[:, agent], None]
+            nearest[:, agent] = (way**2).sum(-1).min(1, initial=np.inf)
+        far += int((counted & (nearest > FAR**2)).sum())
+        total += int(counted.sum())
+    return far, total
