@@ -34,6 +34,9 @@ LATEST = 10**9
 """Largest frame number."""
 SLOWEST = 0.3
 """Speed [m/s] up to which a pedestrian keeps its heading, because the direction of a filtered velocity is noise."""
+PEDESTRIAN = (0.3, 0.3)
+"""Length and width of a pedestrian in a crowd [m]. With 0.5 m, recorded bodies overlap in 84% of DUT's scenes, because
+people walk side by side; with 0.3 m, in 16%."""
 FASTEST = 40.0
 """Speed [m/s] that no agent on a campus reaches."""
 
@@ -99,6 +102,8 @@ def _read_recording(name: str, group: str, tables: dict[str, Path], rate: float)
     position, velocity, heading = position[order], velocity[order], heading[order]
     walking = np.isnan(heading)
     heading[walking] = direction_of_motion(agent[walking], velocity[walking], SLOWEST)
+    size = typical_sizes(kind)
+    size[kind == KINDS.index("pedestrian")] = PEDESTRIAN
     path = tables.get("ped", tables.get("veh", Path(name)))
     tracks = TrackTable(
         rate=rate,
@@ -108,7 +113,7 @@ def _read_recording(name: str, group: str, tables: dict[str, Path], rate: float)
         heading=unwrapped(heading, agent),
         velocity=velocity,
         ids=ids,
-        size=typical_sizes(kind),
+        size=size,
         kind=kind,
     ).check(path)
     check_motion(

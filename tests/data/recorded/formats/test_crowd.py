@@ -70,7 +70,7 @@ def test_both_tables_of_a_clip_become_one_recording(tmp_path):
     assert tracks.rate == RATE
     assert tracks.ids.tolist() == [0, 1, 2, 3, VEHICLES, VEHICLES + 1]
     assert [KINDS[kind] for kind in tracks.kind] == ["pedestrian"] * 4 + ["car"] * 2
-    assert tracks.size.tolist() == [[0.5, 0.5]] * 4 + [[4.5, 1.8]] * 2
+    assert tracks.size.tolist() == [[0.3, 0.3]] * 4 + [[4.5, 1.8]] * 2
     check(recording, tmp_path, "square_01")
 
 
