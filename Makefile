@@ -31,35 +31,46 @@ install: $(INSTALLED)
 KERNEL_FOLDER := epo_lightning/solvers/gauss_newton/kernel
 KERNEL := $(wildcard $(KERNEL_FOLDER)/*.?pp)
 SOURCES := pyproject.toml constraints.txt $(KERNEL)
+# A comma would end an argument of `call`.
+WITH_DOCS := local,docs
+WITH_TESTS := local,dev,docs
 
+# The requirements of some extras; an extra may name others, as epo_lightning[sim,local].
 define LIST_REQUIREMENTS
-import tomllib
+import re, sys, tomllib
 project = tomllib.load(open("pyproject.toml", "rb"))["project"]
-print(*project["dependencies"], *project["optional-dependencies"]["local"], sep="\n")
+def requirements(extra):
+    for line in project["optional-dependencies"][extra]:
+        others = re.fullmatch(r"epo_lightning\[(.*)\]", line)
+        yield from (r for other in others[1].split(",") for r in requirements(other)) if others else [line]
+print(*project["dependencies"], *(r for extra in sys.argv[1].split(",") for r in requirements(extra)), sep="\n")
 endef
 export LIST_REQUIREMENTS
 
-# The layer is compiled on one core while packages are downloaded and unpacked on another.
+# $(1): the extras. The layer is compiled on one core while packages are downloaded and unpacked on another.
 # Without a compiler its build fails, and the last line says so.
 # --no-compile: Python compiles the modules that are used, when they are used, instead of twelve thousand at once.
+define INSTALL
+@echo "installing into $(VENV) (a minute or two and the download) ..."
+$(PYTHON) -m venv $(VENV)
+$(if $(TORCH_INDEX),$(BIN)/pip install -q --no-compile --index-url $(TORCH_INDEX) -c constraints.txt torch)
+@$(BIN)/python -c "$$LIST_REQUIREMENTS" $(1) > $(VENV)/requirements.txt
+$(BIN)/python $(KERNEL_FOLDER)/build.py > /dev/null 2>&1 & \
+$(BIN)/pip install -q --no-compile -c constraints.txt -r $(VENV)/requirements.txt && wait
+$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[$(1)]'
+endef
+
 $(INSTALLED): $(SOURCES)
-	@echo "installing into $(VENV) (a minute or two and the download) ..."
-	$(PYTHON) -m venv $(VENV)
-	$(if $(TORCH_INDEX),$(BIN)/pip install -q --no-compile --index-url $(TORCH_INDEX) -c constraints.txt torch)
-	@$(BIN)/python -c "$$LIST_REQUIREMENTS" > $(VENV)/requirements.txt
-	$(BIN)/python $(KERNEL_FOLDER)/build.py > /dev/null 2>&1 & \
-	$(BIN)/pip install -q --no-compile -c constraints.txt -r $(VENV)/requirements.txt && wait
-	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[local]'
+	$(call INSTALL,local)
 	touch $@
 
-$(TESTABLE): $(INSTALLED)
-	@echo "installing into $(VENV) what tests need as well (a few minutes and the download) ..."
-	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[dev,docs]'
-	touch $(DOCUMENTABLE) $@
+$(DOCUMENTABLE): $(SOURCES)
+	$(call INSTALL,$(WITH_DOCS))
+	touch $(INSTALLED) $@
 
-$(DOCUMENTABLE): $(INSTALLED)
-	$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[docs]'
-	touch $@
+$(TESTABLE): $(SOURCES)
+	$(call INSTALL,$(WITH_TESTS))
+	touch $(INSTALLED) $(DOCUMENTABLE) $@
 
 # One thread per run and one run per core: small batches gain nothing from a second thread.
 run: $(INSTALLED)

@@ -54,6 +54,7 @@ def check(folder: Path, runs: str, *words: str) -> None:
     assert sorted(path.name for path in (folder / runs).iterdir()) == ["rpi", "sweeps"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="the extra `local` is not installed"
 )

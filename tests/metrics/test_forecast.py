@@ -192,7 +192,8 @@ def evaluate_on_one_of_two(rank: int, folder: str) -> None:
 
 
 def test_two_processes_agree_with_one(tmp_path: Path) -> None:
-    torch.multiprocessing.spawn(evaluate_on_one_of_two, (str(tmp_path),), nprocs=2)
+    # Forked processes need not import PyTorch again.
+    torch.multiprocessing.start_processes(evaluate_on_one_of_two, (str(tmp_path),), nprocs=2, start_method="fork")
     case, subset = big_case()
     whole = filled(case, subset, [slice(0, 23)])
     for rank in range(2):
