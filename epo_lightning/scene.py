@@ -287,6 +287,8 @@ class GameParameters(_Batch):
         goal_headings: heading [rad] wanted at the goal, continuous with the agent's heading (not wrapped); None for scenes
             without goal headings.
         margins: additional distance [m] that a pair keeps, >= 0, by name of the pair feature.
+        reference_controls: controls that an agent would choose by itself, for energies in which a deviation from them has a
+            cost; held constant in derivatives.
     """
 
     own_weights: Mapping[str, Float[Tensor, "B M N"]]
@@ -298,6 +300,7 @@ class GameParameters(_Batch):
     order: Float[Tensor, "B M P"] | None = None
     goal_headings: Float[Tensor, "B M N"] | None = None
     margins: Mapping[str, Float[Tensor, "B M P"]] = dataclasses.field(default_factory=dict)
+    reference_controls: Float[Tensor, "B M N K 2"] | None = None
 
     def for_modes(self, modes: int) -> GameParameters:
         """The same games for M modes: a single game is repeated for all of them. Initial strategies stay unchanged."""
@@ -314,6 +317,7 @@ class GameParameters(_Batch):
             order=widen(self.order),
             goal_headings=widen(self.goal_headings),
             margins={name: margin.expand(-1, modes, -1) for name, margin in self.margins.items()},
+            reference_controls=widen(self.reference_controls),
         )
 
 

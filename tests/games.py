@@ -131,6 +131,7 @@ def random_game(
         reference=None if scene.references is None else torch.randint(2, (scenes, modes, agents)),
         goal_headings=torch.randn(scenes, modes, agents, dtype=dtype),
         margins={n: torch.rand(scenes, modes, pairs, dtype=dtype) for n in pair if PAIR_FEATURES[n].margin},
+        reference_controls=spread * torch.randn(scenes, modes, agents, horizon, 2, dtype=dtype),
     )
 
 
@@ -163,6 +164,7 @@ def widen(parameters: GameParameters, agents: int = 2, filling: float = float("n
         goals=None if parameters.goals is None else grow(parameters.goals),
         reference=None if parameters.reference is None else grow(parameters.reference),
         goal_headings=None if parameters.goal_headings is None else grow(parameters.goal_headings),
+        reference_controls=None if parameters.reference_controls is None else grow(parameters.reference_controls),
         margins={name: grow_pairs(margin) for name, margin in parameters.margins.items()},
     )
 

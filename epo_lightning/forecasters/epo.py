@@ -129,7 +129,7 @@ class EPO(Forecaster):
         check_modes(modes, one_game, energy, solver)
         check_initial(initial, modes, one_game, energy, solver)
         check_choice("own_weights", own_weights, OWN_WEIGHTS)
-        check_calibration(calibration, solver)
+        check_calibration(calibration, energy, solver)
         # The network decodes probabilities where neither energies of choices nor orders define them.
         defined = TABLES in solver.provides or energy.pair_order is not None
         check_probabilities(probabilities)
@@ -235,16 +235,19 @@ class EPO(Forecaster):
         # Agents without a goal have the position (0, 0) for it: zero goal weights keep it from attracting them.
         for name in self.energy.goal_terms & own_weights.keys():
             own_weights[name] = own_weights[name].where(goals.exist[:, None], 0.0)
+        strategies = self.strategies(z, scene)
         return GameParameters(
             own_weights=own_weights,
             pair_weights=self.pair_weights(z),
-            initial_controls=self.strategies(z, scene),
+            initial_controls=strategies,
             goals=goals.positions,
             reference=goals.reference,
             context=z if "context" in self.energy.needs else None,
             order=None if orders is None else orders.order,
             goal_headings=goals.headings,
             margins={} if self.margins is None else self.margins(z),
+            # The loss of the initial strategies teaches them; derivatives of the solution hold them constant.
+            reference_controls=strategies.detach() if "reference_controls" in self.energy.needs else None,
         )
 
     @property

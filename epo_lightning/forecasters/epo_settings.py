@@ -26,7 +26,7 @@ def check_needs(energy: Energy, task: Task) -> None:
     Raises:
         ConfigError: the message names the missing fields.
     """
-    known = {"size", "context", "order"} | ({"goals", "goal_headings"} if task.candidates else set())
+    known = {"size", "context", "order", "reference_controls"} | ({"goals", "goal_headings"} if task.candidates else set())
     lacking = energy.needs - known - ({"reference", "reference_speed"} if task.candidates > 1 else set())
     if lacking:
         raise ConfigError(
@@ -102,12 +102,17 @@ def check_initial(initial: str, modes: int, one_game: bool, energy: Energy, solv
         )
 
 
-def check_calibration(calibration: Mapping[str, float] | None, solver: Minimiser) -> None:
-    """Refuse a calibration with a solver that does not lead to a minimum.
+def check_calibration(calibration: Mapping[str, float] | None, energy: Energy, solver: Minimiser) -> None:
+    """Refuse a calibration with a solver that does not lead to a minimum, or of a game with decoded reference controls.
 
     Raises:
         ConfigError: see above.
     """
+    if calibration is not None and "reference_controls" in energy.needs:
+        raise ConfigError(
+            "forecaster.calibration poses the game at the first observed state, for which no reference controls are decoded: "
+            "leave accref and turnrref out of energy.own, or set calibration to null"
+        )
     if calibration is not None and STATIONARY not in solver.provides:
         raise ConfigError(
             "forecaster.calibration needs a solver that leads to a minimum, such as both_sides, game or converging; set "

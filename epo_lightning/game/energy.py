@@ -72,7 +72,8 @@ class Energy(ABC):
 
     @property
     def needs(self) -> set[str]:
-        """Inputs of the terms: some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``size``,
+        """Inputs of the terms: some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``,
+        ``reference_controls``, ``size``,
         ``context``, ``order``."""
         return set()
 

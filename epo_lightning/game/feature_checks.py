@@ -44,13 +44,19 @@ def check_inputs(energy: FeatureEnergy, scene: Scene, parameters: GameParameters
         "goal_headings": (("parameters.goal_headings", parameters.goal_headings),),
         "reference": (("scene.references", scene.references), ("parameters.reference", parameters.reference)),
         "reference_speed": (("scene.reference_speed", scene.reference_speed),),
+        "reference_controls": (("parameters.reference_controls", parameters.reference_controls),),
         "size": (("scene.size", scene.size),),
     }
     for name, feature in energy.own_features.items():
         for what, value in needed[feature.needs] if feature.needs else ():
             if value is None:
                 raise ValueError(f"the energy has the feature {name!r}, but {what} is None")
-            per_agent = {"goals": [agents, 2], "goal_headings": [agents], "reference": [agents]}
+            per_agent = {
+                "goals": [agents, 2],
+                "goal_headings": [agents],
+                "reference": [agents],
+                "reference_controls": [agents, steps, 2],
+            }
             takes = per_agent.get(what.removeprefix("parameters."))
             if takes and list(value.shape) not in ([batch, modes, *takes], [batch, 1, *takes]):
                 raise ValueError(f"{what} has shape {list(value.shape)}; these controls take {[batch, modes, *takes]}")

@@ -124,6 +124,7 @@ class Surroundings:
         wheelbase: distances between the axles [m].
         goal_headings: headings that are wanted at the goals [rad].
         ends: number of steps of every game; None for all steps of the controls.
+        reference_controls: the controls of the strategies that agents would choose by themselves.
     """
 
     initial: Float[Tensor, "B 1 N 4"]
@@ -134,6 +135,15 @@ class Surroundings:
     wheelbase: Float[Tensor, "B 1 N"] | None = None
     goal_headings: Float[Tensor, "B M N"] | None = None
     ends: Int[Tensor, " B"] | None = None
+    reference_controls: Float[Tensor, "B M N K 2"] | None = None
+
+    def reference(self, feature: OwnFeature) -> Float[Tensor, "B _ N _"]:
+        """The desired signal of a feature with the source CONTROL or SPEED, over time."""
+        if feature.source is Source.SPEED:
+            assert self.reference_speed is not None
+            return self.reference_speed[..., None]
+        assert self.reference_controls is not None
+        return self.reference_controls[..., feature.channel]
 
 
 def linear_signal(
@@ -205,8 +215,7 @@ def signal_and_change(
         case Source.CONTROL | Source.RATE | Source.SPEED:
             signal = linear_signal(feature, controls, states[..., SPEED], around.dt)
             if feature.needs:
-                assert around.reference_speed is not None
-                signal = signal - around.reference_speed[..., None]
+                signal = signal - around.reference(feature)
             return signal, linear_signal(feature, directions, moved[..., SPEED], around.dt)
         case Source.STEERING:
             assert around.wheelbase is not None

@@ -108,7 +108,8 @@ class FeatureEnergy(Energy):
 
     @cached_property
     def needs(self) -> set[str]:
-        """Inputs of the own features: some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``size``."""
+        """Inputs of the own features: some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``,
+        ``reference_controls``, ``size``."""
         return {feature.needs for feature in self.own_features.values() if feature.needs}
 
     @property
@@ -348,7 +349,7 @@ class FeatureEnergy(Energy):
     def surroundings(self, scene: Scene, parameters: GameParameters) -> Surroundings:
         """The inputs of own features besides the trajectory."""
         present, needs = scene.agent_mask, self.needs
-        goals = line = reference_speed = wheelbase = headings = None
+        goals = line = reference_speed = wheelbase = headings = reference_controls = None
         if "goals" in needs:
             assert parameters.goals is not None
             goals = torch.where(present[:, None, :, None], parameters.goals, 0.0)
@@ -364,8 +365,19 @@ class FeatureEnergy(Energy):
             reference_speed = torch.where(present, scene.reference_speed, 0.0)[:, None]
         if "size" in needs:
             wheelbase = WHEELBASE * self.size(scene)[:, None, :, 0]
+        if "reference_controls" in needs:
+            assert parameters.reference_controls is not None
+            reference_controls = torch.where(present[:, None, :, None, None], parameters.reference_controls, 0.0)
         return Surroundings(
-            self.current_states(scene), scene.dt, goals, line, reference_speed, wheelbase, headings, scene.game_steps
+            self.current_states(scene),
+            scene.dt,
+            goals,
+            line,
+            reference_speed,
+            wheelbase,
+            headings,
+            scene.game_steps,
+            reference_controls,
         )
 
     def _followed(self, scene: Scene, parameters: GameParameters) -> tuple[tuple[Tensor, ...], Bool[Tensor, "B M N"]]:

@@ -80,7 +80,8 @@ class OwnFeature:
         signal: name of the signal, the key of its bounds in ``energy.bounds``.
         channel: index of the control, for signals of controls.
         bounded: whether the feature is zero within the bounds.
-        needs: further input of the signal: ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``size``; None
+        needs: further input of the signal: ``goals``, ``goal_headings``, ``reference``, ``reference_speed``,
+            ``reference_controls``, ``size``; None
             for no other input.
         function: elementwise function of the signal, or of states and controls for the source TRAJECTORY.
     """
@@ -162,11 +163,14 @@ OWN_FEATURES: dict[str, OwnFeature] = {
         }
     ),
     "heading": OwnFeature(Source.FINAL_HEADING, "heading", needs="goal_headings"),
+    "accref": OwnFeature(Source.CONTROL, "accref", ACCELERATION, needs="reference_controls"),
+    "turnrref": OwnFeature(Source.CONTROL, "turnrref", TURN_RATE, needs="reference_controls"),
 }
 """Own features by name: goal, the offset of the last position from the goal [m]; lane, the offset from the followed
 reference line [m]; vel, the speed, and velref, the speed minus the reference speed [m/s]; acc [m/s^2]; turnr [rad/s]; jerk
 [m/s^3]; turnacc [rad/s^2]; steer, the steering angle [rad]; heading, the last heading minus the one that is wanted at the
-goal [rad], not wrapped to (-pi, pi]; ``...b``, the amount by which the signal leaves its bounds."""
+goal [rad], not wrapped to (-pi, pi]; accref and turnrref, acc and turnr minus those of the strategy that the agent would
+choose by itself (``GameParameters.reference_controls``); ``...b``, the amount by which the signal leaves its bounds."""
 
 
 def _of_vehicles(function: Callable[..., Tensor], extent: Callable[[Tensor], Tensor] | None = None) -> PairFeature:

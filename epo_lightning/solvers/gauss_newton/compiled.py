@@ -234,6 +234,10 @@ class _Call:
             game.goals_b, game.goals_m, game.goals_n, game.goals_x = self.goals[0].stride()
         if self.headings:
             game.goal_headings, game.goal_heading_strides[:] = self.headings[0].data_ptr(), self.headings[0].stride()
+        if "reference_controls" in energy.needs:
+            assert parameters.reference_controls is not None
+            held = _as(like, parameters.reference_controls).expand(-1, modes, -1, -1, -1).contiguous()
+            game.reference_controls = hold(held).data_ptr()
         if scene.game_steps is not None:
             game.ends = hold(_as(torch.int64, scene.game_steps).contiguous()).data_ptr()
         if "lane" in energy.own:

@@ -188,7 +188,7 @@ def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]
     at, square = sums.at, weight.square()
     signal = linear_signal(feature, at.u, at.speed, at.dt, channels=-2)
     if feature.needs:
-        signal = signal - at.by_problem(at.around.reference_speed)
+        signal = signal - at.around.reference(feature).expand(-1, at.modes, -1, -1).flatten(0, 1)
     active = at.within_game
     if active is not None:
         # Entry l of a rate is that from control l to control l + 1, which must be part of the game.

@@ -7,7 +7,7 @@
 #include <cstdint>
 
 /// Weighted own features, in the order in which weights and their gradients are passed.
-enum Own { GOAL, LANE, VELREF, VEL, ACC, TURNR, JERK, TURNACC, STEER, VELB, ACCB, TURNRB, JERKB, TURNACCB, HEADING, OWN_COUNT };
+enum Own { GOAL, LANE, VELREF, VEL, ACC, TURNR, JERK, TURNACC, STEER, VELB, ACCB, TURNRB, JERKB, TURNACCB, HEADING, ACCREF, TURNRREF, OWN_COUNT };
 
 /// Weighted pair features, in the same order as in Python.
 enum Pair { PROXIMITY, CLEARANCE, CIRCLES, HEADWAY, LONGITUDINAL, LATERAL, TIME_TO_CONFLICT, PAIR_COUNT };
@@ -61,6 +61,7 @@ struct EpoGame {
     const void* reference_speed;  // [B, N]
     const void* goal_headings;  // [B, M, N]
     int64_t goal_heading_strides[3];
+    const void* reference_controls;  // [B, M, N, K, 2], contiguous
     const int64_t* ends;       // [B] numbers of steps of the games, or null if all games have K steps
 };
 

@@ -159,6 +159,7 @@ struct Games {
     Vec<T>*goal_x, *goal_y, *goal_heading, *reference_speed, *wheelbase;  // [n]
     Nearest<T> nearest;                   // from `find_nearest`, or kept by an earlier call
     Vec<T>*turn, *thrust;                 // controls [n, K]
+    Vec<T>*reference_turn, *reference_thrust;  // [n, K], only for features of reference controls
     std::vector<Path<T>> path;
 
     Vec<T> own(int feature, int i) const { return weight[i * OWN_COUNT + feature]; }
@@ -345,11 +346,17 @@ struct Games {
 
     INLINE Vec<T> rate(const Vec<T>* control, int k) const { return (control[k] - control[k - 1]) * (T(1) / dt); }
 
+    /// The control of step k minus the reference control.
+    INLINE Vec<T> deviation(int channel, int i, int k) const {
+        return channel ? turn[i * K + k] - reference_turn[i * K + k] : thrust[i * K + k] - reference_thrust[i * K + k];
+    }
+
     INLINE Model<T> control_model(int channel, int i, int k) const {
         Model<T> model;
         const Vec<T> value = channel ? turn[i * K + k] : thrust[i * K + k];
-        const int plain = channel ? TURNR : ACC, bounded = channel ? TURNRB : ACCB;
+        const int plain = channel ? TURNR : ACC, bounded = channel ? TURNRB : ACCB, reference = channel ? TURNRREF : ACCREF;
         if (has(plain)) model.add(own(plain, i), value);
+        if (has(reference)) model.add(own(reference, i), deviation(channel, i, k));
         if (has(bounded)) model.add_bounded(own(bounded, i), value, game.bounds[channel ? BOUND_TURNR : BOUND_ACC]);
         return model;
     }
@@ -388,6 +395,11 @@ struct Games {
                 const T* from = static_cast<const T*>(game.own[f]) + scene[lane] * strides[0] + mode[lane] * strides[1];
                 for (int i = 0; i < n; ++i) weight[i * OWN_COUNT + f][lane] = from[agent[i * W + lane] * strides[2]];
             }
+        }
+        if (game.reference_controls) {
+            reference_turn = arena.take(n * K);
+            reference_thrust = arena.take(n * K);
+            load(static_cast<const T*>(game.reference_controls), reference_turn, reference_thrust);
         }
         goal_x = arena.take(n);
         goal_y = arena.take(n);

@@ -31,6 +31,8 @@ OWN = (
     "jerkb",
     "turnaccb",
     "heading",
+    "accref",
+    "turnrref",
 )
 """Own features in the kernel's order."""
 PAIR = ("proximity", "clearance", "circles", "headway", "longitudinal", "lateral", "time_to_conflict")
@@ -64,6 +66,7 @@ class EpoGame(ctypes.Structure):
         *((name, Integer) for name in ("goals_b", "goals_m", "goals_n", "goals_x")),
         *((name, Address) for name in ("references", "reference", "reference_speed", "goal_headings")),
         ("goal_heading_strides", Integer * 3),
+        ("reference_controls", Address),
         ("ends", Address),
     )
 

@@ -478,9 +478,10 @@ void differentiate(
                 const Vec<T>* control = (channel ? g.turn : g.thrust) + i * K;
                 const Vec<T>*along_mu = channel ? t1.turn : t1.thrust, *along_d = channel ? t2.turn : t2.thrust;
                 Vec<T>* bar = (channel ? bar_turn : bar_thrust) + i * K;
-                const int plain = channel ? TURNR : ACC, bounded = channel ? TURNRB : ACCB;
+                const int plain = channel ? TURNR : ACC, bounded = channel ? TURNRB : ACCB, reference = channel ? TURNRREF : ACCREF;
                 Adjoint<T> own{along_mu[k], along_d[k]};
                 if (g.has(plain)) own.add(g.own(plain, i), control[k], weigh(plain));
+                if (g.has(reference)) own.add(g.own(reference, i), g.deviation(channel, i, k), weigh(reference));
                 if (g.has(bounded))
                     own.add_bounded(g.own(bounded, i), control[k], g.game.bounds[channel ? BOUND_TURNR : BOUND_ACC], weigh(bounded));
                 bar[k] += own.cotangent;
