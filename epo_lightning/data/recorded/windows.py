@@ -23,11 +23,14 @@ from epo_lightning.data.recorded.surroundings import nearest_pieces
 from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.tracks import Recording
 from epo_lightning.registry import ConfigError
+from epo_lightning.scene import KINDS
 
 VECTORS, SPACING = 10, 6.0
 """Vectors V of a lane polyline and their largest length [m]."""
+BESIDE_LANES = [KINDS.index(kind) for kind in ("pedestrian", "bicycle")]
+"""Kinds of agents that often move beside the lanes of vehicles."""
 MOST_BESIDE = 0.5
-"""Largest share of positions on no lane; above it, the map does not belong to the tracks."""
+"""Largest share of positions of vehicles on no lane; above it, the map does not belong to the tracks."""
 AGREE = 0.2
 """Smallest length of the mean of the agents' unit directions; below it, they have no common direction."""
 MOST_AGENTS, LONGEST_SMOOTHING = 32, 10.0
@@ -147,12 +150,13 @@ def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.n
     if recording.lanes is None:
         return Located(np.full(rows, -1), np.zeros(rows), np.zeros(rows)), np.zeros(rows, dtype=int)
     located = recording.lanes.locate(clock.now[:, :2], clock.now[:, 2])
-    beside = float((located.lane < 0).mean()) if rows else 0.0
+    vehicle = ~np.isin(recording.tracks.kind[clock.agent], BESIDE_LANES)[clock.owner]
+    beside = float((located.lane[vehicle] < 0).mean()) if vehicle.any() else 0.0
     if beside > MOST_BESIDE:
         raise RecordingError(
             recording.name,
-            f"{beside:.0%} of all positions lie on no lane of its map: is it the map of another place, or in other "
-            "coordinates? Give it the right one, or set data.map=false",
+            f"{beside:.0%} of all positions of vehicles lie on no lane of its map: is it the map of another place, or in "
+            "other coordinates? Give it the right one, or set data.map=false",
         )
     smooth = located if clock.ending is None else recording.lanes.locate(clock.state[:, :2], clock.state[:, 2])
     return located, lane_changes(clock.owner, smooth, recording.lanes).cumsum()

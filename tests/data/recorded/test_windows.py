@@ -323,7 +323,7 @@ def test_inputs_do_not_depend_on_the_future(smoothing, seed):
 
 def test_a_map_of_another_place_is_refused():
     of = recording()
-    with pytest.raises(RecordingError, match="road: 100% of all positions lie on no lane"):
+    with pytest.raises(RecordingError, match="road: 100% of all positions of vehicles lie on no lane"):
         extract(dataclasses.replace(of, lanes=recording(curve(None, 0.0, (0.0, 500.0))).lanes), WindowConfig())
 
 

@@ -9,7 +9,7 @@ import pytest
 from data.recorded.formats.exid_files import SETTING, drive, meta_of, road, write
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats import exid_tables as reader
-from epo_lightning.data.recorded.formats.exid import exid
+from epo_lightning.data.recorded.formats.levelx import exid
 from epo_lightning.registry import lookup
 from epo_lightning.scene import KINDS
 

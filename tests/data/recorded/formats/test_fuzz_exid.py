@@ -13,9 +13,9 @@ import pytest
 from data.recorded.formats.exid_files import ORIGIN, SETTING, drive, road, write
 from data.recorded.formats.fuzz import CSV, HARMLESS, VALUES, flip, splice, truncate
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.formats.exid import exid
 from epo_lightning.data.recorded.formats.exid_tables import USED
 from epo_lightning.data.recorded.formats.lanelet2 import read_map
+from epo_lightning.data.recorded.formats.levelx import exid
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error")]
 
