@@ -26,7 +26,9 @@ def check_needs(energy: Energy, task: Task) -> None:
     Raises:
         ConfigError: the message names the missing fields.
     """
-    known = {"size", "context", "order", "reference_controls"} | ({"goals", "goal_headings"} if task.candidates else set())
+    known = {"size", "context", "order", "reference_controls"} | (
+        {"goals", "goal_headings"} if task.candidates else set()
+    )
     lacking = energy.needs - known - ({"reference", "reference_speed"} if task.candidates > 1 else set())
     if lacking:
         raise ConfigError(
@@ -110,8 +112,8 @@ def check_calibration(calibration: Mapping[str, float] | None, energy: Energy, s
     """
     if calibration is not None and "reference_controls" in energy.needs:
         raise ConfigError(
-            "forecaster.calibration poses the game at the first observed state, for which no reference controls are decoded: "
-            "leave accref and turnrref out of energy.own, or set calibration to null"
+            "forecaster.calibration poses the game at the first observed state, for which no reference controls are "
+            "decoded: leave accref and turnrref out of energy.own, or set calibration to null"
         )
     if calibration is not None and STATIONARY not in solver.provides:
         raise ConfigError(

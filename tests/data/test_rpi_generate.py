@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import re
 import shutil
 import sys
@@ -51,7 +50,9 @@ def test_the_bytes_do_not_depend_on_the_workers(data, tmp_path):
 def test_generation_goes_on_after_a_kill(data, tmp_path):
     other = RPIData(root=str(tmp_path), **SMALL)
     # A forked process need not import and compile everything again.
-    process = multiprocessing.get_context("fork").Process(target=other.generate, kwargs={"workers": 1, "progress": False})
+    process = multiprocessing.get_context("fork").Process(
+        target=other.generate, kwargs={"workers": 1, "progress": False}
+    )
     process.start()
     deadline = time.time() + 60
     while not list(tmp_path.glob("rpi-pool-*/game-*.safetensors")):
