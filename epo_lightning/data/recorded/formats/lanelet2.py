@@ -94,24 +94,30 @@ class _Lanelet:
 
 
 def read_map(
-    path: Path | str, origin: tuple[float, float], zone: int | None = None, dropped: Counter[str] | None = None
+    path: Path | str,
+    origin: tuple[float, float],
+    zone: int | None = None,
+    dropped: Counter[str] | None = None,
+    north: bool | None = None,
 ) -> LaneGraph:
     """The lanes for vehicles of a Lanelet2 map. A lanelet for both directions becomes one lane in the direction of its ways.
 
     Args:
         path: path of the .osm file.
-        origin: UTM coordinates of the local frame's origin [m].
+        origin: UTM coordinates of the local frame's origin [m]. Not used for a map whose nodes have x and y in metres
+            instead of latitude and longitude: these are taken as they are.
         zone: UTM zone, 1 .. 60; None takes that of the middle of the map.
         dropped: the numbers of items that are left out are added to it, by reason.
+        north: whether northings count from the equator; None for maps that lie north of it.
 
     Raises:
         RecordingError: there is no such file, it is not a Lanelet2 map, numbers are missing or invalid, an id is used
             twice, or there is no lane.
     """
     root = xml.parse(path)
-    if root.tag != "osm":
+    if root.tag not in ("osm", "osm_xy"):
         raise RecordingError(path, f"the root element is <{root.tag}>; a Lanelet2 map has <osm>")
-    ways = _ways(root, _positions(root, origin, zone, path), path)
+    ways = _ways(root, _positions(root, origin, zone, north, path), path)
     left_out: Counter[str] = Counter()
     lanelets = []
     for id, relation in _elements(root, "relation", path).items():
@@ -158,12 +164,14 @@ def _projection(zone: int, north: bool) -> Transformer:
 
 
 def _positions(
-    root: Element, origin: tuple[float, float], zone: int | None, path: Path | str
+    root: Element, origin: tuple[float, float], zone: int | None, north: bool | None, path: Path | str
 ) -> dict[int, Float[np.ndarray, " 2"]]:
     """Positions of all nodes in the local frame [m]."""
     nodes = _elements(root, "node", path)
     if not nodes:
         raise RecordingError(path, "there is no node in it: is it a Lanelet2 map?")
+    if all("x" in node.attrib and "y" in node.attrib and "lat" not in node.attrib for node in nodes.values()):
+        return _metres(nodes, path)
     degrees = np.array(
         [
             [xml.number(node.get(name), f"{name} of node {id}", path) for name in ("lat", "lon")]
@@ -173,8 +181,8 @@ def _positions(
     outside = (np.abs(degrees) > (84.0, 180.0)).any(1)
     latitude, longitude = np.median(degrees[~outside], axis=0) if not outside.all() else (0.0, 0.0)
     zone = int((longitude + 180) // 6) % 60 + 1 if zone is None else zone
-    east, north = _projection(zone, bool(latitude >= 0)).transform(*degrees.T)
-    positions = np.stack((east, north), 1) - np.asarray(origin)
+    utm = _projection(zone, bool(latitude >= 0) if north is None else north)
+    positions = np.stack(utm.transform(*degrees.T), 1) - np.asarray(origin)
     meridian = 6 * zone - 183
     outside |= np.abs((degrees[:, 1] - meridian + 180) % 360 - 180) > WIDEST
     outside |= ~(np.abs(positions) <= FARTHEST).all(1)
@@ -186,6 +194,20 @@ def _positions(
             f"UTM zone {zone}: is it a stray node?",
         )
     return dict(zip(nodes, positions, strict=True))
+
+
+def _metres(nodes: dict[int, Element], path: Path | str) -> dict[int, Float[np.ndarray, " 2"]]:
+    """Positions [m] of nodes that have x and y in the local frame, as the files ``*.osm_xy`` of INTERACTION."""
+    positions = {
+        id: np.array([xml.number(node.get(name), f"{name} of node {id}", path) for name in ("x", "y")])
+        for id, node in nodes.items()
+    }
+    for id, position in positions.items():
+        if not (np.abs(position) <= FARTHEST).all():
+            raise RecordingError(
+                path, f"node {id} at {position.tolist()} was expected in metres, at most {FARTHEST:g} m away"
+            )
+    return positions
 
 
 def _ways(root: Element, positions: dict[int, Float[np.ndarray, " 2"]], path: Path | str) -> dict[int, _Way]:

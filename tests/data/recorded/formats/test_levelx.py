@@ -189,7 +189,7 @@ def test_positions_in_pixels_are_refused(tmp_path):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("trials", [100, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("trials", [60, pytest.param(2000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("format", ["highd", "ind"])
 def test_damaged_tables_give_only_recording_errors(tmp_path, trials, format):
     folder = tmp_path / format
