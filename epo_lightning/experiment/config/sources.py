@@ -11,8 +11,8 @@ from hydra.plugins.config_source import ConfigLoadError, ConfigResult
 from omegaconf import OmegaConf
 
 GROUP = "sweeps"
-HIGHWAYS = ("exid", "us101", "highway_sim")
-"""Data sets of highways, each of which has all rows of ``experiment/highway/`` under its own name."""
+HIGHWAYS = ("exid", "us101", "highway_sim", "highd", "ind", "round", "unid", "interaction")
+"""Data sets with lanes, each of which has all rows of ``experiment/highway/`` under its own name."""
 EXPERIMENTS = "experiment"
 
 _PARSED: dict[tuple[str, str, str, int], bytes] = {}
