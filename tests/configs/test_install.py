@@ -13,7 +13,7 @@ import epo_lightning
 
 PACKAGE = Path(epo_lightning.__file__).parent
 PROJECT = PACKAGE.parent / "pyproject.toml"
-MODULES = {"hydra-core": "hydra", "pillow": "PIL"}
+MODULES = {"hydra-core": "hydra", "pillow": "PIL", "protobuf": "google"}
 """Packages that are imported under another name."""
 OF_DEPENDENCIES = {"yaml", "hatchling"}
 """PyYAML comes with OmegaConf."""

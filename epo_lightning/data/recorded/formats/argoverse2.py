@@ -21,7 +21,8 @@ import numpy as np
 import polars as pl
 import shapely
 
-from epo_lightning.data.recorded.formats.onboard import TYPICAL, References, refuse, tracks_of
+from epo_lightning.data.recorded.formats.onboard import References, refuse, tracks_of
+from epo_lightning.data.recorded.kinds import kinds_of, typical_sizes
 from epo_lightning.data.recorded.lanes import FARTHEST, LANE, SHOULDER, LaneGraph, Polyline
 from epo_lightning.data.recorded.tracks import Recording, RecordingError, RecordingSource, TrackTable
 from epo_lightning.registry import register
@@ -137,16 +138,14 @@ def _tracks(path: Path, dropped: Counter[str]) -> TrackTable:
             f"track {ids[agent[at]]} is of the types {kinds[first][agent][at]!r} and {kinds[at]!r}: an id must belong to "
             "one object",
         )
-    if unknown := sum(kind not in KIND_OF for kind in kinds[first]):
-        dropped["agents of a type that is unknown, taken as 'other'"] += unknown
-    kind = [KIND_OF.get(name, "other") for name in kinds[first]]
+    kind = kinds_of(kinds[first], dropped, KIND_OF)
     return tracks_of(
         path,
         rows["timestep"].to_numpy(),
         agent,
         rows.select(NUMBERS).to_numpy(),
         ids,
-        np.array([TYPICAL[name] for name in kind]).reshape(-1, 2),
+        typical_sizes(kind),
         kind,
         dropped,
     )
@@ -162,7 +161,9 @@ def _table(path: Path) -> pl.DataFrame:
         with path.open("rb") as file:
             rows = pl.read_parquet(file, columns=list(COLUMNS))
     except pl.exceptions.ColumnNotFoundError as error:
-        raise RecordingError(path, f"the columns {', '.join(COLUMNS)} were expected, but {error}") from None
+        raise RecordingError(
+            path, f"the columns {', '.join(COLUMNS)} were expected, but {str(error).partition(';')[0]}"
+        ) from None
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise RecordingError(path, f"it cannot be read as parquet ({reason}): fetch the file again") from None

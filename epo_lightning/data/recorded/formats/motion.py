@@ -53,6 +53,7 @@ def check_motion(
     fast: float = 5.0,
     fastest: float = FASTEST,
     unit: str = "degrees",
+    most: float = 1.25,
 ) -> None:
     """Check that positions, velocities and headings of a recording agree.
 
@@ -65,6 +66,7 @@ def check_motion(
         fast: speed [m/s] above which headings are compared with directions of motion.
         fastest: speed [m/s] that no agent reaches.
         unit: unit of headings in the file, for error messages.
+        most: largest factor between displacements and velocities, in the median.
 
     Raises:
         RecordingError: an agent jumps, displacements and velocities differ by a factor, or headings do not point along the
@@ -84,7 +86,7 @@ def check_motion(
     stated = 0.5 * (speed[within] + speed[within + 1])
     faster = np.maximum(travelled, stated) > moving
     ratio = float(np.median(travelled[faster] / np.maximum(stated[faster], 1e-3))) if faster.any() else 1.0
-    if not 0.8 < ratio < 1.25:
+    if not 1 / most < ratio < most:
         raise RecordingError(
             path,
             f"positions move {ratio:.3g} times as fast as {velocity} say: they were expected in m and m/s, at {rate}",

@@ -14,22 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.formats.motion import check_motion
 from epo_lightning.data.recorded.tracks import FASTEST, Recording, TrackTable
-from epo_lightning.scene import KINDS
 
-TYPICAL = {
-    "car": (4.7, 1.9),
-    "bus": (11.0, 2.9),
-    "motorcycle": (2.2, 0.9),
-    "bicycle": (1.8, 0.7),
-    "pedestrian": (0.5, 0.5),
-    "other": (1.8, 0.9),
-}
-"""Length and width [m] by kind, for agents whose size is not given."""
 RATE = 10.0
 """Frames per second of both data sets [Hz]."""
-MOVING, FAST = 2.0, 5.0
-"""Speeds [m/s] above which positions are compared with velocities, and headings with directions of motion."""
+APART = 2.0
+"""Largest factor between displacements and velocities, in the median: single tracks of parked or distant cars are noisy."""
 NO_TRAFFIC = "recordings without traffic"
 
 
@@ -49,7 +40,7 @@ def tracks_of(
     states: Float[np.ndarray, "T 5"],
     ids: Int[np.ndarray, " A"],
     size: Float[np.ndarray, "A 2"],
-    kind: Sequence[str],
+    kind: Int[np.ndarray, " A"],
     dropped: Counter[str],
 ) -> TrackTable:
     """The tracks of a recording, sorted and checked. Tracks that jump are left out and counted.
@@ -58,7 +49,7 @@ def tracks_of(
         path: path of the file, for error messages.
         frame, agent: frame and index of the agent of each row.
         states: x, y [m], heading [rad], velocities along x and y [m/s] of each row.
-        ids, size, kind: identifier, length and width [m], and name of the kind of each agent.
+        ids, size, kind: identifier, length and width [m], and index of the kind of each agent.
         dropped: counts of items that are left out.
 
     Raises:
@@ -87,13 +78,13 @@ def tracks_of(
         velocity=states[rows, 3:],
         ids=ids[kept],
         size=size[kept],
-        kind=np.array([KINDS.index(name) for name in kind], dtype=int)[kept],
+        kind=kind[kept],
     )
     if not len(table):
         dropped[NO_TRAFFIC] += 1
         return table
     table.check(path)
-    _check_motion(table, path)
+    check_motion(table, path, "the velocities", f"{RATE:g} Hz", unit="radians", most=APART)
     return table
 
 
@@ -107,37 +98,6 @@ def _jumping(
     found = np.zeros(count, dtype=bool)
     found[agent[within[jumps]]] = True
     return found
-
-
-def _check_motion(table: TrackTable, path: Path) -> None:
-    """Check that positions, velocities and headings are consistent in unit and direction.
-
-    Raises:
-        RecordingError: most of the tracks contradict themselves.
-    """
-    within = np.flatnonzero(np.diff(table.agent) == 0)
-    elapsed = np.diff(table.frame)[within] / table.rate
-    travelled = np.linalg.norm(table.position[within + 1] - table.position[within], axis=1) / elapsed
-    speed = np.linalg.norm(table.velocity, axis=1)
-    stated = 0.5 * (speed[within] + speed[within + 1])
-    moving = np.maximum(travelled, stated) > MOVING
-    ratio = float(np.median(travelled[moving] / np.maximum(stated[moving], 1e-3))) if moving.any() else 1.0
-    if not 0.5 < ratio < 2.0:
-        raise RecordingError(
-            path,
-            f"positions move {ratio:.3g} times as fast as the velocities say: they were expected in m and m/s, at "
-            f"{table.rate:g} Hz",
-        )
-    fast = speed > FAST
-    if fast.any():
-        course = np.arctan2(table.velocity[fast, 1], table.velocity[fast, 0])
-        aside = float(np.median(np.abs((table.heading[fast] - course + np.pi) % (2 * np.pi) - np.pi)))
-        if aside > np.pi / 4:
-            raise RecordingError(
-                path,
-                f"headings differ by {np.rad2deg(aside):.0f} degrees from the directions of motion: radians "
-                "counter-clockwise from x were expected",
-            )
 
 
 class References:

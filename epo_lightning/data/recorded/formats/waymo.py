@@ -20,7 +20,7 @@ import shapely
 from google.protobuf.message import DecodeError
 from jaxtyping import Float
 
-from epo_lightning.data.recorded.formats.onboard import RATE, TYPICAL, References, refuse, tracks_of
+from epo_lightning.data.recorded.formats.onboard import RATE, References, refuse, tracks_of
 from epo_lightning.data.recorded.formats.tfrecord import Place, content_of, places
 from epo_lightning.data.recorded.formats.waymo_messages import (
     BIKE_LANE,
@@ -31,6 +31,7 @@ from epo_lightning.data.recorded.formats.waymo_messages import (
     VEHICLE,
     scenario_class,
 )
+from epo_lightning.data.recorded.kinds import TYPICAL_SIZE, kinds_of
 from epo_lightning.data.recorded.lanes import FARTHEST, LANE, SHOULDER, LaneGraph, Polyline
 from epo_lightning.data.recorded.tracks import FASTEST, LONGEST, Recording, RecordingError, RecordingSource, TrackTable
 from epo_lightning.registry import register
@@ -163,14 +164,12 @@ def _tracks(message: Any, path: Path, dropped: Counter[str]) -> TrackTable:
         if not seen:
             dropped["tracks without a valid state"] += 1
             continue
-        if track.object_type not in KIND_OF:
-            dropped["agents of a type that is unknown, taken as 'other'"] += 1
         table = np.array(seen)
         # Sizes change from frame to frame. The first one is known whenever the agent is.
-        size, kind = table[0, 6:], KIND_OF.get(track.object_type, "other")
+        size, kind = table[0, 6:], KIND_OF.get(track.object_type, "unknown")
         if not ((size > 0) & (size <= LONGEST)).all():
             dropped["agents whose size cannot be right, taken as one typical for their type"] += 1
-            size = np.array(TYPICAL[kind])
+            size = np.array(TYPICAL_SIZE.get(kind, TYPICAL_SIZE["other"]))
         frames.append(table[:, 0].astype(int))
         agents.append(np.full(len(table), len(ids)))
         rows.append(table[:, 1:6])
@@ -187,7 +186,7 @@ def _tracks(message: Any, path: Path, dropped: Counter[str]) -> TrackTable:
         np.concatenate([np.empty((0, 5)), *rows]),
         np.array(ids, dtype=int),
         np.array(sizes).reshape(-1, 2),
-        kinds,
+        kinds_of(kinds, dropped),
         dropped,
     )
 

@@ -245,10 +245,10 @@ def test_what_is_left_out_is_counted(tmp_path):
     recording = one(tmp_path, scenario(tracks=tracks, features=features))
     assert recording.tracks.ids.tolist() == [1, 2]
     assert KINDS[recording.tracks.kind[0]] == "other"
-    assert recording.tracks.size[1].tolist() == [4.7, 1.9]
+    assert recording.tracks.size[1].tolist() == [4.5, 1.8]
     assert np.isnan(recording.lanes.speed_limit).all()
     assert recording.dropped == {
-        "agents of a type that is unknown, taken as 'other'": 1,
+        "agents of a class that is unknown, taken as 'other'": 1,
         "agents whose size cannot be right, taken as one typical for their type": 1,
         "tracks that jump, faster than 120 m/s": 1,
         "speed limits that cannot be right": 1,
