@@ -154,7 +154,11 @@ class RecordedData(SceneDataModule):
 
     def identity(self, sources: Sequence[RecordingSource]) -> Any:
         """Plain values that identify the recordings: names, groups, and names, sizes and checksums of all files."""
-        return [[source.name, source.group, [_fingerprint(file) for file in source.files]] for source in sources]
+        # Files may be common to recordings: maps, and shards with hundreds of scenarios.
+        known = {
+            file: _fingerprint(file) for file in dict.fromkeys(file for source in sources for file in source.files)
+        }
+        return [[source.name, source.group, [known[file] for file in source.files]] for source in sources]
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -207,11 +211,14 @@ class RecordedData(SceneDataModule):
 
     def _settings(self) -> dict[str, Any]:
         """The part of the data set's configuration that does not depend on the recordings."""
+        windows = dataclasses.asdict(self.windows)
+        if windows["off_lane"] == "window":
+            del windows["off_lane"]  # a later field, whose default is no part of the configuration
         return {
             "version": VERSION,
             "dataset": self.dataset_name,
             "format": self.format,
-            "windows": dataclasses.asdict(self.windows),
+            "windows": windows,
             "map": self.task.map,
             # Data sets without options keep the names that they had before formats had any.
             **({"options": self.options} if self.options else {}),

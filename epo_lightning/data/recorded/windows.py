@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.clock import TOO_SHORT, Stretches, stretches
@@ -29,8 +30,10 @@ VECTORS, SPACING = 10, 6.0
 """Vectors V of a lane polyline and their largest length [m]."""
 BESIDE_LANES = [KINDS.index(kind) for kind in ("pedestrian", "bicycle")]
 """Kinds of agents that often move beside the lanes of vehicles."""
+STANDING = 2.0
+"""Speed [m/s] up to which a vehicle may be parked."""
 MOST_BESIDE = 0.5
-"""Largest share of positions of vehicles on no lane; above it, the map does not belong to the tracks."""
+"""Largest share of positions of moving vehicles on no lane; above it, the map does not belong to the tracks."""
 AGREE = 0.2
 """Smallest length of the mean of the agents' unit directions; below it, they have no common direction."""
 MOST_AGENTS, LONGEST_SMOOTHING = 32, 10.0
@@ -60,6 +63,8 @@ class WindowConfig:
         smoothing: length [s] of the smoothing filter; null for tracks that are smooth already.
         lanes: largest number of lane polylines L of a scene, the nearest ones.
         speed_limit: reference speed [m/s] on lanes without a speed limit.
+        off_lane: what is left out if an agent is on no lane of the map: the ``window``, or the ``agent``, as if it were not
+            there, such as parked cars. With ``agent``, pedestrians always count as on no lane.
     """
 
     dt: float = 0.2
@@ -74,6 +79,7 @@ class WindowConfig:
     smoothing: float | None = None
     lanes: int = 32
     speed_limit: float = 36.1
+    off_lane: Literal["window", "agent"] = "window"
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -128,11 +134,14 @@ def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | N
     observed = int((last // config.every - (clock.first - 1) // config.every).sum())
     counts[MOMENTS] = observed + counts[TOO_SHORT]
     located, changes = _on_lanes(clock, recording)
-    moments, members = _choose(clock, changes, config, counts)
+    usable = np.ones(len(clock.state), dtype=bool)
+    if recording.lanes is not None and config.off_lane == "agent":
+        usable = (located.lane >= 0) & ~_walking(clock, recording)
+    moments, members = _choose(clock, changes, usable, config, counts)
     counts[AT_ENDS] = observed - counts["windows"]
     if recording.lanes is not None:
         off = ((located.lane[_rows(clock, moments, members)] < 0) & (members >= 0)).any(1)
-        counts["an agent on no lane"] = int(off.sum())
+        counts["an agent on no lane"] += int(off.sum())
         moments, members = moments[~off], members[~off]
     counts["scenes"] = len(moments)
     if not len(moments):
@@ -150,16 +159,23 @@ def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.n
     if recording.lanes is None:
         return Located(np.full(rows, -1), np.zeros(rows), np.zeros(rows)), np.zeros(rows, dtype=int)
     located = recording.lanes.locate(clock.now[:, :2], clock.now[:, 2])
-    vehicle = ~np.isin(recording.tracks.kind[clock.agent], BESIDE_LANES)[clock.owner]
-    beside = float((located.lane[vehicle] < 0).mean()) if vehicle.any() else 0.0
+    # Parked cars and agents beside the lanes say nothing about the map.
+    driving = ~np.isin(recording.tracks.kind[clock.agent], BESIDE_LANES)[clock.owner]
+    driving &= np.abs(clock.now[:, 3]) > STANDING
+    beside = float((located.lane[driving] < 0).mean()) if driving.any() else 0.0
     if beside > MOST_BESIDE:
         raise RecordingError(
             recording.name,
-            f"{beside:.0%} of all positions of vehicles lie on no lane of its map: is it the map of another place, or in "
-            "other coordinates? Give it the right one, or set data.map=false",
+            f"{beside:.0%} of the positions of moving vehicles lie on no lane of its map: is it the map of another place, "
+            "or in other coordinates? Give it the right one, or set data.map=false",
         )
     smooth = located if clock.ending is None else recording.lanes.locate(clock.state[:, :2], clock.state[:, 2])
     return located, lane_changes(clock.owner, smooth, recording.lanes).cumsum()
+
+
+def _walking(clock: Stretches, recording: Recording) -> Bool[np.ndarray, " Z"]:
+    """Mask of the states of pedestrians."""
+    return (recording.tracks.kind == KINDS.index("pedestrian"))[clock.agent][clock.owner]
 
 
 def _rows(clock: Stretches, moments: Int[np.ndarray, " S"], members: Int[np.ndarray, "S N"]) -> Int[np.ndarray, "S N"]:
@@ -168,11 +184,15 @@ def _rows(clock: Stretches, moments: Int[np.ndarray, " S"], members: Int[np.ndar
 
 
 def _choose(
-    clock: Stretches, changes: Int[np.ndarray, " Z"], config: WindowConfig, counts: Counter[str]
+    clock: Stretches,
+    changes: Int[np.ndarray, " Z"],
+    usable: Bool[np.ndarray, " Z"],
+    config: WindowConfig,
+    counts: Counter[str],
 ) -> tuple[Int[np.ndarray, " S"], Int[np.ndarray, "S N"]]:
     """Moments and members (stretches) of the selected windows; the focal agent is first, the others follow by distance."""
     found_moments, found_members = [np.empty(0, dtype=int)], [np.empty((0, config.agents), dtype=int)]
-    for moment, stretch, focal in _crowds(clock, config):
+    for moment, stretch, focal in _crowds(clock, usable, config, counts):
         position = clock.now[_rows(clock, moment, stretch), :2]
         distance = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
         distance[np.broadcast_to((stretch < 0)[:, None], distance.shape)] = np.inf
@@ -205,7 +225,9 @@ def _choose(
     return moments, members
 
 
-def _crowds(clock: Stretches, config: WindowConfig) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _crowds(
+    clock: Stretches, usable: Bool[np.ndarray, " Z"], config: WindowConfig, counts: Counter[str]
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Moments, the stretches present at each (padded with -1), and the mask of those that may be focal, in chunks."""
     before, after = (config.history - 1, config.horizon) if config.complete else (1, 0)
     count = np.maximum(clock.count - before - after, 0)
@@ -214,6 +236,11 @@ def _crowds(clock: Stretches, config: WindowConfig) -> Iterator[tuple[np.ndarray
     moment = clock.first[stretch] + within
     focal = (within >= config.history - 1) & (within + config.horizon < clock.count[stretch])
     kept = moment % config.every == 0
+    on = usable[clock.start[stretch] + moment - clock.first[stretch]]
+    if left_out := int((kept & focal & ~on).sum()):
+        counts["windows"] += left_out
+        counts["an agent on no lane"] += left_out
+    kept &= on
     stretch, moment, focal = stretch[kept], moment[kept], focal[kept]
     order = np.argsort(moment, kind="stable")
     stretch, moment, focal = stretch[order], moment[order], focal[order]

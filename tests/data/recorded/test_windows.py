@@ -19,6 +19,7 @@ from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.tables import SceneTables, joined
 from epo_lightning.data.recorded.windows import AT_ENDS, MOMENTS, WindowConfig, extract
 from epo_lightning.registry import ConfigError
+from epo_lightning.scene import KINDS
 
 from .roads import FOUR, WIDTH, curve, recording
 
@@ -294,6 +295,28 @@ def test_a_vehicle_on_no_lane_is_counted_and_left_out():
     assert fewer["scenes"] == 0
 
 
+@pytest.mark.parametrize(("lane", "kind"), [(3, "car"), (1, "pedestrian")])
+def test_an_agent_on_no_lane_may_be_left_out_alone(lane, kind):
+    config = WindowConfig(off_lane="agent")
+    without, with_it = recording(), recording(vehicles=[*FOUR, (11, 90.0, lane, 24.0, None)])
+    with_it.tracks.kind[-1] = KINDS.index(kind)
+    expected, found = (scenes_of(of, config) for of in (without, with_it))
+    assert len(expected[1]) == len(found[1]) > 0
+    names = [[(e["frame"], e["tracks"]) for e in data.provenance(range(len(data)))] for _, data in (expected, found)]
+    assert names[0] == names[1]
+    # The recording's origin is the mean of all positions, which moves what is rounded.
+    for name in ("history", "future", "goal_candidates", "lanes"):
+        torch.testing.assert_close(getattr(expected[0], name), getattr(found[0], name), rtol=0, atol=1e-3)
+    before, after = (extract(of, config)[1] for of in (without, with_it))
+    assert after["windows"] - before["windows"] == after["an agent on no lane"] - before["an agent on no lane"] > 0
+
+
+def test_parked_cars_do_not_make_a_map_that_of_another_place():
+    parked = [(20 + k, 10.0 * k, 4, 0.0, None) for k in range(9)]
+    scenes, _ = extract(recording(vehicles=[*FOUR, *parked]), WindowConfig(off_lane="agent"))
+    assert scenes is not None
+
+
 @pytest.mark.parametrize("smoothing", [None, 1.0])
 @given(st.integers(0, 10_000))
 @settings(max_examples=10)
@@ -323,7 +346,7 @@ def test_inputs_do_not_depend_on_the_future(smoothing, seed):
 
 def test_a_map_of_another_place_is_refused():
     of = recording()
-    with pytest.raises(RecordingError, match="road: 100% of all positions of vehicles lie on no lane"):
+    with pytest.raises(RecordingError, match="road: 100% of the positions of moving vehicles lie on no lane"):
         extract(dataclasses.replace(of, lanes=recording(curve(None, 0.0, (0.0, 500.0))).lanes), WindowConfig())
 
 

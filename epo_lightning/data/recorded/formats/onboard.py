@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats.motion import check_motion
+from epo_lightning.data.recorded.lanes import FARTHEST
 from epo_lightning.data.recorded.tracks import FASTEST, Recording, TrackTable
 
 RATE = 10.0
@@ -57,13 +58,13 @@ def tracks_of(
     """
     order = np.lexsort((frame, agent))
     frame, agent, states = frame[order], agent[order], states[order]
-    bad = ~np.isfinite(states).all(1)
+    bad = ~(np.isfinite(states).all(1) & (np.abs(states[:, :2]) <= FARTHEST).all(1))
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         raise RecordingError(
             path,
             f"track {ids[agent[row]]} has the numbers {states[row].tolist()} in frame {frame[row]}: position, heading and "
-            "velocity were expected to be finite; fetch the file again",
+            f"velocity were expected to be finite, and positions at most {FARTHEST:g} m: is the file damaged?",
         )
     kept = ~_jumping(frame, agent, states[:, :2], len(ids))
     if not kept.all():
