@@ -73,6 +73,8 @@ def slow_energy(scene, parameters, controls, b, m, stride=1):
         signals["lane"] = [min(distance_to_segment(p, *ends) for ends in pairwise(line)) for p in path]
         signals["jerk"] = [(b[0] - a[0]) / dt for a, b in pairwise(u)]
         signals["turnacc"] = [(b[1] - a[1]) / dt for a, b in pairwise(u)]
+        chosen = parameters.reference_controls[b, m, i].tolist()
+        signals["accref"], signals["turnrref"] = ([c[e] - d[e] for c, d in zip(u, chosen, strict=True)] for e in (0, 1))
         for name, values in signals.items():
             total += 0.5 * sum((own[name][b, m, i].item() * z) ** 2 for z in values)
             if name + "b" not in own:

@@ -14,7 +14,7 @@ from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarq
 
 from .games import MODES, build_energy, game_of, in_order, padded, poisoned
 
-NEEDS = {"goals", "goal_headings", "reference", "reference_speed", "size", "context", "order"}
+NEEDS = {"goals", "goal_headings", "reference", "reference_speed", "size", "context", "order", "reference_controls"}
 
 
 class EnergySuite:
@@ -62,7 +62,7 @@ class EnergySuite:
     def test_a_missing_required_input_is_named(self, energy):
         scene, game = game_of(energy)
         for name in energy.needs:
-            of_game = name in ("goals", "goal_headings", "reference", "context", "order")
+            of_game = name in ("goals", "goal_headings", "reference", "context", "order", "reference_controls")
             lacking, holder = (game, "game") if of_game else (scene, "scene")
             lacking = dataclasses.replace(lacking, **{name: None})
             with pytest.raises(ValueError, match=name):

@@ -46,6 +46,9 @@ def game_of(energy: Energy, scenes: int = 3, agents: int = 3, starts: int = MODE
         if "goal_headings" in energy.needs
         else None,
         margins={name: weight(count) for name in energy.decoded_margins},
+        reference_controls=0.5 * torch.randn(scenes, MODES, agents, HORIZON, 2, dtype=torch.float64)
+        if "reference_controls" in energy.needs
+        else None,
     )
     return scene, parameters
 
@@ -80,6 +83,7 @@ def padded(scene: Scene, parameters: GameParameters, filling: float, agents: int
         order=grow_pairs(parameters.order),
         goal_headings=grow(parameters.goal_headings),
         margins={name: grow_pairs(margin) for name, margin in parameters.margins.items()},
+        reference_controls=grow(parameters.reference_controls),
     )
 
 
@@ -98,7 +102,7 @@ def in_order(
         return table[:, :, agents][:, :, :, agents][:, :, first, second]
 
     pair_order = energy.pair_order
-    changes = dict.fromkeys(("goals", "goal_headings", "reference", "initial_controls"))
+    changes = dict.fromkeys(("goals", "goal_headings", "reference", "initial_controls", "reference_controls"))
     moved = {name: value[:, :, agents] for name in changes if (value := getattr(parameters, name)) is not None}
     return reordered(scene, agents), dataclasses.replace(
         parameters,

@@ -88,7 +88,7 @@ def test_path_derivative_is_that_of_the_truncated_problem(steps):
     cotangent = torch.randn_like(parameters.initial_controls)
     (cotangent * solve(GAME, scene, leaves).controls).sum().backward()
     found = [tensor.grad for tensor in floats(leaves)]
-    assert len(found) == len(ALL) + 4  # own weights, one pair weight, goals, headings, initial controls
+    assert len(found) == len(ALL) + 5  # own weights, one pair weight, goals, headings, initial and reference controls
     moves = [torch.randn_like(tensor) for tensor in found]
 
     def value(size: float) -> torch.Tensor:
@@ -164,7 +164,7 @@ def test_no_steps_return_the_start():
 
 
 @pytest.mark.parametrize("weight", [float("nan"), 1e100])
-@pytest.mark.parametrize("solve", [GradientDescent(4, 0.02), Langevin(4, 0.1)])
+@pytest.mark.parametrize("solve", [GradientDescent(4, 0.01), Langevin(4, 0.1)])
 def test_a_stopped_sample_keeps_its_last_finite_iterate(solve, weight):
     scene, parameters = game()
     bad = broken(parameters, (1, 0), weight)
