@@ -130,7 +130,7 @@ def _help(arguments: Arguments) -> None:
     for line in (tree() / "conf" / f"{arguments.verb}.yaml").read_text(encoding="utf-8").splitlines():
         if not line.startswith(hidden):
             print(f"  {line}")
-    if arguments.verb == "generate":
+    if arguments.verb in ("generate", "evaluate", "predict"):
         with hydra(arguments.extra) as instance:
             print(f"  data=         {' | '.join(sorted(options_of(instance, 'data')))}")
     if arguments.verb == "train":
@@ -224,7 +224,13 @@ def _resume(folder: str, others: Sequence[str]) -> None:
 
 
 def _multirun(arguments: Arguments) -> None:
-    """Check every job, then let Hydra launch them."""
+    """Check every job, then let Hydra launch them; evaluations run one after the other."""
+    if arguments.verb == "evaluate":
+        from epo_lightning.experiment.config import compose
+
+        for words in compose.jobs("evaluate", arguments.overrides, arguments.extra):
+            _single(Arguments("evaluate", words, extra=arguments.extra))
+        return
     if arguments.verb != "train":
         raise ConfigError(f"epo {arguments.verb} has no option -m: use runs=<folder> for several runs")
     from epo_lightning.experiment.config import compose

@@ -45,6 +45,8 @@ SILENCE = 600.0
 """Seconds without new progress after which a run on another machine, whose lock may be invisible here, is interrupted."""
 
 
+OTHER = "scores-on-"
+"""Beginning of the names of files with scores on data on which a run was not trained."""
 LOCK = ".lock"
 HEADER = "# The resolved configuration of this run.\n"
 

@@ -235,7 +235,7 @@ def manifest(folder: Path, command: str = "", config: Mapping[str, Any] | None =
 
 def is_set(folder: Path) -> bool:
     """Whether a folder is a data set, broken or not."""
-    return (folder / MANIFEST).is_file() and (folder / f"{SPLITS[0]}.safetensors").is_file()
+    return (folder / MANIFEST).is_file() and any(folder.glob("*.safetensors"))
 
 
 def configs(root: Path, kind: str) -> list[tuple[Path, dict[str, Any]]]:

@@ -136,11 +136,13 @@ class SceneDataModule(LightningDataModule):
         task: sizes and units of the scenes; every data module sets it, in its class or its constructor.
         share: share of the scenes of every split that is used.
         num_agents: number of agents per scene N.
+        history: number of observed steps H; None if it is not known before a scene is read.
         order_seed: seed of the order of batches; the data's own seed unless a run sets its own.
     """
 
     task: Task
     num_agents: int
+    history: int | None = None
 
     def __init__(self, batch_size: int, seed: int, share: float = 1.0) -> None:
         super().__init__()

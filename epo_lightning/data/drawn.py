@@ -234,7 +234,7 @@ class DrawnData(SceneDataModule):
         if scenes < 1:
             raise ConfigError(f"data.scenes must be 1 or more, not {scenes}")
         self.num_agents, self.scenes = self.preset.agents if agents is None else agents, scenes
-        self.task = self.preset.task
+        self.task, self.history = self.preset.task, self.preset.history
 
     @property
     def digest(self) -> str:

@@ -1,9 +1,11 @@
-"""Scores of trained runs on the test or validation split."""
+"""Scores of trained runs, on the test or validation split of their data, or on other data."""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +16,46 @@ from epo_lightning import pretrained
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
-from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
+from epo_lightning.experiment.opening import open_checkpoint, open_data, refuse_changed_config, split_of
+from epo_lightning.experiment.other_data import OtherData, keys_of, open_other
 from epo_lightning.experiment.truth import TruthTest
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
+from epo_lightning.run_folder import OTHER, RunFolder, discover, read_json, write_json
 from epo_lightning.schema import read
 
 TOLERANCE = 1e-5
 """Relative difference below which two scores are the same: machines and batch sizes change the last digits."""
 
 
-def evaluate(config: dict[str, Any]) -> list[tuple[RunFolder, Path, dict[str, float]]]:
+def evaluate(config: dict[str, Any], overrides: Sequence[str] = ()) -> list[tuple[RunFolder, Path, dict[str, float]]]:
     """Score one run, or all runs below a folder, and write each one's scores to a file.
+
+    Args:
+        config: the resolved configuration of ``epo evaluate`` as plain values.
+        overrides: the user's overrides; settings of other data that they name do not follow the run.
 
     Returns:
         run, file and scores of every run.
 
     Raises:
-        ConfigError: no run, a run that is not finished, changed data, or a checkpoint that does not fit.
+        ConfigError: no run, a run that is not finished, changed data, or a checkpoint that does not fit. Among several
+            runs, those that cannot read the other data are left out, unless that is all of them.
     """
     assembly.quiet()
-    settings = read(EvaluateSettings, config)
-    return [(run, *score(run, settings)) for run in _chosen(settings)]
+    settings, given = read(EvaluateSettings, config), keys_of(overrides)
+    scored, refused = [], []
+    for run in _chosen(settings):
+        try:
+            scored.append((run, *score(run, settings, given=given)))
+        except ConfigError as error:
+            if settings.run is not None or settings.data is None:
+                raise
+            refused.append(error)
+            print(f"{run.path}: left out, {error}")
+    if refused and not scored:
+        raise ConfigError(f"none of the {len(refused)} runs can be scored on this data: {refused[0]}")
+    return scored
 
 
 def _chosen(settings: EvaluateSettings) -> list[RunFolder]:
@@ -58,14 +77,18 @@ def score(
     settings: EvaluateSettings,
     machine: TrainerSettings | None = None,
     devices: int | list[int] = 1,
+    given: Collection[str] = (),
 ) -> tuple[Path, dict[str, float]]:
-    """Score one run and write its scores to a file (:func:`keep`), except for runs that ship with the package.
+    """Score one run and write its scores to a file, except for runs that ship with the package.
+
+    Scores on the run's own data go to the files of :func:`keep`, those on other data to the files of :func:`keep_other`.
 
     Args:
         run: a finished run.
-        settings: the split, the checkpoint and the batch size.
+        settings: the data, the split, the checkpoint and the batch size.
         machine: the accelerator and the threads to compute with; by default those that the run began with.
         devices: the device to compute on, as :func:`.gpus.placed` yields it.
+        given: keys that the user has set (:func:`.other_data.open_other`).
 
     Raises:
         ConfigError: see :func:`evaluate`.
@@ -75,15 +98,48 @@ def score(
     of_run = read(Settings, run.config())
     checkpoint = run.checkpoint(settings.checkpoint)
     forecaster = open_checkpoint(of_run, checkpoint)
+    which = settings.checkpoint if settings.checkpoint in ("best", "last") else checkpoint.name
+    if settings.data is not None:
+        refuse_changed_config(run)
+        other = open_other(run, of_run, forecaster, settings.data, settings.split, given, settings.workers)
+        forecaster.test_metrics = ForecastMetrics(other.task.subsets, other.task.shape)
+        metrics, _ = _test(run, of_run, forecaster, other.loader(settings.batch_size), machine, devices)
+        for note in other.notes:
+            print(f"  {note}")
+        if pretrained.ships(run.path):
+            return run.path, metrics
+        return keep_other(run, other, which, checkpoint, metrics), metrics
     data = open_data(run, of_run, settings.batch_size)
     if data.task.subsets != forecaster.task.subsets:  # a checkpoint that is older than the subsets of its data
         forecaster.test_metrics = ForecastMetrics(data.task.subsets, data.task.shape)
-    loader = split_of(data, settings.split)
+    loader = split_of(data, settings.own_split)
+    truths = TruthTest(data.records(settings.own_split)["weight"]) if isinstance(data, RPIData) else None
+    metrics, costs = _test(run, of_run, forecaster, loader, machine, devices, truths)
+    if pretrained.ships(run.path):
+        return run.metrics_file(settings.own_split), metrics
+    scored = {"split": settings.own_split, "data_digest": data.digest, "checkpoint": which, "metrics": metrics}
+    if costs:
+        scored["truth"] = costs
+    file = keep(run, scored, checkpoint)
+    if file == run.metrics_file():
+        logs.publish(run)
+    return file, metrics
+
+
+def _test(
+    run: RunFolder,
+    of_run: Settings,
+    forecaster: Any,
+    loader: Any,
+    machine: TrainerSettings | None,
+    devices: int | list[int],
+    truths: TruthTest | None = None,
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """Scores of a forecaster on the batches of a loader, and the costs of ``truths``."""
     seed_everything(of_run.seed, workers=True, verbose=False)
     machine = machine or of_run.trainer
     torch.set_num_threads(machine.threads)
     double = of_run.trainer.precision == "64-true"
-    truths = TruthTest(data.records(settings.split)["weight"]) if isinstance(data, RPIData) else None
     with assembly.naming(machine, run):
         trainer = Trainer(
             accelerator=machine.accelerator,
@@ -101,20 +157,37 @@ def score(
     with assembly.signals():
         (scores,) = trainer.test(forecaster, dataloaders=loader, verbose=False)
     metrics = {name.removeprefix("test/"): float(value) for name, value in scores.items()}
-    if pretrained.ships(run.path):
-        return run.metrics_file(settings.split), metrics
+    return metrics, {} if truths is None else truths.scores()
+
+
+def keep_other(run: RunFolder, other: OtherData, which: str, checkpoint: Path, metrics: Mapping[str, float]) -> Path:
+    """Write scores on other data to a file of their own, and return it.
+
+    The name ``scores-on-<data>-<split>-<digest>-<digest>.json`` has digests of the test and of the checkpoint. If the file
+    holds the same scores it stays as it is; if it holds others, which another version computed, the name gets a number.
+    """
+    digest = _digest(checkpoint)
     scored = {
-        "split": settings.split,
-        "data_digest": data.digest,
-        "checkpoint": settings.checkpoint if settings.checkpoint in ("best", "last") else checkpoint.name,
-        "metrics": metrics,
+        "data": other.name,
+        "split": other.split,
+        "data_digest": other.digest,
+        "test": other.test,
+        "checkpoint": which,
+        "checkpoint_digest": digest,
+        "settings": {key: value for key, value in other.section.items() if key != "root"},
+        "notes": list(other.notes),
+        **other.about(),
+        "metrics": dict(metrics),
     }
-    if truths is not None and (costs := truths.scores()):
-        scored["truth"] = costs
-    file = keep(run, scored, checkpoint)
-    if file == run.metrics_file():
-        logs.publish(run)
-    return file, metrics
+    stem = f"{OTHER}{other.name}-{other.split}-{other.test[:8]}-{digest[:8]}"
+    for number in itertools.count(1):
+        file = run.path / (f"{stem}.json" if number == 1 else f"{stem}-{number}.json")
+        if not _readable(file):
+            write_json(file, scored)
+            return file
+        if _same(read_json(file), scored, ("test", "checkpoint_digest")):
+            return file
+    raise AssertionError("unreachable")
 
 
 def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
@@ -135,11 +208,15 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
             if completed.keys() != stored.keys() or completed["metrics"].keys() != stored["metrics"].keys():
                 write_json(file, completed)
             return file
-    digest = hashlib.sha256(checkpoint.read_bytes()).hexdigest()[:16]
+    digest = _digest(checkpoint)
     other = run.path / f"scores-{scored['split']}-{Path(scored['checkpoint']).stem}-{digest[:8]}.json"
     if not other.is_file():
         write_json(other, {**scored, "checkpoint_digest": digest})
     return other
+
+
+def _digest(checkpoint: Path) -> str:
+    return hashlib.sha256(checkpoint.read_bytes()).hexdigest()[:16]
 
 
 def _readable(file: Path) -> bool:
@@ -150,9 +227,11 @@ def _readable(file: Path) -> bool:
         return False
 
 
-def _same(stored: dict[str, Any], scored: dict[str, Any]) -> bool:
+def _same(
+    stored: dict[str, Any], scored: dict[str, Any], keys: Sequence[str] = ("split", "data_digest", "checkpoint")
+) -> bool:
     """Whether new scores are of the same data and checkpoint as stored ones, and equal them up to the last digits."""
-    if any(stored.get(key) != scored[key] for key in ("split", "data_digest", "checkpoint")):
+    if any(stored.get(key) != scored[key] for key in keys):
         return False
     pairs = [(value, scored["metrics"].get(name, math.inf)) for name, value in stored["metrics"].items()]
     return all(

@@ -55,14 +55,23 @@ def refuse_changed(run: RunFolder, digest: str) -> None:
     Raises:
         ConfigError: the data has another digest now, or config.yaml describes another run than run.json.
     """
-    record = run.record
-    began_with = record.get("data_digest")
+    began_with = run.record.get("data_digest")
     if began_with != digest:
         raise ConfigError(
             f"the data of {run.path} has changed since the run began (digest {began_with}, now {digest}): "
             "restore the data of that digest, or train a new run"
         )
-    found = identity(run.config(), digest)
+    refuse_changed_config(run)
+
+
+def refuse_changed_config(run: RunFolder) -> None:
+    """Refuse a run whose config.yaml describes another run than its run.json.
+
+    Raises:
+        ConfigError: the settings were changed since the run began.
+    """
+    record = run.record
+    found = identity(run.config(), str(record.get("data_digest")))
     if found != record.get("identity", found):
         raise ConfigError(
             f"{run.config_file} was changed since the run began: it describes the run {found}, and run.json the run "

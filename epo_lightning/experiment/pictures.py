@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from epo_lightning.data.datamodule import SceneDataModule
+from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
 from epo_lightning.experiment.config.settings import PredictSettings
 from epo_lightning.experiment.opening import split_of
 from epo_lightning.registry import ConfigError
@@ -22,7 +22,11 @@ def choose(data: Any, split: str, count: int | None) -> tuple[Scene, list[dict[s
     loader = split_of(data, split)
     if not isinstance(data, SceneDataModule):
         return spread(gather(loader), count), None
-    dataset = data.dataset(split)
+    return pick(data.dataset(split), count)
+
+
+def pick(dataset: SceneDataset, count: int | None) -> tuple[Scene, list[dict[str, Any]] | None]:
+    """``count`` scenes at even distances in a data set, and the recording, frame and tracks of each if they are known."""
     scenes = dataset[even(len(dataset), count)]
     provenance = getattr(dataset, "provenance", None)
     return scenes, provenance(scenes.id.tolist()) if provenance and scenes.id is not None else None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,10 @@ from torch import Tensor
 from epo_lightning import pretrained
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import PredictSettings, Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data
-from epo_lightning.experiment.pictures import choose, draw, forecast_of, spread
+from epo_lightning.experiment.opening import open_checkpoint, open_data, refuse_changed_config
+from epo_lightning.experiment.other_data import keys_of, open_other
+from epo_lightning.experiment.pictures import choose, draw, forecast_of, pick, spread
+from epo_lightning.forecasters import Forecaster
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_file, write_json
 from epo_lightning.scene import KINDS, JointForecast, Scene
@@ -54,10 +57,23 @@ MEANING = {
 }
 
 
-def predict(settings: PredictSettings) -> list[Path]:
+@dataclass(frozen=True)
+class Chosen:
+    """The scenes to forecast, their provenance, and the split and data that they are from."""
+
+    scenes: Scene
+    origins: list[dict[str, Any]] | None
+    about: dict[str, Any]
+
+
+def predict(settings: PredictSettings, overrides: Sequence[str] = ()) -> list[Path]:
     """Write ``forecasts.safetensors``, ``figures/`` and ``index.json`` for scenes spread over a split.
 
     The index is written last: a folder without it was left by an interrupted command, and the next one completes it.
+
+    Args:
+        settings: the run, the data and the scenes.
+        overrides: the user's overrides; settings of other data that they name do not follow the run.
 
     Returns:
         the files that were written.
@@ -75,7 +91,8 @@ def predict(settings: PredictSettings) -> list[Path]:
         raise ConfigError(f"{out} holds forecasts already: nothing is overwritten; choose another out=<folder>")
     of_run = read(Settings, run.config())
     forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
-    scenes, origins = _scenes_of(run, of_run, settings)
+    chosen = _scenes_of(run, of_run, settings, forecaster, overrides)
+    scenes = chosen.scenes
     forecast = forecast_of(forecaster, scenes)
     tensors = dict(_tensors(scenes, forecast))
     out.mkdir(parents=True, exist_ok=True)
@@ -84,39 +101,51 @@ def predict(settings: PredictSettings) -> list[Path]:
     index = {
         "run": str(run.path),
         "title": of_run.title,
-        "split": settings.split,
-        "data_digest": run.record.get("data_digest"),
+        **chosen.about,
         "dt": scenes.dt,
         "scenes": len(scenes.history),
-        "subsets": list(assembly.build_data(of_run.data).task.subsets),
         "tensors": {name: MEANING.get(name, name.replace("/", " of ")) for name in sorted(tensors)},
         "pictures": [{"file": str(file.relative_to(out)), "rows": rows} for file, rows in pictures],
     }
     if scenes.kind is not None:
         index["kinds"] = list(KINDS)
-    if origins is not None:
-        index["provenance"] = origins
+    if chosen.origins is not None:
+        index["provenance"] = chosen.origins
     write_json(index_file, index)
     return [tensors_file, index_file, *(file for file, _ in pictures)]
 
 
 def _scenes_of(
-    run: RunFolder, of_run: Settings, settings: PredictSettings
-) -> tuple[Scene, list[dict[str, Any]] | None]:
+    run: RunFolder, of_run: Settings, settings: PredictSettings, forecaster: Forecaster, overrides: Sequence[str]
+) -> Chosen:
     """The scenes to forecast; where a shipped run's data set is not on this machine, the examples that ship with it.
 
     Raises:
-        ConfigError: the data is missing or has changed.
+        ConfigError: the data is missing, has changed, or cannot be read by the run.
     """
+    if settings.data is not None:
+        refuse_changed_config(run)
+        given = keys_of(overrides)
+        other = open_other(run, of_run, forecaster, settings.data, settings.split, given, settings.workers)
+        for note in other.notes:
+            print(f"  {note}")
+        scenes, origins = pick(other.scenes, settings.scenes)
+        about = {"split": other.split, "data_digest": other.digest, "subsets": list(other.task.subsets)}
+        return Chosen(scenes, origins, {**about, "data": other.name, "notes": list(other.notes)})
+    about = {
+        "split": settings.own_split,
+        "data_digest": run.record.get("data_digest"),
+        "subsets": list(assembly.build_data(of_run.data).task.subsets),
+    }
     try:
-        return choose(open_data(run, of_run), settings.split, settings.scenes)
+        return Chosen(*choose(open_data(run, of_run), settings.own_split, settings.scenes), about)
     except ConfigError as missing:
         if not pretrained.ships(run.path):
             raise
         scenes = pretrained.examples(run.path)
         count, name = len(scenes.history), run.path.name
         print(f"{count} example scenes that ship with {name} are forecast instead of its test split: {missing}")
-        return spread(scenes, settings.scenes), None
+        return Chosen(spread(scenes, settings.scenes), None, about)
 
 
 def _tensors(scenes: Scene, forecast: JointForecast) -> Iterable[tuple[str, Tensor]]:

@@ -19,9 +19,9 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report import EvaluatedRun, Report, build_tables, collect, write_report
 from epo_lightning.report.render import code
 from epo_lightning.report.rows import Row
-from epo_lightning.report.runs import scored
+from epo_lightning.report.runs import scored, scored_elsewhere
 from epo_lightning.report.tables import distinct
-from epo_lightning.report.write import is_timed, why_left_out
+from epo_lightning.report.write import is_measured, is_timed, why_left_out
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import read
 
@@ -55,7 +55,7 @@ def of_sweep(sweep: Sweep) -> Report:
         ConfigError: none of them is done, or one cannot be read.
     """
     jobs = sweep.jobs
-    done = [job for job in jobs if scored(job.run) or is_timed(job.run)]
+    done = [job for job in jobs if is_measured(job.run)]
     if not done:
         raise ConfigError(
             f"none of the {len(jobs)} runs of the sweep {sweep.label} is evaluated: `epo sweep status {sweep.label}` says "
@@ -68,7 +68,8 @@ def of_sweep(sweep: Sweep) -> Report:
         for run in (collect(with_scores) if with_scores else ())
         if not asked[run.path] or run.split in asked[run.path]
     ]
-    measured = {run.path for run in evaluated} | {job.run.path for job in done if is_timed(job.run)}
+    measured = {run.path for run in evaluated}
+    measured |= {job.run.path for job in done if is_timed(job.run) or scored_elsewhere(job.run)}
     left_out = []
     for job in jobs:
         if job.run.path not in measured:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from epo_lightning import pretrained
@@ -18,7 +19,7 @@ from epo_lightning.experiment.config.settings import (
     measures,
 )
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder
+from epo_lightning.run_folder import RunFolder, read_json
 from epo_lightning.schema import check_part, read
 
 SCHEMAS: dict[str, type] = {
@@ -37,8 +38,8 @@ def check_settings(verb: str, config: dict[str, Any]) -> Any:
         ConfigError: an unknown key, a missing key or a value that is not allowed.
     """
     settings: Any = read(SCHEMAS[verb], config)
-    if isinstance(settings, GenerateSettings):
-        check_part("data", settings.data)
+    if (section := getattr(settings, "data", None)) is not None:
+        check_part("data", section)
     return settings
 
 
@@ -108,15 +109,25 @@ def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     settings = check_settings("evaluate", config)
     from epo_lightning.experiment.evaluate import evaluate
 
-    for run, file, metrics in evaluate(config):
+    own = settings.data is None
+    for run, file, metrics in evaluate(config, overrides):
         shown = ", ".join(f"{name} {metrics[name]:.4f}" for name in HEADLINE if name in metrics)
-        print(f"{run.path} ({settings.split}): {shown}")
-        if file != run.metrics_file(settings.split):
-            print(
-                f"  in {file}: {run.metrics_file(settings.split).name} is for the best checkpoint, and is never replaced"
-            )
+        print(f"{run.path} ({settings.own_split if own else _tested_on(file)}): {shown}")
+        if own and file != run.metrics_file(settings.own_split):
+            name = run.metrics_file(settings.own_split).name
+            print(f"  in {file}: {name} is for the best checkpoint, and is never replaced")
+        elif not own and file.is_file():
+            print(f"  in {file}")
     if settings.run not in pretrained.names():
         print(f"next: epo report runs={settings.runs or settings.run} out=report")
+
+
+def _tested_on(file: Path) -> str:
+    """The data, split and number of scenes of a file with scores on other data."""
+    if not file.is_file():  # a shipped run, beside which nothing is written
+        return "other data"
+    content = read_json(file)
+    return f"{content['data']}, {content['split']}, {content['scenes']} scenes"
 
 
 def predict_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
@@ -124,7 +135,7 @@ def predict_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     settings = check_settings("predict", config)
     from epo_lightning.experiment.predict import predict
 
-    written = predict(settings)
+    written = predict(settings, overrides)
     print("\n".join(f"wrote {path}" for path in written))
 
 

@@ -32,7 +32,7 @@ class Content:
         title: title of the page.
         command: command that writes the page again.
         preface, legend, worth_legend, comparison_legend: Markdown; only bold, underline and code are rendered.
-        tables, costs, worth, comparisons, settings: shown on the page; all but ``tables`` are text in columns.
+        tables, transfer, costs, worth, comparisons, settings: shown on the page; all but ``tables`` are text in columns.
         charts: figures, grouped by their section.
         pictures: PNG files.
         made: provenance of every row.
@@ -48,6 +48,7 @@ class Content:
     worth_legend: str
     comparison_legend: str
     tables: Sequence[Table]
+    transfer: Sequence[Sheet]
     costs: Sequence[Sheet]
     worth: Sequence[Sheet]
     comparisons: Sequence[Sheet]

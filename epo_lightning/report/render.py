@@ -301,7 +301,7 @@ def to_csv(tables: Iterable[Table]) -> str:
         for metric, cell in row.cells.items():
             values = (cell.mean, cell.deviation, cell.paper, cell.difference)
             lines.append((*same, cell.n, metric, *map(_full, values), *behind))
-    return _csv(CSV_HEADER, lines)
+    return csv_text(CSV_HEADER, lines)
 
 
 def comparisons_to_csv(comparisons: Iterable[Comparisons]) -> str:
@@ -314,14 +314,15 @@ def comparisons_to_csv(comparisons: Iterable[Comparisons]) -> str:
             values = map(_full, (found.mean, found.low, found.high, found.p))
             names = (run.data, run.split, pair.one.name, pair.other.name, metric)
             lines.append((*names, *values, found.n, seeds, found.reason, *behind))
-    return _csv(COMPARISON_HEADER, lines)
+    return csv_text(COMPARISON_HEADER, lines)
 
 
 def _full(value: float | None) -> str:
     return "" if value is None else repr(value)
 
 
-def _csv(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+def csv_text(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    """CSV with a header, without cells that spreadsheets would read as formulas."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)

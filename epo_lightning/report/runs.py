@@ -10,7 +10,7 @@ from typing import Any
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, discover, read_json
+from epo_lightning.run_folder import OTHER, RunFolder, discover, read_json
 
 TRAIN = "train one first, epo train experiment=rpi/v_lstm_epo"
 COPY = "copy the run folder again from where it was made, or move it away"
@@ -24,7 +24,8 @@ class EvaluatedRun:
         path: the run folder.
         name: label of its row in tables.
         seed: seed of the run.
-        data: name of its data set.
+        data: name of the data set on which it was evaluated.
+        trained_data: name of its own data set.
         backbone, forecaster: names of its parts.
         experiment: name of its experiment file; empty for none.
         goal: use of given goals, ``energy`` or ``all``.
@@ -46,6 +47,7 @@ class EvaluatedRun:
     name: str
     seed: int
     data: str
+    trained_data: str
     backbone: str
     forecaster: str
     experiment: str
@@ -134,10 +136,49 @@ def read_run(run: RunFolder) -> list[EvaluatedRun]:
     return [_read_split(run, config, record, file) for file in files]
 
 
+def read_other(run: RunFolder) -> list[tuple[EvaluatedRun, Mapping[str, Any]]]:
+    """Scores of one run folder on other data, each with the contents of its file, in the order in which they were written.
+
+    Raises:
+        ConfigError: as :func:`read_run`.
+    """
+    files = scored_elsewhere(run)
+    if not files:
+        return []
+    _require_records(run)
+    config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
+    found = []
+    for file in files:
+        again = f"delete it, and `epo evaluate run={run.path} data=<data set>` writes it again"
+        content = _sound(lambda file=file: read_json(file), again)  # type: ignore[misc]
+        for key in ("data", "split", "test", "checkpoint"):
+            _entry(content, file, again, key)
+        found.append((_evaluated(run, config, record, file, content, str(content["split"]), again), content))
+    return found
+
+
+def scored_elsewhere(run: RunFolder) -> list[Path]:
+    """Files with a run's scores on other data; of the same test and checkpoint, later versions come later."""
+    return sorted(run.path.glob(f"{OTHER}*.json"), key=lambda file: (len(file.name), file.name))
+
+
 def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, Any], file: Path) -> EvaluatedRun:
     split = file.stem.removeprefix("metrics").removeprefix("-") or "test"
     again = f"epo evaluate run={run.path} split={split} writes it again"
     result = _sound(lambda: read_json(file), again)
+    return _evaluated(run, config, record, file, result, split, again)
+
+
+def _evaluated(
+    run: RunFolder,
+    config: Mapping[str, Any],
+    record: Mapping[str, Any],
+    file: Path,
+    result: Mapping[str, Any],
+    split: str,
+    again: str,
+) -> EvaluatedRun:
+    """The scores in one file of a run folder; ``again`` says how to write it again."""
     metrics = _entry(result, file, again, "metrics")
     if not isinstance(metrics, Mapping) or not all(isinstance(value, int | float) for value in metrics.values()):
         raise ConfigError(f"{file}: metrics must be numbers by name; {again}")
@@ -156,11 +197,13 @@ def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, 
         raise ConfigError(f"{run.config_file}: seed must be a whole number, not {seed!r}; {COPY}")
     trained = recorded("data_digest")
     _entry(config, run.config_file, COPY, "data", "name")
+    trained_data = data_name(config["data"])
     return EvaluatedRun(
         path=run.path,
         name=mask(setting("title")),
         seed=int(seed),
-        data=data_name(config["data"]),
+        data=str(result.get("data", trained_data)),
+        trained_data=trained_data,
         backbone=setting("backbone", "name"),
         forecaster=setting("forecaster", "name"),
         experiment=str(config.get("experiment") or ""),

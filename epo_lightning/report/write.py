@@ -27,11 +27,12 @@ from epo_lightning.report.render import (
     to_rich,
     without_html,
 )
-from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, scored
+from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, scored, scored_elsewhere
 from epo_lightning.report.selection import BestSetting, best_settings
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import Table, build_tables
 from epo_lightning.report.timings import places, read_timings, timing_sheet
+from epo_lightning.report.transfer import transfer_sheets, transfers, transfers_to_csv
 from epo_lightning.report.worth import LEGEND as WORTH_LEGEND
 from epo_lightning.report.worth import build_worth
 from epo_lightning.run_folder import RunFolder, write_file
@@ -44,7 +45,7 @@ class Report:
     Attributes:
         title: title of the report.
         command: command that writes the report.
-        runs: all run folders that have scores or were timed.
+        runs: all run folders that have scores, on their own or on other data, or were timed.
         evaluated: scores of these runs.
         left_out: the other run folders, each with the reason.
         sweep: command that began the sweep; empty for a report of other runs.
@@ -65,8 +66,8 @@ class Report:
             ConfigError: as :func:`~epo_lightning.report.collect`.
         """
         known = find_runs(folder)
-        runs = [run for run in known if scored(run) or is_timed(run)]
-        # Runs that were only timed are worth a report; without any of them, collect says what is missing.
+        runs = [run for run in known if is_measured(run)]
+        # Runs that were only timed, or scored on other data, are worth a report; without any, collect says what is missing.
         only_timed = runs and not any(map(scored, runs))
         return cls(
             title=Path(folder).expanduser().resolve().name,
@@ -80,6 +81,11 @@ class Report:
 def is_timed(run: RunFolder) -> bool:
     """Whether the time of the run's forecasts was measured."""
     return run.metrics_file("time").is_file()
+
+
+def is_measured(run: RunFolder) -> bool:
+    """Whether a run has anything to report: scores on its own or on other data, or the time of its forecasts."""
+    return bool(scored(run) or scored_elsewhere(run) or is_timed(run))
 
 
 def why_left_out(run: RunFolder) -> str:
@@ -127,6 +133,8 @@ def write_report(
     notes = [*notes, *damaged, *([hint] if hint else [])]
     made, charts = how_made(tables, timings), charts_of(tables, timings)
     costs = cost_sheets(tables, timings)
+    elsewhere = transfers(report.runs)
+    transfer = transfer_sheets(elsewhere)
     others = [timing for timing in timings if timing not in timings_of(tables, timings)]  # a cost is said once
     timed = [timing_sheet(where, same) for where, same in places(others).items()]
     shown: list[Sheet] = [*settings, *worth, *compared, *timed]
@@ -140,6 +148,7 @@ def write_report(
             *(without_html(note) + "\n" for note in notes),
             *(to_markdown(table) for table in tables),
             legend(tables) + "\n" if tables else "",
+            *(to_markdown(sheet) for sheet in transfer),
             *(to_markdown(sheet) for sheet in costs),
             *(to_markdown(sheet) for sheet in shown),
             WORTH_LEGEND + "\n" if worth else "",
@@ -157,6 +166,7 @@ def write_report(
         worth_legend=WORTH_LEGEND,
         comparison_legend=COMPARISON_LEGEND,
         tables=tables,
+        transfer=transfer,
         costs=costs,
         worth=worth,
         comparisons=compared,
@@ -169,11 +179,13 @@ def write_report(
         sweep=report.sweep,
     )
     files = {"results.md": markdown, "index.html": page(content)}
+    if elsewhere:
+        files["transfer.csv"] = transfers_to_csv(elsewhere)
     if tables:
         files["results.csv"] = to_csv(tables)
         caveat = _caveat(tables) if preface.strip() else ""
         latex = [to_latex(table, caveat=caveat) for table in tables]
-        latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in costs]
+        latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in (*transfer, *costs)]
         latex += [comparisons_to_latex(entry, caveat=caveat) for entry in (*of_game, *comparisons)]
         latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in settings]
         files["results.tex"] = "\n".join(latex)
@@ -187,7 +199,7 @@ def write_report(
     console = console or Console()
     for note in notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
-    for rich in (*map(to_rich, tables), *map(to_rich, costs), *map(to_rich, shown)):
+    for rich in (*map(to_rich, tables), *map(to_rich, transfer), *map(to_rich, costs), *map(to_rich, shown)):
         console.print(rich)
     if report.left_out:
         console.print(_summary(report.left_out), style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -25,9 +25,10 @@ class Stretches:
         count: number of steps of each stretch.
         start: first row of each stretch.
         state: x, y [m], heading [rad], speed [m/s] of every row; headings are unwrapped.
-        ending: for smoothed tracks, every row's state and the J - 1 states before it, estimated without later frames; None
-            for tracks that are not smoothed. ``state`` is smoothed with later frames too, which is more accurate, but the
-            inputs of a forecaster must not contain the future.
+        ending: every row's state and the J - 1 states before it, estimated without later frames, for tracks that are
+            smoothed and for clocks whose steps lie between frames; None if ``state`` needs no later frame. ``state`` is
+            smoothed and interpolated with later frames too, which is more accurate, but the inputs of a forecaster must not
+            contain the future.
     """
 
     dt: float
@@ -50,7 +51,12 @@ class Stretches:
 
 
 def stretches(
-    tracks: TrackTable, dt: float, smoothing: float | None, shortest: int, every: int = 1
+    tracks: TrackTable,
+    dt: float,
+    smoothing: float | None,
+    shortest: int,
+    every: int = 1,
+    interpolate: bool = False,
 ) -> tuple[Stretches, dict[str, int]]:
     """Stretches of a recording, resampled to the clock.
 
@@ -61,18 +67,19 @@ def stretches(
             are smooth already.
         shortest: smallest number of steps of a stretch; shorter ones are left out.
         every: steps between two windows.
+        interpolate: whether the clock may be faster than the recording.
 
     Returns:
         the stretches, the numbers of stretches that were interrupted or left out, by reason, and under ``TOO_SHORT`` the
         number of windows in those that were left out.
 
     Raises:
-        ConfigError: the clock is faster than the recording.
+        ConfigError: the clock is faster than the recording, without ``interpolate``.
     """
-    if dt * tracks.rate < 1 - 1e-6:
+    if dt * tracks.rate < 1 - 1e-6 and not interpolate:
         raise ConfigError(
             f"data.windows.dt={dt} asks for more than the recording's {tracks.rate:g} frames per second: "
-            f"use {1 / tracks.rate:g} or more"
+            f"use {1 / tracks.rate:g} or more, or data.windows.interpolate=true"
         )
     rows = len(tracks)
     new = np.append(True, (np.diff(tracks.agent) != 0) | (np.diff(tracks.frame) != 1))[:rows]
@@ -109,6 +116,8 @@ def stretches(
     ending = None
     if window:
         ending = _ending(raw, row, lower, at - lower, window, tracks.rate, dt)
+    elif ((share > 1e-6) & (share < 1 - 1e-6)).any():
+        ending = _continued(raw, values, row, share[:, 0], np.repeat(start, count), tracks.rate, dt)
     return Stretches(dt, tracks.agent[begin], first, count, start, _states(values), ending), dropped
 
 
@@ -183,6 +192,38 @@ def _ending(
     fitted = _states(_evaluate(fit, around[:, None], at))
     earlier = np.maximum(row[:, None] - np.round(np.arange(steps) * dt * rate).astype(int), (row - before)[:, None])
     return np.where(whole[:, None, None], fitted, _states(raw[earlier]))
+
+
+def _continued(
+    raw: Float[np.ndarray, "n 5"],
+    values: Float[np.ndarray, "Z 5"],
+    row: Int[np.ndarray, " Z"],
+    share: Float[np.ndarray, " Z"],
+    start: Int[np.ndarray, " Z"],
+    rate: float,
+    dt: float,
+) -> Float[np.ndarray, "Z J 4"]:
+    """States of every step, and of the J - 1 steps before it, that need no frame after the step, without smoothing.
+
+    A step between two frames continues the motion of the earlier one at constant velocity. J - 1 earlier steps can lie
+    between the same two frames: there are none unless the clock is faster than the recording.
+
+    Args:
+        raw: recorded positions, headings and velocities.
+        values: the same, interpolated at every step.
+        row: index into ``raw`` of the last frame up to each step.
+        share: time from that frame to the step [frames], 0 to 1.
+        start: first row of each row's stretch.
+    """
+    index, frames = np.arange(len(row)), dt * rate
+    found = []
+    for earlier in range(max(1, int(np.ceil(1 / frames - 1e-6)))):
+        since = share - earlier * frames
+        ahead = raw[row].copy()
+        ahead[:, :2] += ahead[:, 3:] * (since / rate)[:, None]
+        between = (since > 1e-6) & (share < 1 - 1e-6)
+        found.append(np.where(between[:, None], ahead, values[np.maximum(index - earlier, start)]))
+    return _states(np.stack(found, 1))
 
 
 def _parabolas(window: int, rate: float) -> tuple[Float[np.ndarray, " window"], Float[np.ndarray, "3 window"]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import shlex
 import shutil
@@ -26,10 +25,10 @@ from epo_lightning.data.recorded.duplicates import Drives, used_once
 from epo_lightning.data.recorded.extraction import Extracted, extract_to_file, is_complete, read_extracted
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
-from epo_lightning.data.recorded.splits import UNITS, SplitRule
+from epo_lightning.data.recorded.splits import ALL, UNITS, SplitRule
 from epo_lightning.data.recorded.tables import SceneTables, joined, selected
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
-from epo_lightning.data.recorded.windows import WindowConfig
+from epo_lightning.data.recorded.windows import WindowConfig, identifying
 from epo_lightning.data.workers import Report, finished
 from epo_lightning.metrics.functional.interaction import SUBSETS
 from epo_lightning.registry import ConfigError, lookup, nearest, register
@@ -69,7 +68,13 @@ class RecordedData(SceneDataModule):
         share: share of the scenes of every split that is used, drawn once.
         duplicates: ``once`` to use the same vehicles at the same moments once where recordings overlap, within a split and
             across splits (:mod:`~epo_lightning.data.recorded.duplicates`); ``keep`` to use every recording as it is.
+
+    Attributes:
+        whole: whether all recordings form a single split ``all``, for tests of forecasters that learned on other data. It is
+            set before anything is read.
     """
+
+    whole = False
 
     def __init__(
         self,
@@ -97,7 +102,7 @@ class RecordedData(SceneDataModule):
         self.options = dict(options or {})
         self.list_sources = _with_options(format, self.options)
         self.windows = read(WindowConfig, windows, "data.windows")
-        self.num_agents = self.windows.agents
+        self.num_agents, self.history = self.windows.agents, self.windows.history
         if self.windows.lane_change and not map:
             raise ConfigError("data.windows.lane_change asks for lanes, but data.map is false: set it to false as well")
         for name, share in (("test_share", test_share), ("val_share", val_share)):
@@ -150,6 +155,8 @@ class RecordedData(SceneDataModule):
         Raises:
             ConfigError: ``test`` names a group that does not exist, or there are too few recordings for three splits.
         """
+        if self.whole:
+            return {ALL: list(sources)}
         return self.rule.checked(sources)
 
     def identity(self, sources: Sequence[RecordingSource]) -> Any:
@@ -211,14 +218,11 @@ class RecordedData(SceneDataModule):
 
     def _settings(self) -> dict[str, Any]:
         """The part of the data set's configuration that does not depend on the recordings."""
-        windows = dataclasses.asdict(self.windows)
-        if windows["off_lane"] == "window":
-            del windows["off_lane"]  # a later field, whose default is no part of the configuration
         return {
             "version": VERSION,
             "dataset": self.dataset_name,
             "format": self.format,
-            "windows": windows,
+            "windows": identifying(self.windows),
             "map": self.task.map,
             # Data sets without options keep the names that they had before formats had any.
             **({"options": self.options} if self.options else {}),

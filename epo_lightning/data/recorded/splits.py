@@ -13,6 +13,8 @@ from epo_lightning.data.recorded.tracks import RecordingSource
 from epo_lightning.registry import ConfigError, nearest
 
 UNITS = ("recording", "group")
+ALL = "all"
+"""Name of the split that has all recordings, for tests of forecasters that learned on other data."""
 SEEDS, SUGGESTED = 100, 3
 """Number of seeds that are tried where a split is empty, and largest number of those that an error suggests."""
 NAMED = 12
@@ -117,9 +119,9 @@ class SplitRule:
                     total[reason] = total.get(reason, 0) + count
             gone = ", ".join(f"{reason}: {count}" for reason, count in total.items() if count) or "no window at all"
             full = {source.name for source in sources if counts[source.name].get("scenes")}
+            advice = "Relax data.windows." if split == ALL else f"{self._advice(sources, full)} Or relax data.windows."
             raise ConfigError(
-                f"the split {split!r} of {dataset} has no scene ({gone}). Its recordings are {_some(names)}. "
-                f"{self._advice(sources, full)} Or relax data.windows."
+                f"the split {split!r} of {dataset} has no scene ({gone}). Its recordings are {_some(names)}. {advice}"
             )
 
     def _advice(self, sources: Sequence[RecordingSource], full: Collection[str]) -> str:

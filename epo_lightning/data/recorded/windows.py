@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -65,6 +65,8 @@ class WindowConfig:
         speed_limit: reference speed [m/s] on lanes without a speed limit.
         off_lane: what is left out if an agent is on no lane of the map: the ``window``, or the ``agent``, as if it were not
             there, such as parked cars. With ``agent``, pedestrians always count as on no lane.
+        interpolate: whether ``dt`` may be less than the time between two frames of a recording. Steps between frames are
+            then interpolated, and the last steps of a history are computed without the frames after them.
     """
 
     dt: float = 0.2
@@ -80,6 +82,7 @@ class WindowConfig:
     lanes: int = 32
     speed_limit: float = 36.1
     off_lane: Literal["window", "agent"] = "window"
+    interpolate: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -111,6 +114,20 @@ class WindowConfig:
             )
 
 
+LATER = ("off_lane", "interpolate")
+"""Settings of windows that older versions did not have."""
+
+
+def identifying(windows: WindowConfig) -> dict[str, Any]:
+    """The settings of windows that identify a data set; later settings enter only if they differ from their default.
+
+    Data sets that were extracted before these settings existed keep their digest.
+    """
+    defaults = {field.name: field.default for field in fields(WindowConfig)}
+    values = asdict(windows)
+    return {name: value for name, value in values.items() if name not in LATER or value != defaults[name]}
+
+
 def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | None, dict[str, int]]:
     """The scenes of a recording.
 
@@ -128,7 +145,9 @@ def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | N
         )
     counts: Counter[str] = Counter(recording.dropped)
     shortest = config.history + config.horizon if config.complete else 2
-    clock, left_out = stretches(recording.tracks, config.dt, config.smoothing, shortest, config.every)
+    clock, left_out = stretches(
+        recording.tracks, config.dt, config.smoothing, shortest, config.every, config.interpolate
+    )
     counts.update(left_out)
     last = clock.first + clock.count - 1
     observed = int((last // config.every - (clock.first - 1) // config.every).sum())

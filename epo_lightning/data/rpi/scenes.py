@@ -97,7 +97,7 @@ class RPIData(SceneDataModule):
     """
 
     task = Task(horizon=40, dt=0.1, subsets=SUBSETS)
-    num_agents = 2
+    num_agents, history = 2, 19
 
     def __init__(
         self,

@@ -209,6 +209,16 @@ def measures(score: str | Sequence[str] | None) -> tuple[Measured, ...]:
     return tuple(which for which in typing.get_args(Measured) if which in asked)
 
 
+def check_workers(workers: int | None) -> None:
+    """Refuse a number of processes that cannot be meant.
+
+    Raises:
+        ConfigError: not between 1 and ``MOST_PROCESSES``.
+    """
+    if workers is not None and not 1 <= workers <= MOST_PROCESSES:
+        raise ConfigError(f"workers must be between 1 and {MOST_PROCESSES}, or null for one per core, not {workers}")
+
+
 @dataclass(frozen=True)
 class GenerateSettings:
     """Configuration of ``epo generate``."""
@@ -219,10 +229,23 @@ class GenerateSettings:
     strict: bool = False
 
     def __post_init__(self) -> None:
-        if self.workers is not None and not 1 <= self.workers <= MOST_PROCESSES:
-            raise ConfigError(
-                f"workers must be between 1 and {MOST_PROCESSES}, or null for one per core, not {self.workers}"
-            )
+        check_workers(self.workers)
+
+
+Split = Literal["test", "val", "train", "all"]
+"""Names of splits; ``all`` is that of all recordings, for data on which a run was not trained."""
+
+
+def check_split(split: str | None, data: Mapping[str, Any] | None) -> None:
+    """Refuse a split that a run's own data is not scored on.
+
+    Raises:
+        ConfigError: ``train`` or ``all`` without other data.
+    """
+    if data is None and split not in (None, "test", "val"):
+        raise ConfigError(
+            f"split={split} needs data=<data set>: on its own data, a run is scored on split=test or split=val"
+        )
 
 
 @dataclass(frozen=True)
@@ -231,13 +254,22 @@ class EvaluateSettings:
 
     run: str | None = None
     runs: str | None = None
-    split: Literal["test", "val"] = "test"
+    data: Mapping[str, Any] | None = None
+    split: Split | None = None
     checkpoint: str = "best"
     batch_size: int = 256
+    workers: int | None = None
+
+    @property
+    def own_split(self) -> str:
+        """The split of the run's own data."""
+        return self.split or "test"
 
     def __post_init__(self) -> None:
         if (self.run is None) == (self.runs is None):
             raise ConfigError("choose what to evaluate: run=<run folder>, or runs=<folder> for all runs below it")
+        check_split(self.split, self.data)
+        check_workers(self.workers)
         if self.batch_size < 2:
             raise ConfigError(f"batch_size must be 2 or more, not {self.batch_size}")
 
@@ -248,13 +280,22 @@ class PredictSettings:
 
     run: str
     out: str = "predictions"
-    split: Literal["test", "val"] = "test"
+    data: Mapping[str, Any] | None = None
+    split: Split | None = None
     checkpoint: str = "best"
     scenes: int | None = 64
     figures: int = 4
     animate: int = 0
+    workers: int | None = None
+
+    @property
+    def own_split(self) -> str:
+        """The split of the run's own data."""
+        return self.split or "test"
 
     def __post_init__(self) -> None:
+        check_split(self.split, self.data)
+        check_workers(self.workers)
         if self.scenes is not None and self.scenes < 1:
             raise ConfigError(f"scenes must be 1 or more, or null for all, not {self.scenes}")
         for name in ("figures", "animate"):

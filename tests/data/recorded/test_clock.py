@@ -123,6 +123,43 @@ def test_a_clock_faster_than_the_recording_is_refused():
         stretches(traffic(curve(None), FOUR), 0.02, None, 1)
 
 
+@given(
+    st.integers(0, 10_000),
+    st.sampled_from([(2.5, 0.2), (2.5, 0.1), (2.5, 0.25), (23.98, 0.2), (7.0, 0.5), (25.0, 0.1)]),
+)
+@settings(max_examples=30)
+def test_clocks_between_frames_interpolate_the_past_and_continue_the_present(seed, times):
+    """Against a loop over the frames that are known at each step: those up to it."""
+    rate, dt = times
+    tracks = walk(seed, rate, [40, 61, 83])
+    clock, _ = stretches(tracks, dt, None, shortest=1, interpolate=True)
+    assert clock.ending is not None
+    deep = clock.ending.shape[1]
+    assert deep == max(1, np.ceil(1 / (dt * rate) - 1e-6))
+    for stretch, rows in enumerate(pieces(tracks)):
+        time, heading = tracks.frame[rows] / rate, np.unwrap(tracks.heading[rows])
+        motion = np.column_stack([tracks.position[rows], heading, tracks.velocity[rows]])
+        for step in range(0, clock.count[stretch], 7):
+            now = (clock.first[stretch] + step) * dt
+            known = time <= now + 1e-9
+            last = motion[known][-1]
+            for before in range(min(deep, step + 1)):
+                at = now - before * dt
+                if at > time[known][-1] + 1e-9:
+                    x, y = last[:2] + last[3:] * (at - time[known][-1])
+                    angle, vx, vy = last[2:]
+                else:
+                    x, y, angle, vx, vy = (np.interp(at, time[known], column) for column in motion[known].T)
+                wanted = [x, y, angle, vx * np.cos(angle) + vy * np.sin(angle)]
+                found = clock.ending[clock.start[stretch] + step, before]
+                np.testing.assert_allclose(found, wanted, atol=1e-8)
+
+
+def test_clocks_on_frames_need_no_estimate():
+    for rate, dt in ((25.0, 0.2), (10.0, 0.2), (2.5, 0.4)):
+        assert stretches(walk(0, rate, [40, 61]), dt, None, shortest=1)[0].ending is None
+
+
 def test_a_recording_without_traffic_has_no_tracks():
     tracks = traffic(curve(None), FOUR)
     empty = {f.name: getattr(tracks, f.name)[:0] for f in dataclasses.fields(tracks) if f.name != "rate"}

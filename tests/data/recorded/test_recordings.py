@@ -116,6 +116,37 @@ def test_splits_are_drawn_by_group_where_none_is_named(folder):
     assert len(other) > 1
 
 
+def test_all_recordings_are_one_split_of_a_data_set_of_its_own(folder):
+    module, usual = data(folder), data(folder)
+    module.whole = True
+    made = module.generate(workers=1, progress=False)
+    assert module.digest != usual.digest
+    assert made != usual.generate(workers=1, progress=False)
+    assert sorted(file.name for file in made.glob("*.safetensors")) == ["all.safetensors"]
+    assert len(module.report()["recordings"]["all"]) == 9
+    scenes = module.open("all")
+    splits = [usual.open(split) for split in ("train", "val", "test")]
+    assert len(scenes) == sum(map(len, splits))
+    assert scenes[torch.arange(len(scenes))].subset is not None
+    copied = data(made)
+    copied.whole = True
+    assert copied.digest == module.digest
+    one = folder.parent / "one"
+    one.mkdir()
+    shutil.copy(folder / "a-0.road", one)
+    alone = data(one, test=None)
+    alone.whole = True
+    alone.generate(workers=1, progress=False)
+    assert len(alone.open("all")) > 0
+
+
+def test_the_digest_has_a_later_setting_of_windows_only_if_it_is_set(folder):
+    plain, set_ = data(folder), data(folder, windows={"dt": 0.2, "interpolate": False})
+    assert "interpolate" not in plain.config["windows"]
+    assert plain.digest == set_.digest
+    assert data(folder, windows={"dt": 0.2, "interpolate": True}).digest != plain.digest
+
+
 def test_extraction_continues_after_an_error(folder, tmp_path):
     one = data(folder).generate(workers=1, progress=False)
     again = data(folder, root=str(tmp_path / "again"))

@@ -1,0 +1,129 @@
+"""Transfer tables: which scores stand in which cell, and damaged files."""
+
+from __future__ import annotations
+
+import csv
+import statistics
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.transfer import labels_of, transfer_sheets, transfers, transfers_to_csv
+from epo_lightning.run_folder import RunFolder, write_json
+
+from .run_folders import make_run, scores
+
+
+def on(run: RunFolder, data: str, value: float, name: str = "", **changes: Any) -> None:
+    """Write scores of a run on other data."""
+    content = {
+        "data": data,
+        "split": "all",
+        "data_digest": f"digest-{data}",
+        "test": f"test-{data}",
+        "checkpoint": "best",
+        "scenes": 12,
+        "recordings": 3,
+        "agents": {"car": 3, "pedestrian": 1},
+        "notes": ["no map"],
+        "metrics": scores(value),
+        **changes,
+    }
+    write_json(run.path / f"scores-on-{data}-all-1-2{name}.json", content)
+
+
+def three_runs(home: Path) -> list[RunFolder]:
+    """Two seeds of a row that was trained on a, and one that learned nothing."""
+    runs = [
+        make_run(home / f"sc{seed}", "SC", "scene_consistent", scores(1.0 + seed), seed=seed, data="a")
+        for seed in (0, 1)
+    ]
+    runs.append(make_run(home / "cv", "Const. Vel.", "constant_velocity", scores(9.0), data="a"))
+    for place, run in enumerate(runs):
+        on(run, "b", 4.0 + place)
+    on(runs[0], "c", 7.0)
+    return runs
+
+
+def test_cells_are_means_over_seeds_by_training_and_test(tmp_path: Path) -> None:
+    lines = transfers(three_runs(tmp_path))
+    sade, sfde, overlap, tests = transfer_sheets(lines)
+    assert (sade.title, sfde.title, overlap.title) == ("Transfer: SADE", "Transfer: SFDE", "Transfer: OR (JFP)")
+    assert sade.header == ("trained on", "method", "n", "a, test", "b, all", "c, all")
+    deviation = statistics.stdev([1.0, 2.0])
+    assert sade.lines == (
+        ("-", "Const. Vel.", "1", "9.000", "6.000", "-"),
+        ("a", "SC", "2", f"1.500 ± {deviation:.3f}", f"4.500 ± {deviation:.3f}", "7.000"),
+    )
+    assert sade.ends == {0, 1}
+    assert tests.lines[1] == ("b, all", "car 75%, pedestrian 25%", "no map", "12", "3")
+    assert tests.lines[0] == ("a, test", "-", "-", "-", "-")
+
+
+def test_the_csv_has_every_score(tmp_path: Path) -> None:
+    rows = list(csv.DictReader(transfers_to_csv(transfers(three_runs(tmp_path))).splitlines()))
+    found = {(row["trained_on"], row["method"], row["test_on"], row["split"], row["metric"]): row for row in rows}
+    assert len(found) == len(rows) == 5 * 6
+    row = found["a", "SC", "b", "all", "minSFDE"]
+    assert (float(row["mean"]), row["n"], row["seeds"], row["scenes"]) == (4.5, "2", "0 1", "12")
+    assert row["data_digest"] == "digest-b"
+
+
+def test_runs_without_scores_elsewhere_give_no_table(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "sc", "SC", "scene_consistent", scores(1.0), data="a")
+    assert transfers([run]) == []
+    assert transfer_sheets([]) == []
+
+
+def test_rows_of_several_data_sets_share_the_columns_of_the_same_scenes(tmp_path: Path) -> None:
+    one = make_run(tmp_path / "one", "SC", "scene_consistent", scores(1.0), data="a", digest="A")
+    other = make_run(tmp_path / "other", "SC", "scene_consistent", scores(2.0), data="b", digest="B")
+    on(one, "b", 3.0, split="test", data_digest="B")
+    on(other, "a", 4.0, split="test", data_digest="A")
+    sheet = transfer_sheets(transfers([one, other]))[0]
+    assert sheet.header[3:] == ("a, test", "b, test")
+    assert [line[0] for line in sheet.lines] == ["a", "b"]
+    assert [line[3:] for line in sheet.lines] == [("1.000", "3.000"), ("4.000", "2.000")]
+
+
+def test_labels_of_other_scenes_have_columns_of_their_own(tmp_path: Path) -> None:
+    one = make_run(tmp_path / "one", "SC", "scene_consistent", None, data="a")
+    on(one, "b", 3.0, data_digest="first1", name="-x")
+    on(one, "b", 4.0, data_digest="second", name="-y")
+    on(one, "c", 5.0, test="disc01", name="-x")
+    on(one, "c", 6.0, test="box002", name="-y")
+    lines = transfers([one])
+    labels = list(labels_of(lines).values())
+    assert labels == ["b, all (first1)", "b, all (second)", "c, all (box002)", "c, all (disc01)"]
+    assert transfer_sheets(lines)[0].lines == (("a", "SC", "1", "3.000", "4.000", "6.000", "5.000"),)
+
+
+def test_of_two_versions_the_later_one_counts_and_checkpoints_have_lines_of_their_own(tmp_path: Path) -> None:
+    one = make_run(tmp_path / "one", "SC", "scene_consistent", None, data="a")
+    on(one, "b", 3.0)
+    on(one, "b", 4.0, name="-2")
+    on(one, "b", 5.0, name="-10")
+    on(one, "b", 8.0, checkpoint="last", name="-last")
+    sheet = transfer_sheets(transfers([one]))[0]
+    assert sheet.lines == (("a", "SC", "1", "5.000"), ("a", "SC, checkpoint last", "1", "8.000"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{}", "has no entry data"),
+        ("half", "is not JSON"),
+        ('{"data": "b", "split": "all", "test": "t", "checkpoint": "best", "data_digest": "d"}', "no entry metrics"),
+        (
+            '{"data": "b", "split": "all", "test": "t", "checkpoint": "best", "data_digest": "d", "metrics": {"a": "x"}}',
+            "metrics must be numbers",
+        ),
+    ],
+)
+def test_damaged_files_are_named_with_a_remedy(tmp_path: Path, text: str, message: str) -> None:
+    run = make_run(tmp_path / "one", "SC", "scene_consistent", None)
+    (run.path / "scores-on-b-all-1-2.json").write_text(text)
+    with pytest.raises(ConfigError, match=rf"scores-on-b-all-1-2\.json.*{message}.*epo evaluate run=.*one data="):
+        transfers([run])
