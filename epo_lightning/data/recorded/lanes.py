@@ -203,6 +203,35 @@ class LaneGraph:
         found.offset[found.lane < 0] = 0.0
         return found
 
+    def around(
+        self, position: Float[np.ndarray, "T 2"], heading: Float[np.ndarray, " T"], distance: float, angle: float
+    ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """All lanes near positions whose directions are similar to headings.
+
+        Args:
+            position, heading: positions [m] and headings [rad].
+            distance: largest distance from a lane's area [m].
+            angle: largest angle between the direction of a lane and the heading [rad].
+
+        Returns:
+            rows of the positions, lanes, arc lengths on their centrelines [m], and costs: the offset [m], plus ``ASTRAY``
+            metres for every radian of heading error.
+        """
+        row, lane = self._tree.query(shapely.points(position), predicate="dwithin", distance=distance)
+        along, offset = self.centrelines.project(lane, position[row])
+        across = self._across(lane, along, heading[row])
+        similar = across < angle
+        cost = np.abs(offset) + ASTRAY * across
+        return row[similar], lane[similar], along[similar], cost[similar]
+
+    def _across(
+        self, lane: Int[np.ndarray, " n"], along: Float[np.ndarray, " n"], heading: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Angle between headings and the directions of lanes [rad]."""
+        _, tangent = self.centrelines.at(lane, along)
+        turned = np.cos(heading) * tangent[:, 0] + np.sin(heading) * tangent[:, 1]
+        return np.asarray(np.arccos(np.clip(turned, -1.0, 1.0)))
+
     def _nearer(
         self,
         found: Located,
@@ -213,9 +242,7 @@ class LaneGraph:
     ) -> None:
         """Write the best lane of each row into ``found``; ``row`` and ``lane`` are pairs of rows and candidate lanes."""
         along, offset = self.centrelines.project(lane, position[row])
-        _, tangent = self.centrelines.at(lane, along)
-        turned = np.cos(heading[row]) * tangent[:, 0] + np.sin(heading[row]) * tangent[:, 1]
-        across = np.arccos(np.clip(turned, -1.0, 1.0))
+        across = self._across(lane, along, heading[row])
         (fits,) = np.nonzero(across < ALONG)
         # The best candidate is written last and stays; of equal ones, the lane with the lowest index.
         order = fits[np.lexsort((-lane[fits], -(np.abs(offset) + ASTRAY * across)[fits]))]

@@ -38,11 +38,21 @@ class Route:
         references: points of the reference lines [m].
         candidates: goal candidates [m].
         line: index of the reference line of each candidate; the same for all agents.
+        count: number of lines of each agent, the first ones; the others repeat the first. None if every agent has all.
     """
 
     references: Float[np.ndarray, "n R Q 2"]
     candidates: Float[np.ndarray, "n G 2"]
     line: Int[np.ndarray, " G"]
+    count: Int[np.ndarray, " n"] | None = None
+
+
+def reach(speed: Float[np.ndarray, " n"], time: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Arc lengths [m] from agents to their nearest and farthest goal candidates: braking, or accelerating, for ``time`` [s]."""
+    speed = np.maximum(speed, 0.0)
+    far = speed * time + ACCELERATING * time**2 / 2
+    stopping = np.minimum(speed / BRAKING, time)
+    return np.minimum(speed * stopping - BRAKING * stopping**2 / 2, far - SHORTEST), far
 
 
 class Routes:
@@ -50,13 +60,13 @@ class Routes:
 
     def __init__(self, lanes: LaneGraph) -> None:
         self.lanes = lanes
-        straight = _straightest(lanes.successors, lanes, forwards=True)
-        back = _straightest(lanes.predecessors, lanes, forwards=False)
+        straight = straightest(lanes.successors, lanes, forwards=True)
+        back = straightest(lanes.predecessors, lanes, forwards=False)
         length = lanes.centrelines.length
         chains = []
         for lane in range(len(lanes)):
-            before = _follow(lane, back, length, BACKWARDS)[:0:-1]
-            chains.append((before, _follow(lane, straight, length, FORWARDS)))
+            before = follow(lane, back, length, BACKWARDS)[:0:-1]
+            chains.append((before, follow(lane, straight, length, FORWARDS)))
         sides = (lanes.centre, lanes.left, lanes.right)
         self.lines = Polylines(
             [np.concatenate([side[lane] for lane in (*before, *after)]) for side in sides for before, after in chains]
@@ -65,7 +75,7 @@ class Routes:
         self.parts = Polylines([line for side in sides for line in side])
         self.begin = np.array(
             [
-                _length(np.concatenate([*(side[each] for each in before), side[lane][:1]]))
+                polyline_length(np.concatenate([*(side[each] for each in before), side[lane][:1]]))
                 for side in sides
                 for lane, (before, _) in enumerate(chains)
             ]
@@ -85,10 +95,7 @@ class Routes:
             located: lanes of the agents; every agent must be on a lane.
             time: horizon within which goals are reached [s].
         """
-        speed = np.maximum(speed, 0.0)
-        far = speed * time + ACCELERATING * time**2 / 2
-        stopping = np.minimum(speed / BRAKING, time)
-        near = np.minimum(speed * stopping - BRAKING * stopping**2 / 2, far - SHORTEST)
+        near, far = reach(speed, time)
         count, lane = len(self.lanes), located.lane
         chosen = []
         for side, (neighbour, distance) in enumerate(self.beside):
@@ -110,7 +117,7 @@ class Routes:
         return Route(references, candidates, np.repeat(np.arange(LINES), PER_LINE))
 
 
-def _straightest(following: Sequence[tuple[int, ...]], lanes: LaneGraph, forwards: bool) -> Int[np.ndarray, " W"]:
+def straightest(following: Sequence[tuple[int, ...]], lanes: LaneGraph, forwards: bool) -> Int[np.ndarray, " W"]:
     """For each lane the successor (or predecessor) with the smallest change of direction; -1 for none."""
     found = np.full(len(lanes), -1)
     for lane, others in enumerate(following):
@@ -127,11 +134,11 @@ def _direction(line: Polyline, at_end: bool) -> Float[np.ndarray, " 2"]:
     return way / np.linalg.norm(way)
 
 
-def _length(line: Polyline) -> float:
+def polyline_length(line: Polyline) -> float:
     return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
 
 
-def _follow(lane: int, following: np.ndarray, length: np.ndarray, distance: float) -> list[int]:
+def follow(lane: int, following: np.ndarray, length: np.ndarray, distance: float) -> list[int]:
     """A lane and the lanes that follow it, up to ``distance`` [m] beyond its end or until a lane repeats."""
     chain, gone = [lane], 0.0
     while gone < distance:
