@@ -30,6 +30,8 @@ VERSION = 1
 """Version of the draws: raised whenever the same seed would give other scenes."""
 LANE_WIDTH, LANES = 3.5, 4
 """Width [m] and number of the road's lanes."""
+DRAWN_LANES = 32
+"""Number of lane polylines of a scene."""
 HEADWAY = 25.0
 """Mean distance [m] from a vehicle to the next one on its lane."""
 
@@ -170,7 +172,7 @@ def _highway(scenes: int, agents: int, preset: Preset, draw: torch.Generator) ->
         x = (now[:, :1] + ahead)[:, None].expand(-1, LINES, -1)
         return torch.stack((x, middle[..., None].expand_as(x)), -1).float()
 
-    pieces = WindowConfig.lanes // LANES
+    pieces = DRAWN_LANES // LANES
     across = LANE_WIDTH * torch.arange(LANES, dtype=torch.float64).repeat_interleave(pieces)
     reach = SPACING * VECTORS * (torch.arange(pieces + 1) - pieces // 2 + 1.0)
     ends = torch.stack((reach[:-1], reach[1:]), 1).repeat(LANES, 1)
@@ -188,22 +190,25 @@ def _highway(scenes: int, agents: int, preset: Preset, draw: torch.Generator) ->
     }
 
 
+HIGHWAY = Preset(
+    WindowConfig.agents,
+    WindowConfig.history,
+    Task(
+        WindowConfig.horizon,
+        WindowConfig.dt,
+        SUBSETS,
+        shape="box",
+        candidates=LINES * PER_LINE,
+        map=True,
+        scale=20.0,
+    ),
+    _highway,
+)
+
 LIKE: Mapping[str, Preset] = {
     "rpi": Preset(RPIData.num_agents, 19, RPIData.task, _rpi),
-    "highway": Preset(
-        WindowConfig.agents,
-        WindowConfig.history,
-        Task(
-            WindowConfig.horizon,
-            WindowConfig.dt,
-            SUBSETS,
-            shape="box",
-            candidates=LINES * PER_LINE,
-            map=True,
-            scale=20.0,
-        ),
-        _highway,
-    ),
+    "highway": HIGHWAY,
+    "urban": HIGHWAY,
     "pedestrians": Preset(4, 8, Task(12, 0.4, SUBSETS, candidates=0, scale=5.0), _pedestrians),
 }
 """The sorts of random scenes, by the name in ``data.like``."""
@@ -214,8 +219,8 @@ class DrawnData(SceneDataModule):
     """Scenes drawn in memory, with the shapes of a task.
 
     Args:
-        like: ``rpi`` (two discs with given goals), ``highway`` (vehicles, lanes and goal candidates) or ``pedestrians``
-            (no map, no goals).
+        like: ``rpi`` (two discs with given goals), ``highway`` or ``urban`` (vehicles, lanes and goal candidates) or
+            ``pedestrians`` (no map, no goals).
         agents: number per scene; None for that of the task.
         scenes: number per split.
         seed: seed of the random scenes, and of the order of batches unless a run sets its own.

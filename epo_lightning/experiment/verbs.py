@@ -73,7 +73,8 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     if dataset in HIGHWAYS or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
         words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]
     else:
-        words = [f"experiment={'exid' if data.task.map else 'ucy'}/v_lstm_epo", *kept]
+        rows = "ucy" if not data.task.map else "urban" if settings.data.get("windows", {}).get("lines") else "exid"
+        words = [f"experiment={rows}/v_lstm_epo", *kept]
     print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
 
 

@@ -1,8 +1,9 @@
 """Routes through junctions: reference lines along all successors within reach, and goal candidates on them.
 
 An agent may follow any successor of its lane, and may change once to a neighbouring lane of its way. Where lanes overlap, as
-on a junction, it may be on any lane near it whose direction is similar to its heading. Of all lines that differ within its
-reach, the R most reachable ones are kept, see :func:`choose_lines`.
+on a junction, it may be on any lane near it whose direction is similar to its heading. Of all centrelines that differ within
+its reach, the R most reachable ones are kept, see :func:`choose_lines`; if there are fewer, the boundaries of the same lanes
+follow, because vehicles cut bends or swing wide.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from epo_lightning.data.recorded.routes import (
     BEHIND,
     BEYOND,
     BRAKING,
-    FORWARDS,
     PER_LINE,
     POINTS,
+    SHORTEST,
     Route,
     follow,
     polyline_length,
@@ -38,6 +39,8 @@ CHANGE = 4.0
 """Cost [m] of a lane change, as much as such an offset from the line."""
 SIDEWAYS = 5.0
 """Largest lateral acceleration [m/s^2]: a bend that an agent cannot take with it, though it brakes, is out of reach."""
+BESIDES = 500.0
+"""Cost [m] of a lane's boundary: boundaries are used after all centrelines that are in reach."""
 UNREACHABLE = 1000.0
 """Cost [m] of a line with such a bend: it is used only if there are lines to spare."""
 APART = 1.0
@@ -50,19 +53,17 @@ class Way(NamedTuple):
     """A way from an agent over lanes.
 
     Attributes:
-        lanes: lanes of the way, in driving order.
-        anchor: the lane on which the agent is projected, an index into ``lanes``.
+        lanes: lanes of the way, in driving order; the agent is projected on the first one.
         cost: how far the agent is from the way: offset, difference in direction and lane changes [m].
     """
 
     lanes: tuple[int, ...]
-    anchor: int
     cost: float
 
 
 @dataclass(frozen=True)
 class _Lines:
-    """Lines of ways: geometry, and where the anchor lane begins on each [m]."""
+    """Lines of ways: whole geometry, that of the first lane, and the arc length at which this lane begins [m]."""
 
     whole: Polylines
     parts: Polylines
@@ -81,23 +82,22 @@ def ways(
         length: length of every lane [m].
     """
     found: list[Way] = []
-    changes: list[tuple[float, int, int, tuple[int, ...], float]] = []
+    changes: list[tuple[float, int, int, tuple[int, ...], float, float]] = []
     for lane, along, cost in starts:
         for path, begins in _followed(lane, -along, far, lanes, length):
-            found.append(Way(path, 0, cost))
+            found.append(Way(path, cost))
             for place, (each, gone) in enumerate(zip(path, begins, strict=True)):
                 for neighbour in (int(lanes.left_of[each]), int(lanes.right_of[each])):
                     if neighbour >= 0 and lanes.kind[neighbour] != SHOULDER:
-                        changes.append((max(gone, 0.0), len(changes), neighbour, path[:place], cost + CHANGE))
+                        changes.append((max(gone, 0.0), len(changes), neighbour, path[:place], gone, cost + CHANGE))
     seen = {lane for way in found for lane in way.lanes}
-    for _, _, neighbour, before, cost in sorted(changes):
+    for _, _, neighbour, before, gone, cost in sorted(changes):
         if neighbour in seen or len(found) >= MOST_WAYS:
             continue
         # A lane that begins ahead, a turning bay, is reached over the lanes before it.
         before = () if lanes.predecessors[neighbour] else before
-        gone = sum(length[lane] for lane in before) - (starts[0][1] if before else 0.0)
         for path, _ in _followed(neighbour, gone, far, lanes, length):
-            found.append(Way((*before, *path), 0, cost))
+            found.append(Way((*before, *path), cost))
             seen |= set(path)
     return sorted(found, key=lambda way: way.cost)[:MOST_WAYS]
 
@@ -155,14 +155,17 @@ class Junctions:
         """
         near, far = reach(speed, time)
         found = self._ways(position, heading, located, far)
-        number: dict[tuple[tuple[int, ...], int], int] = {}
+        number: dict[tuple[int, ...], int] = {}
         line = np.full((len(found), max(map(len, found), default=1)), -1)
         cost = np.full(line.shape, np.inf)
         for row, of_agent in enumerate(found):
             for column, way in enumerate(of_agent):
-                line[row, column] = number.setdefault((way.lanes, way.anchor), len(number))
+                line[row, column] = number.setdefault(way.lanes, len(number))
                 cost[row, column] = way.cost
         lines = self._lines(list(number))
+        # Centrelines, then left and right boundaries.
+        line = np.concatenate([np.where(line < 0, -1, line + side * len(number)) for side in range(3)], 1)
+        cost = np.concatenate([cost, cost + BESIDES, cost + BESIDES], 1)
         agent, column = np.nonzero(line >= 0)
         of = line[agent, column]
         on_part, _ = lines.parts.project(of, position[agent])
@@ -214,18 +217,19 @@ class Junctions:
             ways(starts[ends[agent] : ends[agent + 1]], float(far[agent]), self.lanes, length) for agent in own.tolist()
         ]
 
-    def _lines(self, named: Sequence[tuple[tuple[int, ...], int]]) -> _Lines:
-        """The lines of ways: their lanes, continued straight ahead and back."""
-        length, centre = self.lanes.centrelines.length, self.lanes.centre
+    def _lines(self, paths: Sequence[tuple[int, ...]]) -> _Lines:
+        """Centrelines, left and right boundaries of ways: their lanes, continued straight ahead and back."""
+        length = self.lanes.centrelines.length
         whole, parts, begin = [], [], []
-        for path, anchor in named:
-            before = follow(path[0], self.back, length, BACKWARDS)[:0:-1]
-            after = [lane for lane in follow(path[-1], self.ahead, length, FORWARDS)[1:] if lane not in path]
-            before = [lane for lane in before if lane not in path]
-            whole.append(np.concatenate([centre[lane] for lane in (*before, *path, *after)]))
-            until = [centre[lane] for lane in (*before, *path[:anchor])]
-            begin.append(polyline_length(np.concatenate([*until, centre[path[anchor]][:1]])))
-            parts.append(centre[path[anchor]])
+        for side in (self.lanes.centre, self.lanes.left, self.lanes.right):
+            for path in paths:
+                before = [lane for lane in follow(path[0], self.back, length, BACKWARDS)[:0:-1] if lane not in path]
+                after = [
+                    lane for lane in follow(path[-1], self.ahead, length, BEYOND + SHORTEST)[1:] if lane not in path
+                ]
+                whole.append(np.concatenate([side[lane] for lane in (*before, *path, *after)]))
+                begin.append(polyline_length(np.concatenate([*(side[lane] for lane in before), side[path[0]][:1]])))
+                parts.append(side[path[0]])
         return _Lines(Polylines(whole), Polylines(parts), np.array(begin))
 
 

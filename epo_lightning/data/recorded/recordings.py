@@ -124,7 +124,7 @@ class RecordedData(SceneDataModule):
                 f"data.scale must be positive, not {scale}: the length [m] that corresponds to 1 in the inputs of a network"
             )
         self.frame = frame
-        candidates = LINES * PER_LINE if map else 0
+        candidates = (self.windows.lines or LINES) * PER_LINE if map else 0
         self.task = Task(
             self.windows.horizon, float(self.windows.dt), SUBSETS, shape, candidates, map=map, scale=float(scale)
         )

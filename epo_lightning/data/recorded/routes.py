@@ -48,7 +48,7 @@ class Route:
 
 
 def reach(speed: Float[np.ndarray, " n"], time: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Arc lengths [m] from agents to their nearest and farthest goal candidates: braking, or accelerating, for ``time`` [s]."""
+    """Arc lengths [m] from agents to their nearest and farthest candidates: braking or accelerating for ``time`` [s]."""
     speed = np.maximum(speed, 0.0)
     far = speed * time + ACCELERATING * time**2 / 2
     stopping = np.minimum(speed / BRAKING, time)

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.metrics.functional import interactive_scenes
 from epo_lightning.scene import Scene
 
@@ -85,15 +84,20 @@ class RecordedScenes:
         if len(self.tables["polylines"]):
             points = move(self.tables["polylines"][of["lanes"].clamp_min(0).long()])
             there = (of["lanes"] >= 0)[..., None].expand(*points.shape[:2], points.shape[2] - 1)
-            line = torch.arange(LINES).repeat_interleave(PER_LINE).expand(*present.shape, -1)
+            candidates, references = self.tables["candidates"], self.tables["references"]
+            count = references.shape[1]
+            line = torch.arange(count).repeat_interleave(candidates.shape[1] // count).expand(*present.shape, -1)
+            on_line = present[..., None].expand(*present.shape, count)
+            if "lines" in self.tables:
+                on_line = on_line & (torch.arange(count) < self.tables["lines"][rows][..., None])
             on_map = {
                 "lanes": torch.cat((points[:, :, :-1], points[:, :, 1:]), -1).where(there[..., None], 0.0),
                 "lane_mask": there,
-                "goal_candidates": known(move(self.tables["candidates"][rows])),
-                "goal_mask": present[..., None].expand(*present.shape, line.shape[-1]),
+                "goal_candidates": known(move(candidates[rows])),
+                "goal_mask": on_line.gather(-1, line),
                 "goal_reference": line,
-                "references": known(move(self.tables["references"][rows])),
-                "reference_mask": present[..., None].expand(*present.shape, LINES),
+                "references": known(move(references[rows])),
+                "reference_mask": on_line,
                 "reference_speed": known(self.tables["reference_speed"][rows]),
             }
         scene = Scene(

@@ -30,6 +30,44 @@ def nearest_pieces(
     return found
 
 
+def reachable_pieces(
+    polylines: Float[np.ndarray, "T V+1 2"],
+    position: Float[np.ndarray, "A 2"],
+    far: Float[np.ndarray, " A"],
+    members: Int[np.ndarray, "S N"],
+    centre: Float[np.ndarray, "S 2"],
+) -> Int[np.ndarray, "S L"]:
+    """Indices of the polylines with a point within reach of an agent of the scene, nearest to the centre first.
+
+    L is the largest number of any scene; the others are padded with -1.
+
+    Args:
+        polylines: points of the map's polylines.
+        position: position of each agent.
+        far: distance [m] within which an agent may be at the end of the horizon.
+        members: agents of each scene, -1 for none.
+        centre: centre of each scene.
+    """
+    points = polylines.reshape(-1, 2)
+    near = np.zeros((len(position), len(polylines)), dtype=bool)
+    for chunk in range(0, len(position), CHUNK // 16):
+        rows = slice(chunk, chunk + CHUNK // 16)
+        distance = np.linalg.norm(position[rows, None] - points, axis=-1).reshape(
+            -1, len(polylines), polylines.shape[1]
+        )
+        near[rows] = (distance <= far[rows, None, None]).any(-1)
+    there = np.zeros((len(members), len(polylines)), dtype=bool)
+    for column in members.T:
+        there |= near[column] & (column >= 0)[:, None]
+    ordered = nearest_pieces(polylines, centre, len(polylines))
+    kept = np.take_along_axis(there, ordered, 1)
+    count = kept.sum(1)
+    # Kept pieces come first, in their order.
+    place = np.argsort(~kept, axis=1, kind="stable")[:, : count.max(initial=0)]
+    found = np.take_along_axis(ordered, place, 1)
+    return np.where(np.arange(place.shape[1]) < count[:, None], found, -1).astype(np.int32)
+
+
 def far_from_lanes(scenes: SceneTables) -> tuple[int, int]:
     """Numbers of moving agents that end farther than ``FAR`` from every lane point of their scene, and of all moving agents.
 

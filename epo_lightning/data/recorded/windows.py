@@ -18,9 +18,10 @@ from jaxtyping import Bool, Int
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.clock import TOO_SHORT, Stretches, stretches
+from epo_lightning.data.recorded.junctions import Junctions
 from epo_lightning.data.recorded.lanes import Located, lane_changes
-from epo_lightning.data.recorded.routes import Routes, pieces
-from epo_lightning.data.recorded.surroundings import nearest_pieces
+from epo_lightning.data.recorded.routes import BEYOND, Routes, pieces, reach
+from epo_lightning.data.recorded.surroundings import nearest_pieces, reachable_pieces
 from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.tracks import Recording
 from epo_lightning.registry import ConfigError
@@ -61,12 +62,15 @@ class WindowConfig:
         every: steps between two windows.
         complete: whether neighbours must be observed in the whole window, like the focal agent, or only at the current step.
         smoothing: length [s] of the smoothing filter; null for tracks that are smooth already.
-        lanes: largest number of lane polylines L of a scene, the nearest ones.
+        lanes: largest number of lane polylines L of a scene, the nearest ones; null for all that an agent may reach.
         speed_limit: reference speed [m/s] on lanes without a speed limit.
         off_lane: what is left out if an agent is on no lane of the map: the ``window``, or the ``agent``, as if it were not
             there, such as parked cars. With ``agent``, pedestrians always count as on no lane.
         interpolate: whether ``dt`` may be less than the time between two frames of a recording. Steps between frames are
             then interpolated, and the last steps of a history are computed without the frames after them.
+        lines: largest number of reference lines R of an agent, along all successors of its lane and after one lane change
+            (:mod:`~epo_lightning.data.recorded.junctions`); null for three lines, on its lane and on those beside it, which
+            follow the straightest successors (:mod:`~epo_lightning.data.recorded.routes`).
     """
 
     dt: float = 0.2
@@ -79,10 +83,11 @@ class WindowConfig:
     every: int = 1
     complete: bool = True
     smoothing: float | None = None
-    lanes: int = 32
+    lanes: int | None = 32
     speed_limit: float = 36.1
     off_lane: Literal["window", "agent"] = "window"
     interpolate: bool = False
+    lines: int | None = None
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -92,8 +97,10 @@ class WindowConfig:
             ("least_agents", 1),
             ("every", 1),
             ("lanes", 1),
+            ("lines", 1),
         ):
-            if getattr(self, name) < least:
+            value = getattr(self, name)
+            if value is not None and value < least:
                 raise ConfigError(f"data.windows.{name} must be {least} or more, not {getattr(self, name)}")
         for name in ("dt", "speed_limit"):
             if not 0 < getattr(self, name) < np.inf:
@@ -114,7 +121,7 @@ class WindowConfig:
             )
 
 
-LATER = ("off_lane", "interpolate")
+LATER = ("off_lane", "interpolate", "lines")
 """Settings of windows that older versions did not have."""
 
 
@@ -318,13 +325,24 @@ def _assemble(
     direction = np.where(scattered, heading[:, 0], np.arctan2(ahead[:, 1], ahead[:, 0]))
     candidates, references = np.empty((len(used), 0, 2)), np.empty((len(used), 0, 0, 2))
     speed, polylines = np.empty((len(used), 0)), np.empty((0, VECTORS + 1, 2))
+    lines, near = None, nearest_pieces(polylines, centre, config.lanes or 0)
     if recording.lanes is not None:
         here = Located(located.lane[used], located.along[used], located.offset[used])
-        route = Routes(recording.lanes).of(now[:, :2], now[:, 3], here, config.horizon * config.dt)
+        time = config.horizon * config.dt
+        if config.lines is None:
+            route = Routes(recording.lanes).of(now[:, :2], now[:, 3], here, time)
+        else:
+            route = Junctions(recording.lanes, config.lines).of(now[:, :2], now[:, 2], now[:, 3], here, time)
+            lines = None if route.count is None else route.count.astype(np.int32)
         candidates, references = route.candidates - origin, route.references - origin
         limit = recording.lanes.speed_limit[here.lane]
         speed = np.where(np.isnan(limit), config.speed_limit, limit)
         polylines = pieces(recording.lanes, VECTORS, SPACING)
+        if config.lanes is None:
+            _, far = reach(now[:, 3], time)
+            near = reachable_pieces(polylines, now[:, :2], far + BEYOND, place, centre)
+        else:
+            near = nearest_pieces(polylines, centre, config.lanes)
     return SceneTables(
         history=history,
         history_mask=history_mask,
@@ -338,10 +356,11 @@ def _assemble(
         reference_speed=speed.astype(np.float32),
         polylines=polylines - origin,
         agents=place.astype(np.int32),
-        lanes=nearest_pieces(polylines, centre, config.lanes),
+        lanes=near,
         centre=centre - origin,
         direction=direction,
         recording=np.zeros(len(moments), dtype=np.int32),
         frame=np.round(moments * config.dt * recording.tracks.rate).astype(np.int64),
         origin=origin[None],
+        lines=lines,
     )

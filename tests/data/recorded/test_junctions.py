@@ -1,0 +1,303 @@
+"""Routes through junctions, compared with slow and obvious versions on random road graphs."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from epo_lightning.data.recorded.junctions import (
+    APART,
+    CHANGE,
+    SIDEWAYS,
+    Junctions,
+    _followed,
+    choose_lines,
+    too_sharp,
+    ways,
+)
+from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph
+from epo_lightning.data.recorded.routes import BRAKING, PER_LINE, Routes, reach
+from epo_lightning.data.recorded.scenes import RecordedScenes
+from epo_lightning.data.recorded.surroundings import reachable_pieces
+from epo_lightning.data.recorded.windows import WindowConfig, extract, identifying
+from epo_lightning.registry import ConfigError
+
+from .roads import WIDTH, curve, recording, road
+
+
+def graph(centres, successors, left=None, right=None, kind=None) -> LaneGraph:
+    """A lane graph of centrelines, with boundaries beside them."""
+    count = len(centres)
+    centres = [np.asarray(line, dtype=float) for line in centres]
+    across = []
+    for line in centres:
+        way = np.gradient(line, axis=0)
+        normal = np.stack([-way[:, 1], way[:, 0]], 1)
+        across.append(WIDTH / 2 * normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    none = np.full(count, -1)
+    left = none if left is None else np.array(left)
+    right = none if right is None else np.array(right)
+    return LaneGraph(
+        np.arange(count),
+        [line + side for line, side in zip(centres, across, strict=True)],
+        [line - side for line, side in zip(centres, across, strict=True)],
+        centres,
+        successors,
+        left,
+        right,
+        left,
+        right,
+        np.full(count, np.nan),
+        np.zeros(count, int) if kind is None else np.array(kind),
+    ).check("graph")
+
+
+def crossing() -> LaneGraph:
+    """A road that ends in a junction: lanes 1, 4 lead to the left, 2, 5 straight on, and 3, 6 to the right."""
+    turn = np.linspace(0, np.pi / 2, 12)
+    left = np.stack([12 * np.sin(turn), 12 - 12 * np.cos(turn)], 1)
+    right = np.stack([8 * np.sin(turn), 8 * np.cos(turn) - 8], 1)
+    return graph(
+        [
+            np.stack([np.linspace(-60, 0, 13), np.zeros(13)], 1),
+            left,
+            [[0, 0], [12, 0]],
+            right,
+            [[12, 12], [12, 150]],
+            [[12, 0], [150, 0]],
+            [[8, -8], [8, -150]],
+        ],
+        [(1, 2, 3), (4,), (5,), (6,), (), (), ()],
+    )
+
+
+def random_graph(seed: int, count: int = 6) -> LaneGraph:
+    """Straight lanes anywhere, with random successors and neighbours."""
+    random = np.random.default_rng(seed)
+    start = random.uniform(-50, 50, (count, 2))
+    centres = [[point, point + random.uniform(5, 30, 2)] for point in start]
+    successors = [tuple(np.flatnonzero(random.uniform(size=count) < 0.3).tolist()) for _ in range(count)]
+    beside = [random.permutation(count) for _ in range(2)]
+    beside = [np.where(random.uniform(size=count) < 0.5, each, -1) for each in beside]
+    beside = [np.where(each == np.arange(count), -1, each) for each in beside]
+    return graph(centres, successors, *beside, kind=(random.uniform(size=count) < 0.2).astype(int))
+
+
+@given(st.integers(0, 10_000), st.floats(-30, 5), st.floats(1, 80))
+@settings(max_examples=25)
+def test_all_successors_within_reach_are_followed(seed, begin, far):
+    lanes = random_graph(seed)
+    length = lanes.centrelines.length.tolist()
+    expected = set()
+    for size in range(1, len(lanes) + 1):
+        for path in itertools.permutations(range(len(lanes)), size):  # every sequence of lanes without a loop
+            ends = np.cumsum([begin, *(length[lane] for lane in path)])[1:]
+            if path[0] != 0 or any(after not in lanes.successors[lane] for lane, after in itertools.pairwise(path)):
+                continue
+            goes_on = ends[-1] < far and set(lanes.successors[path[-1]]) - set(path)
+            if (ends[:-1] < far).all() and not goes_on:
+                expected.add(path)
+    found = _followed(0, begin, far, lanes, length)
+    assert {path for path, _ in found} == expected
+    assert len(found) == len(expected)
+    for path, begins in found:
+        np.testing.assert_allclose(begins, begin + np.cumsum([0, *(length[lane] for lane in path[:-1])]))
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=25)
+def test_ways_change_lane_once_at_most_and_only_to_driving_lanes(seed):
+    lanes = random_graph(seed)
+    random = np.random.default_rng(seed)
+    length = lanes.centrelines.length.tolist()
+    starts = [(0, float(random.uniform(0, length[0])), 0.0), (1, float(random.uniform(0, length[1])), 2.0)]
+    far = float(random.uniform(10, 80))
+    found = ways(starts, far, lanes, length)
+    cost = [way.cost for way in found]
+    assert cost == sorted(cost)
+    assert {way.lanes for way in found if way.cost < CHANGE} == {
+        path for lane, along, _ in starts for path, _ in _followed(lane, -along, far, lanes, length)
+    }
+    kept = {lane for way in found if way.cost < CHANGE for lane in way.lanes}
+    beside = {int(side[lane]) for lane in kept for side in (lanes.left_of, lanes.right_of)} - {-1}
+    driving = {lane for lane in beside if lanes.kind[lane] != SHOULDER}
+    assert driving <= {lane for way in found for lane in way.lanes}, "every lane beside a way can be reached"
+    for way in found:
+        jumps = [(one, other) for one, other in itertools.pairwise(way.lanes) if other not in lanes.successors[one]]
+        assert len(jumps) <= (way.cost >= CHANGE)
+        if way.cost >= CHANGE:
+            assert any(lane in driving for lane in way.lanes)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 4))
+@settings(max_examples=30)
+def test_lines_are_chosen_as_by_a_plain_loop(seed, most):
+    random = np.random.default_rng(seed)
+    points = random.uniform(-1, 1, (5, 6, 3, 2)) * random.choice([0.3, 2.0], (5, 6, 1, 1))
+    cost = random.permutation(30).reshape(5, 6).astype(float)
+    absent = random.uniform(size=(5, 6)) < 0.3
+    absent[:, 0] = False
+    cost[absent], points[absent] = np.inf, np.nan
+    order, count = choose_lines(points, cost, most)
+    for row in range(5):
+        kept: list[int] = []
+        for column in sorted(range(6), key=lambda column: cost[row, column]):
+            new = all(np.linalg.norm(points[row, column] - points[row, k], axis=1).max() >= APART for k in kept)
+            if new and len(kept) < most and not absent[row, column]:
+                kept.append(column)
+        assert order[row, : count[row]].tolist() == kept
+
+
+def lines_of(lanes: LaneGraph, most: int, position, heading, speed):
+    position = np.array([position], dtype=float)
+    located = lanes.locate(position, np.array([heading]))
+    return Junctions(lanes, most).of(position, np.array([heading]), np.array([speed]), located, 4.0)
+
+
+@pytest.mark.parametrize(("end", "way"), [((12.0, 30.0), 1), ((30.0, 0.0), 2), ((8.0, -25.0), 3)])
+def test_goals_lie_on_every_way_through_a_junction(end, way):
+    lanes = crossing()
+    route = lines_of(lanes, 6, (-10.0, 0.3), 0.0, 8.0)
+    nearest = np.linalg.norm(route.candidates[0, : route.count[0] * PER_LINE] - end, axis=1).min()
+    assert nearest < 1.5
+    position, heading = np.array([[-10.0, 0.3]]), np.zeros(1)
+    today = Routes(lanes).of(position, np.array([8.0]), lanes.locate(position, heading), 4.0)
+    alone = np.linalg.norm(today.candidates[0] - end, axis=1).min()
+    assert (alone < 2.5) == (way == 2), "three lines follow the straightest successor"
+
+
+def test_the_number_of_lines_is_that_of_the_ways_and_the_others_repeat_the_first():
+    route = lines_of(crossing(), 12, (-10.0, 0.3), 0.0, 8.0)
+    assert route.count.tolist() == [9], "three ways, each with its centreline and two boundaries"
+    np.testing.assert_array_equal(route.references[0, 9], route.references[0, 0])
+    few = lines_of(crossing(), 2, (-10.0, 0.3), 0.0, 8.0)
+    assert few.count.tolist() == [2]
+    np.testing.assert_array_equal(few.references[0], route.references[0, :2])
+    # A vehicle that stands far from the junction does not reach it.
+    still = lines_of(crossing(), 5, (-50.0, 0.0), 0.0, 0.0)
+    assert still.count.tolist() == [3]
+    lateral = still.candidates[0].reshape(5, PER_LINE, 2)[:3, :, 1]
+    np.testing.assert_allclose(lateral, np.array([0.0, WIDTH / 2, -WIDTH / 2])[:, None] * np.ones(PER_LINE))
+
+
+def test_bends_that_a_fast_vehicle_cannot_take_come_last():
+    slow, fast = (lines_of(crossing(), 1, (-2.0, -0.4), -0.2, speed) for speed in (5.0, 20.0))
+    whole = lines_of(crossing(), 12, (-2.0, 0.0), 0.0, 20.0)
+    lines = whole.candidates[0].reshape(12, PER_LINE, 2)
+    assert (np.abs(lines[:3, :, 1]) <= WIDTH / 2 + 1e-9).all(), "straight on and its boundaries come first"
+    assert (np.abs(lines[3 : whole.count[0], -1, 1]) > 20).all(), "the others are used where there are lines to spare"
+    assert (fast.candidates[0, :, 1] == 0).all()
+    assert slow.count.tolist() == [1]
+
+
+@given(st.floats(0, 30), st.floats(3, 60))
+def test_a_bend_is_too_sharp_by_its_speed_after_braking(speed, radius):
+    _, (far,) = reach(np.array([speed]), 4.0)
+    along = np.linspace(0, far, PER_LINE)
+    bend = np.maximum(along - 20.0, 0) / radius  # the bend begins after 20 m
+    inside = np.minimum(along, 20.0)
+    points = np.stack([inside + radius * np.sin(bend), radius * (1 - np.cos(bend))], 1)
+    found = bool(too_sharp(points[None, None], np.array([speed]), np.array([far]))[0, 0])
+    gap = far / (PER_LINE - 1)
+    if bend[-1] == 0 or gap / radius > np.pi / 2:
+        assert bend[-1] > 0 or not found
+        return
+    # The bend is seen up to two gaps late or early.
+    least, most = (max(speed**2 - 2 * BRAKING * max(20.0 + way * gap, 0), 0) / radius for way in (2, -2))
+    if most < 0.9 * SIDEWAYS:
+        assert not found
+    if least > 1.3 * SIDEWAYS and bend[-1] > 3 * gap / radius:
+        assert found
+
+
+def test_an_agent_on_overlapping_lanes_has_the_ways_of_all_of_them():
+    # Just behind the fork the three lanes overlap, and the straight one fits best.
+    route = lines_of(crossing(), 3, (3.0, 0.2), 0.05, 6.0)
+    assert route.count.tolist() == [3]
+    ends = route.candidates[0].reshape(3, PER_LINE, 2)[:, -1]
+    assert (ends[:, 1] > 20).any()
+    assert (ends[:, 1] < -20).any()
+    assert (np.abs(ends[:, 1]) < 1).any()
+
+
+def test_a_turning_bay_that_begins_ahead_is_reached_over_the_lanes_before_it():
+    bay = [[20.0, WIDTH], [40.0, WIDTH]]
+    lanes = graph(
+        [
+            [[0.0, 0.0], [20.0, 0.0]],
+            [[20.0, 0.0], [40.0, 0.0]],
+            bay,
+            [[40.0, 0.0], [140.0, 0.0]],
+            [[40.0, WIDTH], [40.0, 90.0]],
+        ],
+        [(1,), (3,), (4,), (), ()],
+        left=[-1, 2, -1, -1, -1],
+    )
+    route = lines_of(lanes, 4, (5.0, 0.0), 0.0, 10.0)
+    turning = route.candidates[0].reshape(4, PER_LINE, 2)[1]
+    assert turning[-1, 1] > 20
+    assert np.linalg.norm(turning - (30.0, WIDTH), axis=1).min() < 2.0
+
+
+WINDOWS = WindowConfig(lane_change=False, lines=9, lanes=None)
+
+
+def test_scenes_have_the_lines_of_their_agents_and_masks_of_those_that_exist():
+    of = recording(curve(900.0, 0.3))
+    found, _ = extract(of, WINDOWS)
+    columns = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in found.columns().items()}
+    data = RecordedScenes(columns, 0.2, "aligned", [of.name])
+    scene = data[torch.arange(len(data))]
+    assert scene.references.shape[2] == 9
+    assert scene.goal_candidates.shape[2] == 9 * PER_LINE
+    count = columns["lines"][columns["agents"].long()]
+    assert torch.equal(scene.reference_mask.sum(-1), count)
+    assert (count < 9).any()
+    assert torch.equal(scene.goal_mask.sum(-1), PER_LINE * count)
+    assert torch.equal(scene.goal_mask, scene.reference_mask.repeat_interleave(PER_LINE, -1))
+    assert scene.finite.all()
+
+
+def test_lanes_within_reach_equal_a_plain_loop():
+    random = np.random.default_rng(0)
+    lines = random.uniform(-200, 200, (40, 1, 2)) + random.uniform(-9, 9, (40, 11, 2))
+    position, far = random.uniform(-200, 200, (12, 2)), random.uniform(10, 120, 12)
+    members = random.integers(-1, 12, (9, 3))
+    centre = random.uniform(-200, 200, (9, 2))
+    found = reachable_pieces(lines, position, far, members, centre)
+    for scene in range(9):
+        expected = [
+            line
+            for line in sorted(range(40), key=lambda line: np.linalg.norm(lines[line, 5] - centre[scene]))
+            if any(
+                np.linalg.norm(point - position[agent]) <= far[agent]
+                for agent in members[scene]
+                if agent >= 0
+                for point in lines[line]
+            )
+        ]
+        assert found[scene][found[scene] >= 0].tolist() == expected
+
+
+def test_settings_of_junctions_enter_the_identity_of_a_data_set_only_where_they_are_used():
+    assert "lines" not in identifying(WindowConfig())
+    assert identifying(WINDOWS)["lines"] == 9
+    with pytest.raises(ConfigError, match=r"data\.windows\.lines must be 1 or more, not 0"):
+        WindowConfig(lines=0)
+
+
+def test_a_road_without_junctions_has_the_lines_of_its_lanes():
+    place = curve(None)
+    lanes = road(place)
+    position, heading = place(np.array([50.0]), np.array([WIDTH]))
+    located = lanes.locate(position, heading)
+    today = Routes(lanes).of(position, np.array([20.0]), located, 4.0)
+    route = Junctions(lanes, 8).of(position, heading, np.array([20.0]), located, 4.0)
+    assert route.count.tolist() == [7], "three lanes and their four boundaries"
+    ours = {tuple(np.round(point, 3)) for point in route.candidates[0, : 3 * PER_LINE]}
+    assert ours == {tuple(np.round(point, 3)) for point in today.candidates[0]}
