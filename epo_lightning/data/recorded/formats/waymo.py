@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import shapely
 from google.protobuf.message import DecodeError
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from epo_lightning.data.recorded.formats.onboard import RATE, References, refuse, tracks_of
 from epo_lightning.data.recorded.formats.tfrecord import Place, content_of, places
@@ -55,6 +55,8 @@ MILES_PER_HOUR = 0.44704
 """[m/s]"""
 HALF, HALF_BIKE = 1.8, 0.75
 """Distance [m] from a centreline to the boundary of its lane where the map has none."""
+SAME = 1e-6
+"""Largest distance [m] of points of a line that are the same."""
 NARROWEST, WIDEST = 0.5, 3.0
 """Smallest and largest distance [m] from a centreline to a boundary: road edges of other lanes may be named too."""
 
@@ -145,9 +147,11 @@ def _read_recording(name: str, group: str, shard: Path, place: Place) -> Recordi
 
 
 def _tracks(message: Any, path: Path, dropped: Counter[str]) -> TrackTable:
-    steps = np.diff(np.array(message.timestamps_seconds)) * RATE
-    if not (np.abs(steps - 1) <= JITTER).all():
-        at = int(np.flatnonzero(~(np.abs(steps - 1) <= JITTER))[0])
+    with np.errstate(invalid="ignore", over="ignore"):
+        steps = np.diff(np.array(message.timestamps_seconds)) * RATE
+        uneven = ~(np.abs(steps - 1) <= JITTER)
+    if uneven.any():
+        at = int(np.flatnonzero(uneven)[0])
         raise RecordingError(
             path, f"{steps[at] / RATE:.3g} s between the frames {at} and {at + 1}; {1 / RATE:g} s were expected"
         )
@@ -201,7 +205,7 @@ def _lanes(message: Any, path: Path, dropped: Counter[str]) -> LaneGraph | None:
             if feature.id in lanes:
                 raise RecordingError(path, f"there are two lanes with the id {feature.id}: give each its own")
             line = _points(feature.lane.polyline, f"lane {feature.id}", path)
-            if len(line) < 2 or not np.ptp(line, axis=0).any():
+            if _moved(line).sum() < 2:
                 dropped["lanes without length"] += 1
                 continue
             lanes[feature.id], centre[feature.id] = feature.lane, line
@@ -218,7 +222,7 @@ def _lanes(message: Any, path: Path, dropped: Counter[str]) -> LaneGraph | None:
     lines: list[Polyline] = []
     limit = np.full(len(lanes), np.nan)
     for at, (identity, lane) in enumerate(lanes.items()):
-        moved = np.append(True, (np.diff(centre[identity], axis=0) != 0).any(1))
+        moved = _moved(centre[identity])
         lines.append(centre[identity][moved])
         normal = _normals(lines[-1])
         for side, (neighbours, boundaries, sign) in enumerate(
@@ -263,6 +267,11 @@ def _points(points: Any, what: str, path: Path) -> Polyline:
     return line
 
 
+def _moved(line: Polyline) -> Bool[np.ndarray, " n"]:
+    """Mask of the points of a line that differ from the point before."""
+    return np.append(np.ones(min(len(line), 1), dtype=bool), np.hypot(*np.diff(line, axis=0).T) > SAME)
+
+
 def _normals(line: Polyline) -> Polyline:
     """Unit vectors to the left at the points of a line without equal consecutive points."""
     way = np.diff(line, axis=0)
@@ -291,7 +300,8 @@ def _half_width(
 
     def measure(first: int, last: int, other: Any, share: float) -> None:
         part = slice(max(first, 0), max(last, 0) + 1)
-        way = share * shapely.distance(shapely.points(line[part]), other)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = share * shapely.distance(shapely.points(line[part]), other)
         half[part] = np.fmin(half[part], np.clip(way, NARROWEST, WIDEST))
 
     for boundary in boundaries:
