@@ -12,7 +12,7 @@ import json
 import os
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -210,7 +210,9 @@ def read_map(path: Path, dropped: Counter[str]) -> LaneGraph | None:
     segments = _segments(path)
     if not segments:
         return None
-    lanes, lines = [], []
+    lanes: list[dict[str, Any]] = []
+    left: list[Polyline] = []
+    right: list[Polyline] = []
     ids: set[int] = set()
     for segment in segments:
         identity = _whole(segment.get("id"), "the id of a lane", path)
@@ -221,19 +223,22 @@ def read_map(path: Path, dropped: Counter[str]) -> LaneGraph | None:
             _line(segment.get(name), f"{name} of lane {identity}", path)
             for name in ("left_lane_boundary", "right_lane_boundary")
         ]
-        lines_of_lane = (*sides, midway(*sides))
-        if not all(len(line) and np.ptp(line, axis=0).any() for line in lines_of_lane):
+        if not all((line != line[:1]).any() for line in sides):
             dropped["lanes without length"] += 1
             continue
         lanes.append(segment)
-        lines.append(lines_of_lane)
+        for lines, line in zip((left, right), sides, strict=True):
+            lines.append(line)
+    if not lanes:
+        raise RecordingError(path, "none of its lanes has a length: fetch the file again")
+    centre = midways(left, right)
     references = References((segment["id"] for segment in lanes), dropped)
     exits, entries = (
         [_wholes(lane.get(name), f"{name} of lane {lane['id']}", path) for lane in lanes]
         for name in ("successors", "predecessors")
     )
     beside, change = np.full((2, len(lanes)), -1), np.full((2, len(lanes)), -1)
-    chord = [middle[-1] - middle[0] for _, _, middle in lines]
+    chord = [line[-1] - line[0] for line in centre]
     for at, lane in enumerate(lanes):
         for number, side in enumerate(("left", "right")):
             neighbour = lane.get(f"{side}_neighbor_id")
@@ -248,9 +253,9 @@ def read_map(path: Path, dropped: Counter[str]) -> LaneGraph | None:
                     change[number, at] = to
     return LaneGraph(
         ids=np.array([lane["id"] for lane in lanes], dtype=int),
-        left=[left for left, _, _ in lines],
-        right=[right for _, right, _ in lines],
-        centre=[middle for _, _, middle in lines],
+        left=left,
+        right=right,
+        centre=centre,
         successors=references.successors(exits, entries),
         left_of=change[0],
         right_of=change[1],
@@ -261,15 +266,21 @@ def read_map(path: Path, dropped: Counter[str]) -> LaneGraph | None:
     ).check(path)
 
 
-def midway(left: Polyline, right: Polyline) -> Polyline:
-    """The line of the midpoints of two boundaries at equal shares of their lengths, at most ``SPACING`` apart."""
-    if min(len(left), len(right)) < 2:
-        return left[:1]
-    boundaries = [shapely.LineString(line) for line in (left, right)]
-    length = max(shapely.length(boundary) for boundary in boundaries)
-    share = np.linspace(0.0, 1.0, min(int(np.ceil(length / SPACING)), MOST) + 1)
-    points = [shapely.get_coordinates(shapely.line_interpolate_point(b, share, normalized=True)) for b in boundaries]
-    return (points[0] + points[1]) / 2
+def midways(left: Sequence[Polyline], right: Sequence[Polyline]) -> list[Polyline]:
+    """The lines of the midpoints of pairs of boundaries at equal shares of their lengths, at most ``SPACING`` apart."""
+    sides = []
+    for lines in (left, right):
+        owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+        sides.append(shapely.linestrings(np.concatenate(lines), indices=owner))
+    length = np.maximum(*(shapely.length(side) for side in sides))
+    pieces = np.clip(np.ceil(length / SPACING), 1, MOST).astype(int)
+    lane = np.repeat(np.arange(len(left)), pieces + 1)
+    first = np.append(0, (pieces + 1).cumsum())
+    share = (np.arange(len(lane)) - first[lane]) / pieces[lane]
+    points = [
+        shapely.get_coordinates(shapely.line_interpolate_point(side[lane], share, normalized=True)) for side in sides
+    ]
+    return np.split((points[0] + points[1]) / 2, first[1:-1])
 
 
 def _segments(path: Path) -> list[dict[str, Any]]:

@@ -19,6 +19,7 @@ import numpy as np
 import shapely
 from google.protobuf.message import DecodeError
 from jaxtyping import Bool, Float
+from numba import njit
 
 from epo_lightning.data.recorded.formats.onboard import RATE, References, refuse, tracks_of
 from epo_lightning.data.recorded.formats.tfrecord import Place, content_of, places
@@ -55,6 +56,8 @@ MILES_PER_HOUR = 0.44704
 """[m/s]"""
 HALF, HALF_BIKE = 1.8, 0.75
 """Distance [m] from a centreline to the boundary of its lane where the map has none."""
+FLAT = 0.02
+"""Largest distance [m] of a simplified line from the line in the map."""
 SAME = 1e-6
 """Largest distance [m] of points of a line that are the same."""
 NARROWEST, WIDEST = 0.5, 3.0
@@ -199,7 +202,7 @@ def _lanes(message: Any, path: Path, dropped: Counter[str]) -> LaneGraph | None:
     """The lane graph of a scenario; None without lanes."""
     lanes: dict[int, Any] = {}
     centre: dict[int, Polyline] = {}
-    beside: dict[int, Any] = {}
+    beside: dict[int, Polyline] = {}
     for feature in message.map_features:
         if feature.HasField("lane"):
             if feature.id in lanes:
@@ -213,7 +216,7 @@ def _lanes(message: Any, path: Path, dropped: Counter[str]) -> LaneGraph | None:
             if feature.HasField(kind):
                 line = _points(getattr(feature, kind).polyline, f"{kind} {feature.id}", path)
                 if len(line) > 1:
-                    beside[feature.id] = shapely.LineString(line)
+                    beside[feature.id] = line
     if not lanes:
         return None
     references = References(lanes, dropped)
@@ -245,9 +248,9 @@ def _lanes(message: Any, path: Path, dropped: Counter[str]) -> LaneGraph | None:
                 limit[at] = np.nan
     return LaneGraph(
         ids=np.array(list(lanes), dtype=int),
-        left=sides[0],
-        right=sides[1],
-        centre=lines,
+        left=_simplified(sides[0]),
+        right=_simplified(sides[1]),
+        centre=_simplified(lines),
         successors=references.successors(
             [lane.exit_lanes for lane in lanes.values()], [lane.entry_lanes for lane in lanes.values()]
         ),
@@ -284,12 +287,37 @@ def _normals(line: Polyline) -> Polyline:
     return np.stack([-along[:, 1], along[:, 0]], 1)
 
 
+def _simplified(lines: Sequence[Polyline]) -> list[Polyline]:
+    """Lines with fewer points, at most ``FLAT`` from the given ones: the maps have a point every half metre."""
+    found = shapely.simplify([shapely.LineString(line) for line in lines], FLAT)
+    return [shapely.get_coordinates(line) for line in found]
+
+
+@njit(cache=True)
+def _distance(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Distance of each point from a polyline."""
+    found = np.empty(len(points))
+    for k in range(len(points)):
+        x, y = points[k]
+        best = np.inf
+        for j in range(len(line) - 1):
+            along_x, along_y = line[j + 1, 0] - line[j, 0], line[j + 1, 1] - line[j, 1]
+            to_x, to_y = x - line[j, 0], y - line[j, 1]
+            square = along_x * along_x + along_y * along_y
+            share = 0.0
+            if square > 0:
+                share = min(1.0, max(0.0, (to_x * along_x + to_y * along_y) / square))
+            best = min(best, (to_x - share * along_x) ** 2 + (to_y - share * along_y) ** 2)
+        found[k] = np.sqrt(best)
+    return found
+
+
 def _half_width(
     line: Polyline,
     lane: Any,
     neighbours: Sequence[Any],
     boundaries: Sequence[Any],
-    beside: dict[int, Any],
+    beside: dict[int, Polyline],
     centre: dict[int, Polyline],
 ) -> Float[np.ndarray, " n"]:
     """Distance [m] from each point of a centreline to the boundary on one side.
@@ -298,10 +326,9 @@ def _half_width(
     """
     half = np.full(len(line), np.nan)
 
-    def measure(first: int, last: int, other: Any, share: float) -> None:
+    def measure(first: int, last: int, other: Polyline, share: float) -> None:
         part = slice(max(first, 0), max(last, 0) + 1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            way = share * shapely.distance(shapely.points(line[part]), other)
+        way = share * _distance(line[part], other)
         half[part] = np.fmin(half[part], np.clip(way, NARROWEST, WIDEST))
 
     for boundary in boundaries:
@@ -310,8 +337,7 @@ def _half_width(
     known = ~np.isnan(half)
     for neighbour in neighbours:
         if neighbour.feature_id in centre and not known.all():
-            other = shapely.LineString(centre[neighbour.feature_id])
             named = half.copy()
-            measure(neighbour.self_start_index, neighbour.self_end_index, other, 0.5)
+            measure(neighbour.self_start_index, neighbour.self_end_index, centre[neighbour.feature_id], 0.5)
             half = np.where(known, named, half)
     return np.where(np.isnan(half), HALF_BIKE if lane.type == BIKE_LANE else HALF, half)

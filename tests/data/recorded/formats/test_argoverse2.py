@@ -12,7 +12,7 @@ import pytest
 
 from data.recorded.formats.argoverse2_files import city, drive, lane, points, write
 from data.recorded.formats.exid_files import shared
-from epo_lightning.data.recorded.formats.argoverse2 import argoverse2, midway
+from epo_lightning.data.recorded.formats.argoverse2 import argoverse2, midways
 from epo_lightning.data.recorded.lanes import LANE, SHOULDER
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.tracks import RecordingError
@@ -324,10 +324,10 @@ def test_lanes_without_length_are_counted_and_no_lanes_are_no_map(tmp_path):
 def test_a_centreline_is_midway_between_its_boundaries():
     angle = np.linspace(0, np.pi / 2, 40)
     arc = np.stack([np.cos(angle), np.sin(angle)], 1)
-    middle = midway(20.0 * arc, 24.0 * arc[::3])
+    middle, straight = midways([20.0 * arc, np.eye(2)], [24.0 * arc[::3], 2.0 * np.eye(2)])
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), 22.0, atol=0.03)
     assert np.linalg.norm(np.diff(middle, axis=0), axis=1).max() < 2.0
-    assert len(midway(np.zeros((2, 2)), np.zeros((2, 2)))) == 1
+    np.testing.assert_allclose(straight, [[1.5, 0.0], [0.75, 0.75], [0.0, 1.5]])
 
 
 def test_the_samples_agree_with_the_plain_reader():

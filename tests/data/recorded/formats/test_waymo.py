@@ -90,7 +90,8 @@ def test_lanes_have_successors_neighbours_and_boundaries(tmp_path):
     np.testing.assert_allclose(lanes.speed_limit, [11.176, 11.176, np.nan, 11.176, 11.176, 11.176])
     assert recording.dropped == {"lanes without length": 1, "lane references to lanes that do not exist": 1}
     at = {id: lane for lane, id in ids.items()}
-    np.testing.assert_array_equal(lanes.centre[at[10]], line(1.75, 0, 100))
+    np.testing.assert_array_equal(lanes.centre[at[10]], [(0.0, 1.75), (100.0, 1.75)])
+    np.testing.assert_array_equal(lanes.centre[at[14]], [(100.0, 5.25), (110.0, 7.0), (115.0, 12.0), (117.0, 30.0)])
     for id, left, right in (
         (10, 3.5, 0.0),  # a line on the left, an edge on the right
         (12, 3.5, -0.05),  # half way to the neighbour on the left, no information on the right
@@ -113,8 +114,19 @@ def test_repeated_points_and_sharp_turns_keep_boundaries_beside_the_line(tmp_pat
     lanes = recording.lanes
     np.testing.assert_array_equal(lanes.centre[0], [points[k] for k in (0, 1, 3, 4, 5)])
     for side in (lanes.left[0], lanes.right[0]):
-        np.testing.assert_allclose(np.linalg.norm(side - lanes.centre[0], axis=1), 1.8)
+        assert all(min(np.linalg.norm(np.subtract(point, points), axis=1)) == pytest.approx(1.8) for point in side)
     assert (lanes.left[0][:2, 1] > 0).all()
+
+
+def test_simplified_lines_stay_near_those_of_the_map(tmp_path):
+    angle = np.linspace(0, np.pi / 2, 60)
+    points = np.stack([20 * np.sin(angle), 20 - 20 * np.cos(angle)], 1)
+    lanes = one(tmp_path, scenario(features=[feature(1, 3, lane(points.tolist()))])).lanes
+    assert len(lanes.centre[0]) < 30
+    for found, radius in ((lanes.centre[0], 20.0), (lanes.left[0], 18.2), (lanes.right[0], 21.8)):
+        along = np.concatenate([found[:-1] + share * np.diff(found, axis=0) for share in np.linspace(0, 1, 9)])
+        np.testing.assert_allclose(np.linalg.norm(along - [0.0, 20.0], axis=1), radius, atol=0.03)
+    np.testing.assert_array_equal(lanes.centre[0][[0, -1]], points[[0, -1]])
 
 
 def test_boundaries_that_are_far_away_are_not_believed(tmp_path):
@@ -125,7 +137,7 @@ def test_boundaries_that_are_far_away_are_not_believed(tmp_path):
     ]
     lanes = one(tmp_path, scenario(features=features)).lanes
     np.testing.assert_allclose(lanes.left[0][:, 1], 3.0)
-    np.testing.assert_allclose(-lanes.right[0][:, 1], [1.8, 1.8, 0.5, 0.5, 0.5, *[1.8] * 6])
+    np.testing.assert_allclose(lanes.right[0], [(0, -1.8), (5, -1.8), (10, -0.5), (20, -0.5), (25, -1.8), (50, -1.8)])
 
 
 def test_a_scenario_is_one_recording_and_a_shard_is_read_in_places(tmp_path):
