@@ -131,6 +131,16 @@ def _mean_over_agents(values: Tensor, mask: Bool[Tensor, "B N K"]) -> Tensor:
     return torch.where(present, values, 0.0).sum(-1) / present.sum(-1).clamp_min(1)
 
 
+def _relaxed(
+    closest: Float[Tensor, "B *agents"], distance: Float[Tensor, "B M *agents"], relaxation: float
+) -> Float[Tensor, "B *agents"]:
+    """The distance of the closest mode, mixed with a share of the mean over all modes.
+
+    Without relaxation, modes at an infinite distance do not count.
+    """
+    return torch.lerp(closest, distance.mean(1), relaxation) if relaxation > 0 else closest
+
+
 def scene_imitation(
     distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0, temperature: float = 0.0
 ) -> tuple[Float[Tensor, ""], Int[Tensor, " B"]]:
@@ -146,7 +156,7 @@ def scene_imitation(
     closest, mode = joint.min(1)
     if temperature > 0:
         closest = soft_minimum(joint, temperature)
-    return torch.lerp(closest, joint.mean(1), relaxation).mean(), mode
+    return _relaxed(closest, joint, relaxation).mean(), mode
 
 
 def mode_shares(
@@ -192,7 +202,7 @@ def marginal_imitation(
     closest, mode = distance.min(1)
     if temperature > 0:
         closest = soft_minimum(distance, temperature)
-    return _mean_over_agents(torch.lerp(closest, distance.mean(1), relaxation), mask).mean(), mode
+    return _mean_over_agents(_relaxed(closest, distance, relaxation), mask).mean(), mode
 
 
 def marginal_probability(

@@ -1,6 +1,7 @@
 """Data classes of the project: the observed scene, the inferred game, its solution and the forecast.
 
-The letters in shapes mean the same everywhere. ``solvers/gauss_newton`` states the few that it uses otherwise:
+The letters in shapes mean the same everywhere. ``game`` and ``solvers/gauss_newton``
+state the few that they use otherwise:
 
 ====  ==========================  ======  ================================================================
 B     scenes in a batch           P       pairs of agents i < j, P = N (N - 1) / 2

@@ -125,6 +125,17 @@ def test_modes_at_an_infinite_distance_do_not_count():
     assert distance.grad[0, 2] == 0
 
 
+@pytest.mark.parametrize("temperature", [0.0, 2.0])
+def test_losses_without_relaxation_ignore_modes_at_an_infinite_distance(temperature):
+    distance = torch.tensor([[[1.0, 2.0], [3.0, 1.0], [math.inf, math.inf]]], requires_grad=True)
+    for imitation in (losses.scene_imitation, losses.marginal_imitation):
+        found, _ = imitation(distance, MASK[:1], temperature=temperature)
+        assert found.isfinite()
+        (slope,) = torch.autograd.grad(found, distance)
+        assert slope.isfinite().all()
+        assert (slope[0, 2] == 0).all()
+
+
 def test_a_scene_without_observations_has_no_loss_when_annealed():
     for imitation in (losses.scene_imitation, losses.marginal_imitation):
         assert imitation(torch.zeros(1, 2, 2), torch.zeros_like(MASK), temperature=1.0)[0] == 0.0

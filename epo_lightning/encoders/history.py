@@ -30,7 +30,8 @@ def history_vectors(scene: Scene, scale: float = 1.0) -> tuple[Float[Tensor, "B 
     batch, agents, steps = seen.shape
     start, end = position[..., :-1, :], position[..., 1:, :]
     observed = seen[..., :-1] & seen[..., 1:]
-    alone = ~observed.any(-1, keepdim=True) & (torch.arange(2 - steps, 1, device=seen.device) == 0)
+    newest = torch.arange(2 - steps, 1, device=seen.device) == 0
+    alone = ~observed.any(-1, keepdim=True) & newest
     time = scene.dt * torch.arange(2 - steps, 1, dtype=position.dtype, device=position.device)
     time = time[:, None].expand(batch, agents, steps - 1, 1)
     return torch.cat((torch.where(alone[..., None], end, start), end, time), -1), observed | alone

@@ -73,8 +73,8 @@ class Energy(ABC):
     @property
     def needs(self) -> set[str]:
         """Inputs of the terms: some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``,
-        ``reference_controls``, ``size``,
-        ``context``, ``order``."""
+        ``reference_controls``, ``size``, ``context``, ``order``. (For sizes of pairs see ``FeatureEnergy.needs_reach``.)
+        """
         return set()
 
     @property

@@ -68,7 +68,7 @@ def own_derivatives(
     """A declared own feature c(s) of its signal s, with its derivatives.
 
     Args:
-        feature, signal: the feature, and the values z.
+        feature, signal: the feature, and the values s of its signal.
         bounds: lowest and highest value by signal, for bounded features.
         second: whether second derivatives of functions are computed.
     """

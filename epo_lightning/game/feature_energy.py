@@ -224,7 +224,7 @@ class FeatureEnergy(Energy):
             scene, parameters, around: the game.
             at: states and controls.
             moved: their changes along D directions, in the first dimension.
-            slide: whether the nearest point of a line moves with the agent
+            slide: whether the nearest point of a line moves with the agent.
         """
         feature = self.own_features[name]
         if feature.declared:

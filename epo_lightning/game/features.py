@@ -11,8 +11,8 @@ Every feature declares its *source*, the quantity from which its signal is compu
 Jacobian, and solvers need to know nothing else about a feature (:mod:`~epo_lightning.game.feature_derivatives`). A custom
 feature may be undeclared: any differentiable function of the trajectory works, but more slowly::
 
-    @own_feature("lateral")                                   # [.., K, 4], [.., K, 2] -> [.., R]
-    def lateral(states, controls):
+    @own_feature("latacc")                                    # [.., K, 4], [.., K, 2] -> [.., R]
+    def latacc(states, controls):
         return states[..., SPEED] * controls[..., TURN_RATE]
 
     @own_feature("hard_braking", Source.CONTROL, channel=ACCELERATION)   # declared: of the signal alone, elementwise
@@ -81,8 +81,7 @@ class OwnFeature:
         channel: index of the control, for signals of controls.
         bounded: whether the feature is zero within the bounds.
         needs: further input of the signal: ``goals``, ``goal_headings``, ``reference``, ``reference_speed``,
-            ``reference_controls``, ``size``; None
-            for no other input.
+            ``reference_controls``, ``size``; None for no other input.
         function: elementwise function of the signal, or of states and controls for the source TRAJECTORY.
     """
 

@@ -193,7 +193,8 @@ class RPIData(SceneDataModule):
         """
         names = ("history", "goals", "states", "modes", "phi", "step")
         records = cache.load(self.folder, split, names, self.command, self.config)
-        # The robot crosses the circle at the heading 0 and the pedestrian at phi; `step` is the main game's step at t0.
+        # Robot and pedestrian cross the circle on which they start (`game.py`) at the headings 0 and phi; `step` is the step
+        # of the main game at t0.
         phi = records["phi"]
         records["goal_headings"] = torch.stack((torch.zeros_like(phi), phi), -1)
         records["game_steps"] = GameConstants().steps - records["step"]

@@ -284,6 +284,7 @@ def _add_undeclared(sums: _Sums, name: str) -> None:
     value, change = at.energy.own_residual(
         name, at.scene, at.parameters, at.around, (at.states, at.controls), moved
     )  # [B, M, N, R], [2 K, B, M, N, R]
+    # The residual is weighted already, w c, and its derivatives as well.
     value, jacobian = value.flatten(0, 1), change.flatten(1, 2).permute(1, 2, 0, 3)
     sums.add_value(value, value)
     sums.node_gradient += (jacobian @ value[..., None]).view_as(sums.node_gradient)

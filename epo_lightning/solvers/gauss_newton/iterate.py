@@ -45,7 +45,7 @@ class Iterate:
         around: inputs of the own features besides the trajectory.
         u, x: controls and states, by problem.
         unit, left: unit vectors of the headings, and those to their left.
-        moves: M_l, the derivatives of velocities (x, y) by the component speed and by the component heading.
+        moves: M_l, laid out [S, N, component, axis, K]: the derivatives of velocities (x, y) by speed and by heading.
     """
 
     energy: FeatureEnergy

@@ -103,6 +103,8 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
     after = at.to_velocities(sums.positions)
     along_e, along_left = ((direction[:, :, None] * after).sum(3) for direction in (at.unit, at.left))  # [S, N, 3, K]
     faster, turned = nodes.movedim(0, 2).unbind(3)  # [S, N, 2, K]
+    # Entry 0 acts through the velocities, entries 1 and 2 through their changes along mu and d, which are
+    # (change of v) e + v (change of theta) e'.
     node = sums.nodes
     node[:, :, 0] += along_e[:, :, 0] + (turned * along_left[:, :, 1:]).sum(2)
     node[:, :, 1] += at.speed * (along_left[:, :, 0] - (turned * along_e[:, :, 1:]).sum(2))

@@ -5,9 +5,9 @@ l >= l'
 
     M_l^T [dt^2 sum_{k>l} Q_k] M_l',   Q_k the second derivatives by p_k,
 
-so one matrix product with few columns gives the whole lower triangle. All other contributions are banded matrices: controls
-are first differences of z, their rates second differences, speeds contribute to the diagonal, and a steering angle couples a
-turn rate with the speed before it. The model holds the second derivatives by these quantities;
+so the whole lower triangle is that of the product of two tall matrices with 2 N columns each. All other contributions are
+banded matrices: controls are first differences of z, their rates second differences, speeds contribute to the diagonal, and
+a steering angle couples a turn rate with the speed before it. The model holds the second derivatives by these quantities;
 :mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and factorises the matrix.
 
 Pairs are a list of E edges between agents. Agent i of problem s has the number s N + i.
@@ -126,8 +126,8 @@ class QuadraticModel:
         own_dense: all second derivatives of undeclared own features by the nodes; None without.
         edges: the pairs that were evaluated.
         linked: the edges whose two agents are coupled.
-        pair_position: xx, xy and yy of an edge: added to the blocks of both agents, subtracted from the block between them;
-            None without edges.
+        pair_position: xx, xy and yy of an edge; None without edges. ``position`` already contains them for both agents, and
+            the block between the two agents is minus them.
         pair_dense: second derivatives of undeclared pair features by the nodes of both agents; None without.
         own: declared own features by name.
         pair: declared pair features by name.
