@@ -64,11 +64,11 @@ def pedestrians(frames: int = 8, case: str = "", blank: str = "") -> list[str]:
     return rows
 
 
-def write_recording(folder: Path, number: int = 0, suffix: str = ".osm") -> Path:
+def write_recording(folder: Path, number: int = 0, suffix: str = ".osm", frames: int = 12) -> Path:
     """One recording with its map; an empty suffix leaves the map out."""
     place = folder / "recorded_trackfiles" / PLACE
     place.mkdir(parents=True, exist_ok=True)
-    (place / f"vehicle_tracks_{number:03d}.csv").write_text("\n".join([HEADER, *vehicles()]) + "\n")
+    (place / f"vehicle_tracks_{number:03d}.csv").write_text("\n".join([HEADER, *vehicles(frames)]) + "\n")
     header = HEADER.rsplit(",", 3)[0]
     (place / f"pedestrian_tracks_{number:03d}.csv").write_text("\n".join([header, *pedestrians()]) + "\n")
     return write_map(folder, suffix)

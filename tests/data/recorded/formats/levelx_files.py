@@ -49,14 +49,14 @@ def highd_tracks(frames: int = 20) -> tuple[pl.DataFrame, pl.DataFrame]:
     return pl.DataFrame(rows), pl.DataFrame(meta)
 
 
-def write_highd(folder: Path, number: int = 1, location: int = 2, limit: float = -1.0) -> Path:
+def write_highd(folder: Path, number: int = 1, location: int = 2, limit: float = -1.0, frames: int = 20) -> Path:
     """One recording of highD."""
     folder.mkdir(parents=True, exist_ok=True)
-    tracks, meta = highd_tracks()
+    tracks, meta = highd_tracks(frames)
     tracks.write_csv(folder / f"{number:02d}_tracks.csv")
     meta.write_csv(folder / f"{number:02d}_tracksMeta.csv")
     setting = {"id": number, "frameRate": int(RATE), "locationId": location, "speedLimit": limit, "month": "9.2017"}
-    setting |= {"weekDay": "Tue", "startTime": "08:38", "duration": 1.2, "totalDrivenDistance": 100.0}
+    setting |= {"weekDay": "Tue", "startTime": "08:38", "duration": frames / RATE + 0.4, "totalDrivenDistance": 100.0}
     setting |= {"totalDrivenTime": 3.2, "numVehicles": 4, "numCars": 3, "numTrucks": 1}
     setting |= {"upperLaneMarkings": ";".join(map(str, UPPER)), "lowerLaneMarkings": ";".join(map(str, LOWER))}
     pl.DataFrame([setting]).write_csv(folder / f"{number:02d}_recordingMeta.csv", quote_style="never")
@@ -91,15 +91,24 @@ def urban_tracks(recording: int, frames: int = 16) -> tuple[pl.DataFrame, pl.Dat
     return pl.DataFrame(rows), pl.DataFrame(meta)
 
 
-def write_urban(folder: Path, number: int = 0, location: int = 4, osm: Osm | None = None, maps: str = "maps") -> Path:
+def write_urban(
+    folder: Path, number: int = 0, location: int = 4, osm: Osm | None = None, maps: str = "maps", frames: int = 16
+) -> Path:
     """One recording of inD, rounD or uniD; with ``osm`` also the map of its location, in the folder ``maps``."""
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)
-    tracks, meta = urban_tracks(number)
+    tracks, meta = urban_tracks(number, frames)
     tracks.write_csv(data / f"{number:02d}_tracks.csv")
     meta.write_csv(data / f"{number:02d}_tracksMeta.csv")
     setting = {"recordingId": number, "locationId": location, "frameRate": RATE, "speedLimit": 13.9}
-    setting |= {"weekday": "tuesday", "startTime": 9, "duration": 1.4, "numTracks": 5, "numVehicles": 2, "numVRUs": 3}
+    setting |= {
+        "weekday": "tuesday",
+        "startTime": 9,
+        "duration": frames / RATE + 0.8,
+        "numTracks": 5,
+        "numVehicles": 2,
+        "numVRUs": 3,
+    }
     setting |= {"latLocation": 50.78, "lonLocation": 6.07, "xUtmOrigin": ORIGIN[0], "yUtmOrigin": ORIGIN[1]}
     pl.DataFrame([setting | {"orthoPxToMeter": 0.008}]).write_csv(data / f"{number:02d}_recordingMeta.csv")
     if osm is not None:
