@@ -132,20 +132,20 @@ def _scenes_of(
         scenes, origins = pick(other.scenes, settings.scenes)
         about = {"split": other.split, "data_digest": other.digest, "subsets": list(other.task.subsets)}
         return Chosen(scenes, origins, {**about, "data": other.name, "notes": list(other.notes)})
-    about = {
+    own = {
         "split": settings.own_split,
         "data_digest": run.record.get("data_digest"),
         "subsets": list(assembly.build_data(of_run.data).task.subsets),
     }
     try:
-        return Chosen(*choose(open_data(run, of_run), settings.own_split, settings.scenes), about)
+        return Chosen(*choose(open_data(run, of_run), settings.own_split, settings.scenes), own)
     except ConfigError as missing:
         if not pretrained.ships(run.path):
             raise
         scenes = pretrained.examples(run.path)
         count, name = len(scenes.history), run.path.name
         print(f"{count} example scenes that ship with {name} are forecast instead of its test split: {missing}")
-        return Chosen(spread(scenes, settings.scenes), None, about)
+        return Chosen(spread(scenes, settings.scenes), None, own)
 
 
 def _tensors(scenes: Scene, forecast: JointForecast) -> Iterable[tuple[str, Tensor]]:

@@ -147,7 +147,7 @@ def read_other(run: RunFolder) -> list[tuple[EvaluatedRun, Mapping[str, Any]]]:
         return []
     _require_records(run)
     config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
-    found = []
+    found: list[tuple[EvaluatedRun, Mapping[str, Any]]] = []
     for file in files:
         again = f"delete it, and `epo evaluate run={run.path} data=<data set>` writes it again"
         content = _sound(lambda file=file: read_json(file), again)  # type: ignore[misc]

@@ -88,7 +88,7 @@ def test_rows_of_several_data_sets_share_the_columns_of_the_same_scenes(tmp_path
     assert [line[3:] for line in sheet.lines] == [("1.000", "3.000"), ("4.000", "2.000")]
 
 
-def test_labels_of_other_scenes_have_columns_of_their_own(tmp_path: Path) -> None:
+def test_other_scenes_have_columns_of_their_own(tmp_path: Path) -> None:
     one = make_run(tmp_path / "one", "SC", "scene_consistent", None, data="a")
     on(one, "b", 3.0, data_digest="first1", name="-x")
     on(one, "b", 4.0, data_digest="second", name="-y")
