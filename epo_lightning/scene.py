@@ -289,7 +289,7 @@ class GameParameters(_Batch):
             without goal headings.
         margins: additional distance [m] that a pair keeps, >= 0, by name of the pair feature.
         reference_controls: controls that an agent would choose by itself, for energies in which a deviation from them has a
-            cost; held constant in derivatives.
+            cost.
     """
 
     own_weights: Mapping[str, Float[Tensor, "B M N"]]

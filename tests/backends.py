@@ -48,7 +48,8 @@ def reference(energy, scene, parameters, steps, step_size, damping):
 def gradients(parameters: GameParameters) -> dict[str, torch.Tensor]:
     """The gradients of the leaves, by name."""
     leaves = {"initial_controls": parameters.initial_controls, "goals": parameters.goals}
-    leaves |= {"goal_headings": parameters.goal_headings, **parameters.own_weights, **parameters.pair_weights}
+    leaves |= {"goal_headings": parameters.goal_headings, "reference_controls": parameters.reference_controls}
+    leaves |= {**parameters.own_weights, **parameters.pair_weights}
     leaves |= {f"margin of {name}": margin for name, margin in parameters.margins.items()}
     return {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
 

@@ -246,8 +246,7 @@ class EPO(Forecaster):
             order=None if orders is None else orders.order,
             goal_headings=goals.headings,
             margins={} if self.margins is None else self.margins(z),
-            # The loss of the initial strategies teaches them; derivatives of the solution hold them constant.
-            reference_controls=strategies.detach() if "reference_controls" in self.energy.needs else None,
+            reference_controls=strategies if "reference_controls" in self.energy.needs else None,
         )
 
     @property

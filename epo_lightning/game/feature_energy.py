@@ -134,6 +134,11 @@ class FeatureEnergy(Energy):
         return "goal_headings" in self.needs
 
     @cached_property
+    def needs_reference_controls(self) -> bool:
+        """Whether a feature needs reference controls."""
+        return "reference_controls" in self.needs
+
+    @cached_property
     def needs_reach(self) -> bool:
         """Whether a pair feature needs the agents' radii."""
         return any(feature.declared for feature in self.pair_features.values())

@@ -79,7 +79,8 @@ def solve(
 ) -> Solution:
     """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
 
-    The solution is differentiable with respect to weights, margins, goals, their headings and initial controls. Problems
+    The solution is differentiable with respect to weights, margins, goals, their headings, reference controls
+    and initial controls. Problems
     are shared out among ``torch.get_num_threads()`` threads; results do not depend on the number of threads.
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact)
@@ -187,7 +188,9 @@ class _Call:
         self.goals = [_as(controls.dtype, parameters.goals)] if energy.needs_goals else []  # type: ignore[arg-type]
         headed = energy.needs_goal_headings
         self.headings = [_as(controls.dtype, parameters.goal_headings)] if headed else []  # type: ignore[arg-type]
-        self.inputs = (*self.own, *self.pair, *self.margins, *self.goals, *self.headings)
+        referring = energy.needs_reference_controls
+        self.references = [_as(controls.dtype, parameters.reference_controls)] if referring else []  # type: ignore[arg-type]
+        self.inputs = (*self.own, *self.pair, *self.margins, *self.goals, *self.headings, *self.references)
         self.slots = [OWN.index(name) for name in energy.own]
         self.pair_slots = [PAIR.index(name) for name in energy.pair]
         self.margin_slots = [PAIR.index(name) for name in energy.decoded_margins]
@@ -234,10 +237,8 @@ class _Call:
             game.goals_b, game.goals_m, game.goals_n, game.goals_x = self.goals[0].stride()
         if self.headings:
             game.goal_headings, game.goal_heading_strides[:] = self.headings[0].data_ptr(), self.headings[0].stride()
-        if "reference_controls" in energy.needs:
-            assert parameters.reference_controls is not None
-            held = _as(like, parameters.reference_controls).expand(-1, modes, -1, -1, -1).contiguous()
-            game.reference_controls = hold(held).data_ptr()
+        if self.references:
+            game.reference_controls = hold(self.references[0].contiguous()).data_ptr()
         if scene.game_steps is not None:
             game.ends = hold(_as(torch.int64, scene.game_steps).contiguous()).data_ptr()
         if "lane" in energy.own:
@@ -308,6 +309,7 @@ class _Call:
         pair, margins = new((len(self.pair), *shared)), new((len(self.margins), *shared))
         goals = [new((batch, modes, agents, 2)) for _ in self.goals]
         headings = [new((batch, modes, agents)) for _ in self.headings]
+        references = [new(self.controls.shape) for _ in self.references]
         gradients = EpoGradients(controls=controls.data_ptr())
         if iterates is not None:
             gradients.iterates = iterates.data_ptr()
@@ -323,9 +325,11 @@ class _Call:
             gradients.goals = gradient.data_ptr()
         for gradient in headings:
             gradients.goal_headings = gradient.data_ptr()
+        for gradient in references:
+            gradients.reference_controls = gradient.data_ptr()
 
         _check(interface.library().epo_differentiate(self.tape.address, self.game, self.arguments, gradients))
-        return [*own.unbind(0), *pair.unbind(0), *margins.unbind(0), *goals, *headings]
+        return [*own.unbind(0), *pair.unbind(0), *margins.unbind(0), *goals, *headings, *references]
 
 
 def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:

@@ -40,6 +40,7 @@ class Gradients:
         goals: gradient by the goals; None without a feature that needs goals.
         goal_headings: gradient by the headings wanted at the goals; None without a feature that needs them.
         margins: gradients by decoded margins, by name of the pair feature.
+        reference_controls: gradient by the reference controls; None without a feature that needs them.
     """
 
     controls: Float[Tensor, "S N 2 K"]
@@ -48,6 +49,7 @@ class Gradients:
     goals: Float[Tensor, "S N 2"] | None
     goal_headings: Float[Tensor, "S N"] | None
     margins: dict[str, Float[Tensor, "S P"]]
+    reference_controls: Float[Tensor, "S N 2 K"] | None
 
 
 @dataclass(frozen=True)
@@ -83,10 +85,14 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
     sums = _gradients_along_mu(model, changes)
     own: dict[str, Tensor] = {}
     goals = headings = None
+    referring = "reference_controls" in at.energy.needs
+    references = torch.zeros_like(adjoint) if referring else None
     for name, term in model.own.items():
         match term:
             case SignalTerm():
                 along_mu, ahead = _pull_signal(term, changes, sums, dt)
+                if references is not None and term.feature.needs == "reference_controls":
+                    references[:, :, term.feature.channel] += term.weight.square() * along_mu
             case SteeringTerm():
                 along_mu, ahead = _pull_steering(model, term, changes, sums)
             case LaneTerm():
@@ -109,7 +115,7 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
     node[:, :, 0] += along_e[:, :, 0] + (turned * along_left[:, :, 1:]).sum(2)
     node[:, :, 1] += at.speed * (along_left[:, :, 0] - (turned * along_e[:, :, 1:]).sum(2))
     node[:, :, 1] += (faster * along_left[:, :, 1:]).sum(2)
-    return Gradients(sums.controls + dt * suffix_sums(node), own, pair, goals, headings, margins)
+    return Gradients(sums.controls + dt * suffix_sums(node), own, pair, goals, headings, margins, references)
 
 
 def _gradients_along_mu(model: QuadraticModel, changes: _Changes) -> _Sums:

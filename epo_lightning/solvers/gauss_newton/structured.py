@@ -63,8 +63,8 @@ def solve(
 ) -> Solution:
     """Take ``steps`` steps from ``parameters.initial_controls``.
 
-    The controls and states of the solution are differentiable with respect to weights, margins, goals, their headings and
-    initial controls, by unrolling.
+    The controls and states of the solution are differentiable with respect to weights, margins, goals, their headings,
+    reference controls and initial controls, by unrolling.
 
     Args:
         energy, scene, parameters: the game, already validated.
@@ -123,7 +123,8 @@ class Game:
         return self.energy.finite(self.scene, self.parameters)
 
     def tensors(self) -> list[Tensor]:
-        """The tensors of a game that have a gradient: weights, margins, and goals and goal headings if they are needed."""
+        """The tensors of a game that have a gradient: weights, margins, and goals, goal headings and reference
+        controls if they are needed."""
         parameters = self.parameters
         tensors = [parameters.own_weights[name] for name in self.energy.own]
         tensors += [parameters.pair_weights[name] for name in self.energy.pair]
@@ -134,6 +135,9 @@ class Game:
         if self.energy.needs_goal_headings:
             assert parameters.goal_headings is not None
             tensors.append(parameters.goal_headings)
+        if self.energy.needs_reference_controls:
+            assert parameters.reference_controls is not None
+            tensors.append(parameters.reference_controls)
         return tensors
 
     def with_tensors(self, tensors: Sequence[Tensor]) -> GameParameters:
@@ -147,6 +151,7 @@ class Game:
             margins={name: next(given) for name in self.energy.decoded_margins},
             goals=next(given) if self.energy.needs_goals else parameters.goals,
             goal_headings=next(given) if self.energy.needs_goal_headings else parameters.goal_headings,
+            reference_controls=next(given) if self.energy.needs_reference_controls else parameters.reference_controls,
         )
 
     def gradient_of_phi(
@@ -163,6 +168,8 @@ class Game:
             gradients.append(found.goals)
         if self.energy.needs_goal_headings:
             gradients.append(found.goal_headings)
+        if found.reference_controls is not None:
+            gradients.append(found.reference_controls.transpose(-1, -2))
         by = [
             torch.zeros_like(tensor) if gradient is None else gradient.reshape(tensor.shape)
             for tensor, gradient in zip(tensors, gradients, strict=True)

@@ -50,9 +50,8 @@ def make(seed, scenes=3, agents=2, horizon=6, own=ALL, pair=PAIR, size=1.5, spre
 def alone(scene: Scene, parameters: GameParameters, index: int, end: int) -> tuple[Scene, GameParameters]:
     """One game, with controls up to its end only."""
     one = parameters[index].map(torch.clone)
-    return dataclasses.replace(scene[index], game_steps=None), dataclasses.replace(
-        one, initial_controls=one.initial_controls[..., :end, :].contiguous()
-    )
+    cut = {name: getattr(one, name)[..., :end, :].contiguous() for name in ("initial_controls", "reference_controls")}
+    return dataclasses.replace(scene[index], game_steps=None), dataclasses.replace(one, **cut)
 
 
 def pulled(minimise, energy, scene, parameters, ends):
@@ -144,7 +143,7 @@ def assert_alone(minimise, energy, scene, parameters, ends, tolerance):
         assert torch.equal(together.controls[index, ..., end:, :], parameters.initial_controls[index, ..., end:, :])
         for name, its in by_one.items():
             mine = by_together[name][[index]]
-            if name == "initial_controls":
+            if name in ("initial_controls", "reference_controls"):
                 assert (mine[..., end:, :] == 0).all(), "controls after the end get no gradient"
                 mine = mine[..., :end, :]
             scale = its.abs().max().clamp_min(1.0) if its.numel() else 1.0
@@ -153,7 +152,7 @@ def assert_alone(minimise, energy, scene, parameters, ends, tolerance):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_implicit_gradients_are_those_of_each_game_alone(backend):
-    own = ("goal", "heading", "vel", "acc", "turnr", "jerk", "velb")
+    own = ("goal", "heading", "vel", "acc", "turnr", "jerk", "velb", "accref", "turnrref")
     scene, parameters = make(5, 6, 3, 8, own, spread=0.1)
     solver = LevenbergMarquardt(60, 1.0, 1e-1, adaptive=True, backend=backend)
     energy = FeatureEnergy(own, PAIR, BOUNDS)

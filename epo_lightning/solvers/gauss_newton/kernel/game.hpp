@@ -97,6 +97,7 @@ struct EpoGradients {
     void* margins[PAIR_COUNT];  // [B, M, P] each, zero on entry; null for fixed margins
     void* goals;               // [B, M, N, 2], zero on entry
     void* goal_headings;       // [B, M, N], zero on entry
+    void* reference_controls;  // [B, M, N, K, 2], zero on entry
 };
 }
 

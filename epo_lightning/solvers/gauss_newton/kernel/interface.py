@@ -99,6 +99,7 @@ class EpoGradients(ctypes.Structure):
         ("margins", Address * len(PAIR)),
         ("goals", Address),
         ("goal_headings", Address),
+        ("reference_controls", Address),
     )
 
 

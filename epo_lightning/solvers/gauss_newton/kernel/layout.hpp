@@ -33,7 +33,7 @@ constexpr EpoLayoutEntry kLayout[] = {
     EPO_FIELD(EpoRun, initial_energy), EPO_FIELD(EpoRun, energy), EPO_FIELD(EpoRun, gradient_norm), EPO_FIELD(EpoRun, status),
     EPO_FIELD(EpoGradients, controls), EPO_FIELD(EpoGradients, iterates), EPO_FIELD(EpoGradients, states),
     EPO_FIELD(EpoGradients, own), EPO_FIELD(EpoGradients, pair), EPO_FIELD(EpoGradients, margins),
-    EPO_FIELD(EpoGradients, goals), EPO_FIELD(EpoGradients, goal_headings),
+    EPO_FIELD(EpoGradients, goals), EPO_FIELD(EpoGradients, goal_headings), EPO_FIELD(EpoGradients, reference_controls),
     EPO_CONSTANT(GOAL), EPO_CONSTANT(LANE), EPO_CONSTANT(VELREF), EPO_CONSTANT(VEL), EPO_CONSTANT(ACC), EPO_CONSTANT(TURNR),
     EPO_CONSTANT(JERK), EPO_CONSTANT(TURNACC), EPO_CONSTANT(STEER), EPO_CONSTANT(VELB), EPO_CONSTANT(ACCB),
     EPO_CONSTANT(TURNRB), EPO_CONSTANT(JERKB), EPO_CONSTANT(TURNACCB), EPO_CONSTANT(HEADING), EPO_CONSTANT(ACCREF), EPO_CONSTANT(TURNRREF),

@@ -488,6 +488,11 @@ void add_gradients(const Games<T>& games, const ParameterGradients<T>& by, uint3
                 static_cast<T*>(gradients.goals)[2 * row + 1] += by.goal_y[i][lane];
             }
             if (game.own[HEADING]) static_cast<T*>(gradients.goal_headings)[row] += by.goal_heading[i][lane];
+            for (int64_t k = 0; gradients.reference_controls && k < game.K; ++k) {
+                T* const by_step = static_cast<T*>(gradients.reference_controls) + 2 * (row * game.K + k);
+                by_step[ACCELERATION] += by.reference_thrust[i * game.K + k][lane];
+                by_step[TURN_RATE] += by.reference_turn[i * game.K + k][lane];
+            }
             for (int j = i + 1; games.coupled && j < n; ++j, ++pair) {
                 const int64_t a = games.agent[i * Lanes<T>::W + lane], c = games.agent[j * Lanes<T>::W + lane];
                 const int64_t entry = games.problem[lane] * P + a * game.N - a * (a + 1) / 2 + c - a - 1;
@@ -537,8 +542,10 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
             solve_adjoint(group, factors, mu_turn, mu_thrust);
             const int shared = PAIR_COUNT * group.pairs;
             const ParameterGradients<T> by{
-                arena.take(OWN_COUNT * n), arena.take(shared), arena.take(shared), arena.take(n), arena.take(n), arena.take(n)};
+                arena.take(OWN_COUNT * n), arena.take(shared), arena.take(shared), arena.take(n), arena.take(n), arena.take(n),
+                arena.take(n * K), arena.take(n * K)};
             for (int e = 0; e < OWN_COUNT * n; ++e) by.own[e] = Vec<T>{};
+            for (int e = 0; e < n * K; ++e) by.reference_turn[e] = by.reference_thrust[e] = Vec<T>{};
             for (int e = 0; e < shared; ++e) by.pair[e] = by.margin[e] = Vec<T>{};
             for (int e = 0; e < n; ++e) by.goal_x[e] = by.goal_y[e] = by.goal_heading[e] = Vec<T>{};
             differentiate(group, mu_turn, mu_thrust, d_turn, d_thrust, bar_turn, bar_thrust, by);

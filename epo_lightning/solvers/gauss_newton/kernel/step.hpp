@@ -313,6 +313,7 @@ template <class T>
 struct ParameterGradients {
     Vec<T>*own, *pair, *margin;               // [OWN_COUNT, n], [PAIR_COUNT, pairs] twice
     Vec<T>*goal_x, *goal_y, *goal_heading;    // [n]
+    Vec<T>*reference_turn, *reference_thrust;  // [n, K], only for features of reference controls
 };
 
 /// The part of `differentiate` that belongs to an overlap of discs, at one state: adds to the cotangents `sums` [n, 6] of positions
@@ -481,7 +482,12 @@ void differentiate(
                 const int plain = channel ? TURNR : ACC, bounded = channel ? TURNRB : ACCB, reference = channel ? TURNRREF : ACCREF;
                 Adjoint<T> own{along_mu[k], along_d[k]};
                 if (g.has(plain)) own.add(g.own(plain, i), control[k], weigh(plain));
-                if (g.has(reference)) own.add(g.own(reference, i), g.deviation(channel, i, k), weigh(reference));
+                if (g.has(reference)) {
+                    Adjoint<T> deviation{along_mu[k], along_d[k]};
+                    deviation.add(g.own(reference, i), g.deviation(channel, i, k), weigh(reference));
+                    own.cotangent += deviation.cotangent;
+                    (channel ? by.reference_turn : by.reference_thrust)[i * K + k] -= deviation.cotangent;
+                }
                 if (g.has(bounded))
                     own.add_bounded(g.own(bounded, i), control[k], g.game.bounds[channel ? BOUND_TURNR : BOUND_ACC], weigh(bounded));
                 bar[k] += own.cotangent;
