@@ -11,7 +11,7 @@ from hydra.plugins.config_source import ConfigLoadError, ConfigResult
 from omegaconf import OmegaConf
 
 GROUP = "sweeps"
-HIGHWAYS = ("exid", "us101", "highway_sim", "highd", "ind", "round", "unid", "interaction")
+HIGHWAYS = ("exid", "us101", "highway_sim", "highd", "ind", "round", "unid", "interaction", "argoverse2", "waymo")
 """Data sets with lanes, each of which has all rows of ``experiment/highway/`` under its own name."""
 EXPERIMENTS = "experiment"
 

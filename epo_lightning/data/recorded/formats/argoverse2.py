@@ -21,7 +21,7 @@ import numpy as np
 import polars as pl
 import shapely
 
-from epo_lightning.data.recorded.formats.onboard import References, refuse, tracks_of
+from epo_lightning.data.recorded.formats.onboard import References, refuse, tracks_of, without_tiny
 from epo_lightning.data.recorded.kinds import kinds_of, typical_sizes
 from epo_lightning.data.recorded.lanes import FARTHEST, LANE, SHOULDER, LaneGraph, Polyline
 from epo_lightning.data.recorded.tracks import Recording, RecordingError, RecordingSource, TrackTable
@@ -317,4 +317,4 @@ def _line(points: Any, what: str, path: Path) -> Polyline:
         raise RecordingError(path, f"{what} was expected to be a list of points with numbers x and y") from None
     if not (np.abs(line) <= FARTHEST).all():
         raise RecordingError(path, f"{what} has coordinates that are not finite or beyond {FARTHEST:g} m")
-    return line
+    return without_tiny(line)

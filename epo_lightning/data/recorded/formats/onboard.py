@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats.motion import check_motion
-from epo_lightning.data.recorded.lanes import FARTHEST
+from epo_lightning.data.recorded.lanes import FARTHEST, Polyline
 from epo_lightning.data.recorded.tracks import FASTEST, Recording, TrackTable
 
 RATE = 10.0
@@ -99,6 +99,11 @@ def _jumping(
     found = np.zeros(count, dtype=bool)
     found[agent[within[jumps]]] = True
     return found
+
+
+def without_tiny(line: Polyline) -> Polyline:
+    """A line whose coordinates below a nanometre are zero, because squares of such numbers underflow."""
+    return np.where(np.abs(line) < 1e-9, 0.0, line)
 
 
 class References:

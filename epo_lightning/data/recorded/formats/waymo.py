@@ -21,7 +21,7 @@ from google.protobuf.message import DecodeError
 from jaxtyping import Bool, Float
 from numba import njit
 
-from epo_lightning.data.recorded.formats.onboard import RATE, References, refuse, tracks_of
+from epo_lightning.data.recorded.formats.onboard import RATE, References, refuse, tracks_of, without_tiny
 from epo_lightning.data.recorded.formats.tfrecord import Place, content_of, places
 from epo_lightning.data.recorded.formats.waymo_messages import (
     BIKE_LANE,
@@ -267,7 +267,7 @@ def _points(points: Any, what: str, path: Path) -> Polyline:
     line = np.array([(point.x, point.y) for point in points], dtype=float).reshape(-1, 2)
     if not (np.abs(line) <= FARTHEST).all():
         raise RecordingError(path, f"{what} has coordinates that are not finite or beyond {FARTHEST:g} m")
-    return line
+    return without_tiny(line)
 
 
 def _moved(line: Polyline) -> Bool[np.ndarray, " n"]:
@@ -289,8 +289,11 @@ def _normals(line: Polyline) -> Polyline:
 
 def _simplified(lines: Sequence[Polyline]) -> list[Polyline]:
     """Lines with fewer points, at most ``FLAT`` from the given ones: the maps have a point every half metre."""
-    found = shapely.simplify([shapely.LineString(line) for line in lines], FLAT)
-    return [shapely.get_coordinates(line) for line in found]
+    owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+    simple = shapely.simplify(shapely.linestrings(np.concatenate(lines), indices=owner), FLAT, preserve_topology=False)
+    found = [shapely.get_coordinates(line) for line in simple]
+    # A loop that is smaller than the tolerance would have no length.
+    return [line if (line != line[:1]).any() else given for line, given in zip(found, lines, strict=True)]
 
 
 @njit(cache=True)

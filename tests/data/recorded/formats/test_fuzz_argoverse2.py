@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 from collections import Counter
@@ -79,7 +80,7 @@ def set_values(roads, random):
             if isinstance(place, dict) and random.random() < 0.2:
                 del place[key]
             else:
-                place[key] = JSON[random.integers(len(JSON))]
+                place[key] = copy.deepcopy(JSON[random.integers(len(JSON))])
             break
     return roads
 
