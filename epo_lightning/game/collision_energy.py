@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from epo_lightning.checks import check_number, check_whole
 from epo_lightning.game.circles import disc, length_of, row_extent, row_overlap
 from epo_lightning.game.dynamics import Dynamics
+from epo_lightning.game.limits import Bound
 from epo_lightning.game.network_energy import NetworkEnergy
 from epo_lightning.game.networks import MOTION, Layers, motion, squared_distances
 from epo_lightning.game.pairs import pairs
@@ -61,7 +62,7 @@ class CollisionEnergy(NetworkEnergy):
         shape: str,
         own: Sequence[str] = (),
         pair: Sequence[str] = (),
-        bounds: Mapping[str, Sequence[float]] | None = None,
+        bounds: Mapping[str, Bound] | None = None,
         pair_stride: int = 1,
         gamma: float = 10.0,
         waypoints: int = 5,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from epo_lightning.checks import is_number
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, PairFeature
 from epo_lightning.game.game_end import check_game_steps
+from epo_lightning.game.limits import check_bound
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import GameParameters, Scene
@@ -47,6 +48,8 @@ def check_inputs(energy: FeatureEnergy, scene: Scene, parameters: GameParameters
         "reference_controls": (("parameters.reference_controls", parameters.reference_controls),),
         "size": (("scene.size", scene.size),),
     }
+    if energy.bounded_by_kind and scene.kind is None:
+        raise ValueError(f"the bounds of {energy.bounded_by_kind[0]!r} are by kind of agent, but scene.kind is None")
     for name, feature in energy.own_features.items():
         for what, value in needed[feature.needs] if feature.needs else ():
             if value is None:
@@ -105,7 +108,7 @@ def check_bounds(bounds: Any) -> None:
     """Check the bounds of signals.
 
     Raises:
-        ConfigError: no mapping, an unknown signal, or a value that is not [lowest, highest].
+        ConfigError: no mapping, an unknown signal, or bounds that :func:`~epo_lightning.game.limits.check_bound` refuses.
     """
     signals = {feature.signal for feature in OWN_FEATURES.values() if feature.bounded}
     if not isinstance(bounds, Mapping):
@@ -113,11 +116,7 @@ def check_bounds(bounds: Any) -> None:
     for name, bound in bounds.items():
         if name not in signals:
             raise ConfigError(f"unknown signal energy.bounds.{name}: {nearest(str(name), signals)}")
-        pair = list(bound) if isinstance(bound, Sequence) and not isinstance(bound, str) else []
-        if len(pair) != 2 or not all(map(is_number, pair)) or not pair[0] < pair[1]:
-            raise ConfigError(
-                f"energy.bounds.{name} must be [lowest, highest], two numbers in rising order, not {bound!r}"
-            )
+        check_bound(name, bound)
 
 
 def check_margins(margins: Any) -> None:

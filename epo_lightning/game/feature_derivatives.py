@@ -8,7 +8,7 @@ function of the trajectory and is differentiated by forward-mode automatic diffe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -19,6 +19,9 @@ from epo_lightning.game.circles import overlap
 from epo_lightning.game.features import SLOWEST_STEERING, OwnFeature, PairFeature, Source
 from epo_lightning.game.game_end import at_end, until
 from epo_lightning.scene import HEADING, SPEED, TURN_RATE
+
+Bounds = Mapping[str, Sequence[float] | tuple[Tensor, Tensor]]
+"""Lowest and highest value by signal: numbers, or one for every agent, [B, 1, N, 1]."""
 
 
 class Derivatives(NamedTuple):
@@ -63,13 +66,13 @@ def _jvp(function: Callable[[Tensor], Tensor], value: Tensor) -> tuple[Tensor, T
 
 
 def own_derivatives(
-    feature: OwnFeature, signal: Float[Tensor, "*shape"], bounds: Mapping[str, Sequence[float]], second: bool = False
+    feature: OwnFeature, signal: Float[Tensor, "*shape"], bounds: Bounds, second: bool = False
 ) -> Derivatives:
     """A declared own feature c(s) of its signal s, with its derivatives.
 
     Args:
         feature, signal: the feature, and the values s of its signal.
-        bounds: lowest and highest value by signal, for bounded features.
+        bounds: lowest and highest value by signal, for bounded features: numbers, or tensors that broadcast with the signal.
         second: whether second derivatives of functions are computed.
     """
     if feature.bounded:
@@ -102,7 +105,7 @@ def margin_derivatives(
     return _jvp(lambda reach: feature.function(distance, reach), reach)[1], _jvp(by_distance, reach)[1]
 
 
-def violation(value: Float[Tensor, "*shape"], lower: float, upper: float) -> Derivatives:
+def violation(value: Float[Tensor, "*shape"], lower: float | Tensor, upper: float | Tensor) -> Derivatives:
     """The amount by which a signal leaves [lower, upper]; its derivative is 1 above, -1 below and 0 within."""
     excess = (value - upper).clamp_min(0.0) + (lower - value).clamp_min(0.0)
     return Derivatives(excess, (value > upper).to(value.dtype) - (value < lower).to(value.dtype))
@@ -125,6 +128,7 @@ class Surroundings:
         goal_headings: headings that are wanted at the goals [rad].
         ends: number of steps of every game; None for all steps of the controls.
         reference_controls: the controls of the strategies that agents would choose by themselves.
+        bounds: lowest and highest value of each bounded signal.
     """
 
     initial: Float[Tensor, "B 1 N 4"]
@@ -136,6 +140,7 @@ class Surroundings:
     goal_headings: Float[Tensor, "B M N"] | None = None
     ends: Int[Tensor, " B"] | None = None
     reference_controls: Float[Tensor, "B M N K 2"] | None = None
+    bounds: Bounds = field(default_factory=dict)
 
     def reference(self, feature: OwnFeature) -> Float[Tensor, "B _ N _"]:
         """The desired signal of a feature with the source CONTROL or SPEED, over time."""

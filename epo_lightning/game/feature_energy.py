@@ -18,6 +18,7 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, check_names
 from epo_lightning.game.feature_checks import check_bounds, check_inputs, check_margins, refuse_asymmetry
 from epo_lightning.game.feature_derivatives import (
+    Bounds,
     Surroundings,
     own_derivatives,
     pair_derivatives,
@@ -26,6 +27,7 @@ from epo_lightning.game.feature_derivatives import (
 )
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, WHEELBASE, OwnFeature, PairFeature
 from epo_lightning.game.game_end import residual_mask, until
+from epo_lightning.game.limits import Bound, bounds_of_agents
 from epo_lightning.game.pairs import pair_mask, pairs
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, Scene
@@ -59,7 +61,8 @@ class FeatureEnergy(Energy):
         pair: names of :data:`~epo_lightning.game.features.PAIR_FEATURES`. For ``proximity`` an agent is a disc whose radius
             is half its length; for ``circles`` see :mod:`~epo_lightning.game.circles`.
         bounds: lowest and highest value of a signal (speed ``vel``, acceleration ``acc``, ...), for features whose name ends
-            in ``b``: ``{"vel": (-0.05, 2.0)}``.
+            in ``b``: ``{"vel": (-0.05, 2.0)}``, or by kind:
+            ``{"vel": {"pedestrian": (0.0, 3.0), "default": (-2.0, 20.0)}}``.
         dynamics: a :class:`~epo_lightning.game.dynamics.Unicycle`.
         pair_stride: steps between evaluations of pair features: they are evaluated at k = stride, 2 stride, ...
         margins: fixed margins [m] of pair features, ``{"clearance": 0.5}``; those of other features with a margin are
@@ -72,7 +75,7 @@ class FeatureEnergy(Energy):
 
     own: Sequence[str]
     pair: Sequence[str] = ("proximity",)
-    bounds: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    bounds: Mapping[str, Bound] = field(default_factory=dict)
     dynamics: Any = field(default_factory=Unicycle)  # Any, so that other dynamics are refused below with a reason
     pair_stride: int = 1
     margins: Mapping[str, float] = field(default_factory=dict)
@@ -122,6 +125,12 @@ class FeatureEnergy(Energy):
     def decoded_margins(self) -> Sequence[str]:
         """Names of the pair features whose margin is ``parameters.margins``, and not fixed."""
         return [name for name, feature in self.pair_features.items() if feature.margin and name not in self.margins]
+
+    @cached_property
+    def bounded_by_kind(self) -> Sequence[str]:
+        """Signals of the own features whose bounds depend on the kind of agent."""
+        signals = {feature.signal for feature in self.own_features.values() if feature.bounded}
+        return [name for name, bound in self.bounds.items() if name in signals and isinstance(bound, Mapping)]
 
     @cached_property
     def needs_goals(self) -> bool:
@@ -235,7 +244,7 @@ class FeatureEnergy(Energy):
         if feature.declared:
             signal, change = signal_and_change(feature, *at, *moved, around, slide)
             mask = self.residual_mask(scene, feature, at[1].shape[-2])
-            value, first, _ = own_derivatives(feature, signal, self.bounds).within(mask)
+            value, first, _ = own_derivatives(feature, signal, around.bounds).within(mask)
             change = change if first is None else first * change
         else:
             assert feature.function is not None
@@ -383,7 +392,19 @@ class FeatureEnergy(Energy):
             headings,
             scene.game_steps,
             reference_controls,
+            self._bounds_of(scene),
         )
+
+    def _bounds_of(self, scene: Scene) -> Bounds:
+        """Lowest and highest value by signal: numbers, or for bounds by kind those of every agent."""
+        found: dict[str, Sequence[float] | tuple[Tensor, Tensor]] = {}
+        for name, bound in self.bounds.items():
+            if not isinstance(bound, Mapping):
+                found[name] = bound
+            elif name in self.bounded_by_kind:
+                assert scene.kind is not None
+                found[name] = bounds_of_agents(bound, scene.kind, scene.history.dtype)
+        return found
 
     def _followed(self, scene: Scene, parameters: GameParameters) -> tuple[tuple[Tensor, ...], Bool[Tensor, "B M N"]]:
         """The indices of the followed lines in ``scene.references``, and a mask of those that exist."""

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.limits import Bound
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import GameParameters, Scene
@@ -50,7 +51,7 @@ class NetworkEnergy(nn.Module, Energy):
         scale: float,
         own: Sequence[str] = (),
         pair: Sequence[str] = (),
-        bounds: Mapping[str, Sequence[float]] | None = None,
+        bounds: Mapping[str, Bound] | None = None,
         pair_stride: int = 1,
     ) -> None:
         super().__init__()

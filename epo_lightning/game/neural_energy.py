@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from epo_lightning.checks import check_whole
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.energy import GRADIENT
+from epo_lightning.game.limits import Bound
 from epo_lightning.game.network_energy import NetworkEnergy
 from epo_lightning.game.networks import ENCOUNTER, MOTION, Layers, encounter, motion
 from epo_lightning.game.pairs import pairs
@@ -57,7 +58,7 @@ class NeuralEnergy(NetworkEnergy):
         scale: float,
         own: Sequence[str] = (),
         pair: Sequence[str] = (),
-        bounds: Mapping[str, Sequence[float]] | None = None,
+        bounds: Mapping[str, Bound] | None = None,
         pair_stride: int = 1,
         hidden: int = 64,
     ) -> None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -51,6 +52,8 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
     for name in (*energy.own, *energy.pair):
         if name not in (*OWN, *PAIR):
             return f"the compiled layer does not know the feature {name!r}"
+    if energy.bounded_by_kind:
+        return f"the compiled layer takes bounds of all agents, not bounds of {energy.bounded_by_kind[0]!r} by kind"
     if scene.agent_mask.shape[1] > MOST_AGENTS:
         return f"the compiled layer takes up to {MOST_AGENTS} agents, not {scene.agent_mask.shape[1]}"
     library = interface.find()
@@ -213,8 +216,8 @@ class _Call:
         game = self.game = EpoGame(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt)
         game.pair_stride = min(energy.pair_stride, horizon + 1)
         for index, name in enumerate(SIGNALS):
-            if name in energy.bounds:
-                game.bounds[index][:] = energy.bounds[name]
+            if not isinstance(bound := energy.bounds.get(name, {}), Mapping):
+                game.bounds[index][:] = bound
         initial = _as(like, scene.current)
         initial = hold(initial if initial.stride(-1) == 1 else initial.contiguous())
         game.initial, (game.initial_b, game.initial_n) = initial.data_ptr(), initial.stride()[:2]

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.game.feature_derivatives import (
+    Bounds,
     add_linear_gradient,
     linear_signal,
     margin_derivatives,
@@ -184,6 +185,14 @@ def _add_own(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -
             return _add_signal(sums, feature, weight)
 
 
+def _bounds(at: Iterate, feature: OwnFeature) -> Bounds:
+    """Bounds of a feature's signal, for every problem where they depend on the kind of agent: [S, N, 1]."""
+    if not feature.bounded or feature.signal not in at.energy.bounded_by_kind:
+        return at.around.bounds
+    lower, upper = (bound.expand(-1, at.modes, -1, -1).flatten(0, 1) for bound in at.around.bounds[feature.signal])
+    return {feature.signal: (lower, upper)}
+
+
 def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> SignalTerm:
     at, square = sums.at, weight.square()
     signal = linear_signal(feature, at.u, at.speed, at.dt, channels=-2)
@@ -193,7 +202,7 @@ def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]
     if active is not None:
         # Entry l of a rate is that from control l to control l + 1, which must be part of the game.
         active = active[:, :, 0, 1:] if feature.source is Source.RATE else active[:, :, 0]
-    c = own_derivatives(feature, signal, at.energy.bounds, second=True).within(active)
+    c = own_derivatives(feature, signal, _bounds(at, feature), second=True).within(active)
     scaled = square * c.value
     sums.add_value(scaled, c.value)
     curvature = square if c.first is None else square * c.first.square()

@@ -173,7 +173,7 @@ def _of_agents(
             continue
         weight = energy.own_weight(scene, parameters, name)[..., None]
         signal, _ = signal_and_change(feature, *at, *still, around)
-        value, first, _ = own_derivatives(feature, signal, energy.bounds).within(
+        value, first, _ = own_derivatives(feature, signal, around.bounds).within(
             energy.residual_mask(scene, feature, steps)
         )
         first = torch.ones_like(value) if first is None else first
