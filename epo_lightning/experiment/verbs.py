@@ -51,7 +51,7 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     from epo_lightning.experiment.config.sources import HIGHWAYS
 
     data = assembly.build_data(settings.data)
-    strict = {}
+    strict: dict[str, bool] = {}
     if settings.strict:
         if "strict" not in inspect.signature(data.generate).parameters:
             raise ConfigError(

@@ -9,7 +9,7 @@ same vehicle if that motion maps one onto the other wherever both are recorded.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -217,8 +217,8 @@ def _overlaps(recordings: Sequence[Drives]) -> list[tuple[int, int, int]]:
             break
         pairs = np.stack([owner[at], owner[at + apart], frame[at + apart] - frame[at]], 1)
         pairs, count = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0, return_counts=True)
-        for pair, number in zip(pairs.tolist(), count.tolist(), strict=True):
-            votes[tuple(pair)] += number
+        for (one, other, difference), number in zip(pairs.tolist(), count.tolist(), strict=True):
+            votes[one, other, difference] += number
         apart += 1
     best: dict[tuple[int, int], tuple[int, int]] = {}
     for (one, other, difference), number in sorted(votes.items()):
@@ -268,7 +268,9 @@ def _equal_runs(one: Drives, other: Drives, difference: int) -> tuple[Int[np.nda
     return first[rows[:, 0]], its_first[rows[:, 1]]
 
 
-def _rigid(points: Float[np.ndarray, "n 2"], images: Float[np.ndarray, "n 2"]):  # type: ignore[no-untyped-def]
+def _rigid(
+    points: Float[np.ndarray, "n 2"], images: Float[np.ndarray, "n 2"]
+) -> Callable[[Float[np.ndarray, "m 2"]], Float[np.ndarray, "m 2"]]:
     """The rotation and translation that maps points best onto their images, as a function."""
     if not len(points):
         return lambda values: values

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import inspect
 import shlex
 import shutil
 import warnings
-import zlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, partial
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from epo_lightning.data import cache
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
@@ -23,22 +19,22 @@ from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded import summary
 from epo_lightning.data.recorded.duplicates import Drives, used_once
 from epo_lightning.data.recorded.extraction import Extracted, extract_to_file, is_complete, read_extracted
+from epo_lightning.data.recorded.gathering import gather
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
+from epo_lightning.data.recorded.sources import absent, fingerprint, with_options
 from epo_lightning.data.recorded.splits import ALL, UNITS, SplitRule
-from epo_lightning.data.recorded.tables import SceneTables, joined, selected
-from epo_lightning.data.recorded.tracks import Recording, RecordingSource
+from epo_lightning.data.recorded.tables import selected
+from epo_lightning.data.recorded.tracks import RecordingSource
 from epo_lightning.data.recorded.windows import WindowConfig, identifying
 from epo_lightning.data.workers import Report, finished
 from epo_lightning.metrics.functional.interaction import SUBSETS
-from epo_lightning.registry import ConfigError, lookup, nearest, register
+from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.schema import read
 from epo_lightning.task import Task
 
 VERSION = 2
 """Version of the extraction: raised whenever the same recordings would give other scenes."""
-PIECE, PIECES = 1 << 14, 64
-"""Size [bytes] and number of the pieces of a file that enter its checksum; files up to 1 MB are covered completely."""
 DUPLICATES = ("keep", "once")
 
 
@@ -100,7 +96,7 @@ class RecordedData(SceneDataModule):
         super().__init__(batch_size, seed, share)
         self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
         self.options = dict(options or {})
-        self.list_sources = _with_options(format, self.options)
+        self.list_sources = with_options(format, self.options)
         self.windows = read(WindowConfig, windows, "data.windows")
         self.num_agents, self.history = self.windows.agents, self.windows.history
         if self.windows.lane_change and not map:
@@ -162,9 +158,7 @@ class RecordedData(SceneDataModule):
     def identity(self, sources: Sequence[RecordingSource]) -> Any:
         """Plain values that identify the recordings: names, groups, and names, sizes and checksums of all files."""
         # Files may be common to recordings: maps, and shards with hundreds of scenarios.
-        known = {
-            file: _fingerprint(file) for file in dict.fromkeys(file for source in sources for file in source.files)
-        }
+        known = {file: fingerprint(file) for file in dict.fromkeys(file for source in sources for file in source.files)}
         return [[source.name, source.group, [known[file] for file in source.files]] for source in sources]
 
     @cached_property
@@ -252,7 +246,7 @@ class RecordedData(SceneDataModule):
     def _gives(self, config: Mapping[str, Any]) -> bool:
         """Whether these settings, applied to the recordings that ``config`` names, give exactly ``config``."""
         try:
-            sources = [RecordingSource(name, group, (), _absent) for name, group, _ in config["recordings"]]
+            sources = [RecordingSource(name, group, (), absent) for name, group, _ in config["recordings"]]
             return self._config_of(sources, config["recordings"], config.get("skipped", ())) == config
         except (ConfigError, KeyError, TypeError, ValueError):
             return False
@@ -370,37 +364,10 @@ class RecordedData(SceneDataModule):
         self.rule.refuse_empty(self.dataset_name, used, splits, counts)
         tensors, about = {}, {}
         for split in splits:
-            tensors[split], about[split] = self._gather(names[split], tables, counts, extracted)
+            tensors[split], about[split] = gather(names[split], tables, counts, extracted)
         rows = summary.rows_of(sources, splits, extracted, counts)
         report = {**about, "recordings": names, **({"skipped": dict(problems)} if problems else {})}
         cache.write(self.folder, tensors, self.config, report, {summary.FILE: summary.to_csv(rows)})
-
-    def _gather(
-        self,
-        names: Sequence[str],
-        tables: Mapping[str, SceneTables | None],
-        counts: Mapping[str, Mapping[str, int]],
-        extracted: Mapping[str, Extracted],
-    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """The scenes of a split, and a report about them."""
-        total: Counter[str] = Counter()
-        for name in names:
-            total.update(counts[name])
-        full = [found for found in (tables[name] for name in names) if found is not None]
-        whole = joined(full)
-        # A recording without scenes still has its place in the order of recordings.
-        index = np.array([number for number, name in enumerate(names) if tables[name] is not None])
-        columns = whole.columns()
-        origin = np.zeros((len(names), 2))
-        origin[index] = whole.origin
-        columns["recording"], columns["origin"] = index[whole.recording].astype(np.int32), origin
-        tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in columns.items()}
-        about = {**summary.by_unit(total), **summary.describe(whole)}
-        moving = sum(extracted[name].about.get("moving agents", 0) for name in names)
-        if moving:
-            far = sum(extracted[name].about.get("ends far from lanes", 0) for name in names) / moving
-            about["moving agents that end over 10 m from all lanes given"] = far
-        return tensors, about
 
     def per_recording(self) -> list[str]:
         """Lines of a table of what became of each recording; empty for data sets of older versions."""
@@ -424,31 +391,3 @@ class RecordedData(SceneDataModule):
         tables = cache.load(self.folder, split, command=self.command, config=self.config)
         shape = None if split == "train" else self.task.shape
         return RecordedScenes(tables, self.task.dt, self.frame, self.report()["recordings"][split], shape)
-
-
-def _with_options(format: str, options: Mapping[str, Any]) -> Callable[[Path], list[RecordingSource]]:
-    """The function that lists the recordings of a format, with the options of the format.
-
-    Raises:
-        ConfigError: an unknown format, or an option that it does not have.
-    """
-    list_sources = lookup("format", format)
-    known = list(inspect.signature(list_sources).parameters)[1:]
-    for name in options:
-        if name not in known:
-            raise ConfigError(f"unknown key data.options.{name} for format {format!r}: {nearest(name, known)}")
-    return partial(list_sources, **options)
-
-
-def _absent() -> Recording:
-    raise ConfigError("the recordings are absent: only the data set that was extracted from them exists")
-
-
-def _fingerprint(file: Path) -> list[Any]:
-    """Name, size and checksum of a file. In large files only evenly spaced pieces are read, because they have gigabytes."""
-    size, checksum = file.stat().st_size, 0
-    with file.open("rb") as content:
-        for place in range(0, size, max(PIECE, (size - PIECE) // PIECES)):
-            content.seek(place)
-            checksum = zlib.crc32(content.read(PIECE), checksum)
-    return [file.name, size, checksum]

@@ -27,53 +27,8 @@ from epo_lightning.data.recorded.surroundings import reachable_pieces
 from epo_lightning.data.recorded.windows import WindowConfig, extract, identifying
 from epo_lightning.registry import ConfigError
 
+from .crossings import crossing, graph
 from .roads import WIDTH, curve, recording, road
-
-
-def graph(centres, successors, left=None, right=None, kind=None) -> LaneGraph:
-    """A lane graph of centrelines, with boundaries beside them."""
-    count = len(centres)
-    centres = [np.asarray(line, dtype=float) for line in centres]
-    across = []
-    for line in centres:
-        way = np.gradient(line, axis=0)
-        normal = np.stack([-way[:, 1], way[:, 0]], 1)
-        across.append(WIDTH / 2 * normal / np.linalg.norm(normal, axis=1, keepdims=True))
-    none = np.full(count, -1)
-    left = none if left is None else np.array(left)
-    right = none if right is None else np.array(right)
-    return LaneGraph(
-        np.arange(count),
-        [line + side for line, side in zip(centres, across, strict=True)],
-        [line - side for line, side in zip(centres, across, strict=True)],
-        centres,
-        successors,
-        left,
-        right,
-        left,
-        right,
-        np.full(count, np.nan),
-        np.zeros(count, int) if kind is None else np.array(kind),
-    ).check("graph")
-
-
-def crossing() -> LaneGraph:
-    """A road that ends in a junction: lanes 1, 4 lead to the left, 2, 5 straight on, and 3, 6 to the right."""
-    turn = np.linspace(0, np.pi / 2, 12)
-    left = np.stack([12 * np.sin(turn), 12 - 12 * np.cos(turn)], 1)
-    right = np.stack([8 * np.sin(turn), 8 * np.cos(turn) - 8], 1)
-    return graph(
-        [
-            np.stack([np.linspace(-60, 0, 13), np.zeros(13)], 1),
-            left,
-            [[0, 0], [12, 0]],
-            right,
-            [[12, 12], [12, 150]],
-            [[12, 0], [150, 0]],
-            [[8, -8], [8, -150]],
-        ],
-        [(1, 2, 3), (4,), (5,), (6,), (), (), ()],
-    )
 
 
 def random_graph(seed: int, count: int = 6) -> LaneGraph:

@@ -15,7 +15,8 @@ from metrics.slow_interaction import interact
 
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.recordings import RecordedData, _fingerprint
+from epo_lightning.data.recorded.recordings import RecordedData
+from epo_lightning.data.recorded.sources import fingerprint
 from epo_lightning.data.recorded.tracks import RecordingSource
 from epo_lightning.registry import ConfigError, register
 
@@ -177,16 +178,16 @@ def test_fingerprints_cover_small_files_and_samples_of_large_ones(tmp_path):
     for size in (1, 1000, 900_000):
         content = bytearray(np.random.default_rng(0).bytes(size))
         file.write_bytes(content)
-        before = _fingerprint(file)
+        before = fingerprint(file)
         content[size // 2] ^= 1
         file.write_bytes(content)
-        assert _fingerprint(file) != before
+        assert fingerprint(file) != before
     large = bytearray(20_000_000)
     file.write_bytes(large)
-    before = _fingerprint(file)
+    before = fingerprint(file)
     large[9_000_000:10_000_000] = b"1" * 1_000_000
     file.write_bytes(large)
-    assert _fingerprint(file) != before
+    assert fingerprint(file) != before
 
 
 def test_a_split_without_scenes_is_an_error_with_the_reasons(folder):

@@ -1,0 +1,99 @@
+"""Urban rows: those on highways, on scenes with several ways through a junction."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from data.recorded.crossings import turning_traffic
+
+from benchmarks.goals import main as goals
+from epo_lightning.data.recorded.tracks import RecordingSource
+from epo_lightning.experiment import train
+from epo_lightning.experiment.assembly import build_data
+from epo_lightning.experiment.config.compose import compose, tree
+from epo_lightning.experiment.evaluate import evaluate
+from epo_lightning.experiment.predict import predict
+from epo_lightning.experiment.verbs import check_settings
+from epo_lightning.identity import differences
+from epo_lightning.registry import register
+from epo_lightning.run_folder import read_json
+
+ROWS = sorted(file.stem for file in (tree() / "conf" / "experiment" / "urban").glob("*.yaml"))
+
+
+@register("format", "turning")
+def turning(folder: Path) -> list[RecordingSource]:
+    """Files ``<seed>.turning`` of traffic that turns."""
+    return [
+        RecordingSource(
+            file.stem, file.stem, (file,), lambda file=file: turning_traffic(int(file.stem), name=file.stem)
+        )
+        for file in folder.glob("*.turning")
+    ]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Words that choose an extracted data set of turning traffic."""
+    folder = tmp_path_factory.mktemp("turning")
+    for seed in range(5):
+        (folder / f"{seed}.turning").touch()
+    words = ["data=lankershim", "data.format=turning", f"data.folder={folder}", f"data.root={folder / 'cache'}"]
+    words += ["data.windows.smoothing=null", "data.windows.every=2"]
+    build_data(compose("generate", words)["data"]).generate(workers=1, progress=False)
+    return words
+
+
+def test_the_rows_are_those_of_the_highway_on_other_data() -> None:
+    backbones = ("v_lstm", "vibes", "hivt_m")
+    assert {f"{backbone}{suffix}" for backbone in backbones for suffix in ("", "_sc", "_epo")} | {"const_vel"} == set(
+        ROWS
+    )
+    for row in ROWS:
+        urban = compose("train", [f"experiment=urban/{row}", "data=exid"])
+        highway = compose("train", [f"experiment=highway/{row}", "data=exid"])
+        assert differences(urban, highway) == []
+        assert compose("train", [f"experiment=urban/{row}"])["data"]["dataset"] == "lankershim"
+
+
+@pytest.mark.parametrize("row", ["v_lstm_sc", "v_lstm_epo", "vibes"])
+def test_rows_train_on_several_ways_through_a_junction(row: str, data: list[str], tmp_path: Path) -> None:
+    words = [f"experiment=urban/{row}", "budget=smoke", "callbacks.progress=none", f"runs={tmp_path}"]
+    run = train.train(compose("train", [*words, *data, "data.batch_size=4"]))
+    evaluate({"run": str(run.path), "batch_size": 16})
+    metrics = read_json(run.metrics_file())["metrics"]
+    assert all(math.isfinite(value) for value in metrics.values())
+    if row == "v_lstm_epo":
+        out = tmp_path / "seen"
+        predict(
+            check_settings("predict", compose("predict", [f"run={run.path}", f"out={out}", "figures=1", "scenes=3"]))
+        )
+        assert list((out / "figures").glob("scene_*.png"))
+
+
+def test_lanes_of_scenes_reach_as_far_as_agents_get(data: list[str]) -> None:
+    module = build_data(compose("generate", data)["data"])
+    scenes = module.open("train")
+    batch = scenes[torch.arange(len(scenes))]
+    points = torch.where(batch.lane_mask[..., None], batch.lanes, torch.inf).unflatten(-1, (2, 2)).flatten(1, 3)
+    ends = batch.future[:, :, -1, :2]
+    nearest = (points[:, None] - ends[:, :, None]).norm(dim=-1).amin(-1)
+    assert nearest[batch.agent_mask].max() < 5.0
+    assert module.report()["train"].get("moving agents that end over 10 m from all lanes given", 0.0) == 0.0
+
+
+def test_goals_of_turning_agents_are_measured_by_a_command(data: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    shares = {}
+    for lines in ("8", "null"):
+        goals([*data, f"data.windows.lines={lines}"])
+        shown = capsys.readouterr().out.splitlines()
+        turning = next(line.split() for line in shown if line.startswith("turning"))
+        shares[lines] = np.array(turning[1:4], dtype=float)
+    assert shares["8"][0] == shares["null"][0] > 20, "the same agents"
+    assert shares["8"][1] < 1.5
+    assert shares["8"][2] < 3.0
+    assert shares["null"][2] > shares["8"][2] + 1.0, "three lines follow the straightest successor"
