@@ -179,6 +179,8 @@ def follow(
                 f"{name}={theirs[key]:g} does not fit the run, whose forecaster has {key} {value:g}: leave it out, and the "
                 "recordings are read with the run's"
             )
+        else:
+            notes.append(f"{name}={theirs[key]:g}, unlike the run's {value:g}")
     if task.dt != theirs["dt"] and "data.windows.every" not in given:
         windows["every"] = max(1, round(theirs["every"] * theirs["dt"] / task.dt))
     if task.dt < theirs["dt"] and "data.windows.interpolate" not in given:

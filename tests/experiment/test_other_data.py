@@ -202,7 +202,9 @@ def test_recordings_of_another_rate_are_read_at_the_runs(trained: Path) -> None:
     windows = follow(slower, settings, task)[0]["windows"]
     wanted = {"dt": 0.2, "every": 6, "agents": 4, "least_agents": 4, "interpolate": True}
     assert {key: windows[key] for key in wanted} == wanted
-    given = follow(slower, settings, task, {"data.windows.agents", "data.windows.every"})[0]["windows"]
+    section, notes = follow(slower, settings, task, {"data.windows.agents", "data.windows.every"})
+    given = section["windows"]
+    assert "data.windows.agents=8, unlike the run's 4" in notes
     assert (given["agents"], given["least_agents"], given["every"]) == (8, 6, 2)
     assert follow({"name": "drawn"}, settings, task) == ({"name": "drawn"}, ())
 
