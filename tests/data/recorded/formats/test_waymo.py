@@ -75,6 +75,13 @@ def test_tracks_hold_the_valid_states(tmp_path):
     assert recording.dropped["tracks without a valid state"] == 1
 
 
+def test_the_size_of_an_agent_is_that_of_its_first_valid_state(tmp_path):
+    sizes = [(4.0 + 0.01 * k, 1.5 + 0.01 * k) for k in range(91)]
+    seen = [state(float(k), 0.0, 0.0, 10.0, size, valid=k >= 3) for k, size in enumerate(sizes)]
+    found = one(tmp_path, scenario(tracks=[track(1, 1, seen)])).tracks
+    np.testing.assert_array_equal(found.size, np.float32([sizes[3]]))
+
+
 def test_lanes_have_successors_neighbours_and_boundaries(tmp_path):
     recording = read(tmp_path)
     lanes = recording.lanes
