@@ -100,8 +100,7 @@ def waymo(folder: Path) -> list[RecordingSource]:
     for shard in shards:
         if (same := first.setdefault(shard.name, shard)) != shard:
             raise RecordingError(shard, f"{same} has the same name: rename or remove one of the two")
-        home = homes[shard]
-        found += _sources(shard, SPLIT_OF[home] if home else shard.name)
+        found += _sources(shard, SPLIT_OF.get(homes[shard] or "", shard.name))
     return found
 
 
@@ -159,7 +158,8 @@ def _tracks(message: Any, path: Path, dropped: Counter[str]) -> TrackTable:
             path, f"{steps[at] / RATE:.3g} s between the frames {at} and {at + 1}; {1 / RATE:g} s were expected"
         )
     count = len(message.timestamps_seconds)
-    ids, kinds, sizes, frames, agents, rows = [], [], [], [], [], []
+    ids: list[int] = []
+    kinds, sizes, frames, agents, rows = [], [], [], [], []
     for track in message.tracks:
         if len(track.states) != count:
             raise RecordingError(path, f"track {track.id} has {len(track.states)} states, but there are {count} frames")
