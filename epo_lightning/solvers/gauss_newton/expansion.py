@@ -189,7 +189,8 @@ def _bounds(at: Iterate, feature: OwnFeature) -> Bounds:
     """Bounds of a feature's signal, for every problem where they depend on the kind of agent: [S, N, 1]."""
     if not feature.bounded or feature.signal not in at.energy.bounded_by_kind:
         return at.around.bounds
-    lower, upper = (bound.expand(-1, at.modes, -1, -1).flatten(0, 1) for bound in at.around.bounds[feature.signal])
+    both = [torch.as_tensor(bound) for bound in at.around.bounds[feature.signal]]
+    lower, upper = (bound.expand(-1, at.modes, -1, -1).flatten(0, 1) for bound in both)
     return {feature.signal: (lower, upper)}
 
 
