@@ -58,10 +58,11 @@ def main(given: Sequence[str] | None = None) -> None:
     if not words or "--help" in words:
         print(__doc__)
         return
-    data = assembly.build_data(compose("generate", words)["data"])
+    config = compose("generate", words)
+    data = assembly.build_data(config["data"])
     if not isinstance(data, RecordedData) or not data.task.map:
         raise ConfigError("benchmarks.goals measures recorded data with a map: choose data=lankershim or data=us101")
-    data.generate(progress=False)
+    data.generate(workers=config["workers"], progress=False)
     found = []
     for split in data.report()["recordings"]:
         loaded = cache.load(data.folder, split, command=data.command, config=data.config)

@@ -89,7 +89,7 @@ def test_lanes_of_scenes_reach_as_far_as_agents_get(data: list[str]) -> None:
 def test_goals_of_turning_agents_are_measured_by_a_command(data: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     shares = {}
     for lines in ("8", "null"):
-        goals([*data, f"data.windows.lines={lines}"])
+        goals([*data, f"data.windows.lines={lines}", "workers=1"])
         shown = capsys.readouterr().out.splitlines()
         turning = next(line.split() for line in shown if line.startswith("turning"))
         shares[lines] = np.array(turning[1:4], dtype=float)
