@@ -113,7 +113,7 @@ def _followed(
     Returns:
         lanes of each path, and the arc lengths from the agent to their beginnings [m].
     """
-    found = []
+    found: list[tuple[tuple[int, ...], tuple[float, ...]]] = []
     waiting: list[tuple[tuple[int, ...], tuple[float, ...]]] = [((lane,), (begin,))]
     while waiting and len(found) < MOST_WAYS:
         path, begins = waiting.pop()
@@ -159,9 +159,9 @@ class Junctions:
         line = np.full((len(found), max(map(len, found), default=1)), -1)
         cost = np.full(line.shape, np.inf)
         for row, of_agent in enumerate(found):
-            for column, way in enumerate(of_agent):
-                line[row, column] = number.setdefault(way.lanes, len(number))
-                cost[row, column] = way.cost
+            for place, way in enumerate(of_agent):
+                line[row, place] = number.setdefault(way.lanes, len(number))
+                cost[row, place] = way.cost
         lines = self._lines(list(number))
         # Centrelines, then left and right boundaries.
         line = np.concatenate([np.where(line < 0, -1, line + side * len(number)) for side in range(3)], 1)
