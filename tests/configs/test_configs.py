@@ -240,7 +240,7 @@ def test_help_and_configurations_are_printed(epo: Epo, capsys: pytest.CaptureFix
         (["config", "--help"], "check"),
         (["--version"], "epo_lightning"),
         (["config", "experiment=rpi/v_lstm_epo"], "step_size: 0.3"),
-        (["config", "evaluate", "run=x"], "split: test"),
+        (["config", "evaluate", "run=x"], "checkpoint: best"),
         (["config", "check", "experiment=rpi/v_lstm_epo"], "is valid"),
     ):
         assert epo(*words) == 0
