@@ -10,11 +10,13 @@ import pytest
 import torch
 from data.recorded.crossings import turning_traffic
 
+import epo_lightning
 from benchmarks.goals import main as goals
+from benchmarks.turning import main as turning_scores
 from epo_lightning.data.recorded.tracks import RecordingSource
 from epo_lightning.experiment import train
 from epo_lightning.experiment.assembly import build_data
-from epo_lightning.experiment.config.compose import compose, tree
+from epo_lightning.experiment.config.compose import compose, jobs, tree
 from epo_lightning.experiment.evaluate import evaluate
 from epo_lightning.experiment.predict import predict
 from epo_lightning.experiment.verbs import check_settings
@@ -50,14 +52,33 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 def test_the_rows_are_those_of_the_highway_on_other_data() -> None:
     backbones = ("v_lstm", "vibes", "hivt_m")
-    assert {f"{backbone}{suffix}" for backbone in backbones for suffix in ("", "_sc", "_epo")} | {"const_vel"} == set(
-        ROWS
-    )
+    suffixes = ("", "_sc", "_epo", "_epo_no_pair")
+    assert {f"{backbone}{suffix}" for backbone in backbones for suffix in suffixes} | {"const_vel"} == set(ROWS)
     for row in ROWS:
         urban = compose("train", [f"experiment=urban/{row}", "data=exid"])
         highway = compose("train", [f"experiment=highway/{row}", "data=exid"])
         assert differences(urban, highway) == []
         assert compose("train", [f"experiment=urban/{row}"])["data"]["dataset"] == "lankershim"
+
+
+def test_maps_with_junctions_have_lines_along_all_successors() -> None:
+    windows = {}
+    for file in (tree() / "conf" / "data").glob("*.yaml"):
+        section = compose("generate", [f"data={file.stem}"])["data"]
+        if section.get("map"):
+            windows[file.stem] = section["windows"].get("lines"), section["windows"]["lanes"]
+    urban = dict.fromkeys(("argoverse2", "ind", "interaction", "lankershim", "round", "unid", "waymo"), (8, None))
+    highways = dict.fromkeys(("exid", "highd", "us101"), (None, 32))
+    assert windows == {**urban, **highways}
+
+
+def test_the_sweep_has_every_row_and_a_twin_without_pair_terms_of_every_game() -> None:
+    runs = jobs("train", ["sweeps=urban_main"])
+    assert len(runs) == 3 * len(ROWS)
+    configs = {config["experiment"]: config for config in (compose("train", job) for job in runs if "seed=0" in job)}
+    assert configs.keys() == {f"urban/{row}" for row in ROWS}
+    for game in (name for name in configs if name.endswith("_epo")):
+        assert differences(configs[game], configs[f"{game}_no_pair"]) == [("energy.pair", ["proximity"], [])]
 
 
 @pytest.mark.parametrize("row", ["v_lstm_sc", "v_lstm_epo", "vibes"])
@@ -73,6 +94,34 @@ def test_rows_train_on_several_ways_through_a_junction(row: str, data: list[str]
             check_settings("predict", compose("predict", [f"run={run.path}", f"out={out}", "figures=1", "scenes=3"]))
         )
         assert list((out / "figures").glob("scene_*.png"))
+
+
+def test_scores_of_turning_agents_are_those_of_a_loop(
+    data: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["experiment=urban/v_lstm_sc", "budget=untrained", "callbacks.progress=none", f"runs={tmp_path}", *data]
+    run = train.train(compose("train", words))
+    turning_scores([str(run.path)])
+    shown = [line.split()[-6:] for line in capsys.readouterr().out.splitlines()[1:]]
+    scenes = build_data(compose("train", words)["data"]).open("test")
+    scene = scenes[torch.arange(len(scenes))]
+    forecast = epo_lightning.load(run.checkpoint("best")).predict(scene)
+    errors = (forecast.states[..., :2] - scene.future[:, None, ..., :2]).norm(dim=-1)  # [B, M, N, K]
+    for name, turns in (("turning", True), ("others", False)):
+        count, each, joint = 0, [], []
+        for b in range(len(scenes)):
+            turned = [
+                abs(float(scene.future[b, i, -1, 2] - scene.history[b, i, -1, 2])) > math.pi / 6 for i in range(4)
+            ]
+            members = [i for i in range(4) if scene.agent_mask[b, i] and turned[i] == turns]
+            if members:
+                count += len(members)
+                each.append(float(np.mean([errors[b, :, i].mean(-1).min() for i in members])))
+                joint.append(float(errors[b][:, members].mean((1, 2)).min()))
+        (line,) = [line for line in shown if line[0] == name]
+        assert int(line[1]) == count > 0
+        assert float(line[2]) == pytest.approx(np.mean(each), abs=6e-4)
+        assert float(line[4]) == pytest.approx(np.mean(joint), abs=6e-4)
 
 
 def test_lanes_of_scenes_reach_as_far_as_agents_get(data: list[str]) -> None:
