@@ -17,22 +17,24 @@ import platform
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
 from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from epo_lightning.data.mapped import mapped, not_finite
 from epo_lightning.registry import ConfigError
 
 FORMAT = 1
 """Version of the layout. A data set of another version is refused."""
 MANIFEST = "manifest.json"
+LARGE = 1 << 31
+"""Size [bytes] from which on the file of a split is read piece by piece, and is checked only once."""
 SPLITS = ("train", "val", "test")
 PACKAGES = ("epo_lightning", "numba", "numpy", "safetensors", "torch")
 
@@ -120,7 +122,8 @@ def write_file(path: Path, content: bytes) -> None:
     Raises:
         OSError: the disk is full or read-only; the message names the file.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    # Processes with the same number may write the same file from several machines.
+    temporary = path.with_name(f".{path.name}.{platform.node()}-{os.getpid()}")
     with writing(path):
         try:
             temporary.write_bytes(content)
@@ -254,6 +257,8 @@ def configs(root: Path, kind: str) -> list[tuple[Path, dict[str, Any]]]:
 def verify_file(folder: Path, split: str, command: str = "", config: Mapping[str, Any] | None = None) -> Path:
     """The path of a split's file after a check of its size and checksum (a few tenths of a second per 100 MB at most).
 
+    The checksum of a large file that :func:`load` has checked is not computed again, unless the file has changed since.
+
     Raises:
         CacheError: as :func:`manifest`, or a file that is missing, truncated or altered.
     """
@@ -266,7 +271,7 @@ def verify_file(folder: Path, split: str, command: str = "", config: Mapping[str
         raise _broken(f"{path} is missing", folder, command)
     if path.stat().st_size != expected["bytes"]:
         raise _broken(f"{path} has {path.stat().st_size} bytes instead of {expected['bytes']}", folder, command)
-    if file_digest(path) != expected["sha256"]:
+    if not _is_checked(path, expected["sha256"]) and file_digest(path) != expected["sha256"]:
         raise _broken(
             f"{path} has the right size but not the checksum of its manifest: it was altered", folder, command
         )
@@ -292,23 +297,61 @@ def load(
 ) -> dict[str, Tensor]:
     """Tensors of a split, all of them or those in ``names``, after a check of the file and that all numbers are finite.
 
+    The tensors of a large file are memory-mapped and must not be written to; the file need not fit in memory.
+
     Raises:
         CacheError: as :func:`verify_file`, or a number that is not finite.
     """
     path = verify_file(folder, split, command, config)
+    large = path.stat().st_size >= LARGE
     try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in (names or file.keys())}
+        with safe_open(path, framework="np" if large else "pt") as file:
+            wanted = names or tuple(file.keys())
+            tensors = mapped(path, wanted) if large else {name: file.get_tensor(name) for name in wanted}
     except SafetensorError as error:
         raise _broken(f"{path} cannot be read ({error})", folder, command) from None
+    sha256 = manifest(folder)["files"][path.name]["sha256"] if large else ""
+    if large and _is_checked(path, sha256):
+        return tensors
     for name, tensor in tensors.items():
         if tensor.is_floating_point():
-            bad = ~tensor.isfinite().flatten(1).all(1) if tensor.dim() > 1 else ~tensor.isfinite()
-            if bad.any():
-                first = int(torch.nonzero(bad)[0])
+            count, first = not_finite(tensor)
+            if count:
                 raise _broken(
-                    f"split {split!r} in {path}: tensor {name!r} is not finite in {int(bad.sum())} records, first {first}",
+                    f"split {split!r} in {path}: tensor {name!r} is not finite in {count} records, first {first}",
                     folder,
                     command,
                 )
+    if large and names is None:
+        _remember(path, sha256)
     return tensors
+
+
+def _checks(path: Path) -> Path:
+    """File beside a data set that remembers which of its large files were checked."""
+    return path.parent.with_name(f".{path.parent.name}.checked.json")
+
+
+def _state(path: Path, sha256: str) -> list[Any]:
+    found = path.stat()
+    return [found.st_size, found.st_mtime_ns, sha256]
+
+
+def _is_checked(path: Path, sha256: str) -> bool:
+    """Whether a large file was checked before and has not changed since."""
+    if path.stat().st_size < LARGE:
+        return False
+    try:
+        return bool(json.loads(_checks(path).read_text()).get(path.name) == _state(path, sha256))
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def _remember(path: Path, sha256: str) -> None:
+    """Remember that a large file was checked."""
+    try:
+        known = json.loads(_checks(path).read_text())
+    except (OSError, ValueError):
+        known = {}
+    with suppress(OSError):  # a cache may be read-only once its data sets are made
+        write_file(_checks(path), json.dumps({**known, path.name: _state(path, sha256)}).encode())

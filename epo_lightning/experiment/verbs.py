@@ -51,15 +51,23 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     from epo_lightning.experiment.config.sources import HIGHWAYS
 
     data = assembly.build_data(settings.data)
-    strict: dict[str, bool] = {}
+    known = inspect.signature(data.generate).parameters
+    special: dict[str, Any] = {}
     if settings.strict:
-        if "strict" not in inspect.signature(data.generate).parameters:
+        if "strict" not in known:
             raise ConfigError(
                 f"strict=true refuses recordings that cannot be read, and data={settings.data['name']} has no recordings: "
                 "leave it out"
             )
-        strict = {"strict": True}
-    folder = data.generate(workers=settings.workers, progress=settings.progress, **strict)
+        special["strict"] = True
+    if launch := _launch(settings, overrides):
+        if "launch" not in known:
+            raise ConfigError(
+                f"a launcher divides recordings among jobs, and data={settings.data['name']} has no recordings: leave "
+                "hydra/launcher and jobs out"
+            )
+        special["launch"] = launch
+    folder = data.generate(workers=settings.workers, progress=settings.progress, **special)
     print(f"\ndata in {folder}, digest {data.digest}")
     report = data.report()
     _print_report(report)
@@ -76,6 +84,27 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
         rows = "ucy" if not data.task.map else "urban" if settings.data.get("windows", {}).get("lines") else "exid"
         words = [f"experiment={rows}/v_lstm_epo", *kept]
     print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
+
+
+def _launch(settings: GenerateSettings, overrides: Sequence[str]) -> Any:
+    """The function that has recordings extracted by jobs; None without a launcher.
+
+    Raises:
+        ConfigError: a launcher without a number of jobs, or the other way round.
+    """
+    from epo_lightning.experiment import generation
+
+    if generation.chosen(overrides) != (settings.jobs is not None):
+        raise ConfigError(
+            "hydra/launcher=<name> and jobs=<number> belong together: the launcher divides the recordings among so many jobs"
+        )
+    if settings.jobs is None:
+        return None
+    option = "--config-dir="
+    words = [word for word in overrides if not word.startswith(option)]
+    return generation.launching(
+        words, settings.jobs, [w.removeprefix(option) for w in overrides if w.startswith(option)]
+    )
 
 
 def train_and_print(config: dict[str, Any], overrides: Sequence[str]) -> float | None:

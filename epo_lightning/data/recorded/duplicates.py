@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -31,6 +32,8 @@ ENOUGH = 20
 """Smallest number of equal runs at one difference of frames that shows an overlap."""
 NEAR = 0.1
 """Largest mean distance [m] between two tracks of the same vehicle."""
+SLOTS = np.uint64(1 << 26)
+"""Number of remainders of hashes, by which runs of one recording alone are left out before hashes are compared."""
 ORDER = ("test", "val", "train")
 """Splits that keep their scenes first."""
 
@@ -93,7 +96,7 @@ def runs(drives: Drives) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
 
 
 def align(recordings: Sequence[Drives]) -> Shared:
-    """The common times and vehicles of recordings."""
+    """The common times and vehicles of recordings; at most two of these are in memory at a time."""
     shift = np.zeros(len(recordings), dtype=np.int64)
     links: dict[int, list[tuple[int, int]]] = {number: [] for number in range(len(recordings))}
     offsets = np.cumsum([0, *(len(drives.ids) for drives in recordings)])
@@ -154,7 +157,8 @@ def used_once(
         masks of the scenes that are kept, for recordings that have scenes, and numbers of those that are left out, by name.
     """
     names = sorted(drives)
-    shared = align([drives[name] for name in names])
+    place = {name: number for number, name in enumerate(names)}
+    shared = align(_InOrder(names, drives))
     kept: dict[str, np.ndarray] = {}
     counts: dict[str, Counter[str]] = {name: Counter() for name in names}
     taken = np.empty((0, 2))
@@ -165,7 +169,7 @@ def used_once(
             scenes = tables[name]
             if scenes is None:
                 continue
-            number, drive = names.index(name), drives[name]
+            number, drive = place[name], drives[name]
             step = windows.dt * drive.rate
             ids = np.argsort(drive.ids)
             row = ids[np.searchsorted(drive.ids, scenes.track, sorter=ids)]
@@ -186,6 +190,20 @@ def used_once(
     return kept, counts
 
 
+@dataclass(frozen=True)
+class _InOrder(Sequence[Drives]):
+    """Recordings in the order of their names, each of them read when it is asked for."""
+
+    names: Sequence[str]
+    drives: Mapping[str, Drives]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, number: Any) -> Any:
+        return self.drives[self.names[number]]
+
+
 def _windows_overlap(
     members: Int[np.ndarray, "S N"], time: Float[np.ndarray, " S"], taken: Float[np.ndarray, "n 2"], steps: int
 ) -> Bool[np.ndarray, " S"]:
@@ -202,10 +220,16 @@ def _windows_overlap(
 
 def _overlaps(recordings: Sequence[Drives]) -> list[tuple[int, int, int]]:
     """Pairs of recordings with equal runs of speeds, and the difference of their frames at which most runs are equal."""
-    found = [runs(drives) for drives in recordings]
-    owner = np.repeat(np.arange(len(found)), [len(first) for first, _ in found])
-    frame = np.concatenate([drives.frame[first] for drives, (first, _) in zip(recordings, found, strict=True)])
-    key = np.concatenate([key for _, key in found])
+    repeated = _in_several(recordings)
+    rates, owners, frames, keys = [], [], [], []
+    for number, drives in enumerate(recordings):
+        first, of_runs = runs(drives)
+        kept = repeated[of_runs % SLOTS]
+        rates.append(drives.rate)
+        owners.append(np.full(kept.sum(), number))
+        frames.append(drives.frame[first[kept]])
+        keys.append(of_runs[kept])
+    owner, frame, key = np.concatenate(owners), np.concatenate(frames), np.concatenate(keys)
     order = np.lexsort((owner, key))
     owner, frame, key = owner[order], frame[order], key[order]
     votes: Counter[tuple[int, int, int]] = Counter()
@@ -227,8 +251,18 @@ def _overlaps(recordings: Sequence[Drives]) -> list[tuple[int, int, int]]:
     return [
         (one, other, difference)
         for (one, other), (_, difference) in sorted(best.items())
-        if abs(recordings[one].rate - recordings[other].rate) < 1e-6
+        if abs(rates[one] - rates[other]) < 1e-6
     ]
+
+
+def _in_several(recordings: Sequence[Drives]) -> Bool[np.ndarray, " n"]:
+    """Mask [SLOTS] of the remainders of hashes that occur in two or more recordings: others cannot show an overlap."""
+    seen, again = np.zeros(SLOTS, dtype=bool), np.zeros(SLOTS, dtype=bool)
+    for drives in recordings:
+        slot = np.unique(runs(drives)[1] % SLOTS)
+        again[slot] |= seen[slot]
+        seen[slot] = True
+    return again
 
 
 def _same_vehicles(one: Drives, other: Drives, difference: int) -> Int[np.ndarray, "n 2"]:

@@ -1,4 +1,8 @@
-"""Extraction of one recording into a file, the task of a worker process, which starts faster without importing Lightning."""
+"""Extraction of recordings into a file, the task of a worker process, which starts faster without importing Lightning.
+
+The file of one or more recordings is a part of a data set (:mod:`~epo_lightning.data.recorded.parts`). It is complete or
+absent, and its bytes do not depend on the process that writes it, except for the seconds that the work took.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,8 @@ import dataclasses
 import json
 import time
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,48 +22,66 @@ from safetensors.numpy import save
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.surroundings import far_from_lanes
-from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.registry import ConfigError
 
+OUTCOMES = "recordings"
+"""Key of the outcomes in the metadata of a file."""
+RAW = "raw"
+"""First word of the names of columns of the recorded tracks."""
+
 
 @dataclass(frozen=True)
 class Extracted:
-    """The file of one recording, as :func:`extract_to_file` wrote it.
+    """Outcome of the extraction of one recording, without its scenes.
 
     Attributes:
-        tables: the scenes; None if there are none.
         counts: windows, windows that were left out by reason, scenes, and items that were left out before.
         about: number of agents, seconds of recording and of work, warnings, and agents that end far from all given lanes.
         problem: why the recording could not be read; None if it was read.
-        raw: rows of the recording's tracks by name, if they were kept.
     """
 
-    tables: SceneTables | None
     counts: Mapping[str, int]
     about: Mapping[str, Any]
     problem: str | None = None
-    raw: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def extract_to_file(
-    source: RecordingSource, windows: WindowConfig, has_map: bool, file: Path, strict: bool = True, keep: bool = False
+    sources: Sequence[RecordingSource],
+    windows: WindowConfig,
+    has_map: bool,
+    file: Path,
+    strict: bool = True,
+    keep: bool = False,
 ) -> None:
-    """Extract the scenes of one recording into a file.
+    """Extract the scenes of some recordings into a file.
 
     Args:
-        source: the recording.
+        sources: the recordings.
         windows: selection of the windows that become scenes.
-        has_map: whether to use the recording's lanes.
+        has_map: whether to use the recordings' lanes.
         file: file to write.
         strict: whether a recording that cannot be read is an error; otherwise the file says why it cannot be read.
         keep: whether to keep the recorded tracks as well, to find the same vehicles in other recordings.
 
     Raises:
         RecordingError: a recording that cannot be read, if ``strict``.
-        ConfigError: settings that do not fit the recording.
+        ConfigError: settings that do not fit a recording.
     """
+    columns: dict[str, np.ndarray] = {}
+    outcomes = []
+    for number, source in enumerate(sources):
+        of_one, outcome = _extract(source, windows, has_map, strict, keep)
+        columns |= {f"{number} {name}": values for name, values in of_one.items()}
+        outcomes.append(dataclasses.asdict(outcome))
+    cache.write_file(file, save(columns, {OUTCOMES: json.dumps(outcomes)}))
+
+
+def _extract(
+    source: RecordingSource, windows: WindowConfig, has_map: bool, strict: bool, keep: bool
+) -> tuple[dict[str, np.ndarray], Extracted]:
+    """Columns of the scenes of one recording and, if they are kept, of its tracks; and the outcome."""
     begin = time.perf_counter()
     columns: dict[str, np.ndarray] = {}
     counts: dict[str, int] = {}
@@ -84,13 +106,12 @@ def extract_to_file(
                 columns = {name: np.ascontiguousarray(values) for name, values in found.columns().items()}
                 about["ends far from lanes"], about["moving agents"] = far_from_lanes(found)
             if keep:
-                columns |= {f"raw {name}": values for name, values in _raw(recording).items()}
+                columns |= {f"{RAW} {name}": values for name, values in _raw(recording).items()}
             about["agents"] = len(recording.tracks.ids)
             about["recorded"] = _duration(recording)
     about["warnings"] = sorted({str(warning.message) for warning in caught})
     about["seconds"] = time.perf_counter() - begin
-    content = {"counts": counts, "about": about, "problem": problem}
-    cache.write_file(file, save(columns, {name: json.dumps(value) for name, value in content.items()}))
+    return columns, Extracted(counts, about, problem)
 
 
 def _duration(recording: Recording) -> float:
@@ -113,22 +134,13 @@ def _raw(recording: Recording) -> dict[str, np.ndarray]:
     }
 
 
-def read_extracted(file: Path) -> Extracted:
-    """The content of a recording's file, as :func:`extract_to_file` wrote it."""
-    with safe_open(file, framework="np") as content:
-        texts = content.metadata()
-        columns = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118 - not a mapping
-    raw = {name.removeprefix("raw "): columns.pop(name) for name in list(columns) if name.startswith("raw ")}
-    counts, about, problem = (json.loads(texts[name]) for name in ("counts", "about", "problem"))
-    return Extracted(SceneTables(**columns) if columns else None, counts, about, problem, raw)
+def outcomes(file: Path) -> list[Extracted] | None:
+    """Outcomes of the recordings in a file of :func:`extract_to_file`; None if the file is absent or is not readable.
 
-
-def is_complete(file: Path) -> bool:
-    """Whether the file of a recording exists, can be read and holds a recording that could be read.
-
-    It is renamed into place when it is complete.
+    Only the header is read, because a file is renamed into place when it is complete.
     """
     try:
-        return file.is_file() and read_extracted(file).problem is None
+        with safe_open(file, framework="np") as content:
+            return [Extracted(**outcome) for outcome in json.loads(content.metadata()[OUTCOMES])]
     except (SafetensorError, OSError, ValueError, KeyError, TypeError):
-        return False
+        return None

@@ -1,10 +1,11 @@
-"""The scenes of a split, gathered from those of its recordings."""
+"""The scenes of a split, gathered from those of its recordings, which need not fit in memory together."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -12,7 +13,53 @@ from torch import Tensor
 
 from epo_lightning.data.recorded.extraction import Extracted
 from epo_lightning.data.recorded.summary import by_unit, describe
-from epo_lightning.data.recorded.tables import SceneTables, joined
+from epo_lightning.data.recorded.tables import INDEX_OF, SceneTables, shifted
+
+
+class Spool:
+    """Columns that grow by appended rows, each in a file of its own.
+
+    Args:
+        folder: folder of the files; it must not exist.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True)
+        self.folder = folder
+        self._files: dict[str, BinaryIO] = {}
+        self._rows: Counter[str] = Counter()
+        self._like: dict[str, np.ndarray] = {}
+
+    def append(self, columns: Mapping[str, np.ndarray]) -> None:
+        """Append rows to some columns.
+
+        Raises:
+            ValueError: rows of another dtype or shape than those before.
+        """
+        for name, values in columns.items():
+            if name not in self._files:
+                self._files[name] = (self.folder / name).open("wb")
+                self._like[name] = np.empty((0, *values.shape[1:]), values.dtype)
+            like = self._like[name]
+            if (values.dtype, values.shape[1:]) != (like.dtype, like.shape[1:]):
+                raise ValueError(
+                    f"rows of column {name!r} are {values.dtype} {list(values.shape[1:])}, and those before "
+                    f"{like.dtype} {list(like.shape[1:])}"
+                )
+            self._files[name].write(np.ascontiguousarray(values).data)
+            self._rows[name] += len(values)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """All columns, memory-mapped. Nothing can be appended afterwards."""
+        found = {}
+        for name, file in self._files.items():
+            file.close()
+            like = self._like[name]
+            shape = (self._rows[name], *like.shape[1:])
+            # r+, because torch warns of arrays that are read-only. Nothing writes to them.
+            full = 0 not in shape
+            found[name] = np.memmap(file.name, like.dtype, "r+", shape=shape) if full else np.empty(shape, like.dtype)
+        return found
 
 
 def gather(
@@ -20,23 +67,37 @@ def gather(
     tables: Mapping[str, SceneTables | None],
     counts: Mapping[str, Mapping[str, int]],
     extracted: Mapping[str, Extracted],
+    widest: int,
+    folder: Path,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The scenes of a split, and a report about them."""
+    """The scenes of a split as memory-mapped tensors, and a report about them.
+
+    Args:
+        names: recordings of the split, one or more with scenes.
+        tables: scenes of each recording, which are asked for once, in the order of ``names``.
+        counts: windows, windows that were left out by reason, and scenes of each recording.
+        extracted: outcome of the extraction of each recording.
+        widest: largest number of lanes of a scene of the split.
+        folder: folder to make for the files of the tensors, which may be deleted when the tensors are no longer used.
+    """
     total: Counter[str] = Counter()
-    for name in names:
+    before = Counter(dict.fromkeys(INDEX_OF.values(), 0))
+    spool = Spool(folder)
+    for number, name in enumerate(names):
         total.update(counts[name])
-    full = [found for found in (tables[name] for name in names) if found is not None]
-    whole = joined(full)
-    # A recording without scenes still has its place in the order of recordings.
-    index = np.array([number for number, name in enumerate(names) if tables[name] is not None])
-    columns = whole.columns()
-    origin = np.zeros((len(names), 2))
-    origin[index] = whole.origin
-    columns["recording"], columns["origin"] = index[whole.recording].astype(np.int32), origin
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in columns.items()}
-    about = {**by_unit(total), **describe(whole)}
+        found = tables[name]
+        if found is None:
+            # A recording without scenes still has its place in the order of recordings.
+            spool.append({"origin": np.zeros((1, 2))})
+            continue
+        columns = shifted(found, before, widest)
+        columns["recording"] = np.full(len(found), number, dtype=np.int32)
+        spool.append(columns)
+        before.update({field: len(getattr(found, field)) for field in before})
+    gathered = spool.columns()
+    about = {**by_unit(total), **describe(SceneTables(**gathered))}
     moving = sum(extracted[name].about.get("moving agents", 0) for name in names)
     if moving:
         far = sum(extracted[name].about.get("ends far from lanes", 0) for name in names) / moving
         about["moving agents that end over 10 m from all lanes given"] = far
-    return tensors, about
+    return {name: torch.from_numpy(values) for name, values in gathered.items()}, about

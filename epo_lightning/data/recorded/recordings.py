@@ -17,12 +17,13 @@ from epo_lightning.data import cache
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded import summary
-from epo_lightning.data.recorded.duplicates import Drives, used_once
-from epo_lightning.data.recorded.extraction import Extracted, extract_to_file, is_complete, read_extracted
+from epo_lightning.data.recorded.duplicates import used_once
+from epo_lightning.data.recorded.extraction import Extracted, extract_to_file
 from epo_lightning.data.recorded.gathering import gather
+from epo_lightning.data.recorded.parts import Launch, Lazy, Parts
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
-from epo_lightning.data.recorded.sources import absent, fingerprint, with_options
+from epo_lightning.data.recorded.sources import absent, fingerprints, with_options
 from epo_lightning.data.recorded.splits import ALL, UNITS, SplitRule
 from epo_lightning.data.recorded.tables import selected
 from epo_lightning.data.recorded.tracks import RecordingSource
@@ -158,7 +159,7 @@ class RecordedData(SceneDataModule):
     def identity(self, sources: Sequence[RecordingSource]) -> Any:
         """Plain values that identify the recordings: names, groups, and names, sizes and checksums of all files."""
         # Files may be common to recordings: maps, and shards with hundreds of scenarios.
-        known = {file: fingerprint(file) for file in dict.fromkeys(file for source in sources for file in source.files)}
+        known = fingerprints(list(dict.fromkeys(file for source in sources for file in source.files)), self.root)
         return [[source.name, source.group, [known[file] for file in source.files]] for source in sources]
 
     @cached_property
@@ -274,7 +275,9 @@ class RecordedData(SceneDataModule):
             words.append(f"data.root={self.root}")
         return shlex.join(["epo", "generate", *words])
 
-    def generate(self, workers: int | None = None, progress: bool = True, strict: bool = False) -> Path:
+    def generate(
+        self, workers: int | None = None, progress: bool = True, strict: bool = False, launch: Launch | None = None
+    ) -> Path:
         """Extract the scenes unless that was done before, and return the folder of the data set.
 
         Args:
@@ -282,6 +285,7 @@ class RecordedData(SceneDataModule):
             progress: whether to report progress.
             strict: whether a recording that cannot be read is an error. Otherwise it is left out and reported, and the data
                 set is not that of the whole folder: its configuration names the recordings that were left out.
+            launch: function that has parts of the data set extracted by jobs elsewhere; None for processes of this machine.
 
         Raises:
             ConfigError: a recording that cannot be read if ``strict``, no recording that can be read, a split without
@@ -293,7 +297,7 @@ class RecordedData(SceneDataModule):
             # Another process may have extracted the readable ones of these recordings in the meantime.
             self.__dict__.pop("config", None)
             if strict or not self.folder.exists():
-                self._make(workers, progress, strict)
+                self._make(workers, progress, strict, launch)
 
         if strict and self.config.get("skipped"):
             make()  # a recording that still cannot be read is an error
@@ -305,69 +309,72 @@ class RecordedData(SceneDataModule):
         """The recordings that scenes are extracted from."""
         return self.sources()
 
-    def _make(self, workers: int | None, progress: bool, strict: bool) -> None:
-        """Extract each recording into a file of its own, then gather the files of each split."""
-        recordings = {source.name: source for source in self.recordings()}
-        identity = self.identity(list(recordings.values()))
-        config = self._config_of(list(recordings.values()), identity)
+    def _make(self, workers: int | None, progress: bool, strict: bool, launch: Launch | None) -> None:
+        """Extract the recordings into parts, then gather the scenes of each split from them."""
+        recordings = self.recordings()
+        identity = self.identity(recordings)
+        config = self._config_of(recordings, identity)
         work = self.root / f".{self._name(config)}-parts"
         with cache.writing(work):
             work.mkdir(parents=True, exist_ok=True)
-        files = {name: work / f"{number:04d}.safetensors" for number, name in enumerate(recordings)}
-        once = self.duplicates == "once"
-        tasks = [
-            (source, self.windows, self.task.map, files[name], strict, once)
-            for name, source in recordings.items()
-            if not is_complete(files[name])
-        ]
-        before = len(recordings) - len(tasks)
-        report = Report(tasks, lambda task: task[0].name, "recording", "extracting", "extracted", before, progress)
-        for _ in finished(extract_to_file, tasks, workers, report, f"finished recordings are kept in {work}"):
-            pass
-        extracted = {name: read_extracted(file) for name, file in files.items()}
-        problems = {name: part.problem for name, part in extracted.items() if part.problem is not None}
-        used = [source for name, source in recordings.items() if name not in problems]
+        parts = Parts(work, recordings)
+        tasks = parts.tasks(self.windows, self.task.map, strict, self.duplicates == "once")
+        unit, before = "recording" if parts.size == 1 else "part", len(parts.files) - len(tasks)
+        report = Report(tasks, lambda task: task[3], unit, "extracting", "extracted", before, progress)
+        if launch and tasks:
+            launch(tasks, report)
+        else:
+            for _ in finished(extract_to_file, tasks, workers, report, f"finished recordings are kept in {work}"):
+                pass
+        extracted = parts.extracted()
+        problems = {name: one.problem for name, one in extracted.items() if one.problem is not None}
+        used = [source for source in recordings if source.name not in problems]
         if not used:
             raise RecordingError(
                 self.folder_of_recordings, f"no recording can be read; the first one: {next(iter(problems.values()))}"
             )
         if problems:
-            known = dict(zip(recordings, identity, strict=True))
+            known = {source.name: entry for source, entry in zip(recordings, identity, strict=True)}
             config = self._config_of(
                 used, [known[source.name] for source in used], [known[name] for name in sorted(problems)]
             )
         self.__dict__["config"] = config
-        self._write(list(recordings.values()), used, extracted, problems)
+        self._write(recordings, used, parts, extracted)
         shutil.rmtree(work, ignore_errors=True)
 
     def _write(
         self,
         sources: Sequence[RecordingSource],
         used: Sequence[RecordingSource],
+        parts: Parts,
         extracted: Mapping[str, Extracted],
-        problems: Mapping[str, str],
     ) -> None:
         """Gather the scenes of every split and write the data set."""
         splits = self.splits(used)
         names = {split: [source.name for source in held] for split, held in splits.items()}
-        tables = {source.name: extracted[source.name].tables for source in used}
+        tables = Lazy([source.name for source in used], parts.tables)
         counts = {source.name: Counter(extracted[source.name].counts) for source in used}
         if self.duplicates == "once":
-            drives = {source.name: Drives.of(extracted[source.name].raw) for source in used}
-            kept, less = used_once(names, tables, drives, self.windows)
+            kept, less = used_once(names, tables, Lazy(tables.names, parts.drives), self.windows)
             for name, mask in kept.items():
-                found = tables[name]
-                assert found is not None
-                tables[name] = selected(found, mask)
                 counts[name] += less[name]
                 counts[name]["scenes"] = int(mask.sum())
+            tables = Lazy(tables.names, lambda name: selected(parts.tables(name), kept.get(name)))
         self.rule.refuse_empty(self.dataset_name, used, splits, counts)
-        tensors, about = {}, {}
-        for split in splits:
-            tensors[split], about[split] = gather(names[split], tables, counts, extracted)
-        rows = summary.rows_of(sources, splits, extracted, counts)
-        report = {**about, "recordings": names, **({"skipped": dict(problems)} if problems else {})}
-        cache.write(self.folder, tensors, self.config, report, {summary.FILE: summary.to_csv(rows)})
+        columns = parts.folder / "columns"
+        shutil.rmtree(columns, ignore_errors=True)  # files that a killed process left
+        try:
+            tensors, about = {}, {}
+            with cache.writing(columns):
+                for split, held in names.items():
+                    widest = max(parts.lanes(name) for name in held if counts[name].get("scenes"))
+                    tensors[split], about[split] = gather(held, tables, counts, extracted, widest, columns / split)
+            rows = summary.rows_of(sources, splits, extracted, counts)
+            problems = {name: one.problem for name, one in extracted.items() if one.problem is not None}
+            report = {**about, "recordings": names, **({"skipped": problems} if problems else {})}
+            cache.write(self.folder, tensors, self.config, report, {summary.FILE: summary.to_csv(rows)})
+        finally:
+            shutil.rmtree(columns, ignore_errors=True)
 
     def per_recording(self) -> list[str]:
         """Lines of a table of what became of each recording; empty for data sets of older versions."""

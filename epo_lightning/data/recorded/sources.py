@@ -1,19 +1,35 @@
-"""Recordings of a folder: their listing with the options of a format, and the fingerprints of their files."""
+"""Recordings of a folder: their listing with the options of a format, and the fingerprints of their files.
+
+A fingerprint is read from the file. Of many files, fingerprints are remembered in the cache together with the files' sizes
+and times of change, because reading a million files would take longer than starting a training.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import inspect
+import json
+import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
 
+from epo_lightning.data import cache
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.registry import ConfigError, lookup, nearest
 
 PIECE, PIECES = 1 << 14, 64
 """Size [bytes] and number of the pieces of a file that enter its checksum; files up to 1 MB are covered completely."""
+MANY = 1000
+"""Largest number of files that are all read again whenever their fingerprints are needed."""
+RECENT = 10.0
+"""Age [s] up to which a file's time of change is not trusted: another change may have the same time."""
+THREADS = 8
+"""Number of files that are read at once."""
 
 
 def with_options(format: str, options: Mapping[str, Any]) -> Callable[[Path], list[RecordingSource]]:
@@ -47,3 +63,39 @@ def fingerprint(file: Path) -> list[Any]:
             content.seek(place)
             checksum = zlib.crc32(content.read(PIECE), checksum)
     return [file.name, size, checksum]
+
+
+def fingerprints(files: Sequence[Path], root: Path) -> dict[Path, list[Any]]:
+    """Fingerprint of every file.
+
+    Of more than ``MANY`` files, those are not read whose size and time of change are the remembered ones.
+
+    Args:
+        files: the files.
+        root: folder of the cache, in which fingerprints are remembered.
+    """
+    if len(files) <= MANY:
+        return {file: fingerprint(file) for file in files}
+    paths = [str(file.absolute()) for file in files]
+    memo = root / f".fingerprints-{hashlib.sha256(min(paths).encode()).hexdigest()[:12]}.json"
+    known: dict[str, list[int]] = {}
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        known = dict(json.loads(memo.read_text()))
+
+    def entry(file: Path, path: str) -> list[int]:
+        """Size, time of change [ns] and checksum of a file."""
+        found = file.stat()
+        remembered = known.get(path)
+        if remembered and remembered[:2] == [found.st_size, found.st_mtime_ns]:
+            return remembered
+        return [found.st_size, found.st_mtime_ns, fingerprint(file)[2]]
+
+    with ThreadPool(THREADS) as pool:
+        entries = pool.starmap(entry, zip(files, paths, strict=True), chunksize=64)
+    before = (time.time() - RECENT) * 1e9
+    kept = {path: entry for path, entry in zip(paths, entries, strict=True) if entry[1] < before}
+    if kept != known:
+        with contextlib.suppress(OSError):  # a cache may be read-only once its data sets are made
+            root.mkdir(parents=True, exist_ok=True)
+            cache.write_file(memo, json.dumps(kept).encode())
+    return {file: [file.name, size, checksum] for file, (size, _, checksum) in zip(files, entries, strict=True)}

@@ -30,6 +30,8 @@ SHORT_TRACKS = "tracks shorter than a window"
 """A count of tracks that is not reported: ``TOO_SHORT`` counts the same in windows."""
 SHOWN = 60
 """Largest number of recordings that are printed."""
+AT_ONCE = 1 << 16
+"""Largest number of agents whose goal candidates are in memory at once."""
 
 
 def by_unit(counts: Mapping[str, int]) -> dict[str, Any]:
@@ -60,11 +62,15 @@ def describe(scenes: SceneTables) -> dict[str, Any]:
 
 def distance_to_goals(scenes: SceneTables) -> np.ndarray:
     """Distance [A] from the last future position of every agent to its nearest goal candidate [m]."""
-    way = np.linalg.norm(scenes.candidates - scenes.future[:, -1, None, :2], axis=-1)
-    if scenes.lines is not None:
-        per_line = scenes.candidates.shape[1] // scenes.references.shape[1]
-        way = np.where(np.arange(way.shape[1]) < per_line * scenes.lines[:, None], way, np.inf)
-    return np.asarray(way.min(1))
+    found = []
+    for first in range(0, max(1, len(scenes.history)), AT_ONCE):
+        rows = slice(first, first + AT_ONCE)
+        way = np.linalg.norm(scenes.candidates[rows] - scenes.future[rows, -1, None, :2], axis=-1)
+        if scenes.lines is not None:
+            per_line = scenes.candidates.shape[1] // scenes.references.shape[1]
+            way = np.where(np.arange(way.shape[1]) < per_line * scenes.lines[rows, None], way, np.inf)
+        found.append(np.asarray(way.min(1)))
+    return np.concatenate(found)
 
 
 def by_split(report: Mapping[str, Any]) -> list[str]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -73,27 +74,39 @@ OF_SCENES = ("agents", "lanes", "centre", "direction", "recording", "frame")
 """Fields with one row per scene."""
 
 
+def shifted(tables: SceneTables, before: Mapping[str, int], widest: int) -> dict[str, np.ndarray]:
+    """The columns of a piece of longer tables, without those that are None.
+
+    Args:
+        tables: the piece.
+        before: number of rows before the piece, for each of the fields that are values of ``INDEX_OF``.
+        widest: number of lanes per scene of the longer tables; fewer lanes are padded.
+    """
+    columns = tables.columns()
+    lanes = columns["lanes"]
+    columns["lanes"] = np.pad(lanes, ((0, 0), (0, widest - lanes.shape[1])), constant_values=-1)
+    for name, rows in INDEX_OF.items():
+        columns[name] = np.where(columns[name] < 0, -1, columns[name] + np.int64(before[rows]))
+    return columns
+
+
 def joined(parts: Sequence[SceneTables]) -> SceneTables:
     """The concatenation of several tables, with all row indices adjusted.
 
     Tables may have different numbers of lanes per scene; the narrower ones are padded.
     """
-    columns: dict[str, np.ndarray | None] = {}
     widest = max(part.lanes.shape[1] for part in parts)
-    for field in fields(SceneTables):
-        values = [getattr(part, field.name) for part in parts]
-        if field.name == "lanes":
-            values = [np.pad(value, ((0, 0), (0, widest - value.shape[1])), constant_values=-1) for value in values]
-        if field.name in INDEX_OF:
-            before = np.cumsum([0, *(len(getattr(part, INDEX_OF[field.name])) for part in parts)])
-            values = [np.where(value < 0, -1, value + offset) for value, offset in zip(values, before, strict=False)]
-        columns[field.name] = None if values[0] is None else np.concatenate(values)
-    return SceneTables(**columns)  # type: ignore[arg-type]
+    before = Counter(dict.fromkeys(INDEX_OF.values(), 0))
+    pieces = []
+    for part in parts:
+        pieces.append(shifted(part, before, widest))
+        before.update({name: len(getattr(part, name)) for name in before})
+    return SceneTables(**{name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]})
 
 
-def selected(tables: SceneTables, kept: Bool[np.ndarray, " S"]) -> SceneTables | None:
+def selected(tables: SceneTables | None, kept: Bool[np.ndarray, " S"] | None) -> SceneTables | None:
     """The tables of some of the scenes, without the agents of the others; None if no scene is kept."""
-    if not kept.any():
+    if tables is None or kept is None or not kept.any():
         return None
     members = tables.agents[kept]
     used = np.unique(members[members >= 0])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from epo_lightning.data import cache, simulate
+from epo_lightning.data.recorded.parts import Launch
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.registry import ConfigError, register
@@ -98,11 +99,13 @@ class SimulatedHighway(RecordedData):
         """Configuration of the simulation: the same configuration makes the same recordings."""
         return self.simulation
 
-    def generate(self, workers: int | None = None, progress: bool = True, strict: bool = True) -> Path:
+    def generate(
+        self, workers: int | None = None, progress: bool = True, strict: bool = True, launch: Launch | None = None
+    ) -> Path:
         """Simulate the recordings and extract the scenes, unless that was done before, and return the data set's folder.
 
         A simulated recording that cannot be read is always an error, whatever ``strict`` is.
         """
         if not self.folder.exists():
             simulate.make_recordings(self.folder_of_recordings, self.simulation, workers, progress)
-        return super().generate(workers, progress, strict=True)
+        return super().generate(workers, progress, strict=True, launch=launch)

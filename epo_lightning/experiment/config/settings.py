@@ -227,9 +227,12 @@ class GenerateSettings:
     workers: int | None = None
     progress: bool = True
     strict: bool = False
+    jobs: int | None = None
 
     def __post_init__(self) -> None:
         check_workers(self.workers)
+        if self.jobs is not None and self.jobs < 1:
+            raise ConfigError(f"jobs is {self.jobs}, expected the number of jobs of the launcher, 1 or more")
 
 
 Split = Literal["test", "val", "train", "all"]

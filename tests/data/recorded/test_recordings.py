@@ -15,6 +15,7 @@ from metrics.slow_interaction import interact
 
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded import sources
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.sources import fingerprint
 from epo_lightning.data.recorded.tracks import RecordingSource
@@ -188,6 +189,38 @@ def test_fingerprints_cover_small_files_and_samples_of_large_ones(tmp_path):
     large[9_000_000:10_000_000] = b"1" * 1_000_000
     file.write_bytes(large)
     assert fingerprint(file) != before
+
+
+def test_fingerprints_of_many_files_are_remembered_until_a_file_changes(folder, monkeypatch):
+    expected = data(folder).digest
+    opened: list[str] = []
+    monkeypatch.setattr(sources, "fingerprint", lambda file: opened.append(file.stem) or fingerprint(file))
+    assert data(folder).digest == expected
+    assert len(opened) == 9
+    monkeypatch.setattr(sources, "MANY", 8)
+    root, long_ago = folder.parent / "cache", 1_000_000_000
+    for file in folder.iterdir():
+        os.utime(file, (long_ago, long_ago))
+    for count in (9, 0, 0):
+        opened.clear()
+        assert data(folder).digest == expected
+        assert len(opened) == count
+    (folder / "b-3.road").write_text("0.9")  # of the same size, and just now
+    for _ in range(2):
+        opened.clear()
+        changed = data(folder).digest
+        assert changed != expected
+        assert opened == ["b-3"], "a time of change of a moment ago is not trusted"
+    (memo,) = root.glob(".fingerprints-*.json")
+    for damage in ("[", "[1]", '{"a": 1}'):
+        memo.write_text(damage)
+        opened.clear()
+        assert data(folder).digest == changed
+        assert len(opened) == 9
+    os.utime(folder / "b-3.road", (long_ago, long_ago + 1))
+    (folder / "b-3.road").write_text("0.33")
+    os.utime(folder / "b-3.road", (long_ago, long_ago + 1))
+    assert data(folder).digest != changed, "another size"
 
 
 def test_a_split_without_scenes_is_an_error_with_the_reasons(folder):
