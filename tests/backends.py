@@ -115,7 +115,7 @@ class BackendSuite:
         damping = torch.full(like.shape[:2], damping, dtype=like.dtype)
         return self.solve(energy, scene, parameters, steps, step_size, damping, **options)
 
-    @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
+    @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
     @given(game=games(), steps=st.integers(1, 3), damping=st.sampled_from([1.0, 10.0]))
     def test_values_and_gradients_equal_the_reference(self, game, steps, damping):
         energy, scene, parameters = game.make()

@@ -96,7 +96,7 @@ def test_true_games_are_measured(capsys, tmp_path):
     assert "epo generate" in refused(true_game.main, *small)
     generate = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None)
     generate.generate(workers=1, progress=False)
-    true_game.main(["--records", "4", *small])
+    true_game.main(["--records", "2", *small])
     lines = capsys.readouterr().out.splitlines()[-9:]
     assert lines[6].startswith("alternative modes missed by more than 1 mm with the true w: 0 of ")
     assert [line.split(" w")[0] for line in lines[:6]] == ["1", "0.85", "1.15", "0.5", "2", "0"]

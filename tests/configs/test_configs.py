@@ -131,14 +131,20 @@ def test_representatives_hold_every_pair() -> None:
 
 
 @pytest.mark.parametrize("sweep", names(tree() / "sweeps"))
-def test_sweeps_list_their_runs(sweep: str) -> None:
+@pytest.mark.parametrize("every_pair", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["ends", "pairs"])
+def test_sweeps_list_their_runs(sweep: str, every_pair: bool) -> None:
     listed = jobs("train", [f"sweeps={sweep}"])
-    for job in representatives(listed) or [[f"sweeps={sweep}"]]:
+    # A search chooses its runs while it runs.
+    assert len(listed) > 1 or sweep.endswith("_search")
+    with hydra() as instance:
+        known = options_of(instance, "experiment")
+    named = {word.partition("=")[2] for job in listed for word in job if word.startswith("experiment=")}
+    assert named <= set(known)
+    chosen = representatives(listed) if every_pair else listed[:1] + listed[-1:]
+    for job in chosen or [[f"sweeps={sweep}"]]:
         settings = read(Settings, compose("train", job))
         assert settings.measures
         assert "test" not in settings.measures or not sweep.startswith("grid")
-    # A search thinks of its runs as it goes.
-    assert len(listed) > 1 or sweep.endswith("_search")
 
 
 def test_the_first_table_is_small_hard_and_shows_the_remedy_first() -> None:

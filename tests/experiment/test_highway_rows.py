@@ -25,11 +25,12 @@ ROWS = sorted(file.stem for file in (tree() / "conf" / "experiment" / "highway")
 SHARED = Path(os.environ.get("EPO_SHARED", Path(__file__).parents[2].parent / "shared"))
 
 
-def test_the_rows_are_the_papers() -> None:
+def test_the_rows_are_the_papers_and_those_of_other_games() -> None:
     backbones = ("v_lstm", "vibes", "hivt_m")
     main = {f"{backbone}{suffix}" for backbone in backbones for suffix in ("", "_sc", "_epo")}
-    no_pair = {f"{backbone}_epo_no_pair" for backbone in backbones}
-    assert set(ROWS) == main | no_pair | {"const_vel", "v_lstm_epo_no_init", "v_lstm_epo_no_goal"}
+    twins = {f"{backbone}_epo_{name}no_pair" for backbone in backbones for name in ("", "equilibrium_")}
+    games = {f"{backbone}_epo_{name}" for backbone in backbones for name in ("interactive", "equilibrium")}
+    assert set(ROWS) == main | twins | games | {"const_vel", "v_lstm_epo_no_init", "v_lstm_epo_no_goal"}
     with hydra() as instance:
         options = options_of(instance, "experiment")
     for data in HIGHWAYS:

@@ -201,6 +201,7 @@ def group_of(run: str) -> tuple[str, str]:
     raise AssertionError("no run in the file")
 
 
+@pytest.mark.slow
 def test_a_stopped_run_continues_in_the_same_wandb_run(epo: Epo, stopped: Callable[..., None]) -> None:
     stopped("run_dir=run", *WANDB)
     assert [folder["exit_code"] for folder in wandb_folders("run")] == [1]

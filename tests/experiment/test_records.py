@@ -20,10 +20,12 @@ from epo_lightning.run_folder import RunFolder
 ROW = "experiment=rpi/v_lstm_sc"
 
 
-@pytest.fixture(params=[0o027, 0o002], ids=["group reads", "group writes"])
-def umask(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = os.umask(request.param)
-    yield request.param
+@pytest.fixture
+def umask() -> Iterator[int]:
+    """A umask that both adds to and takes from the usual permissions: the group may write, others may not read."""
+    value = 0o007
+    before = os.umask(value)
+    yield value
     os.umask(before)
 
 

@@ -293,6 +293,7 @@ def test_globs_find_experiments_in_folders() -> None:
     assert len(listed) == 3 * len(list((SRC / "conf" / "experiment" / "rpi").glob("*.yaml")))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     find_spec("hydra_plugins.hydra_optuna_sweeper") is None, reason="the extra `search` is not installed"
 )

@@ -110,7 +110,7 @@ def test_energies_and_their_quadratic_models_are_those_of_each_game_alone(ends, 
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(
     ends=st.tuples(*[st.integers(2, 9)] * 3),
     agents=st.integers(1, 3),
@@ -153,10 +153,10 @@ def assert_alone(minimise, energy, scene, parameters, ends, tolerance):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_implicit_gradients_are_those_of_each_game_alone(backend):
     own = ("goal", "heading", "vel", "acc", "turnr", "jerk", "velb", "accref", "turnrref")
-    scene, parameters = make(5, 6, 3, 8, own, spread=0.1)
+    scene, parameters = make(5, 4, 3, 8, own, spread=0.1)
     solver = LevenbergMarquardt(60, 1.0, 1e-1, adaptive=True, backend=backend)
     energy = FeatureEnergy(own, PAIR, BOUNDS)
-    assert_alone(lambda *g: Implicit()(solver, *g), energy, scene, parameters, (8, 2, 5, 3, 8, 6), 1e-7)
+    assert_alone(lambda *g: Implicit()(solver, *g), energy, scene, parameters, (8, 2, 5, 3), 1e-7)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -173,8 +173,8 @@ def test_without_damping_the_matrix_of_a_short_game_is_regular(backend):
 @pytest.mark.parametrize("backward", [Unrolled(), Implicit()], ids=["unrolled", "implicit"])
 def test_gradients_by_margins_and_headings_equal_finite_differences(backend, backward):
     own = ("goal", "heading", "vel", "acc", "turnr")
-    scene, parameters = make(8, 4, 3, 5, own, ("clearance",), size=0.7, spread=0.1)
-    scene = dataclasses.replace(scene, game_steps=torch.tensor([5, 3, 4, 2]))
+    scene, parameters = make(8, 2, 3, 5, own, ("clearance",), size=0.7, spread=0.1)
+    scene = dataclasses.replace(scene, game_steps=torch.tensor([5, 3]))
     energy = FeatureEnergy(own, ["clearance"])
     implicit = isinstance(backward, Implicit)
     solver = (

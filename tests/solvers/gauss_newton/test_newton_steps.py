@@ -142,7 +142,7 @@ def test_newton_steps_have_an_implicit_derivative_and_no_unrolled_one() -> None:
         LevenbergMarquardt(newton_steps=-1, adaptive=True)
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(
     seed=st.integers(0, 10_000),
     agents=st.integers(1, 3),

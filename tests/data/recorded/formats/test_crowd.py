@@ -182,7 +182,7 @@ def test_invalid_folders_are_refused(tmp_path):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("trials", [150, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("trials", [60, pytest.param(2000, marks=pytest.mark.slow)])
 def test_damaged_tables_give_only_recording_errors(tmp_path, trials):
     folder = write(tmp_path / "crowd")
     (source,) = crowd(folder)

@@ -128,7 +128,7 @@ CHANGES = [
 ]
 
 
-@pytest.mark.parametrize("trials", [200, pytest.param(2500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("trials", [80, pytest.param(2500, marks=pytest.mark.slow)])
 def test_damaged_shards_give_only_recording_errors(tmp_path, trials):
     random = np.random.default_rng(trials)
     message = scenario(frames=12)
