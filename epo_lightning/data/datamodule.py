@@ -3,11 +3,14 @@
 All records of a split stay in memory, and a batch is one ``index_select``, which is faster than worker processes. A batch
 holds the scenes of an optimisation step on all devices together. The order of an epoch depends on (seed, epoch) alone: a run
 that is resumed at the beginning of an epoch sees the same batches as without the interruption.
+
+A split that may not fit in memory is read from the disk in blocks of consecutive scenes. An epoch goes through all blocks in
+a random order, ``TOGETHER`` of them at a time, whose scenes are shuffled; the next ones are read in the meantime.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,9 +24,16 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 from epo_lightning.task import Task
 
+TOGETHER = 64
+"""Number of blocks whose scenes are shuffled together."""
+
 
 class SceneDataset(Protocol):
-    """Interface of the scenes of a split; ``dataset[indices]`` with a LongTensor [B] is a batch of B scenes."""
+    """Interface of the scenes of a split; ``dataset[indices]`` with a LongTensor [B] is a batch of B scenes.
+
+    A data set that may not fit in memory has an attribute ``block``, the number of consecutive scenes that are read at once,
+    and a method ``read_ahead(first, last)``, which asks the system to read such scenes from the disk.
+    """
 
     def __len__(self) -> int: ...
 
@@ -50,6 +60,16 @@ class Share:
 
     def __len__(self) -> int:
         return len(self.chosen)
+
+    @property
+    def block(self) -> int | None:
+        """Number of consecutive scenes of the share that are read at once, if it may not fit in memory."""
+        block = getattr(self.whole, "block", None)
+        return block and max(1, round(block * len(self) / len(self.whole)))
+
+    def read_ahead(self, first: int, last: int) -> None:
+        """Ask the system to read the scenes from the position ``first`` to ``last``, inclusive, from the disk."""
+        self.whole.read_ahead(int(self.chosen[first]), int(self.chosen[last]))  # type: ignore[attr-defined]
 
     @property
     def provenance(self) -> Any:
@@ -92,18 +112,36 @@ class BatchSampler(DistributedSampler):
     def __iter__(self) -> Iterator[Tensor]:
         # Because this is a generator function, the order is drawn when the first batch is requested. Lightning creates the
         # iterator of a resumed run before it calls `set_epoch`.
-        count = len(self.scenes)
-        if self.shuffle:
-            order = torch.randperm(count, generator=epoch_generator(self.seed, self.epoch))
-        else:
+        count, block = len(self.scenes), getattr(self.scenes, "block", None)
+        groups: Sequence[Tensor] = ()
+        if not self.shuffle:
             order = torch.arange(count)
+        elif block:
+            order, groups = order_in_blocks(count, block, epoch_generator(self.seed, self.epoch))
+        else:
+            order = torch.randperm(count, generator=epoch_generator(self.seed, self.epoch))
         together = torch.distributed.is_available() and torch.distributed.is_initialized()
         rank, world = (torch.distributed.get_rank(), torch.distributed.get_world_size()) if together else (0, 1)
         if self.shuffle:
             check_divisible(self.batch_size, world)
-        of_rank = (batch[rank::world] for batch in order.split(self.batch_size)[: len(self)])
+        batches = order.split(self.batch_size)[: len(self)]
+        of_rank = (batch[rank::world] for batch in (self._reading_ahead(batches, groups) if groups else batches))
         # The last batch may have fewer scenes than there are ranks; some ranks then have none.
         yield from (indices for indices in of_rank if len(indices))
+
+    def _reading_ahead(self, batches: Sequence[Tensor], groups: Sequence[Tensor]) -> Iterator[Tensor]:
+        """The batches of an order in blocks; while a group of blocks is used, the next one is read."""
+        block: int = self.scenes.block  # type: ignore[attr-defined]
+
+        begun = 0
+        for number, batch in enumerate(batches):
+            used = (number + 1) * self.batch_size // (TOGETHER * block)
+            for group in groups[begun : used + 2]:
+                for first in (group.sort().values * block).tolist():
+                    last = min(first + block, len(self.scenes)) - 1
+                    self.scenes.read_ahead(first, last)  # type: ignore[attr-defined]
+                begun += 1
+            yield batch
 
     def __len__(self) -> int:
         """Batches of the epoch, the same on every rank."""
@@ -127,6 +165,27 @@ def check_divisible(batch_size: int, world: int) -> None:
 def epoch_generator(seed: int, epoch: int) -> torch.Generator:
     """Random generator of one epoch. NumPy mixes seed and epoch into one number of 32 bits; torch uses no more bits."""
     return torch.Generator().manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
+
+
+def order_in_blocks(count: int, block: int, generator: torch.Generator) -> tuple[Tensor, Sequence[Tensor]]:
+    """A random order of scenes that are read in blocks of consecutive ones.
+
+    Args:
+        count: number of scenes.
+        block: scenes per block.
+        generator: source of the random order.
+
+    Returns:
+        the indices [count] of the scenes in order, and the numbers of the blocks in groups of ``TOGETHER``, whose scenes are
+        shuffled together.
+    """
+    groups = torch.randperm(-(-count // block), generator=generator).split(TOGETHER)
+    order = []
+    for group in groups:
+        scenes = (group[:, None] * block + torch.arange(block)).flatten()
+        scenes = scenes[scenes < count]
+        order.append(scenes[torch.randperm(len(scenes), generator=generator)])
+    return torch.cat(order), groups
 
 
 class SceneDataModule(LightningDataModule):

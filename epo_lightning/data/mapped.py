@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
+import mmap
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,6 +43,16 @@ def mapped(path: Path, names: Sequence[str]) -> dict[str, Tensor]:
         first, last = header[name]["data_offsets"]
         found[name] = whole[first:last].view(DTYPES[header[name]["dtype"]]).view(header[name]["shape"])
     return found
+
+
+def read_ahead(tensor: Tensor) -> None:
+    """Ask the system to read a contiguous piece of a memory-mapped tensor from the disk, without waiting for it."""
+    advise = getattr(ctypes.CDLL(None), "madvise", None)
+    if advise is None or not tensor.numel():
+        return
+    begin = tensor.data_ptr() // mmap.PAGESIZE * mmap.PAGESIZE
+    size = tensor.data_ptr() + tensor.nbytes - begin
+    advise(ctypes.c_void_p(begin), ctypes.c_size_t(size), mmap.MADV_WILLNEED)
 
 
 def not_finite(tensor: Tensor) -> tuple[int, int]:

@@ -10,6 +10,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from epo_lightning.data.cache import LARGE
+from epo_lightning.data.mapped import read_ahead
+from epo_lightning.data.recorded.tables import INDEX_OF, OF_AGENTS, OF_SCENES
 from epo_lightning.metrics.functional import interactive_scenes
 from epo_lightning.scene import Scene
 
@@ -17,6 +20,8 @@ FRAMES = ("fixed", "aligned")
 """Axes of a scene: those of the recording, or x along the mean heading of its agents. The origin is their mean position."""
 
 
+BLOCK = 1 << 22
+"""Size [bytes] of the consecutive scenes that are read at once from a file that may not fit in memory."""
 UNKNOWN = -1
 """Subset of a scene that has not been read yet."""
 
@@ -39,6 +44,8 @@ class RecordedScenes:
     ) -> None:
         self.tables, self.dt, self.frame, self.names = tables, dt, frame, tuple(names)
         self.shape = shape
+        size = sum(tensor.nbytes for tensor in tables.values())
+        self.block = max(1, len(self) * BLOCK // size) if size >= LARGE else None
         self._subset = torch.full((len(self),), UNKNOWN)
 
     def __len__(self) -> int:
@@ -46,6 +53,21 @@ class RecordedScenes:
 
     def set_epoch(self, epoch: int) -> None:
         """Does nothing: every epoch has the same scenes."""
+
+    def read_ahead(self, first: int, last: int) -> None:
+        """Ask the system to read the scenes from ``first`` to ``last``, inclusive, from the disk, with agents and lanes."""
+        scenes = slice(first, last + 1)
+        for name, rows in INDEX_OF.items():
+            if name == "recording":
+                continue
+            index = self.tables[name][scenes]
+            index = index[index >= 0]
+            of_rows = OF_AGENTS if name == "agents" else (rows,)
+            for column in of_rows:
+                if column in self.tables and len(index):
+                    read_ahead(self.tables[column][int(index.min()) : int(index.max()) + 1])
+        for column in OF_SCENES:
+            read_ahead(self.tables[column][scenes])
 
     def __getitem__(self, indices: Tensor) -> Scene:
         of = {name: self.tables[name][indices] for name in ("agents", "lanes", "centre", "direction", "recording")}

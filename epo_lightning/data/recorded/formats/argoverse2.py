@@ -70,7 +70,7 @@ def argoverse2(folder: Path) -> list[RecordingSource]:
     if not folder.is_dir():
         raise RecordingError(folder, "there is no such folder: name the one with train/ and val/, or with scenarios")
     provided = {split: folder / split for split in SPLITS if (folder / split).is_dir()}
-    if set(provided) > {"test"}:
+    if set(provided) - {"test"}:
         if "test" in provided:
             warnings.warn(f"{provided.pop('test')} is left out: its scenarios have no futures", stacklevel=2)
         places: list[tuple[str | None, Path]] = list(provided.items())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from itertools import pairwise
 
 import numpy as np
@@ -169,6 +170,10 @@ def test_the_publishers_splits_are_groups(tmp_path):
     splits = RecordedData("argoverse2", "argoverse2", str(tmp_path), windows, test=["val"]).splits(found)
     assert [source.name for source in splits["test"]] == ["d"]
     assert sorted(source.name for part in ("train", "val") for source in splits[part]) == ["a", "b", "c"]
+    (tmp_path / "both").mkdir()
+    for split in ("train", "val"):
+        shutil.copytree(tmp_path / split, tmp_path / "both" / split)
+    assert [source.group for source in argoverse2(tmp_path / "both")] == ["train", "train", "train", "val"]
     # A folder of a split alone, or any other folder, has one group per scenario.
     assert [(source.name, source.group) for source in argoverse2(tmp_path / "train")] == [(n, n) for n in "abc"]
     assert [source.name for source in argoverse2(tmp_path / "test")] == ["e"]
