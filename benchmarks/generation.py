@@ -2,7 +2,7 @@
 
     python -m benchmarks.generation --recordings 5000 --workers 2
 
-Scenarios in the format of Argoverse 2 are made first: 11 s of traffic at 10 Hz on a road of 64 lane segments. A fifth of
+Scenarios in the format of Argoverse 2 are made first: 11 s of traffic at 10 Hz on a road of 16 lane segments. A fifth of
 them, and then all of them, are extracted as `epo generate data=argoverse2` does, each time in a new process. The memory is
 that of the process that gathers the scenes, without pages of mapped files, which the system can drop at any time.
 """
@@ -28,9 +28,9 @@ import polars as pl
 
 from benchmarks.measure import positive
 
-FRAMES, AGENTS, MAPS = 110, 44, 20
+FRAMES, AGENTS, MAPS = 110, 12, 20
 """Frames of a scenario, largest number of its agents, and number of different maps."""
-PIECES, LENGTH, WIDTH, LANES = 8, 75.0, 3.5, 4
+PIECES, LENGTH, WIDTH, LANES = 4, 150.0, 3.5, 2
 """Pieces of a road, length of a piece [m], width of a lane [m], and lanes per direction."""
 MILLION = 1_000_000
 

@@ -89,7 +89,12 @@ def main(given: Sequence[str] | None = None) -> None:
     size = sum(tensor.nbytes for tensor in tables.values())
     data = RecordedScenes(tables, 0.2, "aligned", ["copy"] * len(tables["origin"]))
     print(f"{len(data):,} scenes, {size / 1e9:.1f} GB, {size / len(data):,.0f} bytes per scene")
+    known = cache.load(arguments.source, "train")
+    known["recording"], known["origin"] = known["recording"] * 0, known["origin"][:1]
+    small = RecordedScenes(known, 0.2, "aligned", ["source"])
     for count in arguments.batch:
+        draws = (torch.randint(0, len(small), (count,)) for _ in iter(int, 1))
+        measure(f"the source, in memory, batches of {count}", small, draws, arguments.seconds)
         sampler = BatchSampler(data, count, shuffle=True, seed=0)
         measure(f"order of a training, batches of {count}", data, iter(sampler), arguments.seconds)
         draw = (torch.randint(0, len(data), (count,)) for _ in iter(int, 1))
