@@ -5,7 +5,7 @@ devices, processes) are left out. The digest of the data replaces its path.
 
 Four hashes are recorded with a run:
 
-- ``data_digest``: what its data set is made from: its settings and, for recordings, their files (``data.digest``).
+- ``data_digest``: hash of the settings of the data set and, for recordings, of their files (``data.digest``).
 - ``identity``: the settings that decide on its result, and ``data_digest``.
 - ``row``: the same without the seed; runs of one row of a table share it.
 - ``variant``: the settings without the seed; empty if nothing differs from the files of experiment and budget. It ends the

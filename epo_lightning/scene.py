@@ -134,7 +134,8 @@ class Scene(_Batch):
         goal_headings: heading [rad] that an agent wants at each goal candidate, continuous with the agent's heading: it is
             not wrapped to (-pi, pi], so a difference of 2 pi is a full turn.
         game_steps: number of steps from t0 to the end of each scene's game. Controls after the end have no cost and no
-            effect. A forecaster ends longer games at its own `game_horizon`. None if all games end with the last control.
+            effect. A forecaster ends longer games at its `game_horizon`, by default with the forecast. None if all
+            games end with the last control.
 
     Raises:
         TypeError: a field that is not a tensor (numpy arrays included), or a time step that is not a number.

@@ -87,8 +87,8 @@ class Share:
 class BatchSampler(DistributedSampler):
     """Index tensors of the batches of an epoch.
 
-    Lightning calls ``set_epoch`` of a loader's sampler before each epoch; after a checkpoint was restored, the number
-    continues from there. The order follows from the seed and this number. In distributed training, rank r of n takes the
+    Lightning calls ``set_epoch`` of a loader's sampler before each epoch; in a continued run, the number of the epoch
+    continues as well. The order follows from the seed and this number. In distributed training, rank r of n takes the
     indices r, r + n, r + 2n, ... of every batch, so that all ranks together see the batch that one process would see.
     The only purpose of the base class DistributedSampler is that Lightning does not replace this sampler by its own.
 

@@ -27,7 +27,8 @@ class OwnWeights(nn.Module):
 
     Args:
         width: size of the agent features.
-        games: number M of games: one per joint mode, or a single one.
+        games: number of games: the number M of joint modes, or 1 if all modes are of one game (then M is 1 in the
+            shapes below).
         features: names of the own features; without any there is no network.
         start: weights at a network output of zero: one number for all features, or numbers by name (1 for names that are
             missing). The weight is start * (1 + output): features differ in unit and magnitude, and so do their weights.

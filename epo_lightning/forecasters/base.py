@@ -19,8 +19,8 @@ from epo_lightning.task import Task
 class Forecaster(LightningModule):
     """A model from a :class:`Scene` to a :class:`JointForecast`, as a LightningModule.
 
-    A subclass defines ``forward(scene)`` and ``losses(scene, forecast)``; their weighted sum is minimised, and all of them
-    are logged. Validation and test metrics are those of :class:`~epo_lightning.metrics.ForecastMetrics`.
+    A subclass defines ``forward(scene)`` and ``losses(scene, forecast)``. The weighted sum of the losses is minimised, and
+    each of them is logged. Validation and test metrics are those of :class:`~epo_lightning.metrics.ForecastMetrics`.
 
     Args:
         task: sizes and units of the data's scenes.

@@ -59,13 +59,13 @@ class Combination:
             (backward, self.backward.needs_from_energy),
             (objective, self.objective.needs_from_energy),
         ):
-            if lacking := needed - self.energy.offers:
+            if lacking := needed - self.energy.offers:  # all of them are needed
                 return f"{part} needs an energy with {_and(lacking)}, which {energy} does not offer"
         for part, needed in (
             (backward, self.backward.needs_from_solver),
             (objective, self.objective.needs_from_solver),
         ):
-            if needed and not needed & self.solver.provides:
+            if needed and not needed & self.solver.provides:  # one of them is enough
                 return f"{part} needs {_or(needed)}, and {solver} provides {_or(self.solver.provides)}"
         if self.objective.through_solution and not self.backward.teaches:
             return f"{objective} learns through the solution, which has no derivative with {backward}"
@@ -79,8 +79,8 @@ class Combination:
         for kind in KINDS:
             for name, part in parts(kind).items():
                 if name != self.names[kind]:
-                    # Only the needs of a derivative depend on its settings, so it has to be an instance; all settings have
-                    # defaults.
+                    # `needs_from_energy` of a derivative depends on its settings, so an instance is made; all settings
+                    # have defaults. Other parts declare their needs as classes.
                     changed = part() if kind == "backward" else part
                     word = f"an energy named {name}" if kind == "energy" else f"{kind}={name}"
                     yield word, replace(self, **{kind: changed}, names={**self.names, kind: name})

@@ -71,9 +71,9 @@ class EPO(Forecaster):
         backward: the derivative of the solution.
         objective: the training objective.
         modes: number M of joint modes.
-        own_start: own weights before training; the weight is own_start * (1 + network output). One number for all features,
-            or numbers by feature name; features that are not named have 1. On highways ``vel``, which pulls speeds towards
-            zero, has to start small.
+        own_start: own weights at a network output of zero; the weight is own_start * (1 + network output). One number
+            for all features, or numbers by feature name; features that are not named have 1. On highways ``vel``, which
+            pulls speeds towards zero, has to start small.
         pair_start: pair weight at a network output of zero.
         symmetric_pairs: whether pair weights are the same in both orders of two agents, so that forecasts do not depend on
             the order of agents.
@@ -142,8 +142,10 @@ class EPO(Forecaster):
         # The part `backward` runs the minimiser and defines the derivative of its solution. (A LightningModule has a method
         # of that name.)
         self.differentiable_solve, self.objective = backward, objective
-        # M games with one initial strategy each, or one game with M; for solvers that choose, one game with C candidates.
-        games, strategies = 1 if one_game else solver.games(modes), solver.strategies(modes)
+        # M games, one per mode; or one game for all modes, which solvers that choose among candidates always have.
+        games = 1 if one_game else solver.games(modes)
+        # M initial strategies, one per mode; for solvers that choose, C candidates.
+        strategies = solver.strategies(modes)
         width, scale, horizon = backbone.width, task.scale, self.game_horizon
         own_names, pair_names = energy.weighted
         start = check_start(own_start, own_names, energy.own)

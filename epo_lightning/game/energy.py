@@ -72,8 +72,10 @@ class Energy(ABC):
 
     @property
     def needs(self) -> set[str]:
-        """Inputs of the terms: some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``,
-        ``reference_controls``, ``size``, ``context``, ``order``. (For sizes of pairs see ``FeatureEnergy.needs_reach``.)
+        """Inputs of the terms, which the scene or the decoded parameters supply.
+
+        Some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``reference_controls``, ``size``,
+        ``context`` and ``order``. (For sizes of pairs see ``FeatureEnergy.needs_reach``.)
         """
         return set()
 

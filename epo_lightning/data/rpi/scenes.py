@@ -34,8 +34,9 @@ class RPIDataset:
     ``sampled`` (one of the record's modes, drawn in every epoch from (seed, epoch, index)).
 
     Args:
-        records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``goal_headings`` [R, 2], ``states`` [R, 2 modes, 2, 40, 4],
-            ``modes`` [R], the number of modes of a record, and ``game_steps`` [R], the steps from t0 to the end of the game.
+        records: R records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``goal_headings`` [R, 2],
+            ``states`` [R, 2 modes, 2, 40, 4], ``modes`` [R], the number of modes of a record, and ``game_steps`` [R],
+            the steps from t0 to the end of the game.
         targets: ``executed``, ``both`` or ``sampled``.
         seed: seed of the random modes of ``sampled``.
     """
@@ -193,8 +194,8 @@ class RPIData(SceneDataModule):
         """
         names = ("history", "goals", "states", "modes", "phi", "step")
         records = cache.load(self.folder, split, names, self.command, self.config)
-        # Robot and pedestrian cross the circle on which they start (`game.py`) at the headings 0 and phi; `step` is the step
-        # of the main game at t0.
+        # Robot and pedestrian want to arrive with the headings with which they start, 0 and phi (`game.py`); `step` is the
+        # step of the main game at t0.
         phi = records["phi"]
         records["goal_headings"] = torch.stack((torch.zeros_like(phi), phi), -1)
         records["game_steps"] = GameConstants().steps - records["step"]

@@ -18,7 +18,7 @@ from epo_lightning.data.rpi.modes import admissible, cheapest
 from epo_lightning.data.rpi.solve import PotentialSettings, solve, solve_potential
 
 HISTORY = 18
-"""Steps before the current state (1.8 s)."""
+"""Steps before the current state (1.8 s); with the current state, a history has 19 states."""
 FUTURE = 40
 """Future steps (4 s)."""
 MAIN_STARTS = 12

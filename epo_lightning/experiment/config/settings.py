@@ -180,7 +180,8 @@ class Settings:
     callbacks: CallbackSettings
     logger: LoggerSettings
     budget: BudgetSettings
-    task: str = ""  # name of the group in conf/task, for readers of a run; sizes come from `data.task`
+    # Chosen file of conf/task, for readers of a run. (The sizes of the scenes are those of the data's `Task`.)
+    task: str = ""
     title: str = "untitled"
     goal: Literal["energy", "all"] = "energy"
     seed: int = 0

@@ -176,7 +176,8 @@ class _Parts:
         beta = self.model.at.beta
         later = ahead[:, 1:]
         if beta != 1.0:
-            # Node l also moves position l, by the share 1 - beta. On the diagonal this share should be squared; see below.
+            # Node l also moves position l, by the share 1 - beta. On the diagonal this share should be squared: the branch
+            # `beta not in (0.0, 1.0)` below corrects it.
             later = later + (1.0 - beta) * self.position[:, start:end]
         by_axis = later.view(batch, count, 2, self.size, width)
         unknowns = count * width
@@ -251,7 +252,8 @@ class _Parts:
             second[:, shift + 2 :] += rate
         bands = [band.view(batch, count + 2, width) for band in (diagonal, first, second)]
         for offset, band in enumerate(bands):
-            # Entry a of the band with this offset couples node a with node a - offset; the block begins with node 2.
+            # Entry a of the band with this offset couples node a with node a - offset; entry 2 is node start + 1, the first
+            # one of the block.
             inner = band[:, 2 + offset :].flatten(1)
             if inner.shape[1]:
                 matrix.diagonal(-offset * width, 1, 2).add_(inner)

@@ -76,7 +76,11 @@ OwnTerm = SignalTerm | SteeringTerm | LaneTerm | GoalTerm | HeadingTerm
 
 @dataclass(frozen=True)
 class PairTerm:
-    """A feature of the distance, c(|p_i - p_j|), with derivatives; those of c and c' by the margin where it is decoded."""
+    """A feature of the distance, c(|p_i - p_j|), with derivatives.
+
+    Attributes:
+        by_margin: derivatives of c and of c' by the margin; None if the margin is not decoded.
+    """
 
     weight: Float[Tensor, "E 1"]
     c: Derivatives
@@ -120,10 +124,10 @@ class QuadraticModel:
         control, node: second derivatives by single controls and by single nodes.
         rate: second derivatives by single rates of controls, zero at the last entry (there are K - 1 rates); None if no
             feature uses a rate.
-        cross: second derivatives by the speed of a node and a heading, that of the same node or of the next; None if it
-            is zero.
+        cross: second derivatives by the speed of node l and the heading of node l (entry 0) or l + 1 (entry 1); None if
+            they are zero.
         position: second derivatives by the positions: xx, xy and yy.
-        own_dense: all second derivatives of undeclared own features by the nodes; None without.
+        own_dense: all second derivatives of undeclared own features by the D = 2 K entries of z; None without.
         edges: the pairs that were evaluated.
         linked: the edges whose two agents are coupled.
         pair_position: xx, xy and yy of an edge; None without edges. ``position`` already contains them for both agents, and

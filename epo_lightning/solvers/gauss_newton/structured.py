@@ -45,7 +45,7 @@ LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e7
 RETRIES = 4
 """Number of times that a failed Cholesky factorisation is repeated with more damping."""
 LEAST_RAISED_DAMPING = 1e-3
-"""Repetition k adds 10^k times the damping, but at least 10^k times this number."""
+"""Repetition k adds 10^k max(damping, this number)."""
 _HOLDING = 1e30
 """Finite stand-in for infinite damping in the matrices, which avoids inf - inf."""
 
@@ -88,8 +88,8 @@ def solve(
         status = torch.maximum(status, outcome)
         iterates.append(controls)
     with torch.no_grad():
-        last = expand(energy, scene, parameters, controls, not split)
-        # A running sum over the agents, to which absent agents add an exact zero.
+        last = expand(energy, scene, parameters, controls, every_pair=not split)
+        # `cumsum` adds agent by agent, and absent ones add an exact zero; `sum` may round differently with the padding.
         gradient_norm = last.gradient.square().flatten(2).sum(-1).cumsum(1)[:, -1].sqrt().view_as(status)
         final_energy = last.value.view_as(status)
     return Solution(
