@@ -119,6 +119,8 @@ def test_scenes_of_a_large_split_are_read_ahead_of_their_batches_and_are_the_sam
         seen.append([])
         for number, indices in enumerate(sampler):
             assert set(indices.tolist()) <= asked, "a batch is used after its scenes were asked for"
+            ahead = (number * 2 // (datamodule.TOGETHER * block) + 2) * datamodule.TOGETHER * block - block
+            assert len(asked) >= min(len(data), ahead), "the next blocks were asked for"
             assert len(asked) <= (number * 2 // (datamodule.TOGETHER * block) + 3) * datamodule.TOGETHER * block
             seen[-1] += indices.tolist()
     assert seen[0] != seen[1]
