@@ -71,7 +71,7 @@ class Parts:
         Raises:
             CacheError: a part is absent or unreadable.
         """
-        found = {}
+        found: dict[str, Extracted] = {}
         for file, members in zip(self.files, self.members, strict=True):
             known = outcomes(file)
             if known is None:
