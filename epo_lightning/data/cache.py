@@ -12,6 +12,7 @@ import errno
 import glob
 import hashlib
 import json
+import multiprocessing
 import os
 import platform
 import shutil
@@ -70,7 +71,13 @@ def locked(folder: Path) -> Iterator[None]:
 
     A second process prints that it waits, and waits; afterwards it must check again whether the folder exists. The lock is a
     file beside the folder; the operating system releases it when the process ends, for whatever reason.
+
+    Raises:
+        RuntimeError: a worker process runs a script again that has started it.
     """
+    # Python refuses only the start of another process here; the worker would wait for its parent's lock before.
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise RuntimeError("a script that generates data must do so below `if __name__ == '__main__':`")
     with writing(folder.parent):
         folder.parent.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder.with_name(f".{folder.name}.lock"))
@@ -109,10 +116,12 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except (OSError, SafetensorError) as error:
         reason = error.strerror if isinstance(error, OSError) else None
+        number = (error.errno if isinstance(error, OSError) else None) or errno.EIO
+        advice = "make room, or set data.root to another folder"
+        if number in (errno.EEXIST, errno.ENOTDIR, errno.EACCES, errno.EROFS):
+            advice = "set data.root to a folder that can be written"
         raise OSError(
-            (error.errno if isinstance(error, OSError) else None) or errno.EIO,
-            f"cannot write ({reason or error}): make room, or set data.root to another folder; finished work is kept",
-            str(path),
+            number, f"cannot write ({reason or error}): {advice}; finished work is kept", str(path)
         ) from error
 
 

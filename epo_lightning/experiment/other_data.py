@@ -128,6 +128,8 @@ def open_other(
             raise ConfigError(f"split=all needs recordings, and data={name} has none: choose split=test, val or train")
         data.whole = True
     if isinstance(data, RecordedData):
+        if not data.folder_of_recordings.exists():
+            notes += (f"no folder {data.folder_of_recordings}: the extracted data set {data.folder} is used",)
         notes += _seen(data, split, known, asked)
         data.generate(workers)
         if skipped := data.report().get("skipped"):
@@ -266,12 +268,12 @@ def _of_training(run: RunFolder, of_run: Settings) -> set[str] | None:
 
 
 def _files(data: RecordedData) -> dict[str, str]:
-    """The files of every recording by its name, as text that is equal for equal files."""
+    """The files of every recording by its name, as text that is equal for files with equal content, whatever their names."""
     recordings = data.config["recordings"]
     if isinstance(recordings, Mapping):  # a simulation: its settings and the recording's name identify the files
         names = [name for held in data.config["splits"].values() for name in held]
         return {name: json.dumps([recordings, name], sort_keys=True) for name in names}
-    return {name: json.dumps(files, sort_keys=True) for name, _, files in recordings}
+    return {name: json.dumps([[size, checksum] for _, size, checksum in files]) for name, _, files in recordings}
 
 
 def _seen(data: RecordedData, split: str, known: set[str] | None, asked: bool) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import multiprocessing
 import os
 import stat
 import subprocess
@@ -212,3 +213,10 @@ def test_a_process_waits_while_another_one_makes_the_folder(tmp_path):
         assert [path.name for path in tmp_path.iterdir()] == [".set.lock"]
         (tmp_path / "set").mkdir()
     assert process.communicate(timeout=60) == ("False\n", "")
+
+
+def test_a_script_that_its_worker_runs_again_is_refused_instead_of_waiting_for_itself(tmp_path, monkeypatch):
+    # Python sets this in a spawned process while it imports the main module.
+    monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(RuntimeError, match="__main__"):
+        cache.make_once(tmp_path / "set", lambda: None)

@@ -7,6 +7,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from epo_lightning import cli
 from epo_lightning.experiment.assembly import build_data
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.other_data import follow
+from epo_lightning.experiment.other_data import _files, follow
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import read
 
@@ -262,6 +263,12 @@ def test_recordings_of_the_training_are_found_in_any_folder(
     assert epo("evaluate", *moved, "workers=1", "data.windows.radius=9") == 0
     (last,) = [file for file in others(tmp_path / "run") if file not in (own, new)]
     assert "is unknown: its own data is not here" in content(last)["notes"][0]
+
+
+def test_renamed_files_are_the_same_recordings() -> None:
+    recordings = [["a", "x", [["a.csv", 9, 77]]], ["b", "y", [["b.csv", 9, 77]]], ["c", "z", [["c.csv", 9, 78]]]]
+    files = _files(SimpleNamespace(config={"recordings": recordings}))  # type: ignore[arg-type]
+    assert files["a"] == files["b"] != files["c"]
 
 
 def test_a_run_without_goals_is_scored_on_any_recordings(epo: Epo, home: Path) -> None:

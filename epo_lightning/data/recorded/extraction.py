@@ -97,7 +97,7 @@ def _extract(
                 recording = dataclasses.replace(recording, lanes=None)
             found, counts = extract(recording, windows)
         except RecordingError as error:
-            if strict:
+            if strict or _may_be_readable(source, error):
                 raise
             problem = str(error)
         else:
@@ -112,6 +112,15 @@ def _extract(
     about["warnings"] = sorted({str(warning.message) for warning in caught})
     about["seconds"] = time.perf_counter() - begin
     return columns, Extracted(counts, about, problem)
+
+
+def _may_be_readable(source: RecordingSource, error: RecordingError) -> bool:
+    """Whether the operating system could not read a file of a recording, for instance over a network, that lay there before.
+
+    Such a file is not known to be broken, so a data set without its recording would be wrong.
+    """
+    cause = error.__cause__ or error.__context__
+    return isinstance(cause, OSError) and any(str(cause.filename) == str(file) for file in source.files)
 
 
 def _duration(recording: Recording) -> float:

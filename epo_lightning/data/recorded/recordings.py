@@ -23,7 +23,7 @@ from epo_lightning.data.recorded.gathering import gather
 from epo_lightning.data.recorded.parts import Launch, Lazy, Parts
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
-from epo_lightning.data.recorded.sources import absent, fingerprints, with_options
+from epo_lightning.data.recorded.sources import absent, altered, check_names, fingerprints, warn_of_copies, with_options
 from epo_lightning.data.recorded.splits import ALL, UNITS, SplitRule
 from epo_lightning.data.recorded.tables import selected
 from epo_lightning.data.recorded.tracks import RecordingSource
@@ -144,6 +144,7 @@ class RecordedData(SceneDataModule):
         found = sorted(self.list_sources(folder), key=lambda source: source.name)
         if not found:
             raise ConfigError(f"{folder} holds no recording in the format {self.format!r}: is it the right folder?")
+        check_names(found)
         return found
 
     def splits(self, sources: Sequence[RecordingSource]) -> dict[str, list[RecordingSource]]:
@@ -326,6 +327,10 @@ class RecordedData(SceneDataModule):
         else:
             for _ in finished(extract_to_file, tasks, workers, report, f"finished recordings are kept in {work}"):
                 pass
+        if names := altered(identity, self.identity(recordings)):
+            shutil.rmtree(work, ignore_errors=True)
+            raise ConfigError(f"files of {names[0]} have changed while they were read: give the command again")
+        warn_of_copies(recordings, identity)
         extracted = parts.extracted()
         problems = {name: one.problem for name, one in extracted.items() if one.problem is not None}
         used = [source for source in recordings if source.name not in problems]

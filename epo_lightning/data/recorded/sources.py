@@ -11,6 +11,7 @@ import hashlib
 import inspect
 import json
 import time
+import warnings
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -99,3 +100,37 @@ def fingerprints(files: Sequence[Path], root: Path) -> dict[Path, list[Any]]:
             root.mkdir(parents=True, exist_ok=True)
             cache.write_file(memo, json.dumps(kept).encode())
     return {file: [file.name, size, checksum] for file, (size, _, checksum) in zip(files, entries, strict=True)}
+
+
+def check_names(sources: Sequence[RecordingSource]) -> None:
+    """Refuse names that cannot be written.
+
+    Raises:
+        ConfigError: the name of a file is not UTF-8.
+    """
+    for source in sources:
+        try:
+            source.name.encode()
+        except UnicodeEncodeError:
+            raise ConfigError(f"the name of the recording {source.name!a} is not UTF-8: rename its files") from None
+
+
+def altered(before: Sequence[Any], now: Sequence[Any]) -> list[str]:
+    """Names of the recordings whose files differ between two identities of the same recordings."""
+    return [entry[0] for entry, its in zip(before, now, strict=True) if entry != its]
+
+
+def warn_of_copies(sources: Sequence[RecordingSource], identity: Sequence[Any]) -> None:
+    """Warn of recordings that have the same content in files of their own."""
+    first: dict[str, RecordingSource] = {}
+    copies = []
+    for source, (_, _, files) in zip(sources, identity, strict=True):
+        one = first.setdefault(json.dumps([[size, checksum] for _, size, checksum in files]), source)
+        if one.files != source.files:  # the recordings of a shard have its file in common
+            copies.append(f"{source.name} of {one.name}")
+    if copies:
+        warnings.warn(
+            f"{len(copies)} recordings are copies of others and may be in other splits ({', '.join(copies[:3])}): remove "
+            "them, or choose data.duplicates=once",
+            stacklevel=3,
+        )

@@ -37,8 +37,8 @@ MOST_BESIDE = 0.5
 """Largest share of positions of moving vehicles on no lane; above it, the map does not belong to the tracks."""
 AGREE = 0.2
 """Smallest length of the mean of the agents' unit directions; below it, they have no common direction."""
-MOST_AGENTS, LONGEST_SMOOTHING = 32, 10.0
-"""Largest number of agents of a scene, and largest length [s] of the smoothing window."""
+MOST_AGENTS, MOST_LINES, LONGEST_SMOOTHING = 32, 64, 10.0
+"""Largest numbers of agents of a scene and of lines of an agent, and largest length [s] of the smoothing window."""
 MOMENTS, AT_ENDS = "agents at steps of the clock", "near the beginning or end of a track"
 """Names of counts: possible windows, one per agent and step, and those whose agent is not observed in the whole window."""
 REASONS = ("too few agents around", "the same agents twice", "no lane change", "an agent on no lane")
@@ -109,6 +109,8 @@ class WindowConfig:
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
                 raise ConfigError(f"data.windows.{name} must be positive, or null for none, not {value}")
+        if self.lines is not None and self.lines > MOST_LINES:
+            raise ConfigError(f"data.windows.lines must be {MOST_LINES} or less, not {self.lines}")
         if self.agents > MOST_AGENTS:
             raise ConfigError(f"data.windows.agents must be {MOST_AGENTS} or less, not {self.agents}")
         if self.smoothing is not None and self.smoothing > LONGEST_SMOOTHING:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded import summary
+from epo_lightning.data.recorded.extraction import extract_to_file
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.splits import SplitRule
 from epo_lightning.data.recorded.surroundings import FAR, MOVING, far_from_lanes
@@ -31,7 +33,10 @@ def streets(folder: Path) -> list[RecordingSource]:
 
     def source(file: Path) -> RecordingSource:
         def read():
-            text = file.read_text()
+            try:
+                text = file.read_text()
+            except OSError as error:
+                raise RecordingError(file, f"the file cannot be read: {error.strerror}") from error
             if text.startswith("broken"):
                 raise RecordingError(file, f"the turn is {text!r}; a number was expected")
             vehicles = FOUR[:2] if text == "empty" else FOUR
@@ -87,6 +92,40 @@ def test_a_broken_recording_is_left_out_named_and_never_taken_for_the_whole_fold
     for split in ("train", "val", "test"):
         name = f"{split}.safetensors"
         assert (made / name).read_bytes() == (fewer.folder / name).read_bytes()
+
+
+def test_a_file_that_changes_while_it_is_read_makes_no_data_set(folder):
+    def change_and_extract(tasks, report):
+        (folder / "b-4.road").write_text("0.77")
+        for task in tasks:
+            extract_to_file(*task)
+
+    with pytest.raises(ConfigError, match="files of b-4 have changed while they were read"):
+        data(folder).generate(progress=False, launch=change_and_extract)
+    assert not list((folder.parent / "cache").glob("streets-*"))
+    data(folder).generate(workers=1, progress=False)
+
+
+def test_a_file_that_the_system_cannot_read_is_not_taken_for_a_broken_one(folder):
+    def lose_and_extract(tasks, report):
+        (folder / "b-4.road").unlink()
+        for task in tasks:
+            extract_to_file(*task)
+
+    with pytest.raises(RecordingError, match=r"b-4.road.*cannot be read: No such file"):
+        data(folder).generate(progress=False, launch=lose_and_extract)
+
+
+def test_copies_of_a_recording_are_named(folder):
+    (folder / "c-9.road").write_bytes((folder / "a-0.road").read_bytes())
+    with pytest.warns(UserWarning, match="1 recordings are copies.*c-9 of a-0.*data.duplicates=once"):
+        data(folder).generate(workers=1, progress=False)
+
+
+def test_a_name_that_is_not_utf_8_is_refused_at_once(folder):
+    (Path(os.fsdecode(os.fsencode(folder) + b"/c-\xff.road"))).write_text("0.5")
+    with pytest.raises(ConfigError, match=r"'c-\\udcff' is not UTF-8: rename"):
+        data(folder).generate(workers=1, progress=False)
 
 
 def test_training_finds_the_data_set_without_the_broken_recording_and_says_so(folder):
