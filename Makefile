@@ -16,6 +16,7 @@ PYTHON ?= python3
 VENV ?= .venv
 RUNS ?= runs/first
 OUT ?= .
+BUILDER ?= html
 BIN := $(VENV)/bin
 EPO := $(BIN)/epo
 # One stamp for what running needs, one for what the site needs as well, and one for what testing needs as well (simulator,
@@ -57,7 +58,7 @@ $(if $(TORCH_INDEX),$(BIN)/pip install -q --no-compile --index-url $(TORCH_INDEX
 @$(BIN)/python -c "$$LIST_REQUIREMENTS" $(1) > $(VENV)/requirements.txt
 $(BIN)/python $(KERNEL_FOLDER)/build.py > /dev/null 2>&1 & \
 $(BIN)/pip install -q --no-compile -c constraints.txt -r $(VENV)/requirements.txt && wait
-$(BIN)/pip install -q --no-compile -c constraints.txt -e '.[$(1)]'
+$(BIN)/pip install -q --no-compile --no-deps -e '.[$(1)]'
 endef
 
 $(INSTALLED): $(SOURCES)
@@ -107,9 +108,9 @@ lint: $(TESTABLE)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# -W: a reference that leads nowhere ends it.
+# -W: a reference that leads nowhere ends it. BUILDER=dummy checks the site without writing it.
 docs: $(DOCUMENTABLE)
-	$(BIN)/python -m sphinx -q -W --keep-going -j auto -b html docs build/docs
+	$(BIN)/python -m sphinx -q -W --keep-going -j auto -b $(BUILDER) docs build/docs
 
 checkpoint: $(INSTALLED)
 	$(EPO) generate data=rpi_hard_reduced data.placements=8

@@ -1,7 +1,6 @@
 """Data classes of the project: the observed scene, the inferred game, its solution and the forecast.
 
-The letters in shapes mean the same everywhere. ``game`` and ``solvers/gauss_newton``
-state the few that they use otherwise:
+Letters in shapes (``game`` and ``solvers/gauss_newton`` state the few that they use otherwise):
 
 ====  ==========================  ======  ================================================================
 B     scenes in a batch           P       pairs of agents i < j, P = N (N - 1) / 2
@@ -134,8 +133,8 @@ class Scene(_Batch):
         goal_headings: heading [rad] that an agent wants at each goal candidate, continuous with the agent's heading: it is
             not wrapped to (-pi, pi], so a difference of 2 pi is a full turn.
         game_steps: number of steps from t0 to the end of each scene's game. Controls after the end have no cost and no
-            effect. A forecaster ends longer games at its `game_horizon`, by default with the forecast. None if all
-            games end with the last control.
+            effect. A forecaster whose `game_horizon` is the forecast's removes these numbers. None if all games end
+            with the last control.
 
     Raises:
         TypeError: a field that is not a tensor (numpy arrays included), or a time step that is not a number.
@@ -304,7 +303,7 @@ class GameParameters(_Batch):
     margins: Mapping[str, Float[Tensor, "B M P"]] = dataclasses.field(default_factory=dict)
     reference_controls: Float[Tensor, "B M N K 2"] | None = None
 
-    def for_modes(self, modes: int) -> GameParameters:
+    def for_every_mode(self, modes: int) -> GameParameters:
         """The same games for M modes: a single game is repeated for all of them. Initial strategies stay unchanged."""
 
         def widen(tensor: Tensor | None) -> Tensor | None:

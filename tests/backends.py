@@ -7,6 +7,7 @@ plain automatic differentiation through both.
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -36,7 +37,7 @@ def reference(energy, scene, parameters, steps, step_size, damping):
     iterates = [parameters.initial_controls]
     for _ in range(steps):
         controls = iterates[-1]
-        with nearest_points_held():
+        with nullcontext() if energy.lane_slides else nearest_points_held():
             jacobian = torch.func.jacfwd(lambda u: stacked(energy, scene, parameters, u).sum((0, 1)))(controls)
         jacobian = jacobian.permute(1, 2, 0, 3, 4, 5).flatten(3)
         residual = stacked(energy, scene, parameters, controls)[..., None]
@@ -68,6 +69,7 @@ class Draw:
     absent: int
     seed: int
     ends: tuple[int, int] | None
+    lane_slides: bool
 
     def make(self) -> tuple[FeatureEnergy, Scene, GameParameters]:
         torch.manual_seed(self.seed)
@@ -80,7 +82,7 @@ class Draw:
         ends = None if self.ends is None else torch.tensor([min(end, horizon) for end in self.ends])
         scene = dataclasses.replace(scene, agent_mask=mask, game_steps=ends)
         return (
-            FeatureEnergy(sorted(self.own), self.pair, bounds, pair_stride=self.stride),
+            FeatureEnergy(sorted(self.own), self.pair, bounds, pair_stride=self.stride, lane_slides=self.lane_slides),
             scene,
             random_game(scene, 2, horizon, pair=self.pair or ("proximity",)),
         )
@@ -100,6 +102,7 @@ def games(most: int = 8) -> st.SearchStrategy[Draw]:
         absent=st.integers(0, most),
         seed=st.integers(0, 10_000),
         ends=st.none() | st.tuples(st.integers(1, 40), st.integers(1, 40)),
+        lane_slides=st.booleans(),
     )
 
 

@@ -61,7 +61,7 @@ class PolylineBackbone(Backbone):
         self.goal_to_graph = nn.Linear(2, self.width) if self.goal_input else None
         self.lanes = lanes
         self.lane_to_graph = None if lanes is None else nn.Linear(lanes.width, self.width)
-        self.left_out = nn.Dropout(self.dropout)
+        self.drop = nn.Dropout(self.dropout)
 
     def history_encoder(self) -> LSTMHistory | TransformerHistory:
         """The encoder of the agents' histories: an LSTM, unless a subclass overrides it."""
@@ -69,7 +69,7 @@ class PolylineBackbone(Backbone):
 
     def agent_features(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
         """Features of each agent's history, and of its goal where that is an input of the network."""
-        features = self.to_graph(self.left_out(self.history(scene)))
+        features = self.to_graph(self.drop(self.history(scene)))
         if self.goal_to_graph is not None:
             features = features + self.goal_to_graph(given_goals(scene) / self.scale)
         return features

@@ -73,9 +73,10 @@ def locked(folder: Path) -> Iterator[None]:
     file beside the folder; the operating system releases it when the process ends, for whatever reason.
 
     Raises:
-        RuntimeError: a worker process runs a script again that has started it.
+        RuntimeError: a worker process executes the script that started it, as the script lacks a ``__main__`` guard.
     """
-    # Python refuses only the start of another process here; the worker would wait for its parent's lock before.
+    # Python itself complains only when such a worker starts a process. Before that, the worker would wait for ever for the
+    # lock of its parent.
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise RuntimeError("a script that generates data must do so below `if __name__ == '__main__':`")
     with writing(folder.parent):

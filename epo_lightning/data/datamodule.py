@@ -110,8 +110,8 @@ class BatchSampler(DistributedSampler):
             self.scenes.set_epoch(epoch)
 
     def __iter__(self) -> Iterator[Tensor]:
-        # Because this is a generator function, the order is drawn when the first batch is requested. Lightning creates the
-        # iterator of a resumed run before it calls `set_epoch`.
+        # This is a generator function, so the order is drawn when the first batch is requested. Drawn earlier, a resumed run
+        # would have the order of epoch 0, because Lightning creates its iterator before it calls `set_epoch`.
         count, block = len(self.scenes), getattr(self.scenes, "block", None)
         groups: Sequence[Tensor] = ()
         if not self.shuffle:

@@ -54,8 +54,8 @@ class OwnWeights(nn.Module):
 class SharedWeights(nn.Module):
     """Weights of own features that all agents, modes and scenes share: one learned number for each feature.
 
-    For populations whose agents differ only in how they weigh each other, as in RPI: all scenes together then determine what
-    a single history does not.
+    For populations whose agents differ only in how they weigh each other, as in RPI: a single history
+    does not determine these weights, but all scenes together do.
 
     Args:
         games: number M of games: one per joint mode, or a single one.

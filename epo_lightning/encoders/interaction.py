@@ -22,7 +22,7 @@ class Attention(nn.Module):
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(width, width)
         self.value = nn.Linear(width, width)
-        self.left_out = nn.Dropout(dropout)
+        self.drop = nn.Dropout(dropout)
         self.scale = 1.0 / math.sqrt(width)
 
     def forward(
@@ -32,7 +32,7 @@ class Attention(nn.Module):
         scores = self.query(features) @ self.key(sources).mT * self.scale
         # A large negative number instead of -inf keeps the softmax finite in a scene without any source.
         gathered = scores.masked_fill(~mask[:, None, :], -1e9).softmax(-1) @ self.value(sources)
-        return features + torch.where(mask.any(-1)[:, None, None], self.left_out(gathered), 0.0)
+        return features + torch.where(mask.any(-1)[:, None, None], self.drop(gathered), 0.0)
 
 
 class TwoStageAttention(nn.Module):

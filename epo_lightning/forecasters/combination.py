@@ -80,7 +80,7 @@ class Combination:
             for name, part in parts(kind).items():
                 if name != self.names[kind]:
                     # `needs_from_energy` of a derivative depends on its settings, so an instance is made; all settings
-                    # have defaults. Other parts declare their needs as classes.
+                    # have defaults. All other parts declare their needs as attributes of their classes.
                     changed = part() if kind == "backward" else part
                     word = f"an energy named {name}" if kind == "energy" else f"{kind}={name}"
                     yield word, replace(self, **{kind: changed}, names={**self.names, kind: name})

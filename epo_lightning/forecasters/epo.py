@@ -130,7 +130,7 @@ class EPO(Forecaster):
         check_initial(initial, modes, one_game, energy, solver)
         check_choice("own_weights", own_weights, OWN_WEIGHTS)
         check_calibration(calibration, energy, solver)
-        # The network decodes probabilities where neither energies of choices nor orders define them.
+        # The network decodes probabilities unless the energies of choices among candidates (TABLES) or orders define them.
         defined = TABLES in solver.provides or energy.pair_order is not None
         check_probabilities(probabilities)
         check_decodes_probabilities(probabilities, energy, solver)
@@ -189,7 +189,7 @@ class EPO(Forecaster):
         if self.calibration is not None and not self.training:
             parameters = self.calibration(self._minimiser, self.energy, solved_scene, parameters)
         if TABLES not in self.solver.provides:
-            parameters = parameters.for_modes(self.modes)
+            parameters = parameters.for_every_mode(self.modes)
         solution = self.differentiable_solve(self._minimiser, self.energy, solved_scene, parameters)
         logits = self._mode_logits(z, scene, goals, orders, solution)
         return JointForecast(
@@ -206,7 +206,11 @@ class EPO(Forecaster):
         )
 
     def _with_game_end(self, scene: Scene) -> Scene:
-        """The scene as the solver sees it: games end at ``game_horizon`` at the latest, or all with the forecast (None)."""
+        """The scene as the solver sees it.
+
+        If ``game_horizon`` is longer than the forecast, games end at their own ends, or at ``game_horizon`` if that is
+        earlier. Otherwise ``game_steps`` is removed, so that all games end with the forecast.
+        """
         steps = scene.game_steps
         if steps is None:
             return scene

@@ -24,7 +24,8 @@ from epo_lightning.registry import ConfigError, nearest, parts
 from epo_lightning.scene import GameParameters, Scene
 
 GRADIENT, RESIDUALS, FEATURES = "gradient", "residuals", "features"
-"""Optional properties of an energy. GRADIENT: its gradient by the controls is useful. RESIDUALS: it is half the sum of
+"""Optional properties of an energy. GRADIENT: it can be minimised along its gradient with
+respect to the controls. RESIDUALS: it is half the sum of
 squares of residuals. FEATURES: its residuals are named features, whose Jacobians have a structure that the fast solver
 uses."""
 
@@ -75,7 +76,7 @@ class Energy(ABC):
         """Inputs of the terms, which the scene or the decoded parameters supply.
 
         Some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``reference_controls``, ``size``,
-        ``context`` and ``order``. (For sizes of pairs see ``FeatureEnergy.needs_reach``.)
+        ``context`` and ``order``. Pair terms that use the sizes of agents read ``scene.size``, which ``validate`` checks.
         """
         return set()
 

@@ -178,9 +178,10 @@ def add_linear_gradient(
     node: Float[Tensor, "*batch 2 K"],
     dt: float,
 ) -> None:
-    """Backpropagate the gradient by a linear signal (``gradient``); the adjoint of :func:`linear_signal`.
+    """Backpropagate ``gradient``, the gradient with respect to a linear signal; the adjoint of :func:`linear_signal`.
 
-    Adds to the gradient by the controls (``control``) or, for speeds, to that by speed and heading (``node``), in place.
+    Adds in place to ``control``, the gradient with respect to the controls, or, for signals of states, to ``node``, the
+    gradient with respect to speed and heading.
     """
     match feature.source:
         case Source.CONTROL:
@@ -213,8 +214,7 @@ def signal_and_change(
         moved, directions: the changes of states and controls.
         around: the other inputs of the signal.
         slide: only for lines: whether the nearest point of the line moves when the agent moves, which gives the exact
-            derivative. If False, the point is held fixed, as in the solver. Motion along the line then seems to have a
-            cost, so the solver's steps are shorter, but they lead to the same solution.
+            derivative. If False, the point is held fixed (``FeatureEnergy.lane_slides``).
     """
     match feature.source:
         case Source.CONTROL | Source.RATE | Source.SPEED:

@@ -67,6 +67,9 @@ class FeatureEnergy(Energy):
         pair_stride: steps between evaluations of pair features: they are evaluated at k = stride, 2 stride, ...
         margins: fixed margins [m] of pair features, ``{"clearance": 0.5}``; those of other features with a margin are
             ``parameters.margins``.
+        lane_slides: whether the nearest point of a line moves along the line with the agent in the Jacobian of ``lane``,
+            which is the exact derivative. Otherwise it is held: then motion along the line seems to have a cost, so
+            Gauss-Newton steps are shorter, but they lead to the same solution.
 
     A game of ``scene.game_steps`` steps has no terms after its end (:mod:`~epo_lightning.game.game_end`).
     """
@@ -79,6 +82,7 @@ class FeatureEnergy(Energy):
     dynamics: Any = field(default_factory=Unicycle)  # Any, so that other dynamics are refused below with a reason
     pair_stride: int = 1
     margins: Mapping[str, float] = field(default_factory=dict)
+    lane_slides: bool = False
 
     def __post_init__(self) -> None:
         check_names("own", self.own, OWN_FEATURES, "feature")
@@ -238,11 +242,11 @@ class FeatureEnergy(Energy):
             scene, parameters, around: the game.
             at: states and controls.
             moved: their changes along D directions, in the first dimension.
-            slide: whether the nearest point of a line moves with the agent.
+            slide: whether the nearest point of a line moves with the agent also if ``lane_slides`` is false.
         """
         feature = self.own_features[name]
         if feature.declared:
-            signal, change = signal_and_change(feature, *at, *moved, around, slide)
+            signal, change = signal_and_change(feature, *at, *moved, around, slide or self.lane_slides)
             mask = self.residual_mask(scene, feature, at[1].shape[-2])
             value, first, _ = own_derivatives(feature, signal, around.bounds).within(mask)
             change = change if first is None else first * change
@@ -337,9 +341,9 @@ class FeatureEnergy(Energy):
     def finite(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
         """Mask of the games whose inputs are finite.
 
-        Only inputs whose NaN or infinity may have no effect on the solution are checked: weights of pairs that never touch,
-        positions of agents that no feature uses, and points of reference lines that are never the nearest. The NaN of any
-        other input reaches the controls and is seen there.
+        A NaN of most inputs reaches the controls and is found there. This mask checks the others, whose NaN or infinity may
+        have no effect on the solution: weights of pairs that never touch, positions of agents that no feature uses, and
+        points of reference lines that are never the nearest.
         """
         present = scene.agent_mask
         finite = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)
@@ -455,7 +459,7 @@ class FeatureEnergy(Energy):
         return None if scene.game_steps is None else residual_mask(feature.source, scene.game_steps, steps)
 
     def evaluated(self, scene: Scene) -> Int[Tensor, " B"] | None:
-        """Number of steps of each game at which pair features are evaluated; None for all evaluated steps."""
+        """Number of steps of each game at which pair features are evaluated; None if all games have the same number."""
         return None if scene.game_steps is None else scene.game_steps // self.pair_stride
 
     def pair_exists(self, scene: Scene, feature: PairFeature, steps: int) -> Bool[Tensor, "B 1 P _"]:

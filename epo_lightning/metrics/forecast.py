@@ -45,7 +45,7 @@ MODE_METRICS = tuple(f"minSADE_{k}" for k in range(1, 17))
 PROBABILITY_METRICS = ("brier_minSADE",)
 """Scores of displacements and probabilities together, for forecasts with several modes."""
 COLLAPSE_METRICS = ("missed",)
-"""Scores of the modes of a subset's scenes: the share of scenes without any mode near the future."""
+"""Scores of subsets alone: the share of a subset's scenes in which no mode is near the future."""
 PAIR_METRICS = ("pair_effect",)
 """Mean displacement [m] between the most likely joint mode and the solution of the same game without its pair terms."""
 COLUMNS = (

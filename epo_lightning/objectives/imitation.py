@@ -24,9 +24,9 @@ class Imitation(Objective):
     Args:
         weights: lambda of ``imitation``, ``goal`` (unused if no goal is decoded), ``probability`` and ``initial``.
             ``initial`` is the imitation loss of the initial strategies; it is used if no gradient reaches them through the
-            solution (``truncated``, ``implicit``). For games that go on after the forecast, it includes the mean difference
-            of their later controls from those of the solution, because no data shows these. If orders of agents are decoded,
-            ``probability`` is their cross entropy.
+            solution (``truncated``, ``implicit``). If games go on after the forecast, it also compares the initial controls
+            after the forecast with those of the solution, because there are no data for them. If orders of agents are
+            decoded, ``probability`` is their cross entropy.
         power: exponent of the distances; the paper's is 1, TGL's 1.05.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.

@@ -129,7 +129,7 @@ class Implicit(Backward):
             solution = minimiser(energy, scene, parameters)
         if not torch.is_grad_enabled() or solution.controls.numel() == 0:
             return solution
-        exact, games = self.hessian == "exact", parameters.for_modes(solution.controls.shape[1])
+        exact, games = self.hessian == "exact", parameters.for_every_mode(solution.controls.shape[1])
         if isinstance(energy, FeatureEnergy):
             backend = getattr(minimiser, "backend", "auto")
             controls, status = implicit.attach(energy, scene, games, solution.controls, exact, backend)

@@ -103,6 +103,7 @@ def test_extraction_is_timed(capsys):
         assert float(number.replace(",", "")) > 0
 
 
+@pytest.mark.slow
 def test_true_games_are_measured(capsys, tmp_path):
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null"]
     assert "epo generate" in refused(true_game.main, *small)

@@ -77,7 +77,7 @@ class SolverSuite:
         assert set(solution.status.flatten().tolist()) <= set(Status)
         states = energy.dynamics.rollout(energy.current_states(scene), solution.controls, scene.dt)
         torch.testing.assert_close(solution.states, states)
-        torch.testing.assert_close(solution.energy, energy(scene, game.for_modes(MODES), solution.controls))
+        torch.testing.assert_close(solution.energy, energy(scene, game.for_every_mode(MODES), solution.controls))
         if TABLES in self.provides:
             assert solution.tables is not None
             assert solution.assignment is not None

@@ -180,7 +180,7 @@ class Settings:
     callbacks: CallbackSettings
     logger: LoggerSettings
     budget: BudgetSettings
-    # Chosen file of conf/task, for readers of a run. (The sizes of the scenes are those of the data's `Task`.)
+    # Name of the chosen file of conf/task, recorded in config.yaml. (Sizes of scenes are those of the data's `Task`.)
     task: str = ""
     title: str = "untitled"
     goal: Literal["energy", "all"] = "energy"

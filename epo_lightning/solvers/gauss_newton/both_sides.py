@@ -110,7 +110,7 @@ class BothSides(Minimiser):
         weights = {name: torch.cat((weight, torch.zeros_like(weight)), 1) for name, weight in game.pair_weights.items()}
         start = game.initial_controls.expand(-1, 2, -1, -1, -1)
         found = descend(
-            energy, scene, dataclasses.replace(game.for_modes(2), pair_weights=weights, initial_controls=start)
+            energy, scene, dataclasses.replace(game.for_every_mode(2), pair_weights=weights, initial_controls=start)
         )
         first, alone = found.controls.chunk(2, 1)
         gamma = first.new_tensor(self.reflections)[:, None, None, None]

@@ -213,7 +213,7 @@ class _Call:
             kept.append(tensor)
             return tensor
 
-        game = self.game = EpoGame(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt)
+        game = self.game = EpoGame(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt, lane_slides=energy.lane_slides)
         game.pair_stride = min(energy.pair_stride, horizon + 1)
         for index, name in enumerate(SIGNALS):
             if not isinstance(bound := energy.bounds.get(name, {}), Mapping):

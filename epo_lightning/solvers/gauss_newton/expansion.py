@@ -260,7 +260,7 @@ def _add_lane(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
     scaled = square * offset
     sums.positions[:, :, :2] += scaled
     sums.positions[:, :, XX_YY] += square
-    if sums.exact:
+    if sums.exact or at.energy.lane_slides:
         sums.positions[:, :, 2:] -= square * _outer(tangent, 2)
     sums.add_value(scaled, offset)
     return LaneTerm(weight, offset, tangent)

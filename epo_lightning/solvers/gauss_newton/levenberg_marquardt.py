@@ -58,8 +58,8 @@ class LevenbergMarquardt(Stepwise):
             is divided by 10 (down to 1e-7); any other step is rejected, and the damping is multiplied by 10 (up to 1e7).
             These decisions have no gradient.
         test_steps: number of steps outside training; None for the same number.
-        newton_steps: number of adaptive steps with the Hessian that follow. Near a minimum they converge quadratically,
-            and Gauss-Newton steps linearly. They have no derivative: use ``backward=implicit``.
+        newton_steps: number of adaptive Newton steps, with the exact Hessian, after the S Gauss-Newton steps. Near a minimum
+            they converge quadratically, and Gauss-Newton steps linearly. They have no derivative: use ``backward=implicit``.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it supports the game.
     """
 
@@ -148,7 +148,7 @@ class LevenbergMarquardt(Stepwise):
             )
         start = parameters.initial_controls
         energy.validate(scene, parameters, start)
-        parameters = parameters.for_modes(start.shape[1])
+        parameters = parameters.for_every_mode(start.shape[1])
         if start.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"initial_controls are of type {start.dtype}; the layer takes float32 and float64")
         if scene.history.dtype != start.dtype:

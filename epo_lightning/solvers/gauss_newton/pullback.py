@@ -168,8 +168,10 @@ def _pull_lane(model: QuadraticModel, term: LaneTerm, changes: _Changes, sums: _
     square = term.weight.square()[..., None]
     active = model.at.within_game
     along_mu, along_d = changes.positions if active is None else changes.positions.where(active, 0.0)
-    ahead = term.offset + along_d
     across = along_mu - term.tangent * (term.tangent * along_mu).sum(2, keepdim=True)
+    if model.at.energy.lane_slides:
+        along_mu, along_d = across, along_d - term.tangent * (term.tangent * along_d).sum(2, keepdim=True)
+    ahead = term.offset + along_d
     sums.positions[:, :, 0] -= square * across
     sums.positions[:, :, 1] -= square * ahead
     sums.positions[:, :, 2] -= square * along_mu

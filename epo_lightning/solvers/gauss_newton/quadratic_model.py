@@ -5,7 +5,8 @@ l >= l'
 
     M_l^T [dt^2 sum_{k>l} Q_k] M_l',   Q_k the second derivatives by p_k,
 
-so the whole lower triangle is that of the product of two tall matrices with 2 N columns each. All other contributions are
+so the lower triangle of this part equals that of a product A B^T, where A and B have a row for each unknown and two columns
+(x and y) for each agent. All other contributions are
 banded matrices: controls are first differences of z, their rates second differences, speeds contribute to the diagonal, and
 a steering angle couples a turn rate with the speed before it. The model holds the second derivatives by these quantities;
 :mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and factorises the matrix.

@@ -16,8 +16,8 @@ factor gives mu = (J^T J + lambda I)^-1 alpha v. With the scalar
 
     phi(u, p) = -<J mu, r + J d>     with mu and d held constant,
 
-the gradient by the parameters p is dphi/dp, and that by the controls u is v + dphi/du. Both are computed in closed form
-(:mod:`~epo_lightning.solvers.gauss_newton.pullback`).
+the gradient with respect to the parameters p is dphi/dp, and that with respect to the controls u is v + dphi/du. Both are
+computed in closed form (:mod:`~epo_lightning.solvers.gauss_newton.pullback`).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e7
 RETRIES = 4
 """Number of times that a failed Cholesky factorisation is repeated with more damping."""
 LEAST_RAISED_DAMPING = 1e-3
-"""Repetition k adds 10^k max(damping, this number)."""
+"""The k-th repetition adds 10^k max(damping, this number) to the damping."""
 _HOLDING = 1e30
 """Finite stand-in for infinite damping in the matrices, which avoids inf - inf."""
 

@@ -128,6 +128,7 @@ def test_a_job_whose_file_is_gone_extracts_nothing_more(folder, tmp_path):
 
 
 @pytest.mark.skipif(not JOBLIB, reason="the extra `local` is not installed")
+@pytest.mark.slow
 def test_jobs_of_a_launcher_one_of_which_is_killed_give_the_same_bytes(folder, capfd):
     data(folder, "alone").generate(workers=1, progress=False)
     expected = contents(data(folder, "alone"))

@@ -17,8 +17,7 @@ theseus = pytest.importorskip(
 def test_steps_equal_theseus():
     scene = random_scene(3, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, modes=1, horizon=6)
-    # Automatic differentiation lets the nearest point of a lane slide along it, where our model holds it.
-    energy = FeatureEnergy([name for name in ALL if name != "lane"], bounds=BOUNDS)
+    energy = FeatureEnergy(ALL, bounds=BOUNDS, lane_slides=True)  # as automatic differentiation does
     shape = parameters.initial_controls.shape
 
     def residuals(optim_vars, aux_vars):

@@ -154,7 +154,7 @@ def assert_alone(minimise, energy, scene, parameters, ends, tolerance):
 def test_implicit_gradients_are_those_of_each_game_alone(backend):
     own = ("goal", "heading", "vel", "acc", "turnr", "jerk", "velb", "accref", "turnrref")
     scene, parameters = make(5, 4, 3, 8, own, spread=0.1)
-    solver = LevenbergMarquardt(60, 1.0, 1e-1, adaptive=True, backend=backend)
+    solver = LevenbergMarquardt(10, 1.0, 1e-1, adaptive=True, newton_steps=10, backend=backend)
     energy = FeatureEnergy(own, PAIR, BOUNDS)
     assert_alone(lambda *g: Implicit()(solver, *g), energy, scene, parameters, (8, 2, 5, 3), 1e-7)
 
@@ -178,7 +178,7 @@ def test_gradients_by_margins_and_headings_equal_finite_differences(backend, bac
     energy = FeatureEnergy(own, ["clearance"])
     implicit = isinstance(backward, Implicit)
     solver = (
-        LevenbergMarquardt(80, 1.0, 0.1, backend=backend)
+        LevenbergMarquardt(40, 1.0, 0.1, backend=backend)
         if implicit
         else LevenbergMarquardt(2, 0.3, 3.0, backend=backend)
     )

@@ -79,9 +79,12 @@ def sizes(draw):
     integrator=st.sampled_from(["euler", "euler", "heun", "semi_implicit"]),
     stride=st.sampled_from([1, 1, 3]),
     split=st.booleans(),
+    slides=st.booleans(),
     seed=st.integers(0, 1000),
 )
-def test_steps_and_gradients_equal_a_dense_reference(size, absent, own, pair, length, integrator, stride, split, seed):
+def test_steps_and_gradients_equal_a_dense_reference(
+    size, absent, own, pair, length, integrator, stride, split, slides, seed
+):
     torch.manual_seed(seed)
     agents, horizon = size
     scene = random_scene(2, agents, history=2, size=length, dtype=torch.float64)
@@ -90,7 +93,7 @@ def test_steps_and_gradients_equal_a_dense_reference(size, absent, own, pair, le
     if pair:
         weights = dict.fromkeys(pair, parameters.pair_weights["proximity"])
         parameters = dataclasses.replace(parameters, pair_weights=weights)
-    energy = FeatureEnergy(sorted(own), pair, BOUNDS, Unicycle(integrator), stride)
+    energy = FeatureEnergy(sorted(own), pair, BOUNDS, Unicycle(integrator), stride, lane_slides=slides)
     expected = with_gradients(lambda leaves: dense(energy, scene, leaves), parameters)
     if absent == 0:
         assert_same(

@@ -63,6 +63,7 @@ struct EpoGame {
     int64_t goal_heading_strides[3];
     const void* reference_controls;  // [B, M, N, K, 2], contiguous
     const int64_t* ends;       // [B] numbers of steps of the games, or null if all games have K steps
+    int64_t lane_slides;       // whether nearest points of reference lines move with the agents in Gauss-Newton steps
 };
 
 /// Arguments and results of S steps from `start`, in which the controls of absent agents are zero. Every array of controls is

@@ -68,6 +68,7 @@ class EpoGame(ctypes.Structure):
         ("goal_heading_strides", Integer * 3),
         ("reference_controls", Address),
         ("ends", Address),
+        ("lane_slides", Integer),
     )
 
 

@@ -25,7 +25,7 @@ constexpr EpoLayoutEntry kLayout[] = {
     EPO_FIELD(EpoGame, goals), EPO_FIELD(EpoGame, goals_b), EPO_FIELD(EpoGame, goals_m), EPO_FIELD(EpoGame, goals_n),
     EPO_FIELD(EpoGame, goals_x), EPO_FIELD(EpoGame, references), EPO_FIELD(EpoGame, reference),
     EPO_FIELD(EpoGame, reference_speed), EPO_FIELD(EpoGame, goal_headings), EPO_FIELD(EpoGame, goal_heading_strides),
-    EPO_FIELD(EpoGame, reference_controls), EPO_FIELD(EpoGame, ends),
+    EPO_FIELD(EpoGame, reference_controls), EPO_FIELD(EpoGame, ends), EPO_FIELD(EpoGame, lane_slides),
     EPO_FIELD(EpoRun, steps), EPO_FIELD(EpoRun, step_size), EPO_FIELD(EpoRun, damping), EPO_FIELD(EpoRun, damping_problem),
     EPO_FIELD(EpoRun, damping_agent), EPO_FIELD(EpoRun, exact), EPO_FIELD(EpoRun, adaptive),
     EPO_FIELD(EpoRun, record), EPO_FIELD(EpoRun, start), EPO_FIELD(EpoRun, iterates),

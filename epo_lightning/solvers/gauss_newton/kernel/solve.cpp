@@ -290,7 +290,7 @@ class Range {
             group.load_parameters();
             if (has_lines && record)
                 group.template find_nearest<true>(Nearest<T>::at(step.nearest[n].data() + index * Nearest<T>::size(n, game_.K), n, game_.K));
-            else if (has_lines && exact)
+            else if (has_lines && (exact || game_.lane_slides))
                 group.template find_nearest<true>(Nearest<T>::at(arena_.take(Nearest<T>::size(n, game_.K)), n, game_.K));
             else if (has_lines)
                 group.template find_nearest<false>(Nearest<T>::at(arena_.take(Nearest<T>::size(n, game_.K)), n, game_.K));

@@ -129,7 +129,7 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, bool exact, Vec<T
             P[2 * i * ld + 2 * i] += in_x.stiffness;
             P[(2 * i + 1) * ld + 2 * i + 1] += in_y.stiffness;
         }
-        if (P && exact && g.has(LANE)) {  // the nearest point of the line moves with the agent
+        if (P && (exact || g.game.lane_slides) && g.has(LANE)) {  // the nearest point of the line moves with the agent
             const int at = i * (g.K + 1) + state;
             const Vec<T> x = g.own(LANE, i) * g.nearest.tangent_x[at], y_ = g.own(LANE, i) * g.nearest.tangent_y[at];
             P[2 * i * ld + 2 * i] -= x * x;
@@ -433,27 +433,37 @@ void differentiate(
             if (g.has(VELREF)) speed.add(g.own(VELREF, i), p.speed[state] - g.reference_speed[i], weigh(VELREF));
             if (g.has(VELB)) speed.add_bounded(g.own(VELB, i), p.speed[state], g.game.bounds[BOUND_VEL], weigh(VELB));
             nodes[2 * i + 1] += speed.cotangent;
-            const auto pull_to = [&](int feature, Vec<T> w, Vec<T> x, Vec<T> y, Vec<T> tangent_x, Vec<T> tangent_y) {
+            const auto pull_to = [&](int feature, Vec<T> w, Vec<T> x, Vec<T> y, Vec<T> tangent_x, Vec<T> tangent_y, bool slides) {
                 // The nearest point of a reference line moves along the line with the agent. Along the line, the residual therefore
-                // has the derivative zero.
+                // has the derivative zero. The Jacobian J has it as well if `slides`.
                 const Vec<T> squared = w * w;
-                const Vec<T> gap_x = p.x[state] - x + t2.x[state], gap_y = p.y[state] - y + t2.y[state];
                 const Vec<T> along_line = t1.x[state] * tangent_x + t1.y[state] * tangent_y;
-                s[0] -= squared * (t1.x[state] - along_line * tangent_x);
-                s[1] -= squared * (t1.y[state] - along_line * tangent_y);
+                const Vec<T> across_x = t1.x[state] - along_line * tangent_x, across_y = t1.y[state] - along_line * tangent_y;
+                Vec<T> mu_x = t1.x[state], mu_y = t1.y[state], gap_x = p.x[state] - x + t2.x[state], gap_y = p.y[state] - y + t2.y[state];
+                if (slides) {
+                    const Vec<T> ahead = t2.x[state] * tangent_x + t2.y[state] * tangent_y;
+                    mu_x = across_x;
+                    mu_y = across_y;
+                    gap_x -= ahead * tangent_x;
+                    gap_y -= ahead * tangent_y;
+                }
+                s[0] -= squared * across_x;
+                s[1] -= squared * across_y;
                 s[2] -= squared * gap_x;
                 s[3] -= squared * gap_y;
-                s[4] -= squared * t1.x[state];
-                s[5] -= squared * t1.y[state];
-                weigh(feature) -= T(2) * w * (t1.x[state] * gap_x + t1.y[state] * gap_y);
+                s[4] -= squared * mu_x;
+                s[5] -= squared * mu_y;
+                weigh(feature) -= T(2) * w * (mu_x * gap_x + mu_y * gap_y);
             };
             if (g.has(LANE)) {
                 const int at = i * (K + 1) + state;
-                pull_to(LANE, g.own(LANE, i), g.nearest.x[at], g.nearest.y[at], g.nearest.tangent_x[at], g.nearest.tangent_y[at]);
+                pull_to(
+                    LANE, g.own(LANE, i), g.nearest.x[at], g.nearest.y[at], g.nearest.tangent_x[at], g.nearest.tangent_y[at],
+                    g.game.lane_slides != 0);
             }
             if (g.has(GOAL) && g.ends_at(state)) {
                 const Vec<T> w = g.final_weight(GOAL, i, state);
-                pull_to(GOAL, w, g.goal_x[i], g.goal_y[i], Vec<T>{}, Vec<T>{});
+                pull_to(GOAL, w, g.goal_x[i], g.goal_y[i], Vec<T>{}, Vec<T>{}, false);
                 const Vec<T> squared = w * w;
                 by.goal_x[i] += squared * t1.x[state];
                 by.goal_y[i] += squared * t1.y[state];
