@@ -187,7 +187,7 @@ class EPO(Forecaster):
         orders = self._decode_orders(z, scene)
         parameters = self._infer_game(z, scene, goals, orders)
         if self.calibration is not None and not self.training:
-            parameters = self.calibration(self._minimiser, self.energy, solved_scene, parameters)
+            parameters = self.calibration(self.solver, self.energy, solved_scene, parameters)
         if TABLES not in self.solver.provides:
             parameters = parameters.for_every_mode(self.modes)
         solution = self.differentiable_solve(self._minimiser, self.energy, solved_scene, parameters)
