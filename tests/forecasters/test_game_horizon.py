@@ -151,6 +151,22 @@ def test_calibration_runs_outside_of_training_only(monkeypatch: pytest.MonkeyPat
     assert seen == [1]
 
 
+def test_calibration_solves_its_games_as_training_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With ``test_steps``, forecasts are refined by a few steps, but a game of the history has to be solved."""
+    solver = {**SOLVER, "newton_steps": 0, "test_steps": 2}
+    forecaster, scene = build_forecaster(model(GAME, **{**PARTS, "solver": solver})).eval(), scenes()
+    seen = []
+    monkeypatch.setattr(
+        type(forecaster.calibration), "__call__", lambda self, *arguments: seen.append(arguments) or arguments[-1]
+    )
+    forecast = forecaster.predict(scene)
+    minimiser, energy, game, parameters = seen[0]
+    assert minimiser == forecaster.solver
+    refined = dataclasses.replace(minimiser, test_steps=None, steps=2)(energy, game, parameters)
+    torch.testing.assert_close(forecast.solution.states, refined.states)
+    assert not torch.equal(minimiser(energy, game, parameters).states, refined.states)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
