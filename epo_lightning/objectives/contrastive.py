@@ -31,8 +31,8 @@ from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
 class Contrastive(Objective):
     """Energy of the demonstration minus that of the forecast, in the mode closest to the observed future.
 
-    Every mode is a game of its own with one sample. Only the mode whose forecast is closest to the observed future is
-    trained; the others would only learn to avoid their own forecasts. The observed controls are found by tracking
+    Every mode is a game of its own with one sample. Only the mode whose forecast (without noise) is closest to the observed
+    future is trained; the others would only learn to avoid their own forecasts. The observed controls are found by tracking
     (:mod:`~epo_lightning.game.tracking`). The controls after an agent's last observed step are unknown; they are copied
     from the sample, so that both energies are defined. A scene without observations has no gradient.
 
@@ -43,8 +43,9 @@ class Contrastive(Objective):
     tracking.
 
     Args:
-        weights: lambda of ``contrastive``; of ``magnitude``, the squares of both energies, without which a common offset of
-            both could grow without bound; of ``initial``, the distance between initial strategies and samples (cooperative
+        weights: lambda of ``contrastive``; of ``magnitude``, the squares of both energies, which holds a common offset of
+            both but lowers the precision that is learned (EBIOC has no such term, and 0 leaves the temperature to the data);
+            of ``initial``, the distance between initial strategies and samples (cooperative
             training: the network learns to start the chains where they end); of ``goal`` (unused if no goal is decoded);
             and of ``probability``, the cross entropy of the closest mode.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.

@@ -67,6 +67,26 @@ def test_with_exact_samples_the_gradient_is_that_of_the_likelihood():
         assert_close(weight.grad, leaf.grad)
 
 
+def test_the_configured_weights_leave_the_temperature_to_the_data():
+    """With exact samples, the loss of 160 controls of unit variance is stationary at precision 1, and nowhere near it."""
+    shape = (1, 2, 40, 2)
+    scene = random_scene(1, 2, horizon=40, dtype=torch.float64)
+    scene = demonstrate(scene, torch.randint(2, shape) * 2.0 - 1.0)
+    objective, slopes = Contrastive(**{k: v for k, v in yaml.safe_load(CONF.read_text()).items() if k != "name"}), []
+    for precision in (0.8, 1.0, 1.25):
+        root = torch.tensor(precision, dtype=torch.float64).sqrt().requires_grad_()
+        exact = random_game(scene, 1, 40, own=("acc", "turnr"))
+        own = {name: root.expand(1, 1, 2) for name in ("acc", "turnr")}
+        samples = (torch.randint(2, shape) * 2.0 - 1.0)[:, None] / root.detach()
+        exact = dataclasses.replace(exact, own_weights=own, initial_controls=samples)
+        terms = objective(scene, forecast_of(QUADRATIC, scene, exact), QUADRATIC)
+        loss = sum(terms[name][0] * terms[name][1] for name in ("contrastive", "magnitude"))
+        slopes += torch.autograd.grad(loss, root)
+    assert slopes[0] < -0.05
+    assert abs(slopes[1]) < 1e-6
+    assert slopes[2] > 0.05
+
+
 def test_with_langevin_samples_the_gradient_is_within_sampling_error():
     scene = random_scene(4000, 1, horizon=2, dtype=torch.float64)
     controls = torch.randn(4000, 1, 2, 2, dtype=torch.float64)
