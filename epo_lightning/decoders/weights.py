@@ -52,29 +52,35 @@ class OwnWeights(nn.Module):
 
 
 class SharedWeights(nn.Module):
-    """Weights of own features that all agents, modes and scenes share: one learned number for each feature.
+    """Weights of features that all agents or pairs, modes and scenes share: one learned number for each feature.
 
     For populations whose agents differ only in how they weigh each other, as in RPI: a single history
-    does not determine these weights, but all scenes together do.
+    does not determine these weights, but all scenes together do. EBIOC shares the weights of pairs as well.
 
     Args:
         games: number M of games: one per joint mode, or a single one.
-        features: names of the own features.
+        features: names of the features.
         start: weights before training, as for :class:`OwnWeights`. The weight is start * exp(learned number).
+        of_pairs: whether the features are those of the P pairs instead of the N agents.
     """
 
     start: Tensor
 
-    def __init__(self, games: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0) -> None:
+    def __init__(
+        self, games: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0, of_pairs: bool = False
+    ) -> None:
         super().__init__()
-        self.games, self.features = games, tuple(features)
+        self.games, self.features, self.of_pairs = games, tuple(features), of_pairs
         self.register_buffer("start", torch.tensor(_starts(features, start)), persistent=False)
         self.logarithms = nn.Parameter(torch.zeros(len(self.features)))
 
-    def forward(self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> dict[str, Float[Tensor, "B M N"]]:
-        """Weights by feature name."""
+    def forward(
+        self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"] | None = None
+    ) -> dict[str, Float[Tensor, "B M R"]]:
+        """Weights by feature name, of R = N agents or R = P pairs; neither ``z`` nor ``mask`` changes them."""
         weights = (self.start * self.logarithms.exp()).unbind()
-        shape = len(z), self.games, z.shape[1]
+        agents = z.shape[1]
+        shape = len(z), self.games, agents * (agents - 1) // 2 if self.of_pairs else agents
         return {name: weight.expand(shape) for name, weight in zip(self.features, weights, strict=True)}
 
 

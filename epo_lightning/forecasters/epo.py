@@ -25,7 +25,7 @@ from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.forecasters.epo_settings import (
-    OWN_WEIGHTS,
+    WEIGHTS,
     check_calibration,
     check_choice,
     check_decodes_probabilities,
@@ -43,7 +43,7 @@ from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
 from epo_lightning.solvers.backward import Backward
-from epo_lightning.solvers.base import TABLES, Minimiser
+from epo_lightning.solvers.base import SAMPLES, TABLES, Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.task import Task
 
@@ -86,6 +86,7 @@ class EPO(Forecaster):
         one_game: whether the modes are equilibria of one game, found from the initial strategies; its pair weights are
             positive. Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
+        pair_weights: the same for pairs; shared ones are positive.
         calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which corrects the inferred
             pair weights by the history outside training; None for no correction.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
@@ -116,6 +117,7 @@ class EPO(Forecaster):
         game_horizon: int | None = None,
         calibration: Mapping[str, float] | None = None,
         own_weights: str = "decoded",
+        pair_weights: str = "decoded",
         one_game: bool = False,
         probabilities: str = "linear",
         margin: Mapping[str, float] | None = None,
@@ -128,7 +130,8 @@ class EPO(Forecaster):
         check_horizon(self.game_horizon, energy, objective, task)
         check_modes(modes, one_game, energy, solver)
         check_initial(initial, modes, one_game, energy, solver)
-        check_choice("own_weights", own_weights, OWN_WEIGHTS)
+        check_choice("own_weights", own_weights, WEIGHTS)
+        check_choice("pair_weights", pair_weights, WEIGHTS)
         check_calibration(calibration, energy, solver)
         # The network decodes probabilities unless the energies of choices among candidates (TABLES) or orders define them.
         defined = TABLES in solver.provides or energy.pair_order is not None
@@ -156,7 +159,11 @@ class EPO(Forecaster):
             self.own_weights = SharedWeights(games, own_names, start)
         else:
             self.own_weights = OwnWeights(width, games, own_names, start)
-        self.pair_weights = PairWeights(width, games, pair_names, pair_start, symmetric_pairs, positive=one_game)
+        self.pair_weights: PairWeights | SharedWeights
+        if pair_weights == "shared":
+            self.pair_weights = SharedWeights(games, pair_names, pair_start, of_pairs=True)
+        else:
+            self.pair_weights = PairWeights(width, games, pair_names, pair_start, symmetric_pairs, positive=one_game)
         self.strategies: InitialStrategies | ZeroStrategies | Motions
         if initial == "decoded":
             self.strategies = InitialStrategies(width, strategies, horizon, control_scale)
@@ -191,11 +198,12 @@ class EPO(Forecaster):
         if TABLES not in self.solver.provides:
             parameters = parameters.for_every_mode(self.modes)
         solution = self.differentiable_solve(self._minimiser, self.energy, solved_scene, parameters)
-        logits = self._mode_logits(z, scene, goals, orders, solution)
+        settled = self._without_noise(solution, solved_scene, parameters)
+        logits = self._mode_logits(z, scene, goals, orders, settled)
         return JointForecast(
-            states=solution.states[..., : self.task.horizon, :],
+            states=settled.states[..., : self.task.horizon, :],
             probabilities=logits.softmax(1),
-            controls=solution.controls[..., : self.task.horizon, :],
+            controls=settled.controls[..., : self.task.horizon, :],
             initial_states=self._states_of_initial_strategies(scene, parameters),
             parameters=parameters,
             solution=solution,
@@ -258,6 +266,16 @@ class EPO(Forecaster):
     @property
     def _minimiser(self) -> Minimiser:
         return self.solver if self.training else self.solver.for_test()
+
+    def _without_noise(self, solution: Solution, scene: Scene, parameters: GameParameters) -> Solution:
+        """The solution that is the forecast: for samples, the end of the same steps without noise, also in training.
+
+        So the probabilities of modes are learned on the forecasts that they are decoded for outside training.
+        """
+        if SAMPLES not in self._minimiser.provides:
+            return solution
+        with torch.no_grad():
+            return self.solver.for_test()(self.energy, scene, parameters)
 
     def _mode_logits(
         self, z: Tensor, scene: Scene, goals: Goals, orders: DecodedOrders | None, solution: Solution

@@ -13,7 +13,7 @@ from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.solvers.base import STATIONARY, TABLES, Minimiser
 from epo_lightning.task import Task
 
-OWN_WEIGHTS = ("decoded", "shared")
+WEIGHTS = ("decoded", "shared")
 """Sources of the weights of own features: decoded for each agent, or one learned number per feature for all."""
 INITIAL = ("decoded", "zero", "motions")
 """Sources of the initial strategies: decoded by the network, controls of zero (the paper's ablation "no init"), or a mixture
