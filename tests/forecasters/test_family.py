@@ -157,10 +157,24 @@ class JFP(_Row):
     row = "jfp"
     learned = ("density", "marginal")
 
+    def test_the_density_teaches_energies_and_the_regression_candidates(self):
+        forecaster, scene = self.forecaster().train(), self.lesson()
+        decoder = list(forecaster.strategies.parameters())
+        terms = forecaster.losses(scene, forecaster(scene))
+        for name, taught in (("density", False), ("marginal", False), ("regression", True)):
+            found = torch.autograd.grad(terms[name][1], decoder, retain_graph=True, allow_unused=True)
+            assert any(slope is not None and (slope != 0).any() for slope in found) == taught, name
+
 
 class DSDNet(_Row):
     row = "dsdnet"
-    learned = ("density", "marginal")
+    learned = ("density",)
+    solver: ClassVar[dict[str, Any]] = {"candidates": 12}
+
+    def test_the_row_has_a_hundred_candidates_and_no_loss_of_another_row(self):
+        found = written(f"{self.data}_{self.row}")
+        assert found["solver"]["candidates"] == 100
+        assert found["objective"]["weights"]["marginal"] == 0
 
     def test_sampled_motions_are_not_trained(self):
         """The term ``regression`` only measures how well motions cover the observed future."""
@@ -211,7 +225,7 @@ class TestJFP(JFP, Row):
 
 
 class TestDSDNet(DSDNet, Row):
-    pass
+    closer = False  # the given goals choose near motions before any training
 
 
 class TestTGL(TGL, Row):
@@ -224,6 +238,11 @@ class TestEBIOC(EBIOC, Row):
 
 class TestLaplace(Laplace, Row):
     pass
+
+
+@pytest.mark.parametrize("row", ["jfp", "dsdnet", "tgl", "ebioc", "epo", "laplace"])
+def test_every_row_on_rpi_is_given_the_goals(row):
+    assert "goal" in written(f"rpi_{row}")["energy"]["own"]
 
 
 class TestHighwayJFP(JFP, HighwayRow):

@@ -36,6 +36,8 @@ class Candidates(Minimiser):
         candidates: number C of strategies of every agent.
         apart: distance [m] between modes where possible (:func:`~epo_lightning.solvers.discrete.assignments.best`); 0 for
             the best assignments.
+        detached: whether energies take the candidates as constants, so that their density teaches the energies alone and
+            not the candidates.
         modes: number M of joint modes, set by the forecaster.
     """
 
@@ -44,6 +46,7 @@ class Candidates(Minimiser):
     candidates: int = 6
     apart: float = 0.0
     modes: int = 1
+    detached: bool = False
 
     def __post_init__(self) -> None:
         for name in ("candidates", "modes"):
@@ -80,7 +83,7 @@ class Candidates(Minimiser):
         start, mask = parameters.initial_controls, scene.agent_mask
         if scene.history.dtype != start.dtype:
             scene = scene.to(start.dtype)
-        raw = energy.tables(scene, parameters, start)
+        raw = energy.tables(scene, parameters, start.detach() if self.detached else start)
         controls = torch.where(mask[:, None, :, None, None], start, 0.0)
         states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
 
