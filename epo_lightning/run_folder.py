@@ -199,6 +199,18 @@ class RunFolder:
         """The contents of run.json."""
         return read_json(self.record_file)
 
+    def names(self) -> list[str]:
+        """Names of the files in the folder, sorted; none if there is no folder."""
+        return sorted(entry.name for entry in self.path.iterdir() if entry.is_file()) if self.path.is_dir() else []
+
+    def content(self, name: str) -> dict[str, Any]:
+        """The contents of a JSON file in the folder, as :func:`read_json`."""
+        return read_json(self.path / name)
+
+    def log(self) -> list[dict[str, str]]:
+        """The rows of logs/metrics.csv, as :func:`read_log`."""
+        return read_log(self.logs / "metrics.csv")
+
     @property
     def finished(self) -> bool:
         return self.record_file.is_file() and self.record.get("status") == FINISHED

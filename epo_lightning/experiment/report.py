@@ -18,6 +18,7 @@ from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import EvaluatedRun, Report, build_tables, collect, write_report
 from epo_lightning.report.render import code
+from epo_lightning.report.results import read_results, save_results
 from epo_lightning.report.rows import Row
 from epo_lightning.report.runs import scored, scored_elsewhere
 from epo_lightning.report.tables import distinct
@@ -27,6 +28,7 @@ from epo_lightning.schema import read
 
 SCENES, GAMES = 4, 512
 """How many scenes are drawn, and over how many the distribution of learned weights is taken."""
+NOT_DRAWN = "Scenes and learned weights are not drawn: they need checkpoints and data."
 
 
 def report(settings: ReportSettings) -> Path:
@@ -36,14 +38,26 @@ def report(settings: ReportSettings) -> Path:
         the folder of the report.
 
     Raises:
-        ConfigError: no such sweep, no evaluated run, or one that cannot be read.
+        ConfigError: no such sweep, no evaluated run, one that cannot be read, or a damaged results file.
     """
     assembly.quiet()
+    if settings.results and settings.sweep:
+        raise ConfigError(
+            f"results={settings.results} and the sweep {settings.sweep} name different runs: give one of them"
+        )
     sweep = Sweep.find(settings.sweep, (), settings.runs) if settings.sweep else None
-    subject = of_sweep(sweep) if sweep else Report.of_folder(settings.runs)
+    if settings.results:
+        subject = read_results(settings.results)
+    else:
+        subject = of_sweep(sweep) if sweep else Report.of_folder(settings.runs)
     out = Path(settings.out or (sweep.folder / "report" if sweep else "report")).expanduser()
     rows = distinct(build_tables(subject.evaluated))  # whatever cannot be reported is said before anything is drawn
-    drawn, notes = draw(rows, out / "figures")
+    if settings.save:
+        save_results(subject, settings.save)
+    if settings.scenes and not settings.results:
+        drawn, notes = draw(rows, out / "figures")
+    else:
+        drawn, notes = [], [NOT_DRAWN] if rows else []
     write_report(subject, out, drawn, preface(subject.evaluated), notes)
     return out
 

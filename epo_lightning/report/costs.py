@@ -11,7 +11,6 @@ from epo_lightning.report.render import Sheet
 from epo_lightning.report.rows import Row
 from epo_lightning.report.tables import Table, distinct, trained_rows
 from epo_lightning.report.timings import Timing, duration, time
-from epo_lightning.run_folder import RunFolder
 
 TRAINED = ("training", "steps", "ms per step")
 
@@ -56,7 +55,7 @@ def _sheet(title: str, rows: Sequence[Row], timings: Sequence[Timing], labels: d
 
 
 def _line(row: Row, timings: Sequence[Timing], labels: dict[str, str]) -> tuple[str, ...]:
-    records = [RunFolder(run.path).record for run in row.runs]
+    records = [run.records.record for run in row.runs]
     trained = [
         (float(record["seconds"]), int(record["steps"]))
         for record in records

@@ -7,7 +7,6 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,9 +16,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, NullLoc
 from epo_lightning.identity import essence
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.paper import STEPS, is_papers
+from epo_lightning.report.records import Records
 from epo_lightning.report.rows import Row
 from epo_lightning.report.style import MODES, VEHICLES, style
-from epo_lightning.run_folder import read_log
 
 METRIC = "val/minSADE"
 """Score that a training monitors."""
@@ -91,7 +90,7 @@ def learning_curves(rows: Iterable[Row], metric: str = METRIC) -> tuple[list[Cur
         if not any(run.learned for run in row.runs):
             continue
         try:
-            logs = [validation_log(run.path / "logs" / "metrics.csv", metric) for run in row.runs]
+            logs = [validation_log(run.records, metric) for run in row.runs]
         except ConfigError as error:
             notes.append(f"{row.name} is left out: {error}")
             continue
@@ -103,14 +102,17 @@ def learning_curves(rows: Iterable[Row], metric: str = METRIC) -> tuple[list[Cur
     return curves, notes
 
 
-def validation_log(file: Path, metric: str) -> dict[int, float]:
-    """The finite values of one column of a ``metrics.csv``, by the number of training steps done; the last one of a step.
+def validation_log(run: Records, metric: str) -> dict[int, float]:
+    """The finite values of one column of a run's ``metrics.csv``, by the number of training steps done.
+
+    If a step has several, the last one counts.
 
     Raises:
         ConfigError: the file cannot be read, or no row has a finite number in this column.
     """
+    file = run.path / "logs" / "metrics.csv"
     try:
-        rows = read_log(file)
+        rows = run.log()
     except OSError as error:
         raise ConfigError(f"cannot read {file} ({error.strerror})") from error
     values: dict[int, float] = {}

@@ -8,11 +8,11 @@ from typing import Any
 
 from epo_lightning.identity import row_identity
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.records import Records
 from epo_lightning.report.rows import Row
 from epo_lightning.report.runs import data_name
 from epo_lightning.report.tables import Table, distinct
 from epo_lightning.report.timings import Timing
-from epo_lightning.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,7 @@ def how_made(tables: Sequence[Table], timings: Sequence[Timing] = ()) -> list[Ma
 
 def _of_row(row: Row) -> Made:
     runs = tuple(
-        _run(RunFolder(run.path), run.seed, run.command, run.git_commit, run.data_digest, run.parameters)
-        for run in row.runs
+        _run(run.records, run.seed, run.command, run.git_commit, run.data_digest, run.parameters) for run in row.runs
     )
     return Made(row.name, f"{row.runs[0].data}, {row.runs[0].split} split", row.budget, runs)
 
@@ -102,7 +101,7 @@ def _timed(timings: Iterable[Timing]) -> list[Made]:
     ]
 
 
-def _run(run: RunFolder, seed: int, command: str, commit: str, digest: str, parameters: Any) -> MadeRun:
+def _run(run: Records, seed: int, command: str, commit: str, digest: str, parameters: Any) -> MadeRun:
     try:
         record = run.record
     except ConfigError:  # read once already: it is being replaced

@@ -1,16 +1,18 @@
-"""Evaluated runs, read from their run folders."""
+"""Evaluated runs, read from the records of runs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import OTHER, RunFolder, discover, read_json
+from epo_lightning.report.records import CONFIG, RECORD, Records
+from epo_lightning.run_folder import OTHER, RunFolder, discover
 
 TRAIN = "train one first, epo train experiment=rpi/v_lstm_epo"
 COPY = "copy the run folder again from where it was made, or move it away"
@@ -41,6 +43,7 @@ class EvaluatedRun:
         identity: hash of all settings that affect its result.
         row: the same hash without the seed, shared by the runs of a row.
         config: its resolved configuration.
+        records: all records of the run.
     """
 
     path: Path
@@ -64,6 +67,7 @@ class EvaluatedRun:
     identity: str
     row: str
     config: Mapping[str, Any] = field(repr=False)
+    records: Records = field(repr=False, compare=False)
 
     @property
     def learned(self) -> bool:
@@ -91,17 +95,17 @@ def find_runs(folder: str | Path) -> list[RunFolder]:
     return known
 
 
-def scored(run: RunFolder) -> list[Path]:
-    """Files with a run's scores: ``metrics.json`` of the test split first, then ``metrics-<split>.json``."""
-    files = [run.metrics_file(), *sorted(run.path.glob("metrics-*.json"))]
-    return [file for file in files if file.is_file()]
+def scored(run: Records) -> list[str]:
+    """Names of files with a run's scores: ``metrics.json`` of the test split first, then ``metrics-<split>.json``."""
+    names = run.names()
+    return [*(["metrics.json"] if "metrics.json" in names else []), *(n for n in names if fnmatch(n, "metrics-*.json"))]
 
 
-def collect(runs: str | Path | Iterable[RunFolder]) -> list[EvaluatedRun]:
+def collect(runs: str | Path | Iterable[Records]) -> list[EvaluatedRun]:
     """All evaluated runs, one entry for every split that a run was evaluated on.
 
     Args:
-        runs: run folders, or a folder that contains them at any depth. Runs without scores are left out.
+        runs: records of runs, or a folder that contains them at any depth. Runs without scores are left out.
 
     Raises:
         ConfigError: no folder, no run or no evaluated run (with the command that makes one), or a damaged file.
@@ -112,65 +116,67 @@ def collect(runs: str | Path | Iterable[RunFolder]) -> list[EvaluatedRun]:
         raise ConfigError(f"no run {where}: {TRAIN}")
     found = [evaluated for run in known for evaluated in read_run(run)]
     if not found:
-        begun = next((run for run in known if run.record_file.is_file()), known[0])
+        begun = next((run for run in known if RECORD in run.names()), known[0])
         remedy = f"epo evaluate runs={runs}" if isinstance(runs, str | Path) else f"epo evaluate run={begun.path}"
         raise ConfigError(f"none of the {len(known)} runs {where} is evaluated: {remedy} does it")
     return found
 
 
-def _listed(runs: str | Path | Iterable[RunFolder]) -> list[RunFolder]:
-    return find_runs(runs) if isinstance(runs, str | Path) else list(runs)
+def _listed(runs: str | Path | Iterable[Records]) -> list[Records]:
+    return [*find_runs(runs)] if isinstance(runs, str | Path) else [*runs]
 
 
-def read_run(run: RunFolder) -> list[EvaluatedRun]:
-    """Scores of one run folder, one entry for every split on which it was evaluated.
+def read_run(run: Records) -> list[EvaluatedRun]:
+    """Scores of one run, one entry for every split on which it was evaluated.
 
     Raises:
         ConfigError: a file is missing or damaged, or lacks an entry; the message names both and says what to do.
     """
-    files = scored(run)
-    if not files:
+    names = scored(run)
+    if not names:
         return []
     _require_records(run)
     config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
-    return [_read_split(run, config, record, file) for file in files]
+    return [_read_split(run, config, record, name) for name in names]
 
 
-def read_other(run: RunFolder) -> list[tuple[EvaluatedRun, Mapping[str, Any]]]:
-    """Scores of one run folder on other data, each with the contents of its file, in the order in which they were written.
+def read_other(run: Records) -> list[tuple[EvaluatedRun, Mapping[str, Any]]]:
+    """Scores of one run on other data, each with the contents of its file, in the order in which they were written.
 
     Raises:
         ConfigError: as :func:`read_run`.
     """
-    files = scored_elsewhere(run)
-    if not files:
+    names = scored_elsewhere(run)
+    if not names:
         return []
     _require_records(run)
     config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
     found: list[tuple[EvaluatedRun, Mapping[str, Any]]] = []
-    for file in files:
+    for name in names:
+        file = run.path / name
         again = f"delete it, and `epo evaluate run={run.path} data=<data set>` writes it again"
-        content = _sound(lambda file=file: read_json(file), again)  # type: ignore[misc]
+        content = _sound(lambda name=name: run.content(name), again)  # type: ignore[misc]
         for key in ("data", "split", "test", "checkpoint"):
             _entry(content, file, again, key)
         found.append((_evaluated(run, config, record, file, content, str(content["split"]), again), content))
     return found
 
 
-def scored_elsewhere(run: RunFolder) -> list[Path]:
-    """Files with a run's scores on other data; of the same test and checkpoint, later versions come later."""
-    return sorted(run.path.glob(f"{OTHER}*.json"), key=lambda file: (len(file.name), file.name))
+def scored_elsewhere(run: Records) -> list[str]:
+    """Names of files with a run's scores on other data; of the same test and checkpoint, later versions come later."""
+    return sorted((name for name in run.names() if fnmatch(name, f"{OTHER}*.json")), key=lambda name: (len(name), name))
 
 
-def _read_split(run: RunFolder, config: Mapping[str, Any], record: Mapping[str, Any], file: Path) -> EvaluatedRun:
+def _read_split(run: Records, config: Mapping[str, Any], record: Mapping[str, Any], name: str) -> EvaluatedRun:
+    file = run.path / name
     split = file.stem.removeprefix("metrics").removeprefix("-") or "test"
     again = f"epo evaluate run={run.path} split={split} writes it again"
-    result = _sound(lambda: read_json(file), again)
+    result = _sound(lambda: run.content(name), again)
     return _evaluated(run, config, record, file, result, split, again)
 
 
 def _evaluated(
-    run: RunFolder,
+    run: Records,
     config: Mapping[str, Any],
     record: Mapping[str, Any],
     file: Path,
@@ -185,18 +191,19 @@ def _evaluated(
     if result.get("split", split) != split:
         raise ConfigError(f"{file} holds scores of the {result['split']} split, was it renamed? {again}")
     digest = str(_entry(result, file, again, "data_digest"))
+    config_file, record_file = run.path / CONFIG, run.path / RECORD
 
     def setting(*keys: str) -> str:
-        return str(_entry(config, run.config_file, COPY, *keys))
+        return str(_entry(config, config_file, COPY, *keys))
 
     def recorded(key: str) -> str:
-        return str(_entry(record, run.record_file, COPY, key))
+        return str(_entry(record, record_file, COPY, key))
 
     seed = setting("seed")
     if not seed.isdigit():
-        raise ConfigError(f"{run.config_file}: seed must be a whole number, not {seed!r}; {COPY}")
+        raise ConfigError(f"{config_file}: seed must be a whole number, not {seed!r}; {COPY}")
     trained = recorded("data_digest")
-    _entry(config, run.config_file, COPY, "data", "name")
+    _entry(config, config_file, COPY, "data", "name")
     trained_data = data_name(config["data"])
     return EvaluatedRun(
         path=run.path,
@@ -220,6 +227,7 @@ def _evaluated(
         identity=identity(config, trained),
         row=row_identity(config, trained),
         config=config,
+        records=run,
     )
 
 
@@ -257,7 +265,7 @@ def _sound(read: Callable[[], dict[str, Any]], remedy: str) -> dict[str, Any]:
         raise ConfigError(f"{error}; {remedy}") from error
 
 
-def _require_records(run: RunFolder) -> None:
-    for file in (run.config_file, run.record_file):
-        if not file.is_file():
-            raise ConfigError(f"the run folder {run.path} has no {file.name}: {COPY}")
+def _require_records(run: Records) -> None:
+    for name in (CONFIG, RECORD):
+        if name not in run.names():
+            raise ConfigError(f"the run folder {run.path} has no {name}: {COPY}")

@@ -12,9 +12,9 @@ from typing import Any
 from epo_lightning.identity import canonical, essence
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
+from epo_lightning.report.records import TIME, Records
 from epo_lightning.report.render import Sheet
 from epo_lightning.report.runs import data_name
-from epo_lightning.run_folder import RunFolder, read_json
 
 METHOD = ("forecaster", "dynamics", "energy", "solver", "backward", "objective")
 SIZES = ("modes", "steps", "test_steps")
@@ -32,7 +32,7 @@ class Timing:
         agents, steps, modes: N, S (None for a forecaster that solves no game) and M.
         samples: number of measurements.
         mean, median, p10, p90: runtime of a forecast [s].
-        run: the run folder.
+        run: records of the run.
     """
 
     where: str
@@ -46,14 +46,14 @@ class Timing:
     median: float
     p10: float
     p90: float
-    run: RunFolder
+    run: Records
 
 
-def read_timings(runs: Iterable[RunFolder]) -> tuple[list[Timing], list[str]]:
+def read_timings(runs: Iterable[Records]) -> tuple[list[Timing], list[str]]:
     """Timings of the runs that have a runtime.json, and an error message for each file that cannot be read."""
     timings, notes = [], []
     for run in runs:
-        if run.metrics_file("time").is_file():
+        if TIME in run.names():
             try:
                 timings.append(_read(run))
             except ConfigError as error:
@@ -61,14 +61,13 @@ def read_timings(runs: Iterable[RunFolder]) -> tuple[list[Timing], list[str]]:
     return timings, notes
 
 
-def _read(run: RunFolder) -> Timing:
+def _read(run: Records) -> Timing:
     """The timing of a run.
 
     Raises:
         ConfigError: its runtime.json is damaged.
     """
-    file = run.metrics_file("time")
-    content, config = read_json(file), run.config()
+    content, config = run.content(TIME), run.config()
     try:
         seconds = {name: float(content["seconds"][name]) for name in ("mean", "median", "p10", "p90")}
         if not all(math.isfinite(value) and value > 0 for value in seconds.values()):
@@ -91,7 +90,7 @@ def _read(run: RunFolder) -> Timing:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(
-            f"{file} is not what `score=time` writes ({type(error).__name__}: {error}): time the run again"
+            f"{run.path / TIME} is not what `score=time` writes ({type(error).__name__}: {error}): time the run again"
         ) from error
 
 

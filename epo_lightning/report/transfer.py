@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from epo_lightning.report.columns import MISSING, Column
+from epo_lightning.report.records import Records
 from epo_lightning.report.render import Sheet, csv_text, own_text
 from epo_lightning.report.rows import Cell, plain_rows
 from epo_lightning.report.runs import EvaluatedRun, read_other, read_run
 from epo_lightning.report.tables import FORECASTERS
-from epo_lightning.run_folder import RunFolder
 
 METRICS = (Column("minSADE", "SADE"), Column("minSFDE", "SFDE"), Column("overlap_jfp", "OR (JFP)"))
 """Scores that are shown; the CSV has all of them."""
@@ -69,7 +69,7 @@ class Line:
     cells: Mapping[TestSet, Mapping[str, Cell]]
 
 
-def transfers(runs: Iterable[RunFolder]) -> list[Line]:
+def transfers(runs: Iterable[Records]) -> list[Line]:
     """The scores of all rows with a run that was scored on other data, with those on the test split of their own data.
 
     Raises:

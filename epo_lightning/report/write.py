@@ -14,6 +14,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report.costs import cost_sheets, timings_of
 from epo_lightning.report.latex import comparisons_to_latex, sheet_to_latex, to_latex
 from epo_lightning.report.made import Made, how_made
+from epo_lightning.report.records import TIME, Records
 from epo_lightning.report.render import (
     COMPARISON_LEGEND,
     Sheet,
@@ -45,7 +46,7 @@ class Report:
     Attributes:
         title: title of the report.
         command: command that writes the report.
-        runs: all run folders that have scores, on their own or on other data, or were timed.
+        runs: records of all runs that have scores, on their own or on other data, or were timed.
         evaluated: scores of these runs.
         left_out: the other run folders, each with the reason.
         sweep: command that began the sweep; empty for a report of other runs.
@@ -53,7 +54,7 @@ class Report:
 
     title: str
     command: str
-    runs: tuple[RunFolder, ...]
+    runs: tuple[Records, ...]
     evaluated: tuple[EvaluatedRun, ...]
     left_out: tuple[tuple[str, str], ...] = ()
     sweep: str = ""
@@ -78,12 +79,12 @@ class Report:
         )
 
 
-def is_timed(run: RunFolder) -> bool:
+def is_timed(run: Records) -> bool:
     """Whether the time of the run's forecasts was measured."""
-    return run.metrics_file("time").is_file()
+    return TIME in run.names()
 
 
-def is_measured(run: RunFolder) -> bool:
+def is_measured(run: Records) -> bool:
     """Whether a run has anything to report: scores on its own or on other data, or the time of its forecasts."""
     return bool(scored(run) or scored_elsewhere(run) or is_timed(run))
 

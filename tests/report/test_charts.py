@@ -21,6 +21,7 @@ from epo_lightning.report.runtime import draw_modes, heat_map
 from epo_lightning.report.style import svg
 from epo_lightning.report.tables import build_tables, distinct
 from epo_lightning.report.timings import grid, over_modes, places, read_timings, time, timing_sheet
+from epo_lightning.run_folder import RunFolder
 
 from .page_runs import over_runtime, over_steps, rows_with_seeds, timed, write_log
 from .run_folders import make_run, scores
@@ -77,11 +78,12 @@ def test_a_row_with_a_damaged_log_is_left_out_with_a_note(tmp_path: Path) -> Non
 
 
 def test_truncated_lines_are_ignored_and_repeated_steps_count_once(tmp_path: Path) -> None:
-    file = tmp_path / "metrics.csv"
-    file.write_text("epoch,step,val/minSADE\n0,99,0.5\n1,199,0.4\n1,199,0.3\n2,x9,0.2\n2,299,0.2")
-    assert validation_log(file, "val/minSADE") == {100: 0.5, 200: 0.3}
+    run = RunFolder(tmp_path)
+    run.logs.mkdir()
+    (run.logs / "metrics.csv").write_text("epoch,step,val/minSADE\n0,99,0.5\n1,199,0.4\n1,199,0.3\n2,x9,0.2\n2,299,0.2")
+    assert validation_log(run, "val/minSADE") == {100: 0.5, 200: 0.3}
     with pytest.raises(ConfigError, match=r"metrics\.csv has no finite val/minFDE"):
-        validation_log(file, "val/minFDE")
+        validation_log(run, "val/minFDE")
 
 
 def test_the_s_curve_joins_rows_that_differ_only_in_steps(tmp_path: Path) -> None:

@@ -313,4 +313,7 @@ class ReportSettings:
 
     runs: str = "runs"
     sweep: str | None = None
+    results: str | None = None
     out: str | None = None
+    save: str | None = None
+    scenes: bool = True

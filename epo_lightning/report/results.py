@@ -1,0 +1,167 @@
+"""Results files: the records of all runs of a report in one JSON file, from which it is written without run folders.
+
+::
+
+    {
+     "format": "epo_lightning results", "version": 1,
+     "title", "command", "sweep", "left_out":  as in :class:`~epo_lightning.report.write.Report`
+     "runs": [{
+       "folder":   the run folder
+       "reported": the splits whose scores are in the tables
+       "config":   the settings that decide on the result, with title, experiment and budget
+       "record":   command, commit, versions, data digest, parameters, steps, seconds and beginning of the training
+       "scores":   the contents of metrics.json, metrics-<split>.json, scores-on-<test>.json and runtime.json, by name
+       "log":      training step and validation score of every validation, as text
+     }],
+     "digest":    hash of everything else
+    }
+
+The file has no weights, scenes or forecasts, so pictures of scenes and of learned weights cannot be drawn from it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from epo_lightning.identity import ELSEWHERE, SECTIONS, canonical
+from epo_lightning.masking import mask
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.curves import METRIC
+from epo_lightning.report.records import CONFIG, RECORD, TIME, Records
+from epo_lightning.report.runs import read_run, scored, scored_elsewhere
+from epo_lightning.report.write import Report
+from epo_lightning.run_folder import read_json, write_file
+
+FORMAT, VERSION = "epo_lightning results", 1
+SETTINGS = (*SECTIONS, "title", "experiment", "budget")
+"""Sections of a configuration that are saved."""
+RECORDED = (
+    *("command", "git_commit", "versions", "data_digest", "identity", "row", "parameters"),
+    *("began", "steps", "seconds", "status"),
+)
+"""Entries of run.json that are saved."""
+LOGGED = ("step", METRIC)
+"""Columns of the log that are saved."""
+
+
+@dataclass(frozen=True, eq=False)
+class SavedRun:
+    """Records of one run from a results file (:class:`~epo_lightning.report.records.Records`).
+
+    Attributes:
+        path: the run folder that they were read from; it need not exist.
+        settings: the saved part of the configuration.
+        record: the saved entries of run.json.
+        scores: contents of the files with scores and times, by name.
+        validations: the saved columns of the log.
+    """
+
+    path: Path
+    settings: dict[str, Any] = field(repr=False)
+    record: dict[str, Any] = field(repr=False)
+    scores: Mapping[str, dict[str, Any]] = field(repr=False)
+    validations: Sequence[Sequence[str]] = field(repr=False)
+
+    def config(self) -> dict[str, Any]:
+        return self.settings
+
+    def names(self) -> list[str]:
+        return sorted([CONFIG, RECORD, *self.scores])
+
+    def content(self, name: str) -> dict[str, Any]:
+        return self.scores[name]
+
+    def log(self) -> list[dict[str, str]]:
+        return [dict(zip(LOGGED, row, strict=False)) for row in self.validations]
+
+
+def save_results(report: Report, file: str | Path) -> None:
+    """Write the results file of a report. The same runs give the same bytes.
+
+    Raises:
+        ConfigError: a file of a run folder is damaged.
+        OSError: the file cannot be written.
+    """
+    reported: dict[Path, list[str]] = {}
+    for run in report.evaluated:
+        reported.setdefault(run.path, []).append(run.split)
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "title": report.title,
+        "command": report.command,
+        "sweep": report.sweep,
+        "left_out": [list(entry) for entry in report.left_out],
+        "runs": [_saved(run, reported.get(run.path, [])) for run in report.runs],
+    }
+    content = mask(content)
+    write_file(Path(file).expanduser(), json.dumps({**content, "digest": _digest(content)}, indent=1) + "\n")
+
+
+def _saved(run: Records, reported: Sequence[str]) -> dict[str, Any]:
+    """The entry of one run in a results file."""
+    config, record, rows = run.config(), run.record, run.log()
+    settings = {key: config[key] for key in SETTINGS if key in config}
+    for section, _, key in (place.partition(".") for place in ELSEWHERE):
+        if isinstance(values := settings.get(section), Mapping):
+            settings[section] = {name: value for name, value in values.items() if name != key}
+    names = [*scored(run), *scored_elsewhere(run), *({TIME} & {*run.names()})]
+    validations = [row for row in rows if METRIC in row] or rows[:1]  # a log without validations is not a missing one
+    return {
+        "folder": str(run.path),
+        "reported": list(reported),
+        "config": settings,
+        "record": {key: record[key] for key in RECORDED if key in record},
+        "scores": {name: run.content(name) for name in names},
+        "log": [[row[column] for column in LOGGED if column in row] for row in validations],
+    }
+
+
+def read_results(file: str | Path) -> Report:
+    """The report of a results file, as it was saved.
+
+    Raises:
+        ConfigError: the file is missing or damaged, is no results file, or was written by another version.
+    """
+    file = Path(file).expanduser()
+    again = "epo report <sweep> save=<file> writes such a file"
+    try:
+        content = read_json(file)
+    except ConfigError as error:
+        raise ConfigError(f"{error}; {again}") from error
+    if content.get("format") != FORMAT:
+        raise ConfigError(f"{file} is no results file: it has no entry format: {FORMAT!r}; {again}")
+    if content.get("version") != VERSION:
+        raise ConfigError(
+            f"{file} is a results file of version {content.get('version')}, this program reads version {VERSION}; {again}"
+        )
+    digest = content.pop("digest", None)
+    if digest != _digest(content):
+        raise ConfigError(
+            f"{file} is damaged: its content does not have the digest {digest}; was it edited, or copied incompletely? "
+            f"Take the committed file again, or write it again with `{content.get('command', 'epo report')} save={file}`"
+        )
+    entries = content["runs"]
+    runs = [SavedRun(Path(e["folder"]), e["config"], e["record"], e["scores"], e["log"]) for e in entries]
+    return Report(
+        title=content["title"],
+        command=content["command"],
+        runs=tuple(runs),
+        evaluated=tuple(
+            one
+            for run, entry in zip(runs, entries, strict=True)
+            for one in read_run(run)
+            if one.split in entry["reported"]
+        ),
+        left_out=tuple((folder, why) for folder, why in content["left_out"]),
+        sweep=content["sweep"],
+    )
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(canonical(content).encode()).hexdigest()[:16]

@@ -1,0 +1,73 @@
+"""The committed results files are whole and small, and the numbers on the pages are theirs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from epo_lightning.report import build_tables
+from epo_lightning.report.results import read_results
+from epo_lightning.report.runs import read_other
+from epo_lightning.report.tables import distinct
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "game.md").read_text(encoding="utf-8")
+
+
+def numbers(line: str) -> list[str]:
+    """The cells of a table's line without the first one, in plain text."""
+    return [cell.strip().replace("*", "") for cell in line.split("|")[2:-1]]
+
+
+def line_of(start: str, place: int = 0) -> list[str]:
+    return numbers([line for line in PAGE.splitlines() if line.startswith(start)][place])
+
+
+def short(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}".replace("0.", ".", 1) if value < 1 else f"{value:.{digits}f}"
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "results").glob("*.json")), ids=lambda file: file.stem)
+def test_a_committed_results_file_is_whole_small_and_without_folders_of_a_machine(file: Path) -> None:
+    report = read_results(file)
+    assert report.runs
+    assert file.stat().st_size < 1_000_000
+    assert str(file.relative_to(ROOT)) in (ROOT / "docs" / "reports.md").read_text(encoding="utf-8")
+    assert not any(word in file.read_text(encoding="utf-8") for word in ("/tmp/", "/home/", "/work/"))
+    for run in report.runs:
+        assert run.record["command"].startswith("epo train ")
+        assert len(run.record["git_commit"]) == 40
+        assert run.record["data_digest"]
+
+
+def test_the_page_has_the_scores_of_the_inferred_game() -> None:
+    rows = {row.title: row for row in distinct(build_tables(read_results(ROOT / "results" / "game.json").evaluated))}
+    for title, start, digits in (
+        ("V-LSTM + EPO, game", "| V-LSTM + EPO, game |", 5),
+        ("V-LSTM + EPO, game, S = 2", "| the same energy, refined: S = 2", 4),
+        ("V-LSTM + SC, relaxed", "| V-LSTM + SC, relaxed |", 4),
+    ):
+        cells = [rows[title].cells[metric] for metric in ("minSADE", "minSFDE")]
+        shown = [f"{short(cell.mean, digits)} ± {short(cell.deviation or 0, digits)}" for cell in cells]
+        assert line_of(start)[:2] == shown, title
+
+
+def test_the_page_has_the_scores_of_solved_games_on_highways() -> None:
+    report = read_results(ROOT / "results" / "highway_sim_dense_equilibrium.json")
+    found: dict[str, list[float]] = {}
+    for run in report.runs:
+        for one, _ in read_other(run):
+            for metric in ("minSADE", "interactive/minSADE"):
+                found.setdefault(f"{one.experiment.removeprefix('highway/')} {metric}", []).append(one.metrics[metric])
+    for row, metric, start, place in (
+        ("v_lstm_epo_equilibrium", "interactive/minSADE", "| + EPO, solved (`", 0),
+        ("v_lstm_epo_equilibrium", "minSADE", "| + EPO, solved |", 0),
+        ("v_lstm_sc", "interactive/minSADE", "| + SC |", 0),
+        ("v_lstm_sc", "minSADE", "| + SC |", 1),
+        ("vibes_epo_equilibrium", "interactive/minSADE", "| VIBES + EPO, solved", 0),
+        ("hivt_m_epo_equilibrium", "interactive/minSADE", "| HiVT-M + EPO, solved", 0),
+    ):
+        values = found[f"{row} {metric}"]
+        shown = line_of(start, place)[0].partition(" ")[0]
+        assert shown == short(sum(values) / len(values), 3), (row, metric)

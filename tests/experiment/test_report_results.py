@@ -1,0 +1,151 @@
+"""Results files: the report that is written from one is the report of the run folders, byte for byte."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from experiment.test_sweep_report import begin, finish
+from report.page_runs import rows_with_seeds, timed, write_log
+from report.run_folders import make_run, scores
+from report.test_transfer import three_runs
+
+from epo_lightning.experiment.config.settings import ReportSettings
+from epo_lightning.experiment.report import NOT_DRAWN, report
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
+
+FILES = {
+    *("results.md", "results.csv", "results.tex", "index.html", "comparisons.csv"),
+    *("figures/learning_curves.png", "figures/runtime_modes.png"),
+}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def every_section(runs: Path) -> None:
+    """Rows with seeds and logs, runtimes, and a run without scores; one log and one time are damaged."""
+    rows_with_seeds(runs)
+    timed(runs / "times", 4, 2, 1, 0.002)
+    timed(runs / "times", 4, 2, 8, 0.003)
+    make_run(runs / "waiting", "Not evaluated", "marginal", None)
+    logless = make_run(runs / "logless", "Without a log", "marginal", scores(0.7))
+    write_log(logless, [])
+    damaged = make_run(runs / "times" / "damaged", "Damaged", "marginal", None)
+    damaged.metrics_file("time").write_text("{}")
+
+
+def saved(runs: Path = Path("runs"), **settings: object) -> Path:
+    """A results file of run folders, which are deleted afterwards."""
+    report(ReportSettings(runs=str(runs), out="one", save="results/all.json", scenes=False, **settings))  # type: ignore[arg-type]
+    shutil.rmtree(runs)
+    return Path("results/all.json")
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def rebuilt(file: Path) -> dict[str, bytes]:
+    """The files of the report that is written from a results file, in another folder than the first one."""
+    return files(report(ReportSettings(results=str(file), out="elsewhere/two")))
+
+
+def test_a_report_is_rebuilt_from_its_results_file() -> None:
+    every_section(Path("runs"))
+    file = saved()
+    one, two = files(Path("one")), rebuilt(file)
+    assert one.keys() >= FILES
+    assert {name for name in one if one[name] != two.get(name)} == set()
+    assert two.keys() == one.keys()
+    written = two["results.md"].decode()
+    assert NOT_DRAWN in written
+    assert "- `runs/waiting`: interrupted" in written
+    assert "times/damaged/runtime.json is not what" in written
+    assert "logless/logs/metrics.csv is missing or has no row" in two["index.html"].decode()
+
+
+def test_scores_on_other_data_are_rebuilt() -> None:
+    three_runs(Path("runs"))
+    file = saved()
+    one = files(Path("one"))
+    assert "transfer.csv" in one
+    assert rebuilt(file) == one
+
+
+def test_a_sweep_is_rebuilt_with_the_splits_that_it_measures() -> None:
+    for split, value in (("test", 0.3), ("val", 0.9)):
+        finish(make_run(Path("runs/a"), "V-LSTM", "marginal", scores(value), split=split))
+    begin(Path("runs"), "rpi_main", dict.fromkeys(("a", "b")))
+    file = saved(sweep="rpi_main")
+    two = rebuilt(file)
+    assert two == files(Path("one"))
+    written = two["results.md"].decode()
+    assert "test split" in written
+    assert "val split" not in written
+    assert "`epo sweep rpi_main`" in written
+
+
+def test_every_number_has_its_command_commit_seed_and_data_and_no_folder_of_the_machine(tmp_path: Path) -> None:
+    run = make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.3), seed=4, settings={"data.root": str(tmp_path)})
+    run.update(host="a-machine", seconds=2.0, steps=10)
+    content = json.loads(saved().read_text())
+    (entry,) = content["runs"]
+    assert entry["record"] == {
+        "command": "epo train experiment=None seed=4",
+        "git_commit": "0123456789abcdef",
+        "data_digest": "abc",
+        "parameters": 1234,
+        "steps": 10,
+        "seconds": 2.0,
+        "status": "training",
+    }
+    assert entry["config"]["seed"] == 4
+    assert entry["scores"]["metrics.json"] == {"data_digest": "abc", "split": "test", "metrics": scores(0.3)}
+    assert str(tmp_path) not in json.dumps(content)
+
+
+def edited(text: str) -> str:
+    return text.replace("0.315", "0.314")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (edited, r"all\.json is damaged: .* write it again with `epo report runs=runs save=.*all\.json`"),
+        (lambda text: text[:-200], r"all\.json is not JSON .*; epo report <sweep> save=<file> writes such a file"),
+        (lambda text: '{"metrics": {}}', r"all\.json is no results file: it has no entry format"),
+        (lambda text: text.replace('"version": 1', '"version": 2'), "of version 2, this program reads version 1"),
+        (lambda text: "[1]", r"all\.json holds no JSON object"),
+    ],
+)
+def test_a_damaged_or_foreign_file_is_refused(change: Callable[[str], str], message: str) -> None:
+    make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.315))
+    file = saved()
+    text = file.read_text()
+    file.write_text(change(text))
+    assert file.read_text() != text
+    with pytest.raises(ConfigError, match=message):
+        report(ReportSettings(results=str(file), out="two"))
+    assert not Path("two").exists()
+
+
+def test_a_missing_file_and_two_sources_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"cannot read none\.json.*save=<file> writes such a file"):
+        report(ReportSettings(results="none.json"))
+    with pytest.raises(ConfigError, match=r"results=a\.json and the sweep rpi_main name different runs"):
+        report(ReportSettings(results="a.json", sweep="rpi_main"))
+
+
+def test_a_damaged_run_is_not_saved() -> None:
+    make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.3))
+    RunFolder(Path("runs/a")).metrics_file("time").write_text("{")
+    with pytest.raises(ConfigError, match=r"runtime\.json is not JSON"):
+        report(ReportSettings(out="one", save="all.json", scenes=False))
+    assert not Path("all.json").exists()
