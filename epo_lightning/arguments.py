@@ -37,6 +37,7 @@ epo sweep <name> [key=value ...]         train and score all runs of a sweep tha
 epo sweep status [<name or label>]       show the state of its runs
 epo sweep                                list the sweeps
 
+  choices=<file>      train experiments with the settings that a search has chosen (choices.yaml of its report)
   --stop-on-failure   start no more runs after one has failed
 """
 

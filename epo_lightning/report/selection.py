@@ -24,14 +24,14 @@ class BestSetting:
         row: runs and scores of the setting.
         metric: metric on the validation split that chose it.
         words: overrides that train with it: ``experiment=rpi/v_lstm optimizer.lr=0.0005``.
-        candidates: number of settings compared.
+        compared: runs and scores of all settings compared, the best one included.
         left_out: labels of settings that lack seeds or have no finite score.
     """
 
     row: Row
     metric: str
     words: str
-    candidates: int
+    compared: tuple[Row, ...]
     left_out: tuple[str, ...]
 
     @property
@@ -41,6 +41,16 @@ class BestSetting:
     @property
     def settings(self) -> Mapping[str, Any]:
         return self.row.settings
+
+    @property
+    def experiment(self) -> str:
+        """Name of the experiment file; empty for none."""
+        return self.row.runs[0].experiment
+
+    @property
+    def candidates(self) -> int:
+        """Number of settings compared."""
+        return len(self.compared)
 
 
 def best_settings(runs: Iterable[EvaluatedRun], split: str = "val", metric: str = "minSADE") -> list[BestSetting]:
@@ -92,7 +102,7 @@ def _best(runs: list[EvaluatedRun], rows: list[Row], metric: str) -> BestSetting
         )
     best = min(whole, key=lambda row: (row.cells[metric].mean, natural(row.settings)))
     left_out = tuple(row.name for row in rows if row not in whole)
-    return BestSetting(best, metric, _words(best), len(whole), left_out)
+    return BestSetting(best, metric, _words(best), tuple(whole), left_out)
 
 
 def _words(row: Row) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.choices import choices_to_yaml
 from epo_lightning.report.costs import cost_sheets, timings_of
 from epo_lightning.report.latex import comparisons_to_latex, sheet_to_latex, to_latex
 from epo_lightning.report.made import Made, how_made
@@ -180,6 +181,8 @@ def write_report(
         sweep=report.sweep,
     )
     files = {"results.md": markdown, "index.html": page(content)}
+    if choices := choices_to_yaml(best, report.command):
+        files["choices.yaml"] = choices
     if elsewhere:
         files["transfer.csv"] = transfers_to_csv(elsewhere)
     if tables:

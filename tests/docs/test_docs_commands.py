@@ -54,7 +54,7 @@ def composes(words: list[str]) -> None:
         name, *overrides = overrides
         name = name.partition("-")[0]
         assert name in sweeping.known(arguments.extra), name
-        verb, overrides = "train", [f"sweeps={name}", *overrides]
+        verb, overrides = "train", [f"sweeps={name}", *(w for w in overrides if not w.startswith(sweeping.CHOICES))]
         arguments.multirun = True
     if verb == "report" and overrides and "=" not in overrides[0]:
         assert overrides.pop(0) in sweeping.known(arguments.extra)

@@ -3,7 +3,8 @@
 ::
 
     <runs>/sweeps/<label>/
-        sweep.json       the command, and every run: its overrides, its folder (relative to <runs>) and its identity
+        sweep.json       the command, and every run: its overrides, its folder (relative to <runs>) and its identity;
+                         with choices=<file>, the contents of that file
         found/           the same for runs that a searching sweeper (Optuna) has chosen, one file each
         failures/        tracebacks of runs that failed in the last attempt, one file each
         .lock            locked as long as the sweep runs
@@ -232,7 +233,13 @@ class Sweep:
             lock.release()
 
     def begin(
-        self, name: str, command: str, overrides: Sequence[str], jobs: Sequence[Job], stop_on_failure: bool
+        self,
+        name: str,
+        command: str,
+        overrides: Sequence[str],
+        jobs: Sequence[Job],
+        stop_on_failure: bool,
+        choices: Mapping[str, Any] | None = None,
     ) -> None:
         """Write sweep.json with all runs, and delete the tracebacks of earlier attempts."""
         for failure in (self.folder / "failures").glob("*.txt"):
@@ -249,6 +256,7 @@ class Sweep:
             "host": socket.gethostname(),
             "stop_on_failure": stop_on_failure,
             "jobs": [self._entry(job) for job in jobs],
+            **({"choices": mask(dict(choices))} if choices else {}),
         }
         write_json(self.folder / "sweep.json", content)
 

@@ -17,11 +17,14 @@ from epo_lightning.experiment.config.settings import Settings, TrainerSettings
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
 from epo_lightning.experiment.sweeps.watch import news, status, summary
 from epo_lightning.masking import mask
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.report.choices import Choices, read_choices
 from epo_lightning.report.labels import value_text, word
 from epo_lightning.run_folder import RunFolder, read_json
 from epo_lightning.schema import read
 
+CHOICES = "choices="
+"""Beginning of the override that names a choices file (:mod:`epo_lightning.report.choices`)."""
 ATTEMPTS = 3
 """Number of times that the launcher of a sweep is started, if it breaks down."""
 
@@ -33,7 +36,7 @@ def run(
 
     Args:
         name: name of the file in ``sweeps/``.
-        overrides: overrides for every run.
+        overrides: overrides for every run, and ``choices=<file>`` for further overrides of single experiments.
         extra: folders that are searched for configurations first.
         task: function that does a job; at module level, because launchers send it to other processes.
         stop_on_failure: whether no more runs are started after a failure.
@@ -52,15 +55,24 @@ def run(
             )
     runs = _runs(overrides)
     sweep = Sweep.of(name, overrides, runs)
-    words = [f"sweeps={name}", *overrides]
+    files = [word for word in overrides if word.startswith(CHOICES)]
+    choices = read_choices(files[0].removeprefix(CHOICES)) if files else None
+    words = [f"sweeps={name}", *(word for word in overrides if word not in files)]
     # Absolute, because a worker on another machine may start in any folder.
     places = {"sweep": sweep.folder, "runs": sweep.root, "hydra.sweep.dir": sweep.folder}
     words += [f"{key}={value_text(str(place))}" for key, place in places.items()] + ["existing=continue"]
     words += ["hydra/hydra_logging=none"]  # the printed news replace Hydra's own log
-    jobs = _listed(sweep, words, extra)
+    jobs = _listed(sweep, words, extra, choices)
     with sweep.lock():
         states = [sweep.state(job) for job in jobs]
-        sweep.begin(name, shlex.join(mask(["epo", "sweep", name, *overrides])), overrides, jobs, stop_on_failure)
+        sweep.begin(
+            name,
+            shlex.join(mask(["epo", "sweep", name, *overrides])),
+            overrides,
+            jobs,
+            stop_on_failure,
+            choices and choices.content,
+        )
         if jobs:
             print(f"{sweep.label}: {summary(Counter(states))}", flush=True)
         with news(sweep):
@@ -78,7 +90,7 @@ def run(
     return done
 
 
-def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Job]:
+def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: Choices | None = None) -> list[Job]:
     """All runs of a sweep, each once, after a check of everything that could prevent a run from starting.
 
     Searching sweeps choose their runs later, and have none here.
@@ -88,7 +100,8 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Jo
     """
     jobs: dict[Path, Job] = {}
     ready: set[str] = set()
-    for overrides in compose.jobs("train", words, extra):
+    listed = compose.jobs("train", words, extra)
+    for overrides in _with_choices(listed, choices, extra) if choices else listed:
         config = compose.compose("train", overrides, extra)
         job = Job.of(config, overrides)
         if job.run.record_file.is_file():
@@ -105,6 +118,46 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str]) -> list[Jo
             ready.add(data)
         jobs.setdefault(job.run.path, job)
     return list(jobs.values())
+
+
+def _with_choices(listed: Sequence[list[str]], choices: Choices, extra: Sequence[str]) -> list[list[str]]:
+    """The overrides of all runs, with those that were chosen for their experiments.
+
+    Raises:
+        ConfigError: the file has an experiment or a key that does not exist, a key that the sweep or the command sets, or no
+            experiment of the sweep.
+    """
+    file = f"choices={choices.file}"
+    with compose.hydra(extra) as instance:
+        experiments = compose.options_of(instance, "experiment")
+    for experiment in choices.overrides:
+        if experiment not in experiments:
+            raise ConfigError(f"{file}: unknown experiment {experiment!r}: {nearest(experiment, experiments)}")
+    found, used = [], dict[str, str]()
+    for overrides in listed:
+        values = {key.lstrip("+~"): value for key, _, value in (given.partition("=") for given in overrides)}
+        experiment = values.get("experiment", "")
+        chosen = choices.overrides.get(experiment, ())
+        for key in (override.partition("=")[0] for override in chosen):
+            if key in values:
+                raise ConfigError(
+                    f"{key} of {experiment} is set by {file} and by the sweep or its command: leave one out"
+                )
+        if chosen and experiment not in used:
+            try:
+                compose.compose("train", [*overrides, *chosen], extra)
+            except ConfigError as error:
+                raise ConfigError(f"{file}, {experiment}: {error}") from error
+            used[experiment] = " ".join(chosen)
+        found.append([*overrides, *chosen])
+    if not used:
+        raise ConfigError(
+            f"{file} has no experiment of this sweep, only {', '.join(choices.overrides)}"
+            + ("" if listed else "; a sweep that searches its settings takes no choices")
+        )
+    for experiment in choices.overrides:
+        print(f"{file}: {experiment}: {used.get(experiment, 'not in this sweep')}", flush=True)
+    return found
 
 
 def _set_aside(run: RunFolder, settings: TrainerSettings) -> None:

@@ -1,0 +1,94 @@
+"""Choices files: the best setting of every experiment of a search, for ``epo sweep <name> choices=<file>``."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.labels import value_text
+from epo_lightning.report.selection import BestSetting
+
+HEADER = """\
+# The best settings of a search, chosen on the validation split, with the scores of all runs that were compared. Written by
+#   {command}
+# A sweep that trains its rows with them:  epo sweep <name> choices=<this file>
+"""
+OVERRIDE = re.compile(r"(goal|[a-z_]+(\.\w+)+)=.+", re.DOTALL)
+"""An override of one setting: ``optimizer.lr=0.0005``."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """A choices file.
+
+    Attributes:
+        file: path of the file, as given.
+        content: its contents.
+        overrides: the chosen overrides, by experiment.
+    """
+
+    file: str
+    content: dict[str, Any]
+    overrides: dict[str, tuple[str, ...]]
+
+
+def choices_to_yaml(best: Sequence[BestSetting], command: str) -> str:
+    """Text of a choices file; empty without an experiment that has one best setting.
+
+    An experiment that was searched several times, on several data sets or under several titles, is left out.
+    """
+    counts = Counter(entry.experiment for entry in best)
+    content = {
+        entry.experiment: {
+            "overrides": [f"{key}={value_text(value)}" for key, value in entry.settings.items()],
+            "metric": entry.metric,
+            "split": "val",
+            "data": entry.row.runs[0].data,
+            "data_digest": entry.row.data_digest,
+            "budget": entry.row.budget,
+            "runs": [str(run.path) for run in entry.row.runs],
+            "compared": {str(run.path): run.metrics[entry.metric] for row in entry.compared for run in row.runs},
+        }
+        for entry in best
+        if entry.experiment and counts[entry.experiment] == 1
+    }
+    return HEADER.format(command=command) + yaml.safe_dump(content, sort_keys=False, width=120) if content else ""
+
+
+def read_choices(file: str) -> Choices:
+    """The choices in a file.
+
+    Raises:
+        ConfigError: the file cannot be read, or an entry is not an experiment with its overrides.
+    """
+    what = "experiment names with their overrides, as `epo report <search>` writes it"
+    try:
+        content = yaml.safe_load(Path(file).expanduser().read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read choices={file}: {error.strerror}; it must be a file of {what}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"choices={file} is not YAML ({' '.join(str(error).split())}); it must have {what}"
+        ) from error
+    if not isinstance(content, dict) or not content:
+        raise ConfigError(f"choices={file} has no choices: it must have {what}")
+    found = {}
+    for experiment, entry in content.items():
+        words = entry.get("overrides") if isinstance(entry, dict) else None
+        if not isinstance(words, list) or not words:
+            raise ConfigError(f"choices={file}: {experiment} has no list `overrides`; it must have {what}")
+        for word in words:
+            if not isinstance(word, str) or not OVERRIDE.fullmatch(word):
+                raise ConfigError(
+                    f"choices={file}: {experiment} has the override {word!r}, expected a setting of a section, such as "
+                    "optimizer.lr=0.0005"
+                )
+        found[str(experiment)] = tuple(words)
+    return Choices(file, content, found)
