@@ -106,7 +106,8 @@ def distances(
 ) -> Float[Tensor, "B M N"]:
     """Mean Euclidean distance [m] of each agent's futures from the observed one, over observed steps; 0 without any.
 
-    The distance of every step is raised to ``power``; TGL uses 1.05.
+    With a ``power`` above 1, a step's distance is the mean over both coordinates of their absolute errors to that power, as
+    in TGL, which uses 1.05.
 
     Raises:
         ValueError: forecast and observation differ in the number of scenes, agents or steps.
@@ -119,9 +120,8 @@ def distances(
         )
     observed = mask[:, None]
     truth = torch.where(mask[..., None], future[..., :2], 0.0)[:, None]
-    error = torch.linalg.vector_norm(torch.where(observed[..., None], positions - truth, 0.0), dim=-1)
-    if power != 1.0:
-        error = error**power
+    offset = torch.where(observed[..., None], positions - truth, 0.0)
+    error = torch.linalg.vector_norm(offset, dim=-1) if power == 1.0 else (offset.abs() ** power).mean(-1)
     return error.sum(-1) / observed.sum(-1).clamp_min(1)
 
 

@@ -21,13 +21,13 @@ class Unaware(ConvexEnergy):
 
 
 def unaware(energy: ConvexEnergy) -> Unaware:
-    return Unaware(energy.own, energy.pair, energy.gap, energy.direction, energy.within, energy.dynamics)
+    return Unaware(energy.own, energy.pair, energy.gap, energy.direction, energy.within, energy.dynamics, energy.lane)
 
 
 def convex_energy(
-    own=OWN, direction: str = "along", gap: float = 0.5, within: float = 5.0, pair=("order",)
+    own=OWN, direction: str = "along", gap: float = 0.5, within: float = 5.0, pair=("order",), lane=None
 ) -> ConvexEnergy:
-    return ConvexEnergy(list(own), list(pair), gap, direction, within)
+    return ConvexEnergy(list(own), list(pair), gap, direction, within, lane=lane)
 
 
 def convex_game(

@@ -84,7 +84,8 @@ class EPO(Forecaster):
             the forecast cannot explain agents that act for a later goal. With more steps than the forecast, scenes may end
             their games earlier (``game_steps``). Initial strategies are decoded up to that number of steps.
         one_game: whether the modes are equilibria of one game, found from the initial strategies; its pair weights are
-            positive. Otherwise every mode has a game of its own, as in the paper.
+            positive. For energies with orders, modes differ in their orders and goals, and have the same weights (TGL).
+            Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
         pair_weights: the same for pairs; shared ones are positive.
         calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which corrects the inferred
@@ -128,7 +129,7 @@ class EPO(Forecaster):
         self.one_game = one_game
         self.game_horizon = task.horizon if game_horizon is None else game_horizon
         check_horizon(self.game_horizon, energy, objective, task)
-        check_modes(modes, one_game, energy, solver)
+        check_modes(modes, one_game, solver)
         check_initial(initial, modes, one_game, energy, solver)
         check_choice("own_weights", own_weights, WEIGHTS)
         check_choice("pair_weights", pair_weights, WEIGHTS)
@@ -171,15 +172,16 @@ class EPO(Forecaster):
             self.strategies = ZeroStrategies(strategies, horizon)
         else:
             self.strategies = Motions(horizon, strategies, **ranges)
+        order = energy.pair_order
+        goals = games if order is None else modes
         self.goals: GoalDecoder | GivenGoals | NoGoals
         if task.candidates > 1 and energy.needs & {"goals", "goal_headings", "reference"}:
-            self.goals = GoalDecoder(width, scale, games)
+            self.goals = GoalDecoder(width, scale, goals)
         elif energy.needs & {"goals", "goal_headings"}:
-            self.goals = GivenGoals(games)
+            self.goals = GivenGoals(goals)
         else:
             self.goals = NoGoals()
-        order = energy.pair_order
-        self.orders = None if order is None else Orders(width, games, order.symmetric)
+        self.orders = None if order is None else Orders(width, modes, order.symmetric)
         self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, task.horizon, scale)
         # Built last: a decoder of margins must not change the initial weights of the networks above.
         limits = check_margin(margin)
@@ -226,11 +228,19 @@ class EPO(Forecaster):
         return dataclasses.replace(scene, game_steps=steps.clamp_max(self.game_horizon) if longer else None)
 
     def _decode_orders(self, z: Tensor, scene: Scene) -> DecodedOrders | None:
-        """The most likely orders of the pairs; None for energies without orders."""
+        """The most likely orders of the pairs; None for energies without orders.
+
+        During training, objectives that imitate take the observed orders where they are known, in all modes: the closest of
+        the decoded orders may be another one. Modes then differ in their goals alone. The decoder learns from its logits.
+        """
         order = self.energy.pair_order
         if self.orders is None or order is None:
             return None
-        return self.orders(z, scene.agent_mask, order.matters(scene, self.task.horizon))
+        decoded = self.orders(z, scene.agent_mask, order.matters(scene, self.task.horizon))
+        if not (self.training and self.objective.observed_orders and scene.future is not None):
+            return decoded
+        observed, known = order.observed(scene)
+        return decoded._replace(order=torch.where(known[:, None], observed[:, None].to(decoded.order), decoded.order))
 
     def _infer_game(self, z: Tensor, scene: Scene, goals: Goals, orders: DecodedOrders | None) -> GameParameters:
         """The game of every mode: decoded weights and initial strategies, with its goals and orders.
@@ -245,14 +255,20 @@ class EPO(Forecaster):
                 "the energy has a feature of the headings wanted at goals, but scene.goal_headings [B, N, G] is None: "
                 "leave the feature out of energy.own, or choose data with goal headings"
             )
-        own_weights = self.own_weights(z, scene.agent_mask)
+        own_weights, pair_weights = self.own_weights(z, scene.agent_mask), self.pair_weights(z)
+        if orders is not None:
+            # One set of weights may be that of all orders.
+            own_weights, pair_weights = (
+                {name: weight.expand(-1, self.modes, -1) for name, weight in weights.items()}
+                for weights in (own_weights, pair_weights)
+            )
         # Agents without a goal have the position (0, 0) for it: zero goal weights keep it from attracting them.
         for name in self.energy.goal_terms & own_weights.keys():
             own_weights[name] = own_weights[name].where(goals.exist[:, None], 0.0)
         strategies = self.strategies(z, scene)
         return GameParameters(
             own_weights=own_weights,
-            pair_weights=self.pair_weights(z),
+            pair_weights=pair_weights,
             initial_controls=strategies,
             goals=goals.positions,
             reference=goals.reference,

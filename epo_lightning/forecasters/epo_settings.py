@@ -65,18 +65,18 @@ def check_horizon(game_horizon: int, energy: Energy, objective: Objective, task:
         )
 
 
-def check_modes(modes: int, one_game: bool, energy: Energy, solver: Minimiser) -> None:
-    """Refuse a number of modes below one, and one game for all modes where the modes are choices or orders.
+def check_modes(modes: int, one_game: bool, solver: Minimiser) -> None:
+    """Refuse a number of modes below one, and one game for all modes where the modes are choices.
 
     Raises:
         ConfigError: see above.
     """
     if modes < 1:
         raise ConfigError(f"forecaster.modes must be 1 or more, not {modes}")
-    if one_game and (TABLES in solver.provides or energy.pair_order is not None):
+    if one_game and TABLES in solver.provides:
         raise ConfigError(
-            "forecaster.one_game=true needs a solver that begins at initial strategies, and an energy without orders of "
-            "pairs: choices among candidates and orders are modes of one game already"
+            "forecaster.one_game=true needs a solver that begins at initial strategies: choices among candidates are modes "
+            "of one game already"
         )
 
 
@@ -87,7 +87,7 @@ def check_initial(initial: str, modes: int, one_game: bool, energy: Energy, solv
         ConfigError: see above, or motions of another model than the unicycle.
     """
     check_choice("initial", initial, INITIAL)
-    if one_game and initial == "zero" and solver.strategies(modes) > 1:
+    if one_game and initial == "zero" and solver.strategies(modes) > 1 and energy.pair_order is None:
         raise ConfigError(
             "all modes would be the same: forecaster.one_game=true gives them one game, and forecaster.initial=zero one "
             "start. Use solver=both_sides, which finds several equilibria from one start, or initial=decoded"

@@ -8,6 +8,8 @@ likely orders (:mod:`epo_lightning.decoders.orders`). Differences from their gam
   that is zero where the order is kept by a distance, and driving backwards is possible.
 - They have two vehicles in the frame of a lane. Here N agents move in the plane, and the distance of a pair is measured
   along a direction that the present states fix.
+- Their distance term acts from the time of the merge on, which they predict. Here, with a ``lane`` width, it acts at the
+  steps at which both agents would be in one lane if they went straight to the lateral positions of their goals.
 - Their distance term -alpha / (0.1 + d^2) and smooth maximum at the end of the lane are left out, their desired speed is the
   scene's reference speed, and their lane centre is the line through the goal along the present heading.
 - Their weights are made positive by elu(.) + 1 + 1e-5; here weights enter squared, accelerations across have a floor of
@@ -141,7 +143,9 @@ class ConvexEnergy(Energy):
     The pair term ``order`` keeps a distance d_ij, half the sum of both lengths plus a gap, on one side: with s_ij = +1 agent
     i should be ahead of agent j in the direction n_ij, with -1 behind (:class:`~epo_lightning.game.pair_order.PairOrder`
     defines n_ij). a_t is 1 for the steps at which both agents would be near each other at constant velocity, and 0 for the
-    others, because the order of agents that are far apart does not matter.
+    others, because the order of agents that are far apart does not matter. With ``lane``, a_t is also 0 while the agents are
+    farther apart than this across n_ij, on straight lines from their positions at t0 to their goals. a_t does not depend on
+    the controls, so the energy stays convex.
 
     Attributes:
         own: names as above. ``acc`` (weight 1, not decoded) and ``lat_acc`` are mandatory: they make the energy strictly
@@ -151,6 +155,7 @@ class ConvexEnergy(Energy):
         direction: ``along`` or ``across``, the meaning of an order.
         within: distance [m] up to which agents are near each other.
         dynamics: a :class:`~epo_lightning.game.double_integrator.DoubleIntegrator`.
+        lane: lateral distance [m] up to which agents are in one lane; None for no such condition. It needs goals.
     """
 
     offers = frozenset({GRADIENT, RESIDUALS})
@@ -161,6 +166,7 @@ class ConvexEnergy(Energy):
     direction: str = ALONG
     within: float = 20.0
     dynamics: Any = field(default_factory=DoubleIntegrator)  # Any, so that others are refused below with a reason
+    lane: float | None = None
 
     def __post_init__(self) -> None:
         check_names("own", self.own, _OWN, "term")
@@ -175,6 +181,12 @@ class ConvexEnergy(Energy):
             )
         check_number("energy.gap [m]", self.gap, zero=True)
         check_number("energy.within [m]", self.within, finite=False)
+        if self.lane is not None:
+            check_number("energy.lane [m]", self.lane)
+            if not self.goal_terms:
+                raise ConfigError(
+                    "energy.lane needs goals: name goal or lateral in energy.own, or set energy.lane to null"
+                )
         if not isinstance(self.dynamics, DoubleIntegrator):
             raise ConfigError(
                 f"energy=convex is convex only for linear dynamics: it needs dynamics=double_integrator, "
@@ -336,6 +348,9 @@ class ConvexEnergy(Energy):
         ahead = (self.pair_order.directions(scene)[:, None, :, None] * (first - second)[..., :2]).sum(-1)
         short = torch.relu(self.distance(scene)[:, None, :, None] - order * ahead)
         counts = (self.pair_order.near(scene, first.shape[3]) & exists[:, 0, :, None])[:, None]
+        if self.lane is not None:
+            assert parameters.goals is not None
+            counts = counts & self.pair_order.in_one_lane(scene, parameters.goals, first.shape[3], self.lane)
         return torch.where(counts, short, 0.0)
 
     def distance(self, scene: Scene) -> Float[Tensor, "B P"]:

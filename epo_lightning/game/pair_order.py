@@ -71,6 +71,19 @@ class PairOrder:
         position = initial[..., None, :2] + time[:, None] * (initial[..., SPEED, None] * axis)[..., None, :]
         return (position[:, first] - position[:, second]).square().sum(-1) <= self.within**2
 
+    def in_one_lane(
+        self, scene: Scene, goals: Float[Tensor, "B M N 2"], steps: int, lane: float
+    ) -> Bool[Tensor, "B M P K"]:
+        """The steps 1 .. K at which both agents, on straight lines to their goals, are within ``lane`` [m] across n_ij."""
+        present = scene.agent_mask[:, None, :, None]
+        start, goals = torch.where(present, _initial(scene)[:, None, :, :2], 0.0), torch.where(present, goals, 0.0)
+        first, second = pairs(goals.shape[2], goals.device)
+        ahead = self.directions(scene)[:, None]
+        aside = torch.stack((-ahead[..., 1], ahead[..., 0]), -1)
+        before, after = (((at[:, :, first] - at[:, :, second]) * aside).sum(-1, keepdim=True) for at in (start, goals))
+        share = torch.arange(1, steps + 1, dtype=goals.dtype, device=goals.device) / steps
+        return (before + share * (after - before)).abs() <= lane
+
     def matters(self, scene: Scene, steps: int) -> Bool[Tensor, "B P"]:
         """The pairs whose order matters: both agents are present, and near each other at one step 1 .. K at least."""
         return pair_mask(scene) & self.near(scene, steps).any(-1)

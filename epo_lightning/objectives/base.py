@@ -23,6 +23,8 @@ class Objective(ABC):
 
     Attributes:
         term_names: names of the terms, which are also the names of the weights lambda in the configuration.
+        observed_orders: whether games are solved with the observed orders of agents during training, where the energy has
+            orders: the games of orders that were not observed have no observed solution.
         through_solution: whether it needs the derivative of the minimiser's solution; otherwise it uses energies alone.
         needs_from_solver: properties (:mod:`epo_lightning.solvers.base`) of which the minimiser must provide at least one;
             empty if nothing is needed.
@@ -31,6 +33,7 @@ class Objective(ABC):
 
     term_names: ClassVar[tuple[str, ...]]
     through_solution: ClassVar[bool] = False
+    observed_orders: ClassVar[bool] = False
     needs_from_solver: ClassVar[frozenset[str]] = frozenset()
     needs_from_energy: ClassVar[frozenset[str]] = frozenset()
     weights: Mapping[str, float]

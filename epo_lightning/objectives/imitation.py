@@ -27,13 +27,14 @@ class Imitation(Objective):
             solution (``truncated``, ``implicit``). If games go on after the forecast, it also compares the initial controls
             after the forecast with those of the solution, because there are no data for them. If orders of agents are
             decoded, ``probability`` is their cross entropy.
-        power: exponent of the distances; the paper's is 1, TGL's 1.05.
+        power: 1 for the paper's Euclidean distances; above 1 the exponent of both coordinates' absolute errors, 1.05 in TGL.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
     """
 
     term_names = ("imitation", "goal", "probability", "initial")
     through_solution = True
+    observed_orders = True
 
     def __init__(
         self,

@@ -43,7 +43,7 @@ def test_probabilities_of_modes_are_products_of_orders_and_goals(agents):
     scene = highway_scene(6, agents)
     scene.agent_mask[0, 0] = agents == 1  # one agent is absent, another one has no candidate
     scene.goal_mask[1, 0] = False
-    forecaster = tgl(5)
+    forecaster = tgl(5).eval()  # while training, orders are the observed ones
     forecast = forecaster(scene)
     assert isinstance(forecaster.energy, ConvexEnergy)
     matter = forecaster.energy.pair_order.matters(scene, 8)

@@ -187,6 +187,24 @@ class TGL(_Row):
     row = "tgl"
     learned = ("probability", "initial")
 
+    def test_the_modes_of_a_scene_have_the_same_weights(self):
+        """TGL predicts preferences once for all orders."""
+        game = self.forecaster().train()(self.scene(6)).parameters
+        for name, weight in (*game.own_weights.items(), *game.pair_weights.items()):
+            assert torch.equal(weight, weight[:, :1].expand_as(weight)), name
+            assert len(weight[:, 0].unique()) > 2, name
+
+    def test_games_are_taught_in_the_observed_order(self):
+        forecaster, scene = self.forecaster(), self.scene(16)
+        observed, known = forecaster.energy.pair_order.observed(scene)
+        assert known.any()
+        known = known[:, None].expand(-1, self.modes, -1)
+        given = forecaster.train()(scene).parameters.order[known]
+        assert torch.equal(given, observed[:, None].expand(-1, self.modes, -1)[known])
+        decoded = forecaster.eval()(scene).parameters.order
+        assert not torch.equal(decoded[known], given)
+        assert forecaster.train().predict(dataclasses.replace(scene, future=None, future_mask=None)) is not None
+
 
 class EBIOC(Sampled):
     """EBIOC with chains of four steps: some updates lower the energy of the observed future, but not the error."""

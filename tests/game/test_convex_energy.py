@@ -76,7 +76,10 @@ def by_loops(energy, scene, game, b, m):
                 free = math.hypot(
                     xi + t * velocity[0][0] - xj - t * velocity[1][0], yi + t * velocity[0][1] - yj - t * velocity[1][1]
                 )
-                if free <= energy.within:
+                offsets = [(xi - xj, yi - yj), (game.goals[b, m, i] - game.goals[b, m, j]).tolist()]
+                before, after = (n[0] * y - n[1] * x for x, y in offsets)
+                beside = abs(before + (k + 1) / steps * (after - before))
+                if free <= energy.within and (energy.lane is None or beside <= energy.lane):
                     (px, py), (qx, qy) = places[i][k], places[j][k]
                     ahead_by = game.order[b, m, pair].item() * (n[0] * (px - qx) + n[1] * (py - qy))
                     total += 0.5 * (game.pair_weights["order"][b, m, pair].item() * max(0.0, keep - ahead_by)) ** 2
@@ -84,10 +87,11 @@ def by_loops(energy, scene, game, b, m):
     return total
 
 
+@pytest.mark.parametrize("lane", [None, 0.7])
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_energy_equals_loops_over_agents_and_steps(direction):
+def test_energy_equals_loops_over_agents_and_steps(direction, lane):
     scene, game = convex_game()
-    energy = convex_energy(direction=direction, within=2.0)
+    energy = convex_energy(direction=direction, within=2.0, lane=lane)
     values = energy(scene, game, game.initial_controls)
     expected = [[by_loops(energy, scene, game, b, m) for m in range(2)] for b in range(2)]
     torch.testing.assert_close(values, torch.tensor(expected, dtype=torch.float64), rtol=1e-12, atol=0)
@@ -254,6 +258,20 @@ def test_candidates_of_one_game_add_up():
     torch.testing.assert_close(total[:, None], energy(scene, game, chosen), rtol=1e-12, atol=0)
 
 
+def test_the_order_counts_from_the_merge_on():
+    """A vehicle beside another one is in its lane, 3.5 m away, when the last 2.5 m of the change begin."""
+    scene, game = convex_game(1, 2, 1, 10)
+    place = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 3.5, 0.0, 0.0]], dtype=torch.float64)
+    scene = dataclasses.replace(scene, history=place[None, :, None].expand(1, 2, 2, 4))
+    goals = torch.tensor([[9.0, 0.0], [20.0, 0.0]], dtype=torch.float64)
+    game = dataclasses.replace(game, goals=goals[None, None], initial_controls=torch.zeros_like(game.initial_controls))
+    found = {}
+    for lane in (None, 2.5):
+        order = convex_energy(lane=lane).residuals(scene, game, game.initial_controls)["order"]
+        found[lane] = (order[0, 0, 0] != 0).tolist()
+    assert found == {None: [True] * 10, 2.5: [False] * 2 + [True] * 8}
+
+
 def test_the_weight_of_accelerations_is_not_decoded():
     energy = convex_energy()
     assert "acc" not in energy.weighted[0]
@@ -281,7 +299,7 @@ def test_configurations_can_be_built(name):
     dynamics = yaml.safe_load((tree() / "conf" / "dynamics" / "double_integrator.yaml").read_text())
     energy = build("energy", config, dynamics=build("dynamics", dynamics))
     assert isinstance(energy, ConvexEnergy)
-    assert set(config) == {"name", "own", "pair", "gap", "direction", "within"}
+    assert set(config) - {"lane"} == {"name", "own", "pair", "gap", "direction", "within"}
 
 
 @pytest.mark.parametrize(
@@ -297,6 +315,8 @@ def test_configurations_can_be_built(name):
         ({"gap": float("nan")}, r"energy.gap \[m\] must be a number, 0 or more, and finite, not nan"),
         ({"within": 0.0}, r"energy.within \[m\] must be a number, positive, not 0.0"),
         ({"within": float("nan")}, r"energy.within \[m\] must be a number, positive, not nan"),
+        ({"lane": 0.0, "own": ["acc", "lat_acc", "goal"]}, r"energy.lane \[m\] must be a number, positive"),
+        ({"lane": 2.5}, r"energy\.lane needs goals: name goal or lateral in energy\.own"),
         ({"dynamics": Unicycle()}, "dynamics=double_integrator, not Unicycle"),
     ],
 )

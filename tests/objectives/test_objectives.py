@@ -131,12 +131,14 @@ def test_annealed_contrastive_terms_are_sums_over_modes_by_their_shares() -> Non
 
 def test_imitation_takes_the_closest_mode_and_a_share_of_all_with_distances_to_a_power():
     scene = random_scene(1, 2, horizon=3)
-    offset = torch.tensor([2.0, 1.0])[:, None, None, None] * torch.tensor([1.0, 0.0, 0.0, 0.0])
+    offset = torch.tensor([2.0, 1.0])[:, None, None, None] * torch.tensor([0.6, -0.8, 0.0, 0.0])
     forecast = JointForecast(scene.future[:, None] + offset, torch.tensor([[0.75, 0.25]]))
     weights = {"imitation": 1.0, "probability": 0.1}
     for relaxation, power in ((0.0, 1.0), (0.5, 1.0), (0.0, 2.0), (0.5, 2.0)):
         terms = imitation_terms(scene, forecast, weights, relaxation, power)
-        far, closest = 2.0**power, 1.0
+        # Euclidean, or the mean of both coordinates to the power.
+        both = 1.0 if power == 1.0 else (0.6**power + 0.8**power) / 2
+        far, closest = 2.0**power * both, both
         expected = (1 - relaxation) * closest + relaxation * (far + closest) / 2
         assert terms["imitation"][1].item() == pytest.approx(expected, rel=1e-5)
         assert terms["probability"][1].item() == pytest.approx(-math.log(0.25), rel=1e-5)
