@@ -71,7 +71,7 @@ def run(
             overrides,
             jobs,
             stop_on_failure,
-            choices and choices.content,
+            choices.content if choices else None,
         )
         if jobs:
             print(f"{sweep.label}: {summary(Counter(states))}", flush=True)
