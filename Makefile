@@ -92,7 +92,7 @@ test-slow: $(TESTABLE)
 	$(BIN)/python -m pytest -m slow
 
 smoke: $(TESTABLE)
-	$(BIN)/python -m pytest tests/experiment/test_smoke.py
+	$(BIN)/python -m pytest -m 'slow or not slow' tests/experiment/test_smoke.py
 
 # The kernel under AddressSanitizer and UndefinedBehaviorSanitizer, in a library of its own, built by Clang. One test limits the
 # address space, of which the sanitizers reserve terabytes.

@@ -173,15 +173,16 @@ class EPO(Forecaster):
         else:
             self.strategies = Motions(horizon, strategies, **ranges)
         order = energy.pair_order
-        goals = games if order is None else modes
+        # Orders and goals of the modes are variants of one game, unless the solver chooses the modes itself.
+        variants = games if order is None or TABLES in solver.provides else modes
         self.goals: GoalDecoder | GivenGoals | NoGoals
         if task.candidates > 1 and energy.needs & {"goals", "goal_headings", "reference"}:
-            self.goals = GoalDecoder(width, scale, goals)
+            self.goals = GoalDecoder(width, scale, variants)
         elif energy.needs & {"goals", "goal_headings"}:
-            self.goals = GivenGoals(goals)
+            self.goals = GivenGoals(variants)
         else:
             self.goals = NoGoals()
-        self.orders = None if order is None else Orders(width, modes, order.symmetric)
+        self.orders = None if order is None else Orders(width, variants, order.symmetric)
         self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, task.horizon, scale)
         # Built last: a decoder of margins must not change the initial weights of the networks above.
         limits = check_margin(margin)
@@ -258,8 +259,9 @@ class EPO(Forecaster):
         own_weights, pair_weights = self.own_weights(z, scene.agent_mask), self.pair_weights(z)
         if orders is not None:
             # One set of weights may be that of all orders.
+            variants = orders.order.shape[1]
             own_weights, pair_weights = (
-                {name: weight.expand(-1, self.modes, -1) for name, weight in weights.items()}
+                {name: weight.expand(-1, variants, -1) for name, weight in weights.items()}
                 for weights in (own_weights, pair_weights)
             )
         # Agents without a goal have the position (0, 0) for it: zero goal weights keep it from attracting them.

@@ -95,6 +95,7 @@ def test_dashboards_name_missing_data(tmp_path):
     assert "epo generate" in refused(dashboards.main, "--data", "data=rpi", f"data.root={tmp_path}")
 
 
+@pytest.mark.slow
 def test_extraction_is_timed(capsys):
     extraction.main([str(FIXTURE), "--recordings", "1", "--batches", "2"])
     shown = capsys.readouterr().out

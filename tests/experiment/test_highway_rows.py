@@ -78,6 +78,7 @@ def test_old_names_work_in_globs_and_sweeps() -> None:
     assert {config["data"]["dataset"] for config in main} == {"us101"}
 
 
+@pytest.mark.slow  # tests/docs/test_docs_tutorial.py goes the same way
 def test_rows_from_recordings_to_the_table(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert epo("generate", "data=exid", *DATA, "progress=false", "workers=1") == 0
     (following,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]

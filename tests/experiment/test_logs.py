@@ -173,6 +173,7 @@ def test_scores_on_the_test_split_reach_the_dashboard(epo: Epo) -> None:
 # W&B
 
 
+@pytest.mark.slow
 def test_every_run_of_a_sweep_has_its_own_id_name_configuration_and_summary_in_wandb(epo: Epo) -> None:
     assert epo("train", "-m", ROW, *TINY, *WANDB, "seed=0,1") == 0
     runs = [str(run.path) for run in discover("runs")]
