@@ -53,6 +53,18 @@ def test_the_page_has_the_scores_of_the_inferred_game() -> None:
         assert line_of(start)[:2] == shown, title
 
 
+def test_the_page_has_the_scores_of_the_refined_game() -> None:
+    report = read_results(ROOT / "results" / "game_refined.json")
+    rows = {row.title: row for row in distinct(build_tables(report.evaluated))}
+    for title, start, place in (
+        ("V-LSTM + EPO, game, refined by S = 2", "| V-LSTM + EPO, game, refined by S = 2 |", 0),
+        ("V-LSTM + EPO, game, refined by S = 2, no pair", "| the same without its pair term, trained so |", 1),
+    ):
+        cells = [rows[title].cells[metric] for metric in ("minSADE", "minSFDE")]
+        shown = [f"{short(cell.mean, 4)} ± {short(cell.deviation or 0, 4)}" for cell in cells]
+        assert line_of(start, place)[:2] == shown, title
+
+
 def test_the_page_has_the_scores_of_solved_games_on_highways() -> None:
     report = read_results(ROOT / "results" / "highway_sim_dense_equilibrium.json")
     found: dict[str, list[float]] = {}
