@@ -56,8 +56,8 @@ class Annealing:
     those of farther modes shrink, and in the end the closest mode has all of it. This is the loss of Xu et al.
     (Annealed Winner-Takes-All for Motion Forecasting, arXiv 2409.11172), whose temperatures start at about 10 and fall by a
     factor of 0.834 per epoch, with two differences. The fall is geometric too, but counted in optimisation steps. And h,
-    which is quadratic below T and nearly d far above it, takes the place of d: with d itself, a mode at the likelier of two
-    alternatives would be pulled to it equally hard however close it is, and would not leave.
+    which is quadratic below T and nearly d far above it, takes the place of d: with d itself, the pull does not weaken
+    close to an alternative, so that a mode at the likelier one would never leave it for the other.
 
     Attributes:
         temperature: T [m] at the first step; 0 is the paper's loss. Useful values are below half the distance between

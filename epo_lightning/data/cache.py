@@ -75,8 +75,8 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         RuntimeError: a worker process executes the script that started it, as the script lacks a ``__main__`` guard.
     """
-    # Python itself complains only when such a worker starts a process. Before that, the worker would wait for ever for the
-    # lock of its parent.
+    # Such a worker would wait here for ever for the lock of its parent: the error of Python itself comes only later, when
+    # the worker starts a process.
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise RuntimeError("a script that generates data must do so below `if __name__ == '__main__':`")
     with writing(folder.parent):

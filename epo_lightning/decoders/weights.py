@@ -55,7 +55,7 @@ class SharedWeights(nn.Module):
     """Weights of features that all agents or pairs, modes and scenes share: one learned number for each feature.
 
     For populations whose agents differ only in how they weigh each other, as in RPI: a single history
-    does not determine these weights, but all scenes together do. EBIOC shares the weights of pairs as well.
+    does not determine the shared weights, but all scenes together do. EBIOC shares the weights of pairs as well.
 
     Args:
         games: number M of games: one per joint mode, or a single one.

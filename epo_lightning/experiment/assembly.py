@@ -243,7 +243,7 @@ def signals() -> Iterator[None]:
     def end(*_: object) -> None:
         nonlocal told
         told = True
-        # If another handler is installed, it is Lightning's: it has called this one, and Lightning ends the training.
+        # During a fit, Lightning's handler is installed; it calls this one, and Lightning then ends the training itself.
         if signal.getsignal(signal.SIGTERM) is end:
             raise SIGTERMException(128 + signal.SIGTERM)
 

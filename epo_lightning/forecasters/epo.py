@@ -81,15 +81,15 @@ class EPO(Forecaster):
         control_scale: initial control at a network output of one.
         motions: largest ``acceleration`` [m/s^2] and ``curvature`` [1/m] of initial motions.
         game_horizon: number of steps of the game, of which the forecast is the first K; None for K. A game that ends with
-            the forecast cannot explain agents that act for a later goal. With more steps than the forecast, scenes may end
-            their games earlier (``game_steps``). Initial strategies are decoded up to that number of steps.
+            the forecast cannot explain agents that act for a later goal. If it is above K,
+            ``Scene.game_steps`` may end a scene's game earlier. Initial strategies have ``game_horizon`` steps.
         one_game: whether the modes are equilibria of one game, found from the initial strategies; its pair weights are
-            positive. For energies with orders, modes differ in their orders and goals, and have the same weights (TGL).
+            positive. With an energy of orders (which agent of a pair is ahead), modes differ in orders and goals (TGL).
             Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
         pair_weights: the same for pairs; shared ones are positive.
-        calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which corrects the inferred
-            pair weights by the history outside training; None for no correction.
+        calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which, outside
+            training, corrects the inferred pair weights so that the game explains the history; None for no correction.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
             (:mod:`~epo_lightning.decoders.probabilities`).
         margin: ``largest`` margin [m] of pair features with a decoded margin, and the margin before training, ``start``;
@@ -134,7 +134,7 @@ class EPO(Forecaster):
         check_choice("own_weights", own_weights, WEIGHTS)
         check_choice("pair_weights", pair_weights, WEIGHTS)
         check_calibration(calibration, energy, solver)
-        # The network decodes probabilities unless the energies of choices among candidates (TABLES) or orders define them.
+        # The network decodes probabilities, except where they follow from energies of candidates (TABLES) or from orders.
         defined = TABLES in solver.provides or energy.pair_order is not None
         check_probabilities(probabilities)
         check_decodes_probabilities(probabilities, energy, solver)
@@ -231,8 +231,9 @@ class EPO(Forecaster):
     def _decode_orders(self, z: Tensor, scene: Scene) -> DecodedOrders | None:
         """The most likely orders of the pairs; None for energies without orders.
 
-        During training, objectives that imitate take the observed orders where they are known, in all modes: the closest of
-        the decoded orders may be another one. Modes then differ in their goals alone. The decoder learns from its logits.
+        During training, objectives that imitate take the observed orders where they are known, in all modes, because
+        no decoded order may be the observed one. Modes then differ in their goals alone. The decoder learns by the cross
+        entropy of its logits.
         """
         order = self.energy.pair_order
         if self.orders is None or order is None:
@@ -286,9 +287,9 @@ class EPO(Forecaster):
         return self.solver if self.training else self.solver.for_test()
 
     def _without_noise(self, solution: Solution, scene: Scene, parameters: GameParameters) -> Solution:
-        """The solution that is the forecast: for samples, the end of the same steps without noise, also in training.
+        """The solution that is the forecast. A sampling solver is run again without noise, also in training.
 
-        So the probabilities of modes are learned on the forecasts that they are decoded for outside training.
+        So probabilities are learned on forecasts like those outside training.
         """
         if SAMPLES not in self._minimiser.provides:
             return solution

@@ -76,7 +76,7 @@ class Energy(ABC):
         """Inputs of the terms, which the scene or the decoded parameters supply.
 
         Some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``reference_controls``, ``size``,
-        ``context`` and ``order``. Pair terms that use the sizes of agents read ``scene.size``, which ``validate`` checks.
+        ``context`` and ``order``. Sizes that only pair terms use are not listed; ``validate`` checks that they are there.
         """
         return set()
 

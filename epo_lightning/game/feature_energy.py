@@ -67,9 +67,9 @@ class FeatureEnergy(Energy):
         pair_stride: steps between evaluations of pair features: they are evaluated at k = stride, 2 stride, ...
         margins: fixed margins [m] of pair features, ``{"clearance": 0.5}``; those of other features with a margin are
             ``parameters.margins``.
-        lane_slides: whether the nearest point of a line moves along the line with the agent in the Jacobian of ``lane``,
-            which is the exact derivative. Otherwise it is held: then motion along the line seems to have a cost, so
-            Gauss-Newton steps are shorter, but they lead to the same solution.
+        lane_slides: true if the nearest point of a line moves with the agent in the Jacobian of ``lane``, which is the exact
+            derivative. Otherwise the point is held: motion along the line then seems to have a cost, so Gauss-Newton steps
+            are shorter, but they lead to the same solution.
 
     A game of ``scene.game_steps`` steps has no terms after its end (:mod:`~epo_lightning.game.game_end`).
     """
@@ -439,7 +439,7 @@ class FeatureEnergy(Energy):
         return torch.where(exists, parameters.margins[name], 0.0)
 
     def extent(self, scene: Scene) -> Float[Tensor, "B N"] | None:
-        """Largest distance [m] at which agents affect others, without margins; None if a pair feature has no limit."""
+        """Radius [m] in which an agent can affect others, without margins; None if a pair feature has no limit."""
         extents = [feature.extent for feature in self.pair_features.values()]
         finite = [extent(self.size(scene)) for extent in extents if extent is not None]
         return torch.stack(finite).amax(0) if len(finite) == len(extents) else None

@@ -26,7 +26,7 @@ def observed_future(scene: Scene) -> tuple[Float[Tensor, "B N K 4"], Bool[Tensor
 
 def goal_term(scene: Scene, forecast: JointForecast, weight: float) -> Terms:
     """The term L_goal for forecasters that choose among goal candidates; no term for others."""
-    if forecast.goal_log_probabilities is None:
+    if forecast.goal_log_probabilities is None:  # from the logits, as all log-probabilities of a forecast
         return {}
     future, mask = observed_future(scene)
     final, observed = future[:, :, -1, :2], mask[:, :, -1]

@@ -240,6 +240,7 @@ def _add_steering(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
     sums.control_gradient[:, :, TURN_RATE] += scaled * by_turn_rate
     sums.control[:, :, TURN_RATE] += curvature[0]
     # The steering angle of a step depends on the speed at the node before the step. The initial speed is not an unknown.
+    # Entry l of an array of nodes is node l + 1, and a turn rate is the difference of two headings, divided by dt.
     sums.node_gradient[:, :, 0, :-1] += (scaled * by_speed)[..., 1:]
     sums.node[:, :, 0, :-1] += curvature[2][..., 1:]
     cross = curvature[1][..., 1:] / at.dt

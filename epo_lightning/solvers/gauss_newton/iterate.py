@@ -100,7 +100,7 @@ class Iterate:
 
     @property
     def beta(self) -> float:
-        """Weight of the velocity before a step in the position after it (:class:`~epo_lightning.game.dynamics.Unicycle`)."""
+        """A step moves by dt (beta velocity before + (1 - beta) velocity after)."""
         return self.energy.dynamics.beta
 
     @property

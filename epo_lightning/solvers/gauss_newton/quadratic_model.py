@@ -5,11 +5,11 @@ l >= l'
 
     M_l^T [dt^2 sum_{k>l} Q_k] M_l',   Q_k the second derivatives by p_k,
 
-so the lower triangle of this part equals that of a product A B^T, where A and B have a row for each unknown and two columns
-(x and y) for each agent. All other contributions are
-banded matrices: controls are first differences of z, their rates second differences, speeds contribute to the diagonal, and
-a steering angle couples a turn rate with the speed before it. The model holds the second derivatives by these quantities;
-:mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and factorises the matrix.
+where Q_k couples the agents. So the lower triangle of this part equals that of a product A B^T, where A and B have a row for
+each unknown and two columns (x and y) for each agent: a row of B has M_l' in the columns of its own agent. All other
+contributions are banded matrices: controls are first differences of z, their rates second differences, speeds contribute to
+the diagonal, and a steering angle couples a turn rate with the speed before it. The model holds the second derivatives by
+these quantities; :mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and factorises the matrix.
 
 Pairs are a list of E edges between agents. Agent i of problem s has the number s N + i.
 """

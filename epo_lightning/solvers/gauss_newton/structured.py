@@ -3,7 +3,7 @@
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Read this module in this order: :func:`solve` takes
 the steps, :class:`_Step` is one step with its adjoint, :func:`factorise` prepares the solution for d. The matrix is
 factorised in other unknowns than u, the *nodes*: speed and heading after every step (:mod:`.iterate`). Shapes: S problems
-(a scene in a mode), N agents, K steps, E pairs that are evaluated, C sets of agents that are factorised together.
+(a scene in a mode), N agents, K steps, E pairs that are evaluated, C components of one size.
 
 *Splitting.* Two agents are coupled if a pair feature of theirs is not zero; agents that no such pairs connect are
 independent. On a CPU every problem is split into the connected components of its coupled pairs, and components of the same
@@ -71,7 +71,7 @@ def solve(
         steps: number of optimisation steps.
         step_size: alpha.
         damping: lambda of every problem, or of every agent; infinite damping keeps the agent's controls exactly.
-        keep_iterates: whether the solution carries u_0 .. u_S.
+        keep_iterates: whether the solution carries all iterates, from the initial to the last.
         exact: whether the steps use the Hessian (Newton steps); they have no derivative.
         split: whether problems are split into components; by default, on a CPU.
     """
@@ -224,7 +224,7 @@ class Factorisation:
 
     Attributes:
         model: the quadratic model.
-        groups: the sets of agents that were factorised together.
+        groups: components of equal size, each group factorised in one batch.
         factors: the factors of each group.
         status: a :class:`Status` per problem.
         held: mask of the agents with infinite damping; None where damping is given per problem.
