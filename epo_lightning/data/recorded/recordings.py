@@ -330,7 +330,8 @@ class RecordedData(SceneDataModule):
         if names := altered(identity, self.identity(recordings)):
             shutil.rmtree(work, ignore_errors=True)
             raise ConfigError(f"files of {names[0]} have changed while they were read: give the command again")
-        warn_of_copies(recordings, identity)
+        if isinstance(identity, list):  # simulated recordings are identified by their settings instead
+            warn_of_copies(recordings, identity)
         extracted = parts.extracted()
         problems = {name: one.problem for name, one in extracted.items() if one.problem is not None}
         used = [source for source in recordings if source.name not in problems]
