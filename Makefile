@@ -4,6 +4,7 @@
 # make lint        check style and types
 # make smoke       train every experiment for a few steps on drawn scenes (a minute)
 # make docs        build the documentation as a site, with references of API and configuration, in build/docs
+# make tables      write docs/tables anew from the results files in results/
 # make checkpoint  train the checkpoint that ships with the package anew (five minutes)
 # make asan        test the kernel with the sanitizers of addresses and undefined behaviour (Clang, Linux)
 # make wheel       build a package for this platform, with the compiled layer, in dist/
@@ -25,7 +26,7 @@ INSTALLED := $(VENV)/.installed
 DOCUMENTABLE := $(VENV)/.documentable
 TESTABLE := $(VENV)/.testable
 
-.PHONY: run install test test-slow smoke asan lint docs checkpoint wheel clean
+.PHONY: run install test test-slow smoke asan lint docs tables checkpoint wheel clean
 
 install: $(INSTALLED)
 
@@ -121,6 +122,13 @@ lint: $(TESTABLE)
 # -W: a reference that leads nowhere ends it. BUILDER=dummy checks the site without writing it.
 docs: $(DOCUMENTABLE)
 	$(BIN)/python -m sphinx -q -W --keep-going -j auto -b $(BUILDER) docs build/docs
+
+tables: $(patsubst results/%.json,docs/tables/%/results.md,$(wildcard results/*.json))
+
+docs/tables/%/results.md: results/%.json $(INSTALLED)
+	$(EPO) report results=$< out=build/tables/$* > /dev/null
+	rm -rf $(@D) && mkdir -p $(@D)
+	cp -r build/tables/$*/*.md $$(ls -d build/tables/$*/figures 2> /dev/null) $(@D)
 
 checkpoint: $(INSTALLED)
 	$(EPO) generate data=rpi_hard_reduced data.placements=8

@@ -258,7 +258,7 @@ def to_markdown(table: Table | Sheet) -> str:
     rule = "|" + ":--|" * left + "--:|" * (len(header) - left)
     rows = ["| " + " | ".join(line) + " |" for line in (header, *lines)]
     note = ["", _plain(table.note)] if isinstance(table, Sheet) and table.note else []
-    return "\n".join([f"### {_plain(table.title)}", "", rows[0], rule, *rows[1:], *note]) + "\n"
+    return "\n".join([f"## {_plain(table.title)}", "", rows[0], rule, *rows[1:], *note]) + "\n"
 
 
 def _plain(text: str) -> str:

@@ -6,12 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from epo_lightning.experiment.config.settings import ReportSettings
+from epo_lightning.experiment.report import report
 from epo_lightning.report import build_tables
 from epo_lightning.report.results import read_results
 from epo_lightning.report.runs import read_other
 from epo_lightning.report.tables import distinct
 
 ROOT = Path(__file__).parents[2]
+FILES = sorted((ROOT / "results").glob("*.json"))
 PAGE = (ROOT / "docs" / "game.md").read_text(encoding="utf-8")
 
 
@@ -28,17 +31,27 @@ def short(value: float, digits: int) -> str:
     return f"{value:.{digits}f}".replace("0.", ".", 1) if value < 1 else f"{value:.{digits}f}"
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "results").glob("*.json")), ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_a_committed_results_file_is_whole_small_and_without_folders_of_a_machine(file: Path) -> None:
     report = read_results(file)
     assert report.runs
     assert file.stat().st_size < 1_000_000
-    assert str(file.relative_to(ROOT)) in (ROOT / "docs" / "reports.md").read_text(encoding="utf-8")
+    assert str(file.relative_to(ROOT)) in (ROOT / "docs" / "tables" / "index.md").read_text(encoding="utf-8")
     assert not any(word in file.read_text(encoding="utf-8") for word in ("/tmp/", "/home/", "/work/"))
     for run in report.runs:
         assert run.record["command"].startswith("epo train ")
         assert len(run.record["git_commit"]) == 40
         assert run.record["data_digest"]
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_tables_and_figures_are_rebuilt_from_a_results_file_byte_for_byte(file: Path, tmp_path: Path) -> None:
+    committed = ROOT / "docs" / "tables" / file.stem
+    report(ReportSettings(results=str(file), out=str(tmp_path)))
+    shown = {path.relative_to(committed) for path in committed.rglob("*.*")}
+    assert shown == {path.relative_to(tmp_path) for path in (tmp_path / "results.md", *tmp_path.glob("figures/*"))}
+    for path in shown:
+        assert (committed / path).read_bytes() == (tmp_path / path).read_bytes(), f"{path}: make tables writes it again"
 
 
 def test_the_page_has_the_scores_of_the_inferred_game() -> None:

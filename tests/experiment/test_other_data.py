@@ -300,7 +300,7 @@ def test_all_runs_on_several_data_sets_and_the_table_of_them(
     assert not (home / "multirun.yaml").exists()
     assert epo("report", "runs=runs", "out=report") == 0
     text = (home / "report" / "results.md").read_text()
-    assert "### Transfer: SADE" in text
+    assert "## Transfer: SADE" in text
     (header,) = [line for line in text.splitlines() if line.startswith("| trained on | method | n |")][:1]
     assert "ucy, all" in header
     (row,) = [line for line in text.splitlines() if line.startswith("| drawn (highway) | V-LSTM + EPO |")][:1]

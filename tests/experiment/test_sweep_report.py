@@ -106,13 +106,13 @@ def test_a_sweep_that_measures_scores_and_time_is_reported(runs: Path) -> None:
     assert [sweep.state(job) for job in sweep.jobs] == ["done"] * 5 + ["interrupted"]
     assert {run.split for run in of_sweep(sweep).evaluated} == {"test"}
     written = (report(ReportSettings(sweep="table1")) / "results.md").read_text()
-    titles = [line for line in written.splitlines() if line.startswith("### ")]
+    titles = [line for line in written.splitlines() if line.startswith("## ")]
     assert titles == [
-        "### rpi, test split",
-        "### rpi, test split: accuracy of the k most likely modes",
-        "### rpi, test split: equilibrium",
-        "### Cost: rpi",
-        "### How this was made",
+        "## rpi, test split",
+        "## rpi, test split: accuracy of the k most likely modes",
+        "## rpi, test split: equilibrium",
+        "## Cost: rpi",
+        "## How this was made",
     ]
     assert [line.split(" | ")[0] for line in written.splitlines() if line.endswith(" ms |")] == [
         "| JFP",

@@ -13,7 +13,7 @@ from rich.console import Console
 from epo_lightning.report import Report, write_report
 from epo_lightning.report.charts import charts_of
 from epo_lightning.report.columns import Column, significant
-from epo_lightning.report.costs import cost_sheets
+from epo_lightning.report.costs import cost_sheets, last_fifth
 from epo_lightning.report.latex import to_latex
 from epo_lightning.report.paper import is_papers
 from epo_lightning.report.render import legend, to_markdown
@@ -201,6 +201,25 @@ def test_costs_of_untrained_and_untimed_rows_are_dashes(tmp_path: Path) -> None:
     assert "(1) on A slow CPU (cpu, 1 thread); (2) on A CPU (cpu, 1 thread)." in sheet.note
 
 
+def test_the_change_in_the_last_fifth_is_that_of_the_lowest_score(tmp_path: Path) -> None:
+    assert last_fifth({200: 2.0, 400: 1.0, 800: 1.25, 1000: 0.9}) == pytest.approx(-0.1)
+    assert last_fifth({400: 1.0, 800: 0.8, 900: 0.7, 1000: 0.9}) == pytest.approx(-0.125)
+    assert last_fifth({400: 1.0, 1000: 1.5}) == 0
+    assert last_fifth({900: 1.0, 1000: 0.5}) is None
+    assert last_fifth({400: 0.0, 1000: 0.0}) is None
+
+    runs = [make_run(tmp_path / str(seed), "V-LSTM", "marginal", scores(0.3), seed=seed) for seed in range(2)]
+    for run, last in zip(runs, (0.9, 1.0), strict=True):
+        run.update(steps=10, seconds=1.0)
+        (run.path / "logs").mkdir(exist_ok=True)
+        (run.path / "logs" / "metrics.csv").write_text(f"step,val/minSADE\n3,1.0\n9,{last}\n")
+    (sheet,) = cost_sheets(build_tables(collect(runs)), [])
+    assert dict(zip(sheet.header, sheet.lines[0], strict=True))["last fifth"] == "-5.0 %"
+    (runs[1].path / "logs" / "metrics.csv").unlink()
+    (sheet,) = cost_sheets(build_tables(collect(runs)), [])
+    assert "last fifth" not in sheet.header
+
+
 def test_without_times_there_is_no_cost_table(tmp_path: Path) -> None:
     run = make_run(tmp_path, "V-LSTM", "marginal", scores(0.3))
     tables = build_tables(collect([run]))
@@ -224,7 +243,7 @@ def test_costs_are_written_in_every_format(tmp_path: Path) -> None:
     of_methods(tmp_path / "runs")
     console = Console(file=io.StringIO(), width=80)
     markdown = write_report(Report.of_folder(tmp_path / "runs"), tmp_path / "out", console=console)
-    assert "### Cost: rpi" in markdown
+    assert "## Cost: rpi" in markdown
     assert ["EPO", "2", "2 min", "1000", "120", "1234", "3.0 ms"] in lines(markdown, "EPO")
     assert "Time of a forecast" not in markdown  # said once
     printed = console.file.getvalue()  # type: ignore[attr-defined]

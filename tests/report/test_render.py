@@ -53,7 +53,7 @@ def test_a_comparison_is_rendered_in_every_format(tmp_path: Path) -> None:
     assert sheet.lines[1][:2] == ("", "FDE")
     assert sheet.lines[4] == ("", "OR (JFP)", "0.0000", "equal for every seed", "", "3")
     lines = to_markdown(sheet).splitlines()
-    assert lines[0] == "### rpi, test split: +EPO against +SC, seed by seed"
+    assert lines[0] == "## rpi, test split: +EPO against +SC, seed by seed"
     assert lines[2:4] == ["| rows | metric | difference | 95 % interval | p | n |", "|:--|:--|--:|--:|--:|--:|"]
     assert lines[4] == "| V-LSTM + EPO - V-LSTM + SC | ADE | -2.000 | -4.484 to +0.484 | 0.074 | 3 |"
     first, *_, last = csv.DictReader(io.StringIO(comparisons_to_csv([comparisons])))

@@ -51,7 +51,7 @@ def test_markdown_equals_a_hand_written_table(tmp_path: Path) -> None:
         "**0.0000 ± 0.0000** |" in lines
     )
     assert "<u>0.100</u> (0.04, +0.060)" in markdown
-    assert lines.index("A reduced budget.") < lines.index("### rpi, test split")
+    assert lines.index("A reduced budget.") < lines.index("## rpi, test split")
     assert "| V-LSTM + EPO | rpi, test split | reduced | 0, 1 | 0123456789 | abc | 1234 | 2 |" in lines
     assert f"- `{tmp_path}/runs/e1`: `epo train experiment=None seed=1`" in lines
     assert f"Written by `epo report runs={tmp_path}/runs`." in lines
