@@ -8,6 +8,10 @@ A trained forecaster from any folder::
 
     forecaster = epo_lightning.load("RUN/checkpoints/best.ckpt")
     forecast = forecaster.predict(scene)
+
+The futures of any other model, made scene-consistent::
+
+    forecast = epo_lightning.refine(states, probabilities, scene)
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ if TYPE_CHECKING:
     from epo_lightning.game.dynamics import Unicycle
     from epo_lightning.game.energy import Energy
     from epo_lightning.game.feature_energy import FeatureEnergy
+    from epo_lightning.refinement import refine
     from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
     from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -34,6 +39,7 @@ _HOMES = {
     "Solution": "scene",
     "Status": "scene",
     "LevenbergMarquardt": "solvers.gauss_newton.levenberg_marquardt",
+    "refine": "refinement",
 }
 
 __all__ = [
@@ -47,6 +53,7 @@ __all__ = [
     "Status",
     "Unicycle",
     "load",
+    "refine",
 ]
 
 

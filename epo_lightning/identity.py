@@ -7,8 +7,8 @@ Four hashes are recorded with a run:
 
 - ``data_digest``: hash of the settings of the data set and, for recordings, of their files (``data.digest``).
 - ``identity``: the settings that decide on its result, and ``data_digest``.
-- ``row``: the same without the seed; runs of one row of a table share it.
-- ``variant``: the settings without the seed; empty if nothing differs from the files of experiment and budget. It ends the
+- ``row``: the same without the seed, and without the path ``forecaster.frozen``; runs of one row of a table share it.
+- ``variant``: these settings without the data; empty if nothing differs from the files of experiment and budget. It ends the
   name of the run folder (:mod:`.experiment.config.compose`).
 """
 
@@ -66,8 +66,16 @@ def identity(config: Mapping[str, Any], data_digest: str) -> str:
 
 
 def row_identity(config: Mapping[str, Any], data_digest: str) -> str:
-    """Identity of a row of a table: that of its runs, but without the seed, and therefore the same for all of them."""
-    return identity({**config, "seed": None}, data_digest)
+    """Identity of a row of a table: that of its runs, but only of :func:`of_row`, and therefore the same for all of them."""
+    return identity(of_row(config), data_digest)
+
+
+def of_row(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration without what differs between runs of a row: the seed, and the run that a refinement refines."""
+    forecaster = config.get("forecaster")
+    if isinstance(forecaster, Mapping):
+        forecaster = {key: value for key, value in forecaster.items() if key != "frozen"}
+    return {**config, "seed": None, "forecaster": forecaster}
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:

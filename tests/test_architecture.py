@@ -25,6 +25,7 @@ FLOORS = {
     "losses": set(),
     "game": {"scene", "registry", "checks"},
     "solvers": {"game", "scene", "registry", "checks"},
+    "refinement": {"game", "solvers", "scene", "registry", "checks"},
     "encoders": {"scene"},
     "metrics": {"scene", "registry"},
     "decoders": {"scene", "registry", "game"},
@@ -45,6 +46,7 @@ FLOORS = {
         "losses",
         "optimizers",
         "pretrained",
+        "refinement",
     },
     "report": {"scene", "registry", "metrics", "run_folder", "identity", "masking"},
 }

@@ -23,7 +23,7 @@ SUPPLIED: Mapping[str, tuple[str, ...]] = {
     "backward": (),
     "objective": (),
     "optimizer": (),
-    "forecaster": ("task", "optimizer", "backbone", "dynamics", "energy", "solver", "backward", "objective"),
+    "forecaster": ("task", "optimizer", "backbone", "dynamics", "energy", "solver", "backward", "objective", "given"),
 }
 """Arguments that :func:`build_forecaster` supplies to the constructors of each kind of part; a configuration must not set
 them. A constructor gets only those that are in its signature. The kinds are in the order in which parts are built."""
@@ -37,7 +37,7 @@ def check_model(model: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: an unknown or missing key, with the nearest known name.
     """
-    known = (*SUPPLIED, *TASK_KEYS, "goal")
+    known = (*SUPPLIED, *TASK_KEYS, "goal", "given")
     for key in model:
         if key not in known:
             raise ConfigError(f"unknown key {key!r} of a model: {nearest(key, known)}")
@@ -60,8 +60,9 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
 
     Args:
         model: the sections ``forecaster``, ``backbone``, ``dynamics``, ``energy``, ``solver``, ``backward``, ``objective``
-            and ``optimizer``, each with the ``name`` of a part and its arguments; ``goal`` (``energy`` or ``all``); and the
-            fields of a :class:`~epo_lightning.task.Task`.
+            and ``optimizer``, each with the ``name`` of a part and its arguments; ``goal`` (``energy`` or ``all``); the
+            fields of a :class:`~epo_lightning.task.Task`; and, in checkpoints of forecasters on top of another one, the
+            configuration of that one, ``given``, whose weights follow. Without it, it is loaded from ``forecaster.frozen``.
 
     Raises:
         ConfigError: as :func:`check_model`, or a value that a part refuses.
@@ -93,9 +94,29 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
         if kind in named:
             parts[kind] = build(kind, model[kind])
     parts["optimizer"] = build("optimizer", model["optimizer"])
+    if "given" in named:
+        parts["given"] = _given(model)
     forecaster: Forecaster = build("forecaster", model["forecaster"], **parts)
     forecaster.configuration = dict(model)
     return forecaster
+
+
+def _given(model: Mapping[str, Any]) -> Forecaster:
+    """The forecaster on top of which another one is built: see :func:`build_forecaster`.
+
+    Raises:
+        ConfigError: no forecaster is named, or it cannot be loaded.
+    """
+    if "given" in model:
+        return build_forecaster(model["given"])
+    frozen = model["forecaster"].get("frozen")
+    if not frozen:
+        raise ConfigError(
+            "forecaster.frozen names no trained forecaster: give a run folder, a checkpoint or the name of a shipped "
+            "forecaster, such as forecaster.frozen=runs/highway_sim/v_lstm/short-s0"
+        )
+    path = Path(frozen).expanduser()
+    return load(path / "checkpoints" / "best.ckpt" if path.is_dir() else frozen)
 
 
 def load(checkpoint: str | Path) -> Forecaster:

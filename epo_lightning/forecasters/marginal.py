@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import torch
-from torch import Tensor
-
 from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.trajectories import Trajectories
 from epo_lightning.forecasters.base import Forecaster
+from epo_lightning.game.tracking import with_motion
 from epo_lightning.metrics.functional import marginal_to_joint
 from epo_lightning.objectives.base import Terms, checked_weights
 from epo_lightning.objectives.terms import observed_future
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
-from epo_lightning.scene import HEADING, JointForecast, Scene, log_probabilities
+from epo_lightning.scene import JointForecast, Scene, log_probabilities
 from epo_lightning.task import Task
 
 
@@ -57,7 +55,7 @@ class Marginal(Forecaster):
     def forward(self, scene: Scene) -> JointForecast:
         current = scene.current.where(scene.agent_mask[..., None], 0.0)
         positions, probabilities, logits = self.decoder(self.backbone(scene), current[..., :2])
-        states = _with_motion(positions, current, scene.dt)
+        states = with_motion(positions, current[:, None].expand(*positions.shape[:3], 4), scene.dt)
         states, probabilities, logits = marginal_to_joint(states, probabilities, logits)
         # The product of probabilities, as a sum of logarithms: for many agents the product would underflow in float32.
         of_agents = log_probabilities(probabilities, logits, 1)
@@ -81,13 +79,3 @@ class Marginal(Forecaster):
             "imitation": (self.loss_weights["imitation"], imitation),
             "probability": (self.loss_weights["probability"], probability),
         }
-
-
-def _with_motion(positions: Tensor, current: Tensor, dt: float) -> Tensor:
-    """States from positions, with heading and speed of the motion between steps; a standing agent keeps its heading."""
-    before = torch.cat((current[:, None, :, None, :2].expand_as(positions[..., :1, :]), positions[..., :-1, :]), -2)
-    travelled = (positions - before).detach()
-    length = travelled.norm(dim=-1)
-    heading = torch.atan2(travelled[..., 1], travelled[..., 0])
-    heading = torch.where(length > 1e-6, heading, current[:, None, :, None, HEADING])
-    return torch.cat((positions, heading[..., None], length[..., None] / dt), -1)

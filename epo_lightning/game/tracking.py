@@ -80,6 +80,18 @@ def observed_controls(
     return controls, error
 
 
+def with_motion(
+    positions: Float[Tensor, "*batch K 2"], current: Float[Tensor, "*batch 4"], dt: float
+) -> Float[Tensor, "*batch K 4"]:
+    """States from positions, with heading and speed of the motion between steps; a standing agent keeps its heading."""
+    before = torch.cat((current[..., None, :2], positions[..., :-1, :]), -2)
+    travelled = (positions - before).detach()
+    length = travelled.norm(dim=-1)
+    heading = torch.atan2(travelled[..., 1], travelled[..., 0])
+    heading = torch.where(length > 1e-6, heading, current[..., None, HEADING])
+    return torch.cat((positions, heading[..., None], length[..., None] / dt), -1)
+
+
 def demonstrated(scene: Scene) -> Bool[Tensor, "B N K"]:
     """Mask of the controls that an observation determines: those up to an agent's last observed step.
 

@@ -14,12 +14,14 @@ import pytest
 from experiment import tiny
 from experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
 from hydra.types import RunMode
+from suites import untrained
 
 from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose, hydra, jobs, options_of, tree
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import build_forecaster
+from epo_lightning.identity import identity, row_identity
 from epo_lightning.schema import read
 from epo_lightning.task import Task
 
@@ -36,9 +38,19 @@ def of_experiment(name: str) -> dict[str, Any]:
     return compose("train", [f"experiment={name}"])
 
 
+def given(config: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The configuration; if its forecaster refines another one, with a V-LSTM that was not trained."""
+    if config["forecaster"]["name"] != "refined":
+        return config
+    settings = read(Settings, compose("train", ["experiment=highway/v_lstm"]))
+    model = assembly.describe_model(settings, assembly.build_data(config["data"]))
+    frozen = str(untrained(model, folder / "frozen.ckpt"))
+    return {**config, "forecaster": {**config["forecaster"], "frozen": frozen}}
+
+
 @pytest.mark.parametrize("experiment", names(CONF / "experiment"))
-def test_experiments_can_be_built(experiment: str) -> None:
-    settings = read(Settings, of_experiment(experiment))
+def test_experiments_can_be_built(experiment: str, tmp_path: Path) -> None:
+    settings = read(Settings, given(of_experiment(experiment), tmp_path))
     assembly.check_buildable(settings)
     assert settings.title != "untitled"
     assert settings.experiment == experiment.replace("highway/", "exid/")  # recorded with the data that it names
@@ -95,7 +107,7 @@ def test_data_sets_can_be_built_from_their_configuration(data: str) -> None:
 
 
 @pytest.mark.parametrize("backbone", names(CONF / "backbone"))
-@pytest.mark.parametrize("forecaster", names(CONF / "forecaster"))
+@pytest.mark.parametrize("forecaster", [name for name in names(CONF / "forecaster") if name != "refined"])
 def test_backbones_and_forecasters_can_be_built_for_highways(backbone: str, forecaster: str) -> None:
     words = ["experiment=rpi/v_lstm", "energy=exid", f"backbone={backbone}", f"forecaster={forecaster}"]
     words += ["solver=both_sides", "backward=implicit"] if forecaster == "epo_game" else []
@@ -106,6 +118,16 @@ def test_backbones_and_forecasters_can_be_built_for_highways(backbone: str, fore
     learned = [name for name, _ in built.named_parameters()]
     assert any(name.startswith("backbone.lanes") for name in learned) == (forecaster != "constant_velocity")
     assert any(name.startswith("goals") for name in learned) == forecaster.startswith("epo")
+
+
+def test_runs_of_a_row_may_refine_different_runs() -> None:
+    one, other = (
+        compose("train", ["experiment=highway/v_lstm_refined", f"seed={seed}", f"forecaster.frozen=run{seed}"])
+        for seed in (0, 1)
+    )
+    assert one["variant"] == other["variant"] == ""
+    assert row_identity(one, "data") == row_identity(other, "data")
+    assert identity({**one, "seed": 1}, "data") != identity(other, "data")
 
 
 def representatives(listed: list[list[str]]) -> list[list[str]]:

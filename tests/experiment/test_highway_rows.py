@@ -27,7 +27,7 @@ SHARED = Path(os.environ.get("EPO_SHARED", Path(__file__).parents[2].parent / "s
 
 def test_the_rows_are_the_papers_and_those_of_other_games() -> None:
     backbones = ("v_lstm", "vibes", "hivt_m")
-    main = {f"{backbone}{suffix}" for backbone in backbones for suffix in ("", "_sc", "_epo")}
+    main = {f"{backbone}{suffix}" for backbone in backbones for suffix in ("", "_sc", "_epo", "_refined")}
     twins = {f"{backbone}_epo_{name}no_pair" for backbone in backbones for name in ("", "equilibrium_")}
     games = {f"{backbone}_epo_{name}" for backbone in backbones for name in ("interactive", "equilibrium")}
     assert set(ROWS) == main | twins | games | {"const_vel", "v_lstm_epo_no_init", "v_lstm_epo_no_goal"}

@@ -6,11 +6,14 @@ import math
 from pathlib import Path
 
 import pytest
+from suites import untrained
 
-from epo_lightning.experiment import train
+from epo_lightning.experiment import assembly, train
 from epo_lightning.experiment.config.compose import compose, tree
+from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.evaluate import evaluate
 from epo_lightning.run_folder import read_json
+from epo_lightning.schema import read
 
 FOLDER = tree() / "conf" / "experiment"
 ROWS = sorted(str(file.relative_to(FOLDER).with_suffix("")) for file in FOLDER.rglob("*.yaml"))
@@ -31,6 +34,10 @@ FEWER = {f"table1/{row}_dsdnet": ["solver.candidates=20"] for row in ("rpi", "hi
 def test_every_experiment_trains_and_is_scored(experiment: str, tmp_path: Path) -> None:
     like = LIKE.get(experiment.partition("/")[0], "highway")
     words = [*WORDS, *FEWER.get(experiment, ()), f"data.like={like}", f"runs={tmp_path}"]
+    if experiment.startswith("highway/") and experiment.endswith("_refined"):
+        row = read(Settings, compose("train", [f"experiment={experiment.removesuffix('_refined')}", *words]))
+        model = assembly.describe_model(row, assembly.build_data(row.data))
+        words.append(f"forecaster.frozen={untrained(model, tmp_path / 'frozen.ckpt')}")
     run = train.train(compose("train", [f"experiment={experiment}", *words]))
     assert run.record["steps"] == (8 if run.record["parameters"] else 0)
     evaluate({"run": str(run.path), "batch_size": 16})

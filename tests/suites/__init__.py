@@ -4,7 +4,7 @@ from .backbone import BackboneSuite
 from .dynamics import DynamicsSuite
 from .energy import EnergySuite, FeatureSuite
 from .forecaster import ForecasterSuite, HighwaySuite
-from .models import IMITATION, LOSS_WEIGHTS, OWN, highway_model, model
+from .models import IMITATION, LOSS_WEIGHTS, OWN, highway_model, model, untrained
 from .objective import ObjectiveSuite
 from .solver import SolverSuite
 
@@ -22,4 +22,5 @@ __all__ = [
     "SolverSuite",
     "highway_model",
     "model",
+    "untrained",
 ]

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import torch
 from games import EXID
+
+from epo_lightning.forecasters import build_forecaster
 
 OWN = ["goal", "vel", "acc", "turnr", "jerk", "turnacc", "velb", "accb", "turnrb", "jerkb", "turnaccb"]
 LOSS_WEIGHTS = {"imitation": 1.0, "probability": 0.1}
@@ -54,3 +58,11 @@ def highway_model(forecaster: dict[str, Any], **changes: Any) -> dict[str, Any]:
             **changes,
         },
     )
+
+
+def untrained(configuration: dict[str, Any], path: Path) -> Path:
+    """A checkpoint of a forecaster with initial weights, for forecasters on top of it."""
+    with torch.random.fork_rng(devices=[]):
+        weights = build_forecaster(configuration).state_dict()
+    torch.save({"state_dict": weights, "configuration": configuration}, path)
+    return path

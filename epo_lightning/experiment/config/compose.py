@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from epo_lightning.experiment.config.sources import recorded_name
-from epo_lightning.identity import canonical, essence
+from epo_lightning.identity import canonical, essence, of_row
 from epo_lightning.registry import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def resolve(config: DictConfig) -> dict[str, Any]:
         choices["experiment"] = recorded_name(choices["experiment"], choices.get("data", ""))
         values["experiment"] = choices["experiment"]
     if "trainer" in values:
-        own = canonical(essence({**values, "seed": None}))
+        own = canonical(essence(of_row(values)))
         words = tuple(f"{group}={choices[group]}" for group in ("experiment", "budget") if choices.get(group))
         search_path = GlobalHydra.instance().config_loader().get_search_path().get_path()
         same = own == _as_written(words, tuple(entry.path for entry in search_path))
@@ -127,7 +127,7 @@ def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> str | N
     loader = GlobalHydra.instance().config_loader()
     try:
         config = loader.load_configuration("train", list(words), run_mode=RunMode.RUN)
-        return canonical(essence({**_plain_values(config), "seed": None}))
+        return canonical(essence(of_row(_plain_values(config))))
     except Exception:  # a mandatory value is missing: only the other overrides of the run give it
         return None
 

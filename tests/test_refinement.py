@@ -1,0 +1,234 @@
+"""`refine()`: agents give way, nothing else changes, and everything that cannot be refined is refused by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from games import highway_scene, pad, reordered
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from epo_lightning import FeatureEnergy, LevenbergMarquardt, Scene, Unicycle, refine
+from epo_lightning.metrics.functional import overlap_rate
+from epo_lightning.refinement import ENERGY, WEIGHTS
+from epo_lightning.registry import ConfigError
+
+DT, K = 0.2, 20
+APART = {**WEIGHTS, "circles": 0.0}
+"""Weights without interaction."""
+
+
+def crossing(dtype: torch.dtype = torch.float32) -> tuple[Scene, torch.Tensor]:
+    """Two cars at 10 m/s whose straight paths cross; one is there 0.2 s before the other."""
+    start = torch.tensor([[[-20.0, 0.0, 0.0, 10.0]], [[0.0, -18.0, math.pi / 2, 10.0]]], dtype=dtype)
+    scene = Scene(start[None], dt=DT, size=torch.tensor([[[4.5, 1.9], [4.5, 1.9]]], dtype=dtype))
+    states = Unicycle().rollout(scene.current[:, None], torch.zeros(1, 1, 2, K, 2, dtype=dtype), DT)
+    return scene, states
+
+
+def traffic(scenes: int = 3, modes: int = 3, horizon: int = 8) -> tuple[Scene, torch.Tensor, torch.Tensor]:
+    """Vehicles on a motorway, futures that disagree with each other, and probabilities."""
+    scene = highway_scene(scenes, horizon=horizon)
+    time = torch.linspace(0.0, 1.0, horizon)[:, None]
+    states = scene.future[:, None] + 5.0 * torch.randn(scenes, modes, 4, 1, 4) * time.square() * torch.tensor(
+        [1, 0.5, 0, 0]
+    )
+    return scene, states, torch.rand(scenes, modes).softmax(1)
+
+
+def overlaps(states: torch.Tensor, scene: Scene) -> torch.Tensor:
+    """Whether boxes overlap in each mode, [B, M]."""
+    of_modes = [
+        overlap_rate(states[:, [m]], states.new_ones(len(states), 1), scene.size, scene.agent_mask, shape="box")
+        for m in range(states.shape[1])
+    ]
+    return torch.stack(of_modes, 1) > 0
+
+
+def test_crossing_trajectories_that_overlap_stop_overlapping():
+    scene, states = crossing()
+    refined = refine(states, torch.ones(1, 1), scene)
+    assert overlaps(states, scene).all()
+    assert not overlaps(refined.states, scene).any()
+    moved = (refined.states - states)[..., :2].norm(dim=-1)
+    assert 0.2 < moved.max() < 6.0, "they give way by about a car's length"
+
+
+def test_futures_that_do_not_interact_stay_as_they_were_tracked():
+    scene, states = crossing()
+    later = dataclasses.replace(
+        scene, history=scene.history + torch.tensor([[[[0.0] * 4]], [[[0.0, 80.0, 0.0, 0.0]]]])[:, 0]
+    )
+    states = states + later.current[:, None, :, None] - scene.current[:, None, :, None]
+    assert_close(refine(states, torch.ones(1, 1), later).states, states, rtol=0, atol=1e-3)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=10, deadline=None)
+def test_without_pair_weight_the_tracked_input_comes_back(seed: int):
+    torch.manual_seed(seed)
+    scene = highway_scene(2, horizon=K)
+    driven = Unicycle().rollout(
+        scene.current[:, None], 0.1 * torch.randn(2, 3, 4, K, 2) * torch.tensor([10.0, 0.5]), DT
+    )
+    probabilities = torch.rand(2, 3).softmax(1)
+    refined = refine(driven, probabilities, scene, weights=APART, inverse_temperature=1.0)
+    assert_close(refined.states[..., :2], driven[..., :2], rtol=0, atol=1e-2)
+    assert_close(refined.states, refined.initial_states, rtol=0, atol=1e-3)
+    assert_close(refined.probabilities, probabilities)
+
+
+def test_positions_are_enough_and_their_jitter_is_removed():
+    scene, states = crossing()
+    jittered = states[..., :2] + 0.1 * torch.randn(1, 1, 2, K, 2)
+    tracked = refine(jittered, torch.ones(1, 1), scene, weights=APART).states[..., :2]
+    assert (tracked - states[..., :2]).norm(dim=-1).mean() < 0.7 * (jittered - states[..., :2]).norm(dim=-1).mean()
+    exact = refine(jittered, torch.ones(1, 1), scene, weights=APART, noise=0.0).states[..., :2]
+    assert_close(exact[..., 1:, :], jittered[..., 1:, :], rtol=0, atol=1e-3)
+
+
+def test_energies_reweight_probabilities_as_written():
+    scene, states, probabilities = traffic()
+    plain = refine(states, probabilities, scene, inverse_temperature=0.0)
+    refined = refine(states, probabilities, scene, inverse_temperature=0.3)
+    assert_close(plain.probabilities, probabilities)
+    energy = refined.solution.energy
+    expected = probabilities * (-0.3 * (energy - energy.amin(1, keepdim=True))).exp()
+    assert_close(refined.probabilities, expected / expected.sum(1, keepdim=True))
+    assert (energy.amax(1) > energy.amin(1)).all()
+
+
+def test_a_mode_without_probability_keeps_none():
+    scene, states, _ = traffic(modes=2)
+    refined = refine(states, torch.tensor([[1.0, 0.0]] * 3), scene, inverse_temperature=1.0)
+    assert (refined.probabilities == torch.tensor([1.0, 0.0])).all()
+
+
+def test_the_order_of_agents_does_not_matter():
+    scene, states, probabilities = traffic()
+    order = [2, 0, 3, 1]
+    one, other = (
+        refine(*what)
+        for what in ((states, probabilities, scene), (states[:, :, order], probabilities, reordered(scene, order)))
+    )
+    assert_close(other.states, one.states[:, :, order], rtol=0, atol=1e-2)
+    assert_close(other.probabilities, one.probabilities, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
+def test_padding_does_not_matter(filling: float):
+    scene, states, probabilities = traffic()
+    wide = torch.cat((states, torch.full_like(states[:, :, :2], filling)), 2)
+    alone = refine(states, probabilities, scene, inverse_temperature=0.1)
+    padded = refine(wide, probabilities, pad(scene, agents=2, filling=filling), inverse_temperature=0.1)
+    assert_close(padded.states[:, :, :4], alone.states, rtol=0, atol=1e-3)
+    assert_close(padded.probabilities, alone.probabilities, rtol=0, atol=1e-5)
+
+
+def test_scenes_of_a_batch_do_not_change_each_other():
+    scene, states, probabilities = traffic()
+    together = refine(states, probabilities, scene)
+    for index in range(3):
+        alone = refine(states[[index]], probabilities[[index]], scene[index])
+        assert_close(alone.states[0], together.states[index], rtol=0, atol=1e-3)
+
+
+def test_gradients_by_weights_margins_and_temperature_are_those_of_finite_differences():
+    scene, states = crossing(torch.float64)
+    other = states.clone()
+    other[..., 1, :, 1] -= 1.0  # a second mode, in which the second car is later
+    given, probabilities = torch.cat((states, other), 1), torch.tensor([[0.6, 0.4]], dtype=torch.float64)
+    energy = FeatureEnergy(own=("accref", "turnrref"), pair=("clearance",))
+    solver = LevenbergMarquardt(steps=20, step_size=1.0, damping=1.0, adaptive=True, newton_steps=30)
+    probe = torch.randn(1, 2, 2, K, 2, dtype=torch.float64)
+
+    def value(accref, turnrref, clearance, margin, beta):
+        weights = {"accref": accref, "turnrref": turnrref, "clearance": clearance}
+        found = refine(
+            given,
+            probabilities,
+            scene,
+            energy,
+            weights,
+            margins={"clearance": margin},
+            inverse_temperature=beta,
+            solver=solver,
+        )
+        return (found.states[..., :2] * probe).sum() + found.probabilities[0, 0]
+
+    numbers = [torch.tensor(number, dtype=torch.float64, requires_grad=True) for number in (1.0, 20.0, 3.0, 0.4, 0.05)]
+    slopes = torch.autograd.grad(value(*numbers), numbers)
+    for index, slope in enumerate(slopes):
+        ends = []
+        for step in (1e-3, -1e-3):
+            moved = [number.detach() + (step if at == index else 0.0) for at, number in enumerate(numbers)]
+            ends.append(value(*moved))
+        assert_close(slope, (ends[0] - ends[1]) / 2e-3, rtol=1e-3, atol=1e-5)
+        assert slope.abs() > 1e-6
+
+
+def test_no_graph_is_recorded_where_nothing_is_learned():
+    scene, states = crossing()
+    assert not refine(states, torch.ones(1, 1), scene).states.requires_grad
+
+
+def refused(error: type[Exception], message: str, **changes) -> None:
+    scene, states = crossing()
+    arguments = {"states": states, "probabilities": torch.ones(1, 1), "scene": scene, **changes}
+    with pytest.raises(error, match=message):
+        refine(**arguments)
+
+
+GOALS = FeatureEnergy(own=("accref", "turnrref", "goal"), pair=())
+FORGETS = FeatureEnergy(own=("acc", "turnr"), pair=("circles",))
+MARGIN = FeatureEnergy(own=("accref",), pair=("lateral",))
+BROKEN = torch.zeros(1, 1, 2, K, 4)
+BROKEN[0, 0, 1, 3, 0] = math.nan
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"states": [1.0]}, TypeError, "states is a list"),
+        ({"states": torch.zeros(1, 1, 2, K, 4, dtype=torch.long)}, TypeError, r"states is of type torch\.int64"),
+        ({"states": torch.zeros(1, 2, K, 4)}, ValueError, r"\[1, 2, 20, 4\]; this scene takes \[1, M, 2, K, 2 or 4\]"),
+        ({"states": torch.zeros(1, 1, 3, K, 4)}, ValueError, r"\[1, 1, 3, 20, 4\]"),
+        ({"states": torch.zeros(1, 1, 2, K, 3)}, ValueError, "2 or 4"),
+        ({"states": torch.zeros(1, 1, 2, 1, 4)}, ValueError, r"K = 1 step\(s\)"),
+        ({"states": torch.zeros(1, 0, 2, K, 4), "probabilities": torch.ones(1, 0)}, ValueError, r"M = 0 mode"),
+        ({"states": BROKEN}, ValueError, r"states\[0, 0, 1, 3\] is \[nan"),
+        (
+            {"probabilities": torch.ones(1, 2)},
+            ValueError,
+            r"probabilities has shape \[1, 2\]; these states take \[1, 1\]",
+        ),
+        ({"probabilities": torch.full((1, 1), 0.7)}, ValueError, r"probabilities\[0\] is \[0\.6.*sum to 1"),
+        ({"probabilities": torch.full((1, 1), math.nan)}, ValueError, r"probabilities\[0\] is \[nan\]"),
+        ({"weights": {"accref": 1.0}}, ValueError, "weights lacks the feature 'turnrref'"),
+        ({"weights": {**WEIGHTS, "circle": 1.0}}, ValueError, r"unknown feature weights\['circle'\].*'circles'"),
+        ({"weights": {**WEIGHTS, "circles": math.inf}}, ValueError, r"weights\['circles'\] must be a finite number"),
+        ({"weights": {**WEIGHTS, "circles": torch.ones(3)}}, ValueError, r"shape \[3\].*\[1, 1, 1\]"),
+        ({"energy": GOALS, "weights": {}}, ConfigError, "knows no goals"),
+        ({"energy": FORGETS, "weights": {}}, ConfigError, "add accref and turnrref"),
+        (
+            {"energy": MARGIN, "weights": {"accref": 1.0, "lateral": 1.0}},
+            ValueError,
+            "margins lacks the feature 'lateral'",
+        ),
+        ({"margins": {"circles": 0.1}}, ValueError, r"unknown feature margins\['circles'\]"),
+        ({"inverse_temperature": -1.0}, ValueError, "inverse_temperature must be 0 or more"),
+        ({"noise": -0.1}, ValueError, "noise must be a number, 0 or more"),
+        ({"energy": dataclasses.replace(ENERGY, dynamics=Unicycle("heun"))}, ConfigError, "integrator=euler"),
+    ],
+)
+def test_what_cannot_be_refined_is_refused_by_name(changes, error, message):
+    refused(error, message, **changes)
+
+
+def test_sizes_are_needed_where_bodies_interact():
+    scene, states = crossing()
+    refused(ValueError, "size", scene=dataclasses.replace(scene, size=None), states=states)
