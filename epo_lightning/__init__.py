@@ -6,7 +6,7 @@ The layer on plain tensors::
 
 A trained forecaster from any folder::
 
-    forecaster = epo_lightning.load("RUN/checkpoints/best.ckpt")
+    forecaster = epo_lightning.load("RUN/checkpoints/best.ckpt")  # or one that ships: load("rpi/v_lstm_epo")
     forecast = forecaster.predict(scene)
 
 The futures of any other model, made scene-consistent::

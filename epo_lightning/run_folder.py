@@ -36,7 +36,7 @@ from typing import Any, Literal
 
 from epo_lightning import pretrained
 from epo_lightning.masking import mask
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, nearest
 
 TRAINING, FINISHED, FAILED = "training", "finished", "failed"
 State = Literal["waiting", "running", "interrupted", "failed", "finished"]
@@ -148,7 +148,11 @@ class RunFolder:
         """
         run = cls(pretrained.folder_of(path) or Path(path).expanduser())
         if not run.path.is_dir():
-            raise ConfigError(f"no run folder {run.path}: the folder does not exist")
+            shipped = nearest(str(path), pretrained.names())
+            raise ConfigError(
+                f"no run folder {run.path}: the folder does not exist, and no run of that name ships with the package "
+                f"({shipped})"
+            )
         if not run.config_file.is_file() or not run.record_file.is_file():
             below = [str(found.path) for found in discover(run.path)]
             hint = f"; runs below it: {', '.join(below[:8])} (use runs={run.path} for all)" if below else ""
@@ -172,8 +176,10 @@ class RunFolder:
         return self.path / "logs"
 
     def checkpoint(self, which: str = "best") -> Path:
-        """Path of a checkpoint: ``which`` is best, last, or the path itself."""
-        return self.checkpoints / f"{which}.ckpt" if which in ("best", "last") else Path(which).expanduser()
+        """Path of a checkpoint: ``which`` is best, last, the name of a run in the package (its best), or the path itself."""
+        if which in ("best", "last"):
+            return self.checkpoints / f"{which}.ckpt"
+        return pretrained.checkpoint_of(which) or Path(which).expanduser()
 
     @property
     def progress_file(self) -> Path:

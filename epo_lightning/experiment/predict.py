@@ -143,7 +143,7 @@ def _scenes_of(
         if not pretrained.ships(run.path):
             raise
         scenes = pretrained.examples(run.path)
-        count, name = len(scenes.history), run.path.name
+        count, name = len(scenes.history), pretrained.name_of(run.path)
         print(f"{count} example scenes that ship with {name} are forecast instead of its test split: {missing}")
         return Chosen(spread(scenes, settings.scenes), None, own)
 

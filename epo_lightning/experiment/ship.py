@@ -1,4 +1,4 @@
-"""Packing of a finished run for shipping: ``python -m epo_lightning.experiment.ship <run folder> <name>``."""
+"""Making of the forecasters that ship with the package: ``python -m epo_lightning.experiment.ship [<name>]``."""
 
 from __future__ import annotations
 
@@ -6,50 +6,116 @@ import dataclasses
 import hashlib
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 from safetensors.torch import save
+from torch import Tensor
 
 from epo_lightning import pretrained
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.card import SCORES, Recipe, card, recipe_of, recipes
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
-from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_data
+from epo_lightning.experiment.config import compose
+from epo_lightning.experiment.config.settings import EvaluateSettings, Settings
+from epo_lightning.experiment.evaluate import score
+from epo_lightning.experiment.opening import open_data, split_of
 from epo_lightning.experiment.pictures import choose
+from epo_lightning.experiment.train import train
+from epo_lightning.experiment.verbs import generate_and_print
+from epo_lightning.forecasters import load
+from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_file, write_json
+from epo_lightning.run_folder import RunFolder, read_json, write_file, write_json
 from epo_lightning.schema import read
 
 SCENES = 16
 """Example scenes that ship with a run."""
+LARGEST = 900_000
+"""Bytes of weights above which they are stored in half precision, so that every file is smaller than 1 MB."""
 PLACES = {"runs": "runs", "run_dir": None, "sweep": None, "resume": None}
 """Entries of a configuration that name folders of the machine on which the run was made."""
 
 
-def ship(run: RunFolder, folder: Path) -> Path:
-    """Pack a run for shipping into ``folder``: its weights without the optimizer's state, its scores, and example scenes.
+def make(name: str) -> Path:
+    """Generate the data of a shipped forecaster, train it as its recipe says, and replace it in the package.
+
+    A run that was interrupted is continued, and a finished one in ``runs/pretrained/<name>`` is not trained again.
+    """
+    recipe = recipe_of(name)
+    generate_and_print(compose.compose("generate", recipe.data_words), recipe.data_words)
+    words = [*recipe.words, f"run_dir=runs/pretrained/{name}", "existing=continue"]
+    run = train(compose.compose("train", words), words)
+    return ship(run, name, recipe, pretrained.HOME / name)
+
+
+def ship(run: RunFolder, name: str, recipe: Recipe, folder: Path) -> Path:
+    """Pack a run for shipping: weights without the optimizer's state, scores, example scenes and a card.
+
+    The scores are those of the packed weights, which may have a lower precision than the run's.
+
+    Args:
+        run: a finished run.
+        name: name of the forecaster.
+        recipe: how the run was made, and what its card says in words.
+        folder: the packed run; it is replaced if it exists.
 
     Raises:
-        ConfigError: the run is not finished or not scored on the test split, or its data is missing or has changed.
+        ConfigError: the run is not finished, or its data is missing or has changed.
     """
-    if not run.finished or not run.metrics_file().is_file():
-        raise ConfigError(f"{run.path} is not finished and scored: train it with score=test")
-    content = torch.load(run.checkpoint("best"), map_location="cpu", weights_only=True)
-    scenes, _ = choose(open_data(run, read(Settings, run.config())), "test", SCENES)
-    fields = {field.name: getattr(scenes, field.name) for field in dataclasses.fields(scenes)}
-    tensors = {name: value.contiguous() for name, value in fields.items() if isinstance(value, torch.Tensor)}
-
-    packed = RunFolder(folder)
-    packed.begin({**run.config(), **PLACES}, run.record)
-    weights = {key: content[key] for key in ("configuration", "state_dict")}
-    packed.checkpoints.mkdir(exist_ok=True)
-    WholeCheckpoints().save_checkpoint(weights, packed.checkpoint("best"))
-    write_file(folder / "scenes.safetensors", save(tensors, {"dt": str(scenes.dt)}))
-    shutil.copyfile(run.metrics_file(), packed.metrics_file())
-    digest = hashlib.sha256(packed.checkpoint("best").read_bytes()).hexdigest()
-    write_json(packed.record_file, {**run.record, "sha256": digest})
+    assembly.quiet()
+    if not run.finished:
+        raise ConfigError(f"{run.path} is not finished: continue it with `epo train resume={run.path}`")
+    with TemporaryDirectory() as place:
+        packed = _pack(run, RunFolder(Path(place) / "packed"))
+        write_file(packed.path / "card.md", card(name, recipe, packed))
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(packed.path, folder, ignore=shutil.ignore_patterns(".*"))
     return folder
 
 
+def _pack(run: RunFolder, packed: RunFolder) -> RunFolder:
+    """Write everything but the card of a packed run."""
+    content = torch.load(run.checkpoint("best"), map_location="cpu", weights_only=True)
+    data = open_data(run, read(Settings, run.config()))
+    scenes, _ = choose(data, "test", SCENES)
+    fields = {field.name: getattr(scenes, field.name) for field in dataclasses.fields(scenes)}
+    tensors = {name: value.contiguous() for name, value in fields.items() if isinstance(value, Tensor)}
+
+    packed.begin({**run.config(), **PLACES}, run.record)
+    packed.checkpoints.mkdir(exist_ok=True)
+    weights = {"configuration": content["configuration"], "state_dict": shrunk(content["state_dict"])}
+    WholeCheckpoints().save_checkpoint(weights, packed.checkpoint("best"))
+    digest = hashlib.sha256(packed.checkpoint("best").read_bytes()).hexdigest()
+    write_json(packed.record_file, {**run.record, "sha256": digest})
+    write_file(packed.path / "scenes.safetensors", save(tensors, {"dt": str(scenes.dt)}))
+
+    file, _ = score(packed, EvaluateSettings(run=str(packed.path)))
+    total = sum(len(batch.history) for batch in split_of(data, "test"))
+    about = {"scenes": total, "examples": score_examples(packed.path)}
+    write_json(file, {**read_json(file), **about})
+    return packed
+
+
+def shrunk(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights in half precision if they have more than :data:`LARGEST` bytes; loading makes them single precision again."""
+    size = sum(value.numel() * value.element_size() for value in weights.values())
+    half = size > LARGEST
+    return {name: value.half() if half and value.is_floating_point() else value for name, value in weights.items()}
+
+
+def score_examples(run: str | Path) -> dict[str, float]:
+    """Number of the scenes that ship with a run, given by name or folder, and the scores of its forecasts of them."""
+    scenes = pretrained.examples(run)
+    forecaster = load(pretrained.checkpoint_of(run) or RunFolder(Path(run)).checkpoint("best"))
+    metrics = ForecastMetrics(forecaster.task.subsets, forecaster.task.shape)
+    metrics.update(forecaster.predict(scenes), scenes)
+    scores = metrics.compute()
+    return {"scenes": len(scenes.history), **{name: float(scores[name]) for name in SCORES}}
+
+
 if __name__ == "__main__":
-    print(f"wrote {ship(RunFolder.open(sys.argv[1]), pretrained.HOME / sys.argv[2])}")
+    for chosen in sys.argv[1:] or recipes():
+        print(f"wrote {make(chosen)}")

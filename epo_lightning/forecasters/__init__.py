@@ -123,13 +123,13 @@ def load(checkpoint: str | Path) -> Forecaster:
     """Load a trained forecaster in evaluation mode. The checkpoint alone is needed, and no code in it is executed.
 
     Args:
-        checkpoint: path of a ``.ckpt`` file, or the name of a forecaster that ships with the package: ``load("rpi")``.
+        checkpoint: path of a ``.ckpt`` file, or the name of a forecaster that ships with the package:
+            ``load("rpi/v_lstm_epo")``. A path that exists takes precedence.
 
     Raises:
         ConfigError: as :func:`~epo_lightning.forecasters.checkpoint.read_checkpoint`, or weights of another architecture.
     """
-    shipped = pretrained.folder_of(checkpoint)
-    checkpoint = shipped / "checkpoints" / "best.ckpt" if shipped else checkpoint
+    checkpoint = pretrained.checkpoint_of(checkpoint) or checkpoint
     content = read_checkpoint(checkpoint)
     forecaster = build_forecaster(content["configuration"])
     try:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from epo_lightning.pretrained import names
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, nearest
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise ConfigError(
             f"no checkpoint at {path}: give the path of a .ckpt file, such as RUN/checkpoints/best.ckpt, or the name of a "
-            f"forecaster that ships with the package ({', '.join(names())})"
+            f"forecaster that ships with the package ({nearest(str(path), names())})"
         )
     try:
         with zipfile.ZipFile(path) as archive:

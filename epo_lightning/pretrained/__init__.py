@@ -1,8 +1,8 @@
-"""Trained forecasters that ship with the package, each as a run folder without logs.
+"""Trained forecasters that ship with the package, each as a run folder without logs: ``<data>/<row>``.
 
-``rpi`` is V-LSTM + EPO with a relaxed loss (:class:`~epo_lightning.losses.Relaxation`), trained on a fifth of the hard split
-of the robot-pedestrian data. Its run.json holds the command, commit, seed and data digest that it was made with,
-metrics.json its scores, and scenes.safetensors a few scenes of the test split. ``make checkpoint`` makes it again.
+``epo_lightning.load("rpi/v_lstm_epo")`` loads one, and ``epo predict run=rpi/v_lstm_epo`` draws its forecasts. Beside what
+every run folder holds (:mod:`epo_lightning.run_folder`), each has a model card, ``card.md``, and a few scenes of its test
+split, ``scenes.safetensors``. ``recipes.yaml`` says how each is made, and ``make checkpoint`` makes them again.
 """
 
 from __future__ import annotations
@@ -17,8 +17,13 @@ HOME = Path(__file__).parent
 
 
 def names() -> list[str]:
-    """Names of the runs that ship with the package."""
-    return sorted(record.parent.name for record in HOME.glob("*/run.json"))
+    """Names of the forecasters that ship with the package, such as ``rpi/v_lstm_epo``."""
+    return sorted(name_of(record.parent) for record in HOME.rglob("run.json"))
+
+
+def name_of(folder: Path) -> str:
+    """Name of the shipped run in ``folder``, a folder below this package's."""
+    return folder.absolute().relative_to(HOME).as_posix()
 
 
 def folder_of(run: str | Path) -> Path | None:
@@ -26,9 +31,20 @@ def folder_of(run: str | Path) -> Path | None:
     return HOME / str(run) if str(run) in names() and not Path(run).exists() else None
 
 
+def checkpoint_of(run: str | Path) -> Path | None:
+    """Checkpoint of the shipped run with that name; None as :func:`folder_of`."""
+    folder = folder_of(run)
+    return folder / "checkpoints" / "best.ckpt" if folder else None
+
+
 def ships(folder: Path) -> bool:
     """Whether ``folder`` is that of a shipped run: nothing is written there."""
-    return folder.absolute().parent == HOME
+    return folder.absolute().is_relative_to(HOME)
+
+
+def card(run: str | Path) -> str:
+    """Model card of a shipped run, given by name or folder: data, budget, scores, limits, command, commit, seed."""
+    return ((folder_of(run) or Path(run)) / "card.md").read_text(encoding="utf-8")
 
 
 def examples(run: str | Path) -> Scene:

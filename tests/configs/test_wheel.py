@@ -50,5 +50,8 @@ def test_an_installed_wheel_works_from_any_folder(tmp_path: Path) -> None:
     assert "rpi_main" in epo("train", "--help")
     assert "title: VIBES + EPO" in epo("config", "experiment=us101/vibes_epo")
     assert {"page.html.j2", "page.css", "page.js"} <= {path.name for path in (site / "epo_lightning/report").iterdir()}
+    shipped = [path for path in (ROOT / "epo_lightning" / "pretrained").rglob("*") if "__pycache__" not in path.parts]
+    assert len(shipped) > 20
+    assert all((site / path.relative_to(ROOT)).exists() for path in shipped)
     assert not list(elsewhere.iterdir())
-    assert "wrote predictions/forecasts.safetensors" in epo("predict", "run=rpi", "scenes=4", "figures=1")
+    assert "wrote predictions/forecasts.safetensors" in epo("predict", "run=rpi/v_lstm_epo", "scenes=4", "figures=1")

@@ -327,9 +327,9 @@ def test_a_changed_run_is_not_scored_anywhere(epo: Epo, home: Path, refused: Cal
 def test_nothing_is_written_beside_a_run_that_ships(
     epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert epo("evaluate", "run=rpi", "data=drawn", "data.like=rpi", "data.scenes=8") == 0
+    assert epo("evaluate", "run=rpi/v_lstm_epo", "data=drawn", "data.like=rpi", "data.scenes=8") == 0
     assert "minSADE" in capsys.readouterr().out
-    assert not list(RunFolder.open("rpi").path.glob("scores-on-*"))
+    assert not list(RunFolder.open("rpi/v_lstm_epo").path.glob("scores-on-*"))
 
 
 def test_tiny_data_is_no_recording(epo: Epo, home: Path, refused: Callable[..., str]) -> None:
