@@ -17,6 +17,7 @@ epo - energy-based potential games for multi-agent motion forecasting
   epo train resume=<run folder>              continue after a kill
   epo evaluate runs=runs                     score finished runs on the test split
   epo predict run=<run folder> out=<folder>  write and draw forecasts
+  epo explore run=<run folder>               change inferred games on a page and see what follows
   epo report rpi_main                        write the table with the paper's values, figures, and one HTML page
   epo config experiment=rpi/v_lstm_epo       print the resolved configuration
   epo config check experiment=...            check it, without loading anything
@@ -47,6 +48,7 @@ VERBS = {
     "sweep": "train and score all runs of a table or figure; `epo sweep status` shows their state",
     "evaluate": "score runs on the test split",
     "predict": "write and draw a run's forecasts",
+    "explore": "a page on which a run's inferred games are changed by hand and solved anew",
     "report": "tables and figures of evaluated runs",
     "config": "print or check a resolved configuration",
 }

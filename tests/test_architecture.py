@@ -48,6 +48,7 @@ FLOORS = {
         "pretrained",
         "refinement",
     },
+    "explore": {"scene", "registry", "schema", "forecasters", "game", "metrics", "solvers"},
     "report": {"scene", "registry", "metrics", "run_folder", "identity", "masking"},
 }
 """Top-level modules that each one may import besides itself; `experiment` and `cli` may import all."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from epo_lightning import pretrained
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import PredictSettings, Settings
+from epo_lightning.experiment.config.settings import ForecastSettings, PredictSettings, Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, refuse_changed_config
 from epo_lightning.experiment.other_data import keys_of, open_other
 from epo_lightning.experiment.pictures import choose, draw, forecast_of, pick, spread
@@ -91,7 +91,7 @@ def predict(settings: PredictSettings, overrides: Sequence[str] = ()) -> list[Pa
         raise ConfigError(f"{out} holds forecasts already: nothing is overwritten; choose another out=<folder>")
     of_run = read(Settings, run.config())
     forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
-    chosen = _scenes_of(run, of_run, settings, forecaster, overrides)
+    chosen = scenes_of(run, of_run, settings, forecaster, overrides)
     scenes = chosen.scenes
     forecast = forecast_of(forecaster, scenes)
     tensors = dict(_tensors(scenes, forecast))
@@ -115,8 +115,8 @@ def predict(settings: PredictSettings, overrides: Sequence[str] = ()) -> list[Pa
     return [tensors_file, index_file, *(file for file, _ in pictures)]
 
 
-def _scenes_of(
-    run: RunFolder, of_run: Settings, settings: PredictSettings, forecaster: Forecaster, overrides: Sequence[str]
+def scenes_of(
+    run: RunFolder, of_run: Settings, settings: ForecastSettings, forecaster: Forecaster, overrides: Sequence[str]
 ) -> Chosen:
     """The scenes to forecast; where a shipped run's data set is not on this machine, the examples that ship with it.
 

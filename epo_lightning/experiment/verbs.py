@@ -13,6 +13,7 @@ from typing import Any
 from epo_lightning import pretrained
 from epo_lightning.experiment.config.settings import (
     EvaluateSettings,
+    ExploreSettings,
     GenerateSettings,
     PredictSettings,
     ReportSettings,
@@ -26,6 +27,7 @@ SCHEMAS: dict[str, type] = {
     "generate": GenerateSettings,
     "evaluate": EvaluateSettings,
     "predict": PredictSettings,
+    "explore": ExploreSettings,
     "report": ReportSettings,
 }
 HEADLINE = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp")
@@ -169,6 +171,14 @@ def predict_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     print("\n".join(f"wrote {path}" for path in written))
 
 
+def explore_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Serve the page of a run's games until Ctrl-C, and print its address."""
+    settings = check_settings("explore", config)
+    from epo_lightning.experiment.explore import explore
+
+    explore(settings, overrides, lambda address: print(f"open {address} in a browser; Ctrl-C ends", flush=True))
+
+
 def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Write tables and figures of all evaluated runs below a folder, and print the path of the page."""
     settings = check_settings("report", config)
@@ -201,5 +211,6 @@ RUN: dict[str, Callable[[dict[str, Any], Sequence[str]], Any]] = {
     "train": train_and_print,
     "evaluate": evaluate_and_print,
     "predict": predict_and_print,
+    "explore": explore_and_print,
     "report": report_and_print,
 }

@@ -370,8 +370,11 @@ class EPO(Forecaster):
             return None
         alone = {name: torch.zeros_like(weight) for name, weight in parameters.pair_weights.items()}
         without = dataclasses.replace(parameters, pair_weights=alone)
-        solution = self.differentiable_solve(self._minimiser, self.energy, self._with_game_end(scene), without)
-        return solution.states[..., : self.task.horizon, :]
+        return self.solve(scene, without).states[..., : self.task.horizon, :]
+
+    def solve(self, scene: Scene, parameters: GameParameters) -> Solution:
+        """The solution of a given game of a scene, for example an inferred one with other weights or goals."""
+        return self.differentiable_solve(self._minimiser, self.energy, self._with_game_end(scene), parameters)
 
     @property
     def _batches(self) -> int:

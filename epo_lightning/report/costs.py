@@ -115,7 +115,9 @@ def _note(header: Sequence[str], labels: dict[str, str]) -> str:
     where = [
         f"{label.removeprefix('forecast')} on {machine}".strip() for machine, label in labels.items() if label in header
     ]
-    settled = "Last fifth: change of the lowest validation SADE in the last fifth of the steps; near zero, the score has settled."
+    settled = (
+        "Last fifth: change of the lowest validation SADE in the last fifth of the steps; near zero, it has settled."
+    )
     parts = (
         training if {*header} & {*TRAINED} else "",
         settled if SETTLED in header else "",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -14,6 +15,7 @@ sys.path.insert(0, str(ROOT))
 from benchmarks import (
     dashboards,
     epo_layer,
+    explore,
     extraction,
     figures,
     generation,
@@ -105,6 +107,12 @@ def test_extraction_is_timed(capsys):
 
 
 @pytest.mark.slow
+def test_answers_of_the_page_are_timed(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("EPO_CACHE", str(tmp_path))  # no data set: the scenes that ship with the run are taken
+    explore.main(["times", "rpi", "--edits", "2"])
+    assert re.search(r"solver +median +[\d.]+ ms.*\nall +median +[\d.]+ ms", capsys.readouterr().out)
+
+
 def test_true_games_are_measured(capsys, tmp_path):
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null"]
     assert "epo generate" in refused(true_game.main, *small)

@@ -278,18 +278,15 @@ class EvaluateSettings:
             raise ConfigError(f"batch_size must be 2 or more, not {self.batch_size}")
 
 
-@dataclass(frozen=True)
-class PredictSettings:
-    """Configuration of ``epo predict``."""
+@dataclass(frozen=True, kw_only=True)
+class ForecastSettings:
+    """A run and the scenes that it forecasts: the common part of ``epo predict`` and ``epo explore``."""
 
     run: str
-    out: str = "predictions"
     data: Mapping[str, Any] | None = None
     split: Split | None = None
     checkpoint: str = "best"
     scenes: int | None = 64
-    figures: int = 4
-    animate: int = 0
     workers: int | None = None
 
     @property
@@ -302,9 +299,33 @@ class PredictSettings:
         check_workers(self.workers)
         if self.scenes is not None and self.scenes < 1:
             raise ConfigError(f"scenes must be 1 or more, or null for all, not {self.scenes}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictSettings(ForecastSettings):
+    """Configuration of ``epo predict``."""
+
+    out: str = "predictions"
+    figures: int = 4
+    animate: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("figures", "animate"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExploreSettings(ForecastSettings):
+    """Configuration of ``epo explore``."""
+
+    port: int = 8765
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.port < 65536:
+            raise ConfigError(f"port must be a number from 0 to 65535, not {self.port}; 0 takes any free port")
 
 
 @dataclass(frozen=True)
