@@ -1,7 +1,7 @@
 """Answer times of the page of `epo explore`, and a film of it.
 
-    python -m benchmarks.explore times rpi                          # a run folder, or a run that ships with the package
-    epo explore run=rpi                                             # in another terminal
+    python -m benchmarks.explore times rpi/v_lstm_epo             # a run folder, or a run that ships with the package
+    epo explore run=rpi/v_lstm_epo                                # in another terminal
     python -m benchmarks.explore film http://127.0.0.1:8765 explore.gif
 
 The times are those of the server: the solution of the changed game, its energies and its Nash gap. The film needs

@@ -109,7 +109,7 @@ def test_extraction_is_timed(capsys):
 @pytest.mark.slow
 def test_answers_of_the_page_are_timed(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("EPO_CACHE", str(tmp_path))  # no data set: the scenes that ship with the run are taken
-    explore.main(["times", "rpi", "--edits", "2"])
+    explore.main(["times", "rpi/v_lstm_epo", "--edits", "2"])
     assert re.search(r"solver +median +[\d.]+ ms.*\nall +median +[\d.]+ ms", capsys.readouterr().out)
 
 

@@ -23,6 +23,7 @@ from epo_lightning.explore.session import Session
 from epo_lightning.registry import ConfigError
 
 uvicorn = pytest.importorskip("uvicorn", reason="needs epo_lightning[explore]")
+RUN = "rpi/v_lstm_epo"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 
 
@@ -30,7 +31,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 def address() -> Iterator[str]:
     from epo_lightning.explore.server import application
 
-    session = Session(epo_lightning.load("rpi"), pretrained.examples("rpi"), "<b>rpi</b>", ("executed", "alternative"))
+    session = Session(epo_lightning.load(RUN), pretrained.examples(RUN), "<b>rpi</b>", ("executed", "alternative"))
     server = uvicorn.Server(uvicorn.Config(application(session), log_level="error"))
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
@@ -152,6 +153,6 @@ def test_a_port_that_is_taken_is_named(tmp_path: Any, monkeypatch: pytest.Monkey
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match=f"port {port} cannot be used"):
-            explore(ExploreSettings(run="rpi", port=port), [], print)
+            explore(ExploreSettings(run=RUN, port=port), [], print)
     with pytest.raises(ConfigError, match="port must be a number from 0 to 65535"):
-        ExploreSettings(run="rpi", port=70000)
+        ExploreSettings(run=RUN, port=70000)

@@ -17,12 +17,12 @@ from epo_lightning.explore.edit import Edit
 from epo_lightning.explore.session import Session
 from epo_lightning.registry import ConfigError
 
-SCENE = 3
+RUN, SCENE = "rpi/v_lstm_epo", 3
 
 
 @pytest.fixture(scope="module")
 def session() -> Session:
-    return Session(epo_lightning.load("rpi"), pretrained.examples("rpi"), "rpi", ("executed", "alternative"))
+    return Session(epo_lightning.load(RUN), pretrained.examples(RUN), "rpi", ("executed", "alternative"))
 
 
 def states(answer: dict[str, Any], mode: int = 0) -> torch.Tensor:
@@ -148,4 +148,4 @@ def test_edits_that_do_not_fit_are_refused(session: Session, words: dict[str, An
 
 def test_a_forecaster_without_a_game_is_refused() -> None:
     with pytest.raises(ConfigError, match="infers no game"):
-        Session(torch.nn.Linear(1, 1), pretrained.examples("rpi"))
+        Session(torch.nn.Linear(1, 1), pretrained.examples(RUN))
