@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from epo_lightning.game.dynamics import Unicycle
     from epo_lightning.game.energy import Energy
     from epo_lightning.game.feature_energy import FeatureEnergy
+    from epo_lightning.predictions import read_predictions, write_predictions
     from epo_lightning.refinement import refine
     from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
     from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -39,7 +40,9 @@ _HOMES = {
     "Solution": "scene",
     "Status": "scene",
     "LevenbergMarquardt": "solvers.gauss_newton.levenberg_marquardt",
+    "read_predictions": "predictions",
     "refine": "refinement",
+    "write_predictions": "predictions",
 }
 
 __all__ = [
@@ -53,7 +56,9 @@ __all__ = [
     "Status",
     "Unicycle",
     "load",
+    "read_predictions",
     "refine",
+    "write_predictions",
 ]
 
 

@@ -20,7 +20,6 @@ Where agents do not interact, the refined futures are the tracked ones.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
@@ -45,7 +44,7 @@ ENERGY = FeatureEnergy(own=("accref", "turnrref"), pair=("circles",))
 """The energy of :func:`refine` unless another one is given: intentions, and bodies of vehicles that do not overlap."""
 WEIGHTS = {"accref": 1.0, "turnrref": 20.0, "circles": 10.0}
 """Weights of :data:`ENERGY`. At 20 m/s, a turn rate of 0.05 rad/s is felt as an acceleration of 1 m/s^2."""
-SOLVER = LevenbergMarquardt(steps=15, step_size=1.0, damping=1.0, adaptive=True)
+SOLVER = LevenbergMarquardt(steps=10, step_size=1.0, damping=1.0, adaptive=True)
 """The solver of :func:`refine` unless another one is given."""
 INVERSE_TEMPERATURE = 0.03
 """beta of :func:`refine` unless another one is given, chosen on validation data (docs/refine.md)."""
@@ -151,7 +150,7 @@ def refined(
         ValueError: an energy, a solver, weights or margins that cannot be used.
     """
     check_energy(energy, solver)
-    scene = dataclasses.replace(scene.to(states.dtype), game_steps=None)  # the game ends with the forecast
+    scene = _of_game(scene, states.dtype)
     controls = track(states, scene, energy.dynamics, noise)
     batch, modes, agents = controls.shape[:3]
     own, pair = energy.weighted
@@ -186,6 +185,22 @@ def refined(
         parameters=parameters,
         solution=solution,
         logits=logits,
+    )
+
+
+def _of_game(scene: Scene, dtype: torch.dtype) -> Scene:
+    """What the game takes from a scene, which ends with the forecast: histories, maps and ``game_steps`` are left out."""
+
+    def floats(value: Tensor | None) -> Tensor | None:
+        return None if value is None else value.to(dtype)
+
+    return Scene(
+        history=scene.history[:, :, -1:].to(dtype),
+        dt=scene.dt,
+        agent_mask=scene.agent_mask,
+        size=floats(scene.size),
+        kind=scene.kind,
+        reference_speed=floats(scene.reference_speed),
     )
 
 

@@ -26,6 +26,7 @@ FLOORS = {
     "game": {"scene", "registry", "checks"},
     "solvers": {"game", "scene", "registry", "checks"},
     "refinement": {"game", "solvers", "scene", "registry", "checks"},
+    "predictions": {"scene", "registry", "run_folder", "refinement"},
     "encoders": {"scene"},
     "metrics": {"scene", "registry"},
     "decoders": {"scene", "registry", "game"},

@@ -23,8 +23,8 @@ from epo_lightning.scene import HEADING, SPEED
 
 JERK = 5.0
 """J, the jerk [m/s^3] that counts as much as a difference of ``noise``."""
-SLOW = 0.5
-"""Speed [m/s] below which displacements do not tell the heading: it is kept, and displacements across it are ignored."""
+STILL = 1e-3
+"""Least displacement [m] that tells a heading, also without noise."""
 
 
 def followed_controls(
@@ -46,10 +46,11 @@ def followed_controls(
     free = smooth @ torch.cat((begin, positions[..., 1:, :]), -2)
     velocity = torch.cat((begin, free), -2).diff(dim=-2) / dt  # at the nodes 0 .. K-1
     heading = torch.atan2(velocity[..., 1], velocity[..., 0])
-    # At slow nodes, the heading of the last node that was not slow; the first node has the observed heading.
+    # Displacements shorter than the noise tell no heading: there it is that of the last node with a longer one, and
+    # displacements across it are ignored. The first node has the observed heading.
     heading = torch.cat((current[..., None, HEADING], heading[..., 1:]), -1)
     nodes = torch.arange(heading.shape[-1], device=heading.device)
-    known = torch.where((velocity.norm(dim=-1) > SLOW), nodes, 0).cummax(-1).values
+    known = torch.where(dt * velocity.norm(dim=-1) > max(noise, STILL), nodes, 0).cummax(-1).values
     heading = heading.gather(-1, known)
     speed = velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
     speed = torch.cat((current[..., None, SPEED], speed[..., 1:]), -1)

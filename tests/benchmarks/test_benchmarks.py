@@ -20,6 +20,7 @@ from benchmarks import (
     figures,
     generation,
     reading,
+    refinement,
     scaling,
     training_step,
     true_game,
@@ -27,6 +28,8 @@ from benchmarks import (
 from epo_lightning.data.recorded.formats.argoverse2 import argoverse2
 from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.experiment import train
+from epo_lightning.experiment.config.compose import compose
 
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
 SMALL = ["--B", "2", "--M", "1", "--K", "4", "--S", "1", "--repeats", "1"]
@@ -125,6 +128,30 @@ def test_true_games_are_measured(capsys, tmp_path):
     assert float(lines[0].split("executed ")[1].split()[0]) < 1e-5
     assert "fewer than 4000" in refused(true_game.main, "--records", 4000, *small)
     assert "data=rpi" in refused(true_game.main, "data=drawn")
+
+
+@pytest.mark.slow
+def test_refinements_of_runs_are_scored_and_timed(capsys, tmp_path):
+    words = [
+        "data=drawn",
+        "data.scenes=32",
+        "data.batch_size=4",
+        "data.like=highway",
+        "budget=smoke",
+        "callbacks.progress=none",
+    ]
+    run = train.train(compose("train", ["experiment=highway/v_lstm", *words, f"runs={tmp_path}"]))
+    refinement.main(
+        [str(run.path), "--weights", "accref=1", "turnrref=20", "circles=10", "headway=1", "--margins", "headway=0"]
+    )
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[3] for line in lines[1:-1] if " all " in line] == ["given", "tracked", "refined"]
+    assert lines[-1].startswith("CPU ms per scene of 4 agents and 5 modes: ")
+    assert "'circles' is not name=number" in refused(refinement.main, run.path, "--weights", "circles")
+
+
+def test_refinements_name_what_is_no_run(tmp_path):
+    assert str(tmp_path) in refused(refinement.main, tmp_path)
 
 
 def test_figures_are_drawn_and_wrong_runs_are_one_line(tmp_path):

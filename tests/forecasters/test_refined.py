@@ -70,7 +70,7 @@ class Refinements:
 
 
 class TestRefined(Refinements, ForecasterSuite):
-    tolerance = {"rtol": 0.0, "atol": 1e-3}  # a solution is less exact than a forward pass
+    tolerance = {"rtol": 0.0, "atol": 1e-2}  # the solution of a game with random futures amplifies rounding errors
 
     def model(self, **changes: Any) -> dict[str, Any]:
         return model(self.config, given=model(marginal(2), **changes), **PARTS, **changes)

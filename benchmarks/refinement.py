@@ -1,0 +1,169 @@
+"""Scores of trained runs before and after a refinement without training, and its time, on the test split of their data.
+
+    python -m benchmarks.refinement runs/highway/v_lstm/short-s0 --share 0.1
+    python -m benchmarks.refinement runs/rpi/v_lstm_relaxed/reduced-s0 --weights accref=1 turnrref=0.3 clearance=3 \\
+        --margins clearance=0.02 --noise 0.01
+
+For every run: the forecasts as given; *tracked*, with the same weights but without pair terms; and *refined*
+(:func:`epo_lightning.refine`). Scores are those of ``epo evaluate``, for all scenes and for interactive ones where the data
+have them. OR is the overlap rate [%]. The time is CPU time per scene in milliseconds, of batches of 1 and 32 scenes, without
+the forecaster. Nothing is written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from epo_lightning import FeatureEnergy, JointForecast, Scene, refine
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.metrics import ForecastMetrics
+from epo_lightning.refinement import INVERSE_TEMPERATURE, NOISE, WEIGHTS
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
+from epo_lightning.schema import read
+
+SCORES = {"minSADE": "SADE", "minSFDE": "SFDE", "minSADE_1": "k=1", "overlap_jfp": "OR"}
+REPEATS = 21
+"""Calls whose median is the time."""
+
+Forecasts = list[tuple[Scene, Tensor, Tensor]]
+Refinement = Callable[[Tensor, Tensor, Scene], JointForecast]
+
+
+@torch.no_grad()
+def forecasts(folder: str, share: float | None, split: str) -> tuple[Settings, Forecasts, Sequence[str], str]:
+    """Settings of a run; scenes, futures and probabilities in batches of 256; names of the subsets, and shape of agents.
+
+    Raises:
+        ConfigError: no finished run, or its data is missing.
+    """
+    run = RunFolder.open(folder)
+    settings = read(Settings, run.config())
+    forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
+    section = {**settings.data, "batch_size": 256, **({} if share is None else {"share": share})}
+    data = assembly.build_data(section)
+    data.setup("test" if split == "test" else "validate")
+    loader = data.test_dataloader() if split == "test" else data.val_dataloader()
+    found = []
+    for scene in loader:
+        forecast = forecaster(scene)
+        found.append((scene, forecast.states, forecast.probabilities))
+    return settings, found, data.task.subsets, data.task.shape
+
+
+def scores(given: Forecasts, subsets: Sequence[str], shape: str, refinement: Refinement) -> dict[str, float]:
+    """Scores of all batches after a refinement."""
+    metrics = ForecastMetrics(subsets, shape)
+    for scene, states, probabilities in given:
+        metrics.update(refinement(states, probabilities, scene), scene)
+    return {name: float(value) for name, value in metrics.compute().items()}
+
+
+def milliseconds(given: Forecasts, size: int, refinement: Refinement) -> float:
+    """Median CPU time per scene of batches of ``size`` scenes."""
+    scene, states, probabilities = given[0]
+    times = []
+    for repeat in range(REPEATS + 1):
+        rows = [(repeat * size + offset) % len(states) for offset in range(size)]
+        batch = states[rows], probabilities[rows], scene[rows]
+        start = time.process_time()
+        refinement(*batch)
+        times.append(time.process_time() - start)
+    return 1e3 * statistics.median(times[1:]) / size
+
+
+def numbers(words: Iterable[str]) -> dict[str, float]:
+    """Numbers by name.
+
+    Raises:
+        ConfigError: a word that is not name=number.
+    """
+    found = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise ConfigError(f"{word!r} is not name=number") from None
+    return found
+
+
+def report(
+    folder: str,
+    weights: Mapping[str, float],
+    margins: Mapping[str, float],
+    noise: float,
+    beta: float,
+    share: float | None,
+    split: str,
+) -> None:
+    """Print the rows of one run.
+
+    Raises:
+        ConfigError: as :func:`forecasts`, or an energy that cannot be used.
+    """
+    settings, given, subsets, shape = forecasts(folder, share, split)
+    pair = [name for name in weights if name not in ("accref", "turnrref")]
+    energy = FeatureEnergy(own=[name for name in weights if name not in pair], pair=pair, margins=margins)
+
+    def plain(states: Tensor, probabilities: Tensor, scene: Scene) -> JointForecast:
+        return JointForecast(states, probabilities)
+
+    def tracked(states: Tensor, probabilities: Tensor, scene: Scene) -> JointForecast:
+        alone = {**weights, **dict.fromkeys(pair, 0.0)}
+        return refine(states, probabilities, scene, energy, alone, noise=noise)
+
+    def refined(states: Tensor, probabilities: Tensor, scene: Scene) -> JointForecast:
+        return refine(states, probabilities, scene, energy, weights, noise=noise, inverse_temperature=beta)
+
+    groups = [("all", ""), *((name, f"{name}/") for name in subsets)]
+    for label, refinement in (("given", plain), ("tracked", tracked), ("refined", refined)):
+        found = scores(given, subsets, shape, refinement)
+        for group, prefix in groups:
+            values = [found[prefix + key] * (100 if key == "overlap_jfp" else 1) for key in SCORES]
+            row = f"{settings.title}, seed {settings.seed}"
+            print(f"{row:<28}{label:<9}{group:<13}" + "".join(f"{value:>9.4f}" for value in values), flush=True)
+    times = ", ".join(f"{milliseconds(given, size, refined):.2f} in batches of {size}" for size in (1, 32))
+    agents, modes = given[0][1].shape[2], given[0][1].shape[1]
+    print(f"CPU ms per scene of {agents} agents and {modes} modes: {times}", flush=True)
+
+
+@torch.no_grad()
+def main(given: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.refinement",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("runs", nargs="+", help="folders of finished runs")
+    parser.add_argument("--share", type=float, help="share of the scenes of the split (default: that of the run)")
+    parser.add_argument("--split", choices=("test", "val"), default="test")
+    parser.add_argument(
+        "--weights", nargs="+", metavar="NAME=NUMBER", help="weight of each feature (default: those of refine)"
+    )
+    parser.add_argument("--margins", nargs="+", metavar="NAME=METRES", default=[], help="margins of pair features")
+    parser.add_argument("--noise", type=float, default=NOISE, help="noise of given positions [m]")
+    parser.add_argument("--beta", type=float, default=INVERSE_TEMPERATURE, help="inverse temperature")
+    chosen = parser.parse_args(given)
+    torch.set_num_threads(1)
+    assembly.quiet()
+    print(f"{'run':<28}{'':<9}{'scenes':<13}" + "".join(f"{label:>9}" for label in SCORES.values()))
+    try:
+        weights = WEIGHTS if chosen.weights is None else numbers(chosen.weights)
+        for folder in chosen.runs:
+            report(folder, weights, numbers(chosen.margins), chosen.noise, chosen.beta, chosen.share, chosen.split)
+    except ConfigError as error:
+        raise SystemExit(f"benchmarks.refinement: {error}") from None
+
+
+if __name__ == "__main__":
+    main()
