@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from docs.pages import PAGES, ROOT, commands, unknown
+from suites import untrained
 
 from epo_lightning.arguments import parse
 from epo_lightning.experiment import assembly, verbs
@@ -37,6 +38,17 @@ COMMANDS = {command: page for page in PAGES for command in commands(page)}
 def test_shell_blocks_hold_nothing_but_known_programs() -> None:
     assert {page.name: lines for page in PAGES if (lines := unknown(page))} == {}
     assert len(COMMANDS) > 60
+
+
+def make_frozen(words: list[str]) -> None:
+    """In the present folder, the run that a command refines, with initial weights."""
+    for word in words:
+        if word.startswith("forecaster.frozen="):
+            given = [other.replace("_refined", "") for other in words if other != word]
+            settings = read(Settings, compose.compose("train", given))
+            checkpoints = Path(word.partition("=")[2]) / "checkpoints"
+            checkpoints.mkdir(parents=True)
+            untrained(assembly.describe_model(settings, assembly.build_data(settings.data)), checkpoints / "best.ckpt")
 
 
 def composes(words: list[str]) -> None:
@@ -68,6 +80,7 @@ def composes(words: list[str]) -> None:
         return
     runs = compose.jobs("train", overrides, arguments.extra) if arguments.multirun else [overrides]
     for run in runs[:1]:
+        make_frozen(run)
         assembly.check_buildable(read(Settings, compose.compose("train", run, arguments.extra)))
 
 
