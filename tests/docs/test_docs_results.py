@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from math import sqrt
 from pathlib import Path
+from statistics import fmean, stdev
 
 import pytest
+from scipy.stats import t as student
 
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import report
@@ -78,21 +81,45 @@ def test_the_page_has_the_scores_of_the_refined_game() -> None:
         assert line_of(start, place)[:2] == shown, title
 
 
-def test_the_page_has_the_scores_of_solved_games_on_highways() -> None:
-    report = read_results(ROOT / "results" / "highway_sim_dense_equilibrium.json")
-    found: dict[str, list[float]] = {}
-    for run in report.runs:
+def of_dense_highways() -> dict[str, dict[int, dict[str, float]]]:
+    """The scores on a tenth of the test split by row and seed."""
+    found: dict[str, dict[int, dict[str, float]]] = {}
+    for run in read_results(ROOT / "results" / "highway_sim_dense_equilibrium.json").runs:
         for one, _ in read_other(run):
-            for metric in ("minSADE", "interactive/minSADE"):
-                found.setdefault(f"{one.experiment.removeprefix('highway/')} {metric}", []).append(one.metrics[metric])
-    for row, metric, start, place in (
-        ("v_lstm_epo_equilibrium", "interactive/minSADE", "| + EPO, solved (`", 0),
-        ("v_lstm_epo_equilibrium", "minSADE", "| + EPO, solved |", 0),
-        ("v_lstm_sc", "interactive/minSADE", "| + SC |", 0),
-        ("v_lstm_sc", "minSADE", "| + SC |", 1),
-        ("vibes_epo_equilibrium", "interactive/minSADE", "| VIBES + EPO, solved", 0),
-        ("hivt_m_epo_equilibrium", "interactive/minSADE", "| HiVT-M + EPO, solved", 0),
-    ):
-        values = found[f"{row} {metric}"]
-        shown = line_of(start, place)[0].partition(" ")[0]
-        assert shown == short(sum(values) / len(values), 3), (row, metric)
+            found.setdefault(one.experiment.removeprefix("highway/"), {})[one.seed] = dict(one.metrics)
+    return found
+
+
+ROWS = {"EPO, solved": "epo_equilibrium", "EPO, solved, without pair term": "epo_equilibrium_no_pair", "SC": "sc"}
+
+
+@pytest.mark.parametrize(("backbone", "name"), [("v_lstm", "V-LSTM"), ("vibes", "VIBES"), ("hivt_m", "HiVT-M")])
+@pytest.mark.parametrize("row", ROWS)
+def test_the_page_has_the_scores_of_solved_games_on_highways(backbone: str, name: str, row: str) -> None:
+    runs = of_dense_highways()[f"{backbone}_{ROWS[row]}"]
+    assert sorted(runs) == [0, 1, 2]
+    for place, subset in enumerate(("interactive/", "")):
+        shown = line_of(f"| {name} + {row} |", place)
+        for cell, (metric, digits, unit) in zip(
+            shown, (("minSADE", 3, 1), ("minSFDE", 2, 1), ("overlap_jfp", 1, 100), ("minSADE_1", 2, 1)), strict=False
+        ):
+            values = [unit * metrics[subset + metric] for metrics in runs.values()]
+            assert cell == f"{short(fmean(values), digits)} ± {short(stdev(values), digits)}", (row, metric)
+
+
+@pytest.mark.parametrize(
+    ("words", "other"), [("its twin without pair term", "epo_equilibrium_no_pair"), ("+ SC", "sc")]
+)
+def test_the_page_has_the_paired_differences_over_all_backbones(words: str, other: str) -> None:
+    scores = of_dense_highways()
+    shown = line_of(f"| all nine: solved - {words} |")
+    for cell, (metric, digits) in zip(shown, (("interactive/minSADE", 3), ("interactive/minSFDE", 2)), strict=False):
+        found = [
+            scores[f"{backbone}_epo_equilibrium"][seed][metric] - scores[f"{backbone}_{other}"][seed][metric]
+            for backbone in ("v_lstm", "vibes", "hivt_m")
+            for seed in range(3)
+        ]
+        half = student.ppf(0.975, len(found) - 1) * stdev(found) / sqrt(len(found))
+        mean = fmean(found)
+        low, middle, high = (f"{v:+.{digits}f}".replace("0.", ".", 1) for v in (mean - half, mean, mean + half))
+        assert cell == f"{middle} ({low} to {high})"
