@@ -65,8 +65,9 @@ class TestGame(ForecasterSuite):
         return dataclasses.replace(scene, goal_headings=torch.zeros(*scene.agent_mask.shape, 1))
 
     def test_padding_does_not_change_training(self) -> None:
-        """In float64: rounding errors of float32 may lead a descent to another minimum."""
-        forecaster, scene = self.forecaster().double().train(), self.scene(6).to(torch.double)
+        """After few steps: modes of one game that meet in its minimum are equally close, so rounding would choose one."""
+        few = {**SOLVER, "steps": 2, "newton_steps": 0}
+        forecaster, scene = self.forecaster(solver=few).double().train(), self.scene(6).to(torch.double)
         alone = forecaster.losses(scene, forecaster(scene))
         padded = self.padded(scene)
         for name, (_, value) in forecaster.losses(padded, forecaster(padded)).items():
