@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -160,6 +160,26 @@ def read_other(run: Records) -> list[tuple[EvaluatedRun, Mapping[str, Any]]]:
             _entry(content, file, again, key)
         found.append((_evaluated(run, config, record, file, content, str(content["split"]), again), content))
     return found
+
+
+def read_parts(run: Records) -> list[EvaluatedRun]:
+    """Scores of one run on a part of its own data (``data.share``), of each part the ones that were written last.
+
+    Raises:
+        ConfigError: as :func:`read_run`.
+    """
+    found: dict[str, EvaluatedRun] = {}
+    for one, content in read_other(run):
+        if is_part(one, content):
+            part = f"{one.data}, {content['settings']['share']:.0%} of the scenes"
+            found[part] = replace(one, data=part)
+    return list(found.values())
+
+
+def is_part(run: EvaluatedRun, content: Mapping[str, Any]) -> bool:
+    """Whether scores are those of a part of the run's own data: the same recordings and windows, fewer scenes."""
+    share = content.get("settings", {}).get("share", 1)
+    return run.data_digest == run.trained_digest and share < run.config["data"].get("share", 1)
 
 
 def scored_elsewhere(run: Records) -> list[str]:

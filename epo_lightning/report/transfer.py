@@ -16,7 +16,7 @@ from epo_lightning.report.columns import MISSING, Column
 from epo_lightning.report.records import Records
 from epo_lightning.report.render import Sheet, csv_text, own_text
 from epo_lightning.report.rows import Cell, plain_rows
-from epo_lightning.report.runs import EvaluatedRun, read_other, read_run
+from epo_lightning.report.runs import EvaluatedRun, is_part, read_other, read_run
 from epo_lightning.report.tables import FORECASTERS
 
 METRICS = (Column("minSADE", "SADE"), Column("minSFDE", "SFDE"), Column("overlap_jfp", "OR (JFP)"))
@@ -77,7 +77,7 @@ def transfers(runs: Iterable[Records]) -> list[Line]:
     """
     found: list[tuple[TestSet, EvaluatedRun]] = []
     for run in runs:
-        others = read_other(run)
+        others = [(one, about) for one, about in read_other(run) if not is_part(one, about)]
         found += [
             (TestSet(one.data, one.split, one.data_digest, str(about["test"])[:6], about), one) for one, about in others
         ]

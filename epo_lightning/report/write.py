@@ -29,7 +29,7 @@ from epo_lightning.report.render import (
     to_rich,
     without_html,
 )
-from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, scored, scored_elsewhere
+from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, read_parts, scored, scored_elsewhere
 from epo_lightning.report.selection import BestSetting, best_settings
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import Table, build_tables
@@ -126,7 +126,7 @@ def write_report(
     from epo_lightning.report.style import save
 
     out = Path(out).expanduser()
-    tables = build_tables(report.evaluated)
+    tables = build_tables([*report.evaluated, *(part for run in report.runs for part in read_parts(run))])
     timings, damaged = read_timings(report.runs)
     of_game, comparisons = build_worth(tables), build_comparisons(tables)
     worth, compared = ([comparison_sheet(entry) for entry in entries] for entries in (of_game, comparisons))

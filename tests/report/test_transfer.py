@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import csv
+import io
 import statistics
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from epo_lightning.registry import ConfigError
+from epo_lightning.report import Report, write_report
 from epo_lightning.report.transfer import labels_of, transfer_sheets, transfers, transfers_to_csv
 from epo_lightning.run_folder import RunFolder, write_json
 
@@ -75,6 +78,22 @@ def test_runs_without_scores_elsewhere_give_no_table(tmp_path: Path) -> None:
     run = make_run(tmp_path / "sc", "SC", "scene_consistent", scores(1.0), data="a")
     assert transfers([run]) == []
     assert transfer_sheets([]) == []
+
+
+def test_scores_on_a_part_of_the_own_data_are_tables_of_their_own(tmp_path: Path) -> None:
+    """The share of the training is all scenes unless it is set, so scores on a share of a half are no other data."""
+    for seed, half in ((0, 3.0), (1, 5.0)):
+        run = make_run(tmp_path / f"sc{seed}", "SC", "scene_consistent", None, seed=seed, data="a", digest="A")
+        on(run, "a", 9.0, split="test", data_digest="A", settings={"share": 0.5}, name="-0")  # written first
+        on(run, "a", half, split="test", data_digest="A", settings={"share": 0.5}, name="-00")
+        on(run, "b", 7.0, split="test", data_digest="B", settings={"share": 0.5})
+    report = Report.of_folder(tmp_path)
+    write_report(report, tmp_path / "report", console=Console(file=io.StringIO()))
+    text = (tmp_path / "report" / "results.md").read_text()
+    table = text.partition("## a, 50% of the scenes, test split\n")[2].partition("##")[0]
+    assert "| SC | 2 | 4.000 ± 1.414 |" in table
+    assert "| SC | a, 50% of the scenes, test split | reduced | 0, 1 |" in text.partition("## How this was made")[2]
+    assert transfer_sheets(transfers(report.runs))[0].header[3:] == ("b, test",)
 
 
 def test_rows_of_several_data_sets_share_the_columns_of_the_same_scenes(tmp_path: Path) -> None:
