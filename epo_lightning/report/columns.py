@@ -24,9 +24,9 @@ class Column:
 
     @property
     def ranked(self) -> bool:
-        """Whether rows are ranked by it; energies and their gradients and gaps have different units in each row, and the
-        effect of pair terms is neither good nor bad."""
-        return self.metric not in OWN_UNITS and not self.is_effect
+        """Whether rows are ranked by it; energies and their gradients and gaps have different units in each row, the
+        effect of pair terms is neither good nor bad, and of a correlation with the truth more is better."""
+        return self.metric not in OWN_UNITS and not self.is_effect and not self.metric.startswith(TRUE)
 
     @property
     def is_effect(self) -> bool:
@@ -81,6 +81,16 @@ EQUILIBRIUM = (
     Column("gradient_norm", "gradient norm"),
     Column("nash_gap", "Nash gap"),
     Column("nash_gap_relative", "Nash gap, relative"),
+)
+
+TRUE = "true_"
+"""Beginning of the names of metrics that compare inferred costs with the true ones."""
+
+TRUTH = (
+    Column(f"{TRUE}pair_rank", "w: rank correlation"),
+    Column(f"{TRUE}pair_error", "w: median error"),
+    Column(f"{TRUE}goal_error", "goal: median error"),
+    Column(f"{TRUE}vel_error", "speed: median error"),
 )
 
 PROBABILITIES = (

@@ -11,6 +11,7 @@ from typing import Any
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.columns import TRUE
 from epo_lightning.report.records import CONFIG, RECORD, Records
 from epo_lightning.run_folder import OTHER, RunFolder, discover
 
@@ -36,7 +37,7 @@ class EvaluatedRun:
         checkpoint: name of the evaluated checkpoint.
         data_digest: digest of the data on which it was evaluated.
         trained_digest: digest of the data on which it was trained.
-        metrics: scores by name, displacements in m.
+        metrics: scores by name, displacements in m; with the errors of inferred costs, where the true ones are known.
         git_commit: commit of the code; the installed version outside a checkout.
         command: command of the training.
         parameters: number of trained parameters, where known.
@@ -208,6 +209,7 @@ def _evaluated(
     metrics = _entry(result, file, again, "metrics")
     if not isinstance(metrics, Mapping) or not all(isinstance(value, int | float) for value in metrics.values()):
         raise ConfigError(f"{file}: metrics must be numbers by name; {again}")
+    of_costs = {f"{TRUE}{name}": value for name, value in result.get("truth", {}).items()}
     if result.get("split", split) != split:
         raise ConfigError(f"{file} holds scores of the {result['split']} split, was it renamed? {again}")
     digest = str(_entry(result, file, again, "data_digest"))
@@ -240,7 +242,7 @@ def _evaluated(
         checkpoint=str(result.get("checkpoint", "best")),
         data_digest=digest,
         trained_digest=trained,
-        metrics={name: float(value) for name, value in metrics.items()},
+        metrics={name: float(value) for name, value in {**metrics, **of_costs}.items()},
         git_commit=str(record.get("git_commit") or _version(record)),
         command=mask(recorded("command")),  # older versions wrote secrets
         parameters=record.get("parameters"),

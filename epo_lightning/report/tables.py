@@ -19,6 +19,7 @@ from epo_lightning.report.columns import (
     OF_MODES,
     PAIR_EFFECT,
     PROBABILITIES,
+    TRUTH,
     Column,
 )
 from epo_lightning.report.labels import natural
@@ -57,8 +58,8 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
     """Tables of every data set and split: the main table, and tables of subsets, modes and games.
 
     The further tables show scores by subset, of the k most likely modes, of probabilities and missed alternatives, of
-    initial beside solved strategies, the effect of pair terms, and the distance of forecasts from an equilibrium of their
-    game. They contain the rows that have such scores.
+    initial beside solved strategies, the effect of pair terms, the distance of forecasts from an equilibrium of their
+    game, and of inferred costs from the true ones. They contain the rows that have such scores.
 
     Raises:
         ConfigError: rows of one table that were trained under different conditions, or the same run twice.
@@ -94,6 +95,7 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
         effect = (Column(PAIR_EFFECT, "all scenes"), *subset_columns(rows, (Column(PAIR_EFFECT, ""),)))
         tables += _partly_shown(f"{where}: effect of the other agents", effect, rows)
         tables += _partly_shown(f"{where}: equilibrium", EQUILIBRIUM, [row for row in rows if "nash_gap" in row.cells])
+        tables += _partly_shown(f"{where}: inferred against true costs", TRUTH, rows)
     return tables
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
 import shutil
@@ -426,3 +427,17 @@ def test_tables_and_captions_name_the_hard_split(tmp_path: Path) -> None:
         text = (tmp_path / "out" / name).read_text()
         assert "rpi_hard, test split" in text or r"rpi\_hard, test split" in text, name
     assert "Cost: rpi_hard" in (tmp_path / "out" / "results.md").read_text()
+
+
+def test_errors_of_inferred_costs_are_a_table_without_ranks(tmp_path: Path) -> None:
+    for name, rank in (("solved", 0.99), ("refined", 0.1)):
+        run = make_run(tmp_path / name, name, "epo", scores(1.0))
+        content = json.loads((run.path / "metrics.json").read_text())
+        write_json(run.path / "metrics.json", {**content, "truth": {"pair_rank": rank, "pair_error": 1 - rank}})
+    make_run(tmp_path / "sc", "SC", "scene_consistent", scores(1.0))
+    tables = build_tables(collect(tmp_path))
+    found = next(table for table in tables if table.title == "rpi, test split: inferred against true costs")
+    assert [row.name for row in found.rows] == ["refined", "solved"]
+    assert [column.label for column in found.columns] == ["w: rank correlation", "w: median error"]
+    assert [cell.mean for cell in (row.cells["true_pair_rank"] for row in found.rows)] == [0.1, 0.99]
+    assert not any(row.cells[column.metric].rank for row in found.rows for column in found.columns)
