@@ -130,7 +130,7 @@ def _help(arguments: Arguments) -> None:
     for line in (tree() / "conf" / f"{arguments.verb}.yaml").read_text(encoding="utf-8").splitlines():
         if not line.startswith(hidden):
             print(f"  {line}")
-    if arguments.verb in ("generate", "evaluate", "predict", "explore"):
+    if arguments.verb in ("generate", "evaluate", "predict", "explore", "export"):
         with hydra(arguments.extra) as instance:
             print(f"  data=         {' | '.join(sorted(options_of(instance, 'data')))}")
     if arguments.verb == "train":

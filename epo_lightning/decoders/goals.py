@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from epo_lightning.decoders.mlp import MLP
+from epo_lightning.host import readable
 from epo_lightning.scene import Scene
 
 NO_CANDIDATE = -1e9
@@ -135,15 +136,19 @@ class GoalDecoder(nn.Module):
             ValueError: the scene has no candidates.
         """
         candidates, exists = goal_candidates(scene)
-        way = (candidates - scene.current[:, :, None, :2])[exists] / self.scale
+        way = (candidates - scene.current[:, :, None, :2]) / self.scale
         # The first layer of the concatenation, without a copy of the agent's feature for every candidate.
         first = self.mlp.hidden[0]
         assert isinstance(first, nn.Linear)
         of_agent, of_way = first.weight.split([self.width, 2], 1)
-        agent = F.linear(z, of_agent, first.bias).flatten(0, 1)
-        owner = exists.flatten(0, 1).nonzero()[:, 0]
-        logits = self.mlp.after_first(agent[owner] + F.linear(way, of_way))
-        return logits.new_full(exists.shape, NO_CANDIDATE).masked_scatter(exists, logits)
+        agent = F.linear(z, of_agent, first.bias)
+        if self.training or readable(exists):  # only the candidates that exist, which batch normalisation needs
+            owner = exists.flatten(0, 1).nonzero()[:, 0]
+            logits = self.mlp.after_first(agent.flatten(0, 1)[owner] + F.linear(way[exists], of_way))
+            return logits.new_full(exists.shape, NO_CANDIDATE).masked_scatter(exists, logits)
+        way = torch.where(exists[..., None], way, 0.0)
+        logits = self.mlp.after_first(agent[:, :, None] + F.linear(way, of_way))[..., 0]
+        return torch.where(exists, logits, NO_CANDIDATE)
 
 
 def goal_candidates(scene: Scene) -> tuple[Float[Tensor, "B N G 2"], Bool[Tensor, "B N G"]]:
@@ -177,7 +182,7 @@ def choose(scene: Scene, chosen: Int[Tensor, "B M N"]) -> tuple[Float[Tensor, "B
     """Positions of the chosen candidates and the reference lines on which they lie; zero for agents without candidates."""
     candidates, exists = goal_candidates(scene)
     agent = torch.arange(chosen.shape[2], device=chosen.device)
-    index = torch.arange(len(chosen), device=chosen.device)[:, None, None], agent, chosen
+    index = torch.arange(chosen.shape[0], device=chosen.device)[:, None, None], agent, chosen
     goals = torch.where(exists[index][..., None], candidates[index], 0.0)
     if scene.goal_reference is None:
         return goals, None

@@ -46,4 +46,4 @@ class ZeroStrategies(nn.Module):
 
     def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B M N K 2"]:
         """Controls of zero."""
-        return z.new_zeros(len(z), self.count, z.shape[1], self.horizon, 2)
+        return z.new_zeros(z.shape[0], self.count, z.shape[1], self.horizon, 2)

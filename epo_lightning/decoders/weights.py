@@ -80,7 +80,7 @@ class SharedWeights(nn.Module):
         """Weights by feature name, of R = N agents or R = P pairs; neither ``z`` nor ``mask`` changes them."""
         weights = (self.start * self.logarithms.exp()).unbind()
         agents = z.shape[1]
-        shape = len(z), self.games, agents * (agents - 1) // 2 if self.of_pairs else agents
+        shape = z.shape[0], self.games, agents * (agents - 1) // 2 if self.of_pairs else agents
         return {name: weight.expand(shape) for name, weight in zip(self.features, weights, strict=True)}
 
 

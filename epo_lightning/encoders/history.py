@@ -64,7 +64,7 @@ class LSTMHistory(nn.Module):
         order = (~observed).to(torch.uint8).argsort(dim=1, stable=True)
         states, _ = self.lstm(vectors.gather(1, order[..., None].expand_as(vectors)))
         last = observed.sum(1) - 1
-        return states[torch.arange(len(last), device=last.device), last].view(*scene.agent_mask.shape, self.width)
+        return states[torch.arange(last.shape[0], device=last.device), last].view(*scene.agent_mask.shape, self.width)
 
 
 class TransformerHistory(nn.Module):
@@ -107,7 +107,7 @@ class TransformerHistory(nn.Module):
         for layer in self.layers[:-1]:
             tokens = layer(tokens, tokens, observed)
         # Only the newest token of the last layer is read.
-        reader = tokens[torch.arange(len(newest), device=newest.device), newest][:, None]
+        reader = tokens[torch.arange(newest.shape[0], device=newest.device), newest][:, None]
         return self.norm(self.layers[-1](reader, tokens, observed)).view(*scene.agent_mask.shape, self.width)
 
 

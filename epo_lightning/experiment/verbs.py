@@ -14,6 +14,7 @@ from epo_lightning import pretrained
 from epo_lightning.experiment.config.settings import (
     EvaluateSettings,
     ExploreSettings,
+    ExportSettings,
     GenerateSettings,
     PredictSettings,
     ReportSettings,
@@ -28,6 +29,7 @@ SCHEMAS: dict[str, type] = {
     "evaluate": EvaluateSettings,
     "predict": PredictSettings,
     "explore": ExploreSettings,
+    "export": ExportSettings,
     "report": ReportSettings,
 }
 HEADLINE = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp")
@@ -179,6 +181,18 @@ def explore_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     explore(settings, overrides, lambda address: print(f"open {address} in a browser; Ctrl-C ends", flush=True))
 
 
+def export_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Write a run's forecaster as a program, and print the file and its difference from the forecaster."""
+    settings = check_settings("export", config)
+    from epo_lightning.experiment.export import export
+
+    print("exporting, which takes minutes ...", flush=True)
+    file, difference = export(settings, overrides)
+    print(
+        f"wrote {file}, {file.stat().st_size / 1e6:.1f} MB; it differs from the forecaster by {difference:.1g} m at most"
+    )
+
+
 def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Write tables and figures of all evaluated runs below a folder, and print the path of the page."""
     settings = check_settings("report", config)
@@ -212,5 +226,6 @@ RUN: dict[str, Callable[[dict[str, Any], Sequence[str]], Any]] = {
     "evaluate": evaluate_and_print,
     "predict": predict_and_print,
     "explore": explore_and_print,
+    "export": export_and_print,
     "report": report_and_print,
 }

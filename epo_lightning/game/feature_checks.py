@@ -14,6 +14,7 @@ from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, PairFeature
 from epo_lightning.game.game_end import check_game_steps
 from epo_lightning.game.limits import check_bound
 from epo_lightning.game.pairs import pair_mask
+from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import GameParameters, Scene
 
@@ -67,7 +68,7 @@ def check_inputs(energy: FeatureEnergy, scene: Scene, parameters: GameParameters
     check_game_steps(scene, steps)
     if "reference" in energy.needs and parameters.reference.is_floating_point():  # type: ignore[union-attr]
         raise ValueError("parameters.reference holds indices of lines: it takes whole numbers, not floats")
-    if "reference" in energy.needs and controls.device.type == "cpu":  # on a GPU, the check would make the host wait
+    if "reference" in energy.needs and readable(controls):  # on a GPU, the check would make the host wait
         assert scene.references is not None
         assert parameters.reference is not None
         lines = scene.references.shape[2]
@@ -100,7 +101,7 @@ def _check_decoded_margins(energy: FeatureEnergy, scene: Scene, parameters: Game
             raise ValueError(
                 f"margins[{name!r}] has shape {list(margin.shape)}; these controls take {[batch, modes, count]}"
             )
-        if margin.device.type == "cpu" and ((margin < 0) & exists[:, None]).any():
+        if readable(margin) and ((margin < 0) & exists[:, None]).any():
             raise ValueError(f"margins[{name!r}] must be 0 or more [m], but the least one is {float(margin.min())}")
 
 

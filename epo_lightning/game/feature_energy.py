@@ -415,7 +415,7 @@ class FeatureEnergy(Energy):
         assert scene.reference_mask is not None
         assert parameters.reference is not None
         present = scene.agent_mask[:, None]
-        scenes = torch.arange(len(present), device=present.device)[:, None, None]
+        scenes = torch.arange(present.shape[0], device=present.device)[:, None, None]
         agents = torch.arange(present.shape[2], device=present.device)
         index = scenes, agents, torch.where(present, parameters.reference, 0).long()
         return index, scene.reference_mask[index] & present

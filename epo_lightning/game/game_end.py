@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.game.features import Source
+from epo_lightning.host import readable
 from epo_lightning.scene import Scene
 
 
@@ -23,7 +24,7 @@ def check_game_steps(scene: Scene, steps: int) -> None:
         ValueError: a game that ends earlier or later; the message names the first such scene.
     """
     ends = scene.game_steps
-    if ends is None or ends.device.type != "cpu":
+    if ends is None or not readable(ends):
         return
     bad = (ends < 1) | (ends > steps)
     if bad.any():

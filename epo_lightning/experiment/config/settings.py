@@ -328,6 +328,14 @@ class ExploreSettings(ForecastSettings):
             raise ConfigError(f"port must be a number from 0 to 65535, not {self.port}; 0 takes any free port")
 
 
+@dataclass(frozen=True, kw_only=True)
+class ExportSettings(ForecastSettings):
+    """Configuration of ``epo export``."""
+
+    out: str = "forecaster.pt2"
+    scenes: int | None = 4
+
+
 @dataclass(frozen=True)
 class ReportSettings:
     """Configuration of ``epo report``."""

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole, is_number
 from epo_lightning.game.energy import Energy
+from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status, Tables
 from epo_lightning.solvers.base import TABLES, Minimiser
@@ -90,7 +91,7 @@ class Candidates(Minimiser):
         unary, pair = assignments.settle(*raw, mask)
         valid = (unary > -torch.inf).flatten(1).all(1) & (pair > -torch.inf).flatten(1).all(1)
         known = torch.where(valid[:, None, None], unary, 0.0), torch.where(valid[:, None, None, None], pair, 0.0)
-        if unary.device.type == "cpu":  # on other devices, the check would make the host wait
+        if readable(unary):  # on other devices, the check would make the host wait
             _check(known[0])
         log_marginals, log_partition = self.density(*known, mask)
         chosen, lowest = assignments.best(*known, mask, self.modes, states, self.apart)

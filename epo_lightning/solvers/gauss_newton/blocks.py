@@ -74,7 +74,7 @@ class Factors:
         carried: Tensor | None = None
         for index in range(len(self.blocks) - 1, -1, -1):
             block = self.blocks[index]
-            part = parts[index].new_zeros(len(right), block.factor.shape[-1], 1)
+            part = parts[index].new_zeros(right.shape[0], block.factor.shape[-1], 1)
             part[:, : block.unknowns] = parts[index]
             if carried is not None:
                 part += _times(block.moves, carried[:, :width])
@@ -137,7 +137,7 @@ class _Parts:
             return values.to(torch.float64)
 
         # Absent agents and steps after the end of a game get unit matrices, so that they are regular even without damping.
-        control = double(model.control) + damping.reshape(len(damping), -1, 1, 1)
+        control = double(model.control) + damping.reshape(damping.shape[0], -1, 1, 1)
         present = model.at.present[..., None, None]
         control = torch.where(present if model.at.within_game is None else present & model.at.within_game, control, 1.0)
         moves, node, pull = double(model.at.moves), double(model.node), double(model.position)
@@ -165,7 +165,7 @@ class _Parts:
     def eliminate(self, start: int, end: int, cost: Tensor | None) -> tuple[Block, Tensor | None, Tensor]:
         """The block of nodes start + 1 .. end, the cost-to-go P, and LAPACK's info; ``cost`` is P of the block after."""
         width, count = 2 * self.size, end - start
-        batch = len(self.moves)
+        batch = self.moves.shape[0]
         moves = self.moves[:, start:end]
         # ahead[l]: sum of the stiffness of all positions after node start + l, which are those that this node moves. The
         # state's displacement moves all positions from this block on.
@@ -214,10 +214,12 @@ class _Parts:
         if start == 0 and end == self.model.at.horizon:
             self._add_undeclared(nodes)
         info = torch.empty(batch, dtype=torch.int32, device=matrix.device)
-        torch.linalg.cholesky_ex(matrix, out=(matrix, info))
+        # In place, but for programs that are exported: the size of an output cannot be checked there.
+        exported = torch.compiler.is_exporting()
+        matrix, info = torch.linalg.cholesky_ex(matrix, out=None if exported else (matrix, info))
         if state is None:
             return Block(unknowns, right, matrix, None), None, info
-        gain = torch.linalg.solve_triangular(matrix, state, upper=False, out=state)
+        gain = torch.linalg.solve_triangular(matrix, state, upper=False, out=None if exported else state)
         own[:, :width, :width] += ahead[:, 0]
         own = torch.baddbmm(own, gain.mT, gain, alpha=-1)
         return Block(unknowns, right, matrix, gain.mT), own, info
@@ -229,7 +231,7 @@ class _Parts:
         the costs that depends on the state only.
         """
         width, count = 2 * self.size, end - start
-        batch = len(matrix)
+        batch = matrix.shape[0]
         # Over nodes start - 1 .. end: diagonals 0, 1 and 2 of a banded matrix [C, T + 2, F]. A control is a difference of
         # two nodes: c (z' - z)^2 adds c, c to the diagonal and -c beside it. A rate is one of three nodes:
         # r (z'' - 2 z' + z)^2 adds r, 4 r, r to the diagonal, -2 r, -2 r beside it and r two nodes away.

@@ -76,8 +76,8 @@ def expand(
         edges = Edges.all(at.problems, at.agents, at.u.device)
     else:
         edges = Edges.near(energy, scene, parameters, at.states)
-    separation = Separation.of(at, edges) if len(edges.pair) else None
-    linked = torch.zeros(len(edges.pair), dtype=torch.bool, device=at.u.device)
+    separation = Separation.of(at, edges) if edges.pair.shape[0] else None
+    linked = torch.zeros(edges.pair.shape[0], dtype=torch.bool, device=at.u.device)
     pair = {}
     if separation is not None:
         for name, pair_feature in energy.pair_features.items():
@@ -405,7 +405,7 @@ def _add_pair_value(sums: _Sums, edges: Edges, value: Float[Tensor, "E L"]) -> N
 def _set_undeclared_hessian(sums: _Sums, edges: Edges) -> None:
     """Set the second derivatives of undeclared features, by automatic differentiation of their gradient, row by row."""
     at, part = sums.at, sums.at.energy.undeclared
-    if part is not None and not len(edges.pair):
+    if part is not None and not edges.pair.shape[0]:
         part = dataclasses.replace(part, pair=()) if part.own else None
     if part is None:
         return

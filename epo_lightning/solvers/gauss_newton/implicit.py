@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.host import readable
 from epo_lightning.scene import GameParameters, Scene, Status
 from epo_lightning.solvers.gauss_newton import compiled
 from epo_lightning.solvers.gauss_newton.expansion import expand
@@ -49,7 +50,7 @@ def attach(
     ):
         return compiled.attach(energy, scene, parameters, controls, exact)
     none = controls.new_zeros(controls.shape[:2]).flatten()
-    game = Game(energy, scene, parameters, 1.0, none, controls.device.type == "cpu")
+    game = Game(energy, scene, parameters, 1.0, none, readable(controls))
     found, status = _Attach.apply(game, exact, controls, *game.tensors())
     return found, status
 

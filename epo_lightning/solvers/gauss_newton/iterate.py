@@ -76,7 +76,7 @@ class Iterate:
     @property
     def problems(self) -> int:
         """Number S = B M of problems."""
-        return len(self.u)
+        return self.u.shape[0]
 
     @property
     def agents(self) -> int:

@@ -19,6 +19,7 @@ from torch import Tensor
 from epo_lightning.checks import check_number, check_whole, is_number
 from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
@@ -190,7 +191,7 @@ def choose_backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: G
         return compiled.solve
     if name == "compiled":
         raise ValueError(f"solver.backend is 'compiled', but {obstacle}; 'auto' and 'pytorch' can solve this game")
-    if parameters.initial_controls.device.type == "cpu":
+    if readable(parameters.initial_controls):
         compiled.say_once(obstacle)
     return structured.solve
 

@@ -33,6 +33,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.host import readable
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.gauss_newton import blocks
 from epo_lightning.solvers.gauss_newton.edges import Group
@@ -76,7 +77,7 @@ def solve(
         split: whether problems are split into components; by default, on a CPU.
     """
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
-    split = controls.device.type == "cpu" if split is None else split
+    split = readable(controls) if split is None else split
     game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(0, 1), split, exact)
     tensors = game.tensors()
     status = torch.where(game.finite, Status.SOLVED, Status.STOPPED)

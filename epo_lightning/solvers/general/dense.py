@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.game.energy import RESIDUALS, Energy
+from epo_lightning.host import readable
 from epo_lightning.scene import GameParameters, Scene, Status
 from epo_lightning.solvers.general import descent
 
@@ -151,7 +152,7 @@ def factorise(matrix: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batc
     factor, failed = torch.linalg.cholesky_ex(matrix)
     # A NaN in the lower triangle reaches the diagonal of its row; the upper triangle is never read.
     definite = (failed == 0) & factor.diagonal(dim1=-2, dim2=-1).isfinite().all(-1)
-    if definite.device.type == "cpu" and definite.all():
+    if readable(definite) and definite.all():
         return factor, definite
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     return torch.where(definite[..., None, None], factor, identity), definite

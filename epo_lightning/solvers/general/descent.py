@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from epo_lightning.game.energy import Energy
+from epo_lightning.host import readable
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 
 _FAR, _TINY = 1e-3, 1e-6
@@ -75,7 +76,7 @@ def rounding(value: Float[Tensor, "B M"]) -> Float[Tensor, "B M"]:
 
 def ended(done: Bool[Tensor, "B M"]) -> bool:
     """Whether every sample has converged; False on devices where the test would make the host wait."""
-    return done.device.type == "cpu" and bool(done.all())
+    return readable(done) and bool(done.all())
 
 
 def nothing(controls: Float[Tensor, "B M N K 2"]) -> Solution:
@@ -123,7 +124,7 @@ def warn_if_far(
         definite: whether H is positive definite.
     """
     global _warned
-    if _warned or not definite.numel() or definite.device.type != "cpu":
+    if _warned or not definite.numel() or not readable(definite):
         return
     with torch.no_grad():
         far = ~(definite & (decrement <= _FAR * value.abs() + _TINY))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole
 from epo_lightning.game.energy import GRADIENT, Energy
+from epo_lightning.host import readable
 from epo_lightning.registry import register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.base import STATIONARY, Minimiser
@@ -66,7 +67,7 @@ class Newton(Minimiser):
             if descent.ended(now.done):
                 break
             going = ~now.done.all(1)
-            if going.device.type != "cpu" or going.all():
+            if not readable(going) or going.all():
                 now = self._advanced(energy, scene, parameters, now)
             else:  # scenes that have converged are left out
                 now = now.with_(going, self._advanced(energy, scene[going], parameters[going], now.of(going)))
@@ -142,7 +143,7 @@ def _steps(
 ) -> tuple[Float[Tensor, "B M N K 2"], Bool[Tensor, "B M"]]:
     """The damped steps, and a mask of the positive definite matrices, recomputed for ``which`` samples."""
     # On other devices all samples are recomputed, because selecting some would make the host wait for their number.
-    some = which if which.device.type == "cpu" else torch.ones_like(which)
+    some = which if readable(which) else torch.ones_like(which)
     chosen = matrix[some]
     chosen.diagonal(dim1=-2, dim2=-1).add_(damping[some][..., None])
     factor, has_factor = factorise(chosen)
