@@ -72,7 +72,7 @@ class _Batch:
 
 _FLOAT, _INTEGER, _MASK = "floating-point", "integer", "boolean"
 
-_FIELDS: Mapping[str, tuple[str, tuple[str | int, ...], str | None]] = {
+FIELDS: Mapping[str, tuple[str, tuple[str | int, ...], str | None]] = {
     "history": (_FLOAT, ("B", "N", "H", 4), None),
     "history_mask": (_MASK, ("B", "N", "H"), None),
     "agent_mask": (_MASK, ("B", "N"), None),
@@ -170,7 +170,7 @@ class Scene(_Batch):
         if not 0 < self.dt < math.inf:
             raise ValueError(f"scene.dt must be positive and finite [s], not {self.dt}")
         sizes: dict[str, int] = {}
-        for name, (numbers, shape, owner) in _FIELDS.items():
+        for name, (numbers, shape, owner) in FIELDS.items():
             value = getattr(self, name)
             if value is not None:
                 if owner is not None and getattr(self, owner) is None:
@@ -179,7 +179,7 @@ class Scene(_Batch):
             elif name == "history":
                 raise TypeError("scene.history is None; it takes a tensor [B, N, H, 4]: x, y, heading, speed")
 
-        for name, (numbers, shape, owner) in _FIELDS.items():
+        for name, (numbers, shape, owner) in FIELDS.items():
             if numbers == _MASK and getattr(self, name) is None and (owner is None or getattr(self, owner) is not None):
                 ones = torch.ones([sizes[str(dim)] for dim in shape], dtype=torch.bool, device=self.history.device)
                 object.__setattr__(self, name, ones)

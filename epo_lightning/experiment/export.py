@@ -1,4 +1,4 @@
-"""A trained forecaster as a program of PyTorch's own operations, which runs without this package."""
+"""A trained forecaster, network and solver, as a program of PyTorch's own operations, which runs without this package."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import dataclasses
 import io
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.export import Dim, ExportedProgram
 
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import ExportSettings, Settings
@@ -19,46 +20,48 @@ from epo_lightning.experiment.opening import open_checkpoint
 from epo_lightning.experiment.predict import MEANING, scenes_of
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.epo import EPO
+from epo_lightning.forecasters.refined import Refined
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_file
-from epo_lightning.scene import Scene
+from epo_lightning.scene import FIELDS, Scene
 from epo_lightning.schema import read
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 OUTPUTS = ("states", "probabilities")
-"""What the program gives, by name."""
+"""Outputs of a program, by name."""
 NOT_READ = ("dt", "future", "future_mask", "subset", "id", "frame", "kind")
 """Fields of a scene that no forecaster reads."""
-MOST_SCENES = 65536
-"""Largest batch of the program."""
 TOLERANCE = 1e-5
-"""Largest difference [m] between the program and the forecaster."""
+"""Largest difference between the outputs of a program and those of its forecaster, divided by values above 1.
+
+Positions of 150 m have a resolution of 1.5e-5 m in single precision."""
+
+Tensors = dict[str, Tensor]
 
 
 class Program(nn.Module):
-    """A forecaster as a function of the tensors of a scene, by name."""
+    """A forecaster as a function of the tensors of scenes, by name."""
 
     def __init__(self, forecaster: Forecaster, dt: float) -> None:
         super().__init__()
         self.forecaster, self.dt = forecaster, dt
 
-    def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    def forward(self, tensors: Tensors) -> Tensors:
         forecast = self.forecaster(Scene(**tensors, dt=self.dt))
         return {name: getattr(forecast, name) for name in OUTPUTS}
 
 
 def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Path, float]:
-    """Write a run's forecaster as a program (``torch.export``), for batches of any size.
+    """Write a run's forecaster as a program (``torch.export``), for any number of scenes.
 
-    The file also has ``about.json``: title, time step, and shape and meaning of every input and output. Sizes other than the
-    batch are those of the scenes; smaller scenes are padded, as ``agent_mask`` and the other masks say.
+    The file also has ``about.json``: title, time step, and :func:`describe`. Other sizes are those of the example.
 
     Args:
         settings: the run, the scenes that are the example, and the file.
         overrides: the user's overrides; settings of other data that they name do not follow the run.
 
     Returns:
-        the file, and the largest difference [m] between the program and the forecaster on the example.
+        the file, and the largest difference between the program and the forecaster on the example.
 
     Raises:
         ConfigError: a run that cannot be opened, a forecaster that cannot be exported, a file that exists, or a program
@@ -70,32 +73,19 @@ def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Pat
     assembly.quiet()
     run = RunFolder.open(settings.run)
     of_run = read(Settings, run.config())
-    forecaster: Forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint)).eval()
+    forecaster: Forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
     check_exportable(forecaster, of_run.title)
     scenes = scenes_of(run, of_run, settings, forecaster, overrides).scenes
+    forecast = forecaster.predict(scenes)
+    wanted = {name: getattr(forecast, name) for name in OUTPUTS}
     tensors = inputs_of(forecaster, scenes)
-    program = torch_program(forecaster, tensors, scenes.dt)
-    with torch.no_grad():
-        wanted = Program(forecaster, scenes.dt)(tensors)
-        difference = max(
-            float(
-                (program.module()({name: value[:count] for name, value in tensors.items()})[name] - whole[:count])
-                .abs()
-                .max()
-            )
-            for count in {1, len(scenes.history)}
-            for name, whole in wanted.items()
-        )
+    program = program_of(forecaster, tensors, scenes.dt)
+    difference = largest_difference(program.module(), tensors, wanted)
     if not difference <= TOLERANCE:
         raise ConfigError(
-            f"the program of {of_run.title} differs from its forecaster by {difference:.2g} m: it is not written"
+            f"the program of {of_run.title} differs from its forecaster by {difference:.2g}: it is not written"
         )
-    about = {
-        "title": of_run.title,
-        "dt": scenes.dt,
-        "inputs": {name: describe(name, value) for name, value in tensors.items()},
-        "outputs": {name: describe(name, value) for name, value in wanted.items()},
-    }
+    about = {"title": of_run.title, "dt": scenes.dt, **describe(program)}
     content = io.BytesIO()
     torch.export.save(program, content, extra_files={"about.json": json.dumps(about)})
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -104,23 +94,30 @@ def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Pat
 
 
 def check_exportable(forecaster: Forecaster, title: str) -> None:
-    """Refuse forecasters whose computation depends on values, such as solvers that stop when they have converged.
+    """Refuse forecasters with a number of steps that depends on values, such as solvers that stop at convergence.
 
     Raises:
         ConfigError: see above; the message names the part.
     """
-    if not isinstance(forecaster, EPO):
-        return
-    solver = forecaster.solver
-    if not isinstance(solver, LevenbergMarquardt) or solver.adaptive or forecaster.calibration is not None:
-        part = "its calibration" if forecaster.calibration is not None else f"its solver ({type(solver).__name__})"
+    for game in games_of(forecaster):
+        if isinstance(game, EPO) and game.calibration is not None:
+            part = "its calibration"
+        elif not isinstance(game.solver, LevenbergMarquardt) or game.solver.adaptive:
+            part = f"its solver ({type(game.solver).__name__})"
+        else:
+            continue
         raise ConfigError(
-            f"{title} cannot be exported: {part} takes as many steps as the values need, and a program has a fixed "
-            "sequence of operations. Rows with a fixed number of steps can (solver=levenberg_marquardt, solver.adaptive=false)"
+            f"{title} cannot be exported: {part} takes as many steps as the values need, and a program has a fixed sequence "
+            "of operations. Rows with a fixed number of steps can (solver=levenberg_marquardt, solver.adaptive=false)"
         )
 
 
-def inputs_of(forecaster: Forecaster, scenes: Scene) -> dict[str, Tensor]:
+def games_of(forecaster: Forecaster) -> list[EPO | Refined]:
+    """The parts of a forecaster that solve games; a refinement may refine another one's solutions."""
+    return [part for part in forecaster.modules() if isinstance(part, EPO | Refined)]
+
+
+def inputs_of(forecaster: Forecaster, scenes: Scene) -> Tensors:
     """The tensors of scenes that the forecaster may read, by name."""
     ends = isinstance(forecaster, EPO) and forecaster.game_horizon > forecaster.task.horizon
     left_out = NOT_READ if ends else (*NOT_READ, "game_steps")
@@ -128,26 +125,57 @@ def inputs_of(forecaster: Forecaster, scenes: Scene) -> dict[str, Tensor]:
     return {name: value.clone() for name, value in values.items() if name not in left_out and value is not None}
 
 
-def torch_program(forecaster: Forecaster, tensors: dict[str, Tensor], dt: float) -> torch.export.ExportedProgram:
-    """The exported program of a forecaster, with a batch of any size."""
-    if isinstance(forecaster, EPO) and isinstance(forecaster.solver, LevenbergMarquardt):
-        forecaster.solver = dataclasses.replace(forecaster.solver, backend="pytorch")
-    batch = torch.export.Dim("B", min=1, max=MOST_SCENES)
-    # An example of one scene would make a program for one scene.
-    two = {
-        name: value[:2] if len(value) > 1 else value.expand(2, *value.shape[1:]).clone()
-        for name, value in tensors.items()
+def program_of(forecaster: Forecaster, example: Tensors, dt: float) -> ExportedProgram:
+    """The program of a forecaster for any number of scenes and, where its operations allow this, of agents and lanes.
+
+    A game's solver lays out its matrices for a number of agents, which is that of the example.
+    """
+    games = games_of(forecaster)
+    for game in games:
+        if isinstance(game.solver, LevenbergMarquardt):
+            game.solver = dataclasses.replace(game.solver, backend="pytorch")
+    program = Program(forecaster, dt).eval().requires_grad_(False)
+    # A size of one, or one that other dimensions have as well, could become a constant of the program.
+    scenes = torch.arange(7) % example["history"].shape[0]
+    seven = {name: value[scenes] for name, value in example.items()}
+    free = {"B": Dim("B", min=1), "L": Dim.AUTO} | ({} if games else {"N": Dim.AUTO})
+    shapes = {
+        name: {axis: free[letter] for axis, letter in enumerate(FIELDS[name][1]) if letter in free} for name in example
     }
-    shapes = ({name: {0: batch} for name in tensors},)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*were assigned during export")  # an LSTM lists its weights anew
-        return torch.export.export(Program(forecaster, dt), (two,), dynamic_shapes=shapes, strict=False)
+        return torch.export.export(program, (seven,), dynamic_shapes=(shapes,), strict=False)
 
 
-def describe(name: str, value: Tensor) -> dict[str, Any]:
-    """Shape, type and meaning of an input or output; B is the batch."""
+def largest_difference(run: Callable[[Tensors], Tensors], given: Tensors, wanted: Tensors) -> float:
+    """Largest |found - wanted| / max(1, |wanted|) for all scenes and for the first one alone; NaN if an output is NaN."""
+    differences = []
+    for scenes in (slice(None), slice(1)):
+        found = run({name: value[scenes] for name, value in given.items()})
+        for name in wanted:
+            expected = wanted[name][scenes]
+            differences.append(((found[name] - expected).abs() / expected.abs().clamp(min=1.0)).max())
+    return float(torch.stack(differences).max())
+
+
+def describe(program: ExportedProgram) -> dict[str, Any]:
+    """Shape, type and meaning of the inputs and outputs of a program, by name.
+
+    Sizes that are free have their letters: B scenes, N agents, L lanes.
+    """
+    signature = program.graph_signature
+    values = {node.name: node.meta["val"] for node in program.graph.nodes if isinstance(node.meta.get("val"), Tensor)}
+    inputs = {name.removeprefix("tensors_"): values[name] for name in signature.user_inputs}
+    outputs = dict(zip(OUTPUTS, (values[name] for name in signature.user_outputs), strict=True))
+    letters: dict[str, Any] = {}
+    for name, value in inputs.items():
+        letters.update(zip(map(str, value.shape), FIELDS[name][1], strict=True))
+
+    def described(name: str, value: Tensor) -> dict[str, Any]:
+        shape = [letters[str(size)] if isinstance(size, torch.SymInt) else size for size in value.shape]
+        return {"shape": shape, "dtype": str(value.dtype).removeprefix("torch."), "meaning": MEANING[name]}
+
     return {
-        "shape": ["B", *value.shape[1:]],
-        "dtype": str(value.dtype).removeprefix("torch."),
-        "meaning": MEANING[name],
+        "inputs": {name: described(name, value) for name, value in inputs.items()},
+        "outputs": {name: described(name, value) for name, value in outputs.items()},
     }

@@ -186,11 +186,9 @@ def export_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     settings = check_settings("export", config)
     from epo_lightning.experiment.export import export
 
-    print("exporting, which takes minutes ...", flush=True)
     file, difference = export(settings, overrides)
-    print(
-        f"wrote {file}, {file.stat().st_size / 1e6:.1f} MB; it differs from the forecaster by {difference:.1g} m at most"
-    )
+    size = file.stat().st_size / 1e6
+    print(f"wrote {file} ({size:.1f} MB); its outputs differ from the forecaster's by {difference:.1g} at most")
 
 
 def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:

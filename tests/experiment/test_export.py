@@ -7,7 +7,9 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import jaxtyping
 import pytest
 import torch
 
@@ -15,21 +17,41 @@ import epo_lightning
 from epo_lightning import pretrained
 from epo_lightning.decoders import goals
 from epo_lightning.experiment.config.settings import ExportSettings
-from epo_lightning.experiment.export import check_exportable, export, inputs_of
-from epo_lightning.forecasters.constant_velocity import ConstantVelocity
+from epo_lightning.experiment.export import check_exportable, export, inputs_of, largest_difference
 from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError
+from epo_lightning.scene import Scene
 
-STRANGER = """
-import json, sys, torch
+ELSEWHERE = """
+import sys, torch
 about = {"about.json": ""}
 program = torch.export.load(sys.argv[1], extra_files=about).module()
-with torch.no_grad():
-    found = program(torch.load(sys.argv[2]))
+found = [program(given) for given in torch.load(sys.argv[2])]
 assert not any(name.startswith("epo_lightning") for name in sys.modules)
 torch.save(found, sys.argv[3])
 print(about["about.json"])
 """
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No runtime checks of annotations: sizes are symbols while a program is exported, and no ints."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+def run_elsewhere(file: Path, batches: list[dict[str, torch.Tensor]]) -> tuple[list[dict[str, torch.Tensor]], Any]:
+    """What a program gives in a process without this package, and its description."""
+    given, found = file.with_name("given.pt"), file.with_name("found.pt")
+    torch.save(batches, given)
+    # -I: neither the working directory nor PYTHONPATH is searched for modules.
+    words = [sys.executable, "-I", "-c", ELSEWHERE, str(file), str(given), str(found)]
+    printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    return torch.load(found), json.loads(printed)
+
+
+def with_absent_agents(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The inputs with as many absent agents as there are agents."""
+    return {name: torch.cat((value, torch.zeros_like(value)), 1) for name, value in tensors.items()}
 
 
 @pytest.mark.parametrize(
@@ -40,30 +62,32 @@ print(about["about.json"])
         pytest.param("highway_sim/hivt_m_epo", marks=pytest.mark.slow),
     ],
 )
-def test_a_program_gives_the_forecasts_of_its_forecaster_elsewhere(
+@pytest.mark.usefixtures("unchecked")
+def test_a_program_gives_the_forecasts_of_its_forecaster_in_another_process(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("EPO_CACHE", str(tmp_path))  # no data set: the scenes that ship with the run are the example
-    file, difference = export(ExportSettings(run=name, out=str(tmp_path / "it.pt2")))
+    settings = ExportSettings(run=name, out=str(tmp_path / "it.pt2"))
+    file, difference = export(settings)
     assert difference <= 1e-5
     forecaster, scenes = epo_lightning.load(name), pretrained.examples(name)
-    for count in (1, 7):  # other batches than the example's
-        some = scenes[slice(count)]
-        torch.save(inputs_of(forecaster, some), tmp_path / "given.pt")
-        words = [sys.executable, "-I", "-c", STRANGER, *(str(tmp_path / f) for f in ("it.pt2", "given.pt", "found.pt"))]
-        printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-        found, wanted = torch.load(tmp_path / "found.pt"), forecaster.predict(some)
-        torch.testing.assert_close(found["states"], wanted.states, atol=1e-5, rtol=0)
-        torch.testing.assert_close(found["probabilities"], wanted.probabilities, atol=1e-5, rtol=0)
-    about = json.loads(printed)
+    free = name == "rpi/v_lstm_sc"  # a game's program has one number of agents
+    batches = [inputs_of(forecaster, scenes[slice(count)]) for count in (1, 7)]  # other batches than the example's
+    batches += [with_absent_agents(batches[1])] if free else []
+    found, about = run_elsewhere(file, batches)
+    for outputs, batch in zip(found, batches, strict=True):
+        wanted = forecaster.predict(Scene(**batch, dt=scenes.dt))
+        torch.testing.assert_close(outputs["states"], wanted.states, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(outputs["probabilities"], wanted.probabilities, atol=1e-5, rtol=1e-5)
     assert about["dt"] == scenes.dt
-    assert about["inputs"]["history"]["shape"] == ["B", *scenes.history.shape[1:]]
-    assert about["outputs"]["states"]["dtype"] == "float32"
-    with pytest.raises(ConfigError, match="it.pt2 exists: nothing is overwritten"):
-        export(ExportSettings(run=name, out=str(file)))
+    agents = "N" if free else scenes.history.shape[1]
+    assert about["inputs"]["history"]["shape"] == ["B", agents, *scenes.history.shape[2:]]
+    assert about["outputs"]["states"]["shape"][::2] == ["B", agents, 4]
+    with pytest.raises(ConfigError, match=r"it\.pt2 exists: nothing is overwritten"):
+        export(settings)
 
 
-def test_solvers_that_stop_at_convergence_are_refused() -> None:
+def test_what_takes_as_many_steps_as_the_values_need_is_refused() -> None:
     forecaster = epo_lightning.load("rpi/v_lstm_epo")
     check_exportable(forecaster, "two steps")
     forecaster.solver = replace(forecaster.solver, adaptive=True)
@@ -71,6 +95,17 @@ def test_solvers_that_stop_at_convergence_are_refused() -> None:
         ConfigError, match=r"solved cannot be exported: its solver \(LevenbergMarquardt\) takes as many steps"
     ):
         check_exportable(forecaster, "solved")
+    forecaster.calibration = object()
+    with pytest.raises(ConfigError, match=r"calibrated cannot be exported: its calibration takes as many steps"):
+        check_exportable(forecaster, "calibrated")
+
+
+def test_differences_are_relative_for_large_values_and_nan_is_one() -> None:
+    given = {"x": torch.tensor([[0.5], [100.0]])}
+    assert largest_difference(lambda given: given, given, given) == 0.0
+    assert largest_difference(lambda given: {"x": given["x"] + 0.25}, given, given) == 0.25
+    assert largest_difference(lambda given: {"x": given["x"] * 1.5}, given, given) == 0.5
+    assert not largest_difference(lambda given: {"x": given["x"] * torch.nan}, given, given) <= 1e-5
 
 
 def test_values_are_not_readable_on_other_devices_and_while_a_program_is_exported() -> None:
@@ -93,7 +128,3 @@ def test_logits_of_all_goal_candidates_are_those_of_the_existing_ones(monkeypatc
         compact = forecaster.goals.logits(z, scene)
         monkeypatch.setattr(goals, "readable", lambda tensor: False)
         torch.testing.assert_close(forecaster.goals.logits(z, scene), compact, atol=1e-5, rtol=0)
-
-
-def test_forecasters_without_a_game_can_be_exported() -> None:
-    check_exportable(ConstantVelocity.__new__(ConstantVelocity), "constant velocity")

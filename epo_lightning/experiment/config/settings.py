@@ -280,7 +280,7 @@ class EvaluateSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ForecastSettings:
-    """A run and the scenes that it forecasts: the common part of ``epo predict`` and ``epo explore``."""
+    """A run and the scenes that it forecasts: the common part of ``epo predict``, ``epo explore`` and ``epo export``."""
 
     run: str
     data: Mapping[str, Any] | None = None
