@@ -123,3 +123,50 @@ def test_the_page_has_the_paired_differences_over_all_backbones(words: str, othe
         mean = fmean(found)
         low, middle, high = (f"{v:+.{digits}f}".replace("0.", ".", 1) for v in (mean - half, mean, mean + half))
         assert cell == f"{middle} ({low} to {high})"
+
+
+RPI = (ROOT / "docs" / "rpi_results.md").read_text(encoding="utf-8")
+OF_RPI = {
+    "V-LSTM, relaxed": "V-LSTM, relaxed",
+    "V-LSTM + SC, relaxed": "V-LSTM + SC, relaxed",
+    "V-LSTM + EPO, relaxed": "V-LSTM + EPO, relaxed",
+    "V-LSTM + EPO, relaxed, no pair": "the same without its pair term, trained so",
+    "V-LSTM": "V-LSTM",
+    "V-LSTM + SC": "V-LSTM + SC",
+    "V-LSTM + EPO": "V-LSTM + EPO",
+}
+"""Rows on the page by their titles in the results files."""
+
+
+@pytest.mark.parametrize(
+    ("heading", "file", "rows"),
+    [
+        ("The hard split", "rpi_hard_settled", 4),
+        ("Ten epochs", "rpi_hard", 4),
+        ("The paper's split", "rpi_paper_split", 3),
+        ("The paper's loss", "rpi_hard", 3),
+    ],
+)
+def test_the_page_of_rpi_has_the_scores_of_its_files(heading: str, file: str, rows: int) -> None:
+    section = RPI.partition(f"\n## {heading}\n")[2].partition("\n## ")[0].splitlines()
+    found = 0
+    for row in distinct(build_tables(read_results(ROOT / "results" / f"{file}.json").evaluated)):
+        for line in section:
+            if line.startswith(f"| {OF_RPI.get(row.title)} |"):
+                cells = [row.cells[metric] for metric in ("minSADE", "minSFDE")]
+                shown = [f"{short(cell.mean, 4)} ± {short(cell.deviation or 0, 4)}" for cell in cells]
+                assert numbers(line)[:3] == [str(cells[0].n), *shown], row.title
+                found += 1
+    assert found == rows
+
+
+def test_the_page_of_rpi_has_the_steps() -> None:
+    rows = {
+        row.runs[0].config["solver"]["steps"]: row.cells
+        for row in distinct(build_tables(read_results(ROOT / "results" / "rpi_steps.json").evaluated))
+    }
+    for steps, cells in rows.items():
+        line = next(line for line in RPI.splitlines() if line.startswith(f"| {steps} |"))
+        mean, spread = numbers(line)[1].split(" ± ")
+        for text, value in ((mean, cells["minSADE"].mean), (spread, cells["minSADE"].deviation)):
+            assert text == short(value, len(text) - 1)
