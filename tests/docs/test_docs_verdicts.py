@@ -43,9 +43,12 @@ def scores(file: str, experiment: str, metric: str) -> dict[int, float]:
 @pytest.mark.parametrize(
     ("first", "second", "metric"),
     [
-        (("game_refined", "rpi/v_lstm_epo_game_refined"), ("game", "rpi/v_lstm_sc_relaxed"), "minSADE"),
-        (("game_refined", "rpi/v_lstm_epo_game_refined"), ("game", "rpi/v_lstm_sc_relaxed"), "minSFDE"),
-        (("game_refined", "rpi/v_lstm_epo_game_refined"), ("game", "rpi/v_lstm_sc_relaxed"), "alternative/minSADE"),
+        (("rpi_hard_settled", "rpi/v_lstm_epo_relaxed"), ("rpi_hard_settled", "rpi/v_lstm_sc_relaxed"), "minSADE"),
+        (("rpi_hard_settled", "rpi/v_lstm_epo_relaxed"), ("rpi_hard_settled", "rpi/v_lstm_sc_relaxed"), "minSFDE"),
+        (("rpi_hard_settled", "rpi/v_lstm_sc_relaxed"), ("rpi_hard_settled", "rpi/v_lstm_relaxed"), "minSFDE"),
+        (("rpi_paper_split", "rpi/v_lstm_epo_relaxed"), ("rpi_paper_split", "rpi/v_lstm_sc_relaxed"), "minSADE"),
+        (("rpi_hard", "rpi/v_lstm_epo"), ("rpi_hard", "rpi/v_lstm_sc"), "minSADE"),
+        (("rpi_hard", "rpi/v_lstm_epo_relaxed"), ("rpi_hard", "rpi/v_lstm_epo_relaxed_no_pair"), "minSADE"),
     ],
 )
 def test_the_page_has_the_paired_differences(first: tuple[str, str], second: tuple[str, str], metric: str) -> None:
