@@ -10,6 +10,7 @@ learned: the weights are those with which the generator made the records, and th
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +20,9 @@ from scipy import stats
 from torch import Tensor
 
 from benchmarks.measure import positive
-from epo_lightning.data.rpi.game import GameConstants
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.subgames import FUTURE
+from epo_lightning.drive.rpi import true_game
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
@@ -75,24 +76,13 @@ class TrueGames:
 
     def game(self, factor: float = 1.0) -> GameParameters:
         """The true games, with the weight of their pair term multiplied by a factor."""
-        constants = GameConstants()
-        squared = {
-            **dict.fromkeys(("goal", "heading"), constants.terminal),
-            **dict.fromkeys(("acc", "turnr"), constants.effort),
-            "vel": constants.slowness,
-            **dict.fromkeys(("accb", "turnrb", "velb"), 2 * constants.bound),
-        }
-        batch = len(self.weight)
         assert self.scene.goal_candidates is not None
         assert self.scene.goal_headings is not None
         assert self.scene.game_steps is not None
-        return GameParameters(
-            own_weights={name: torch.full((batch, 2, 2), value**0.5).double() for name, value in squared.items()},
-            pair_weights={"clearance": (2 * factor * self.weight).sqrt()[:, None, None].expand(batch, 2, 1)},
-            initial_controls=torch.zeros(batch, 2, 2, int(self.scene.game_steps.max()), 2).double(),
-            goals=self.scene.goal_candidates[:, None, :, 0].expand(-1, 2, -1, -1),
-            goal_headings=self.scene.goal_headings[:, None, :, 0].expand(-1, 2, -1),
-        )
+        goals, headings = self.scene.goal_candidates[:, :, 0], self.scene.goal_headings[:, :, 0]
+        one = true_game(factor * self.weight, goals, headings, int(self.scene.game_steps.max()))
+        both = one.for_every_mode(2)
+        return dataclasses.replace(both, initial_controls=one.initial_controls.expand(-1, 2, -1, -1, -1))
 
     @torch.no_grad()
     def missed(self, solver: Minimiser, energy: Energy, game: GameParameters) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import yaml
 
 ROOT = Path(__file__).parents[1]
-VERBS = ("train", "generate", "evaluate", "predict", "explore", "export", "report")
+VERBS = ("train", "generate", "evaluate", "predict", "explore", "export", "drive", "report")
 LISTED = ("experiment", "sweeps")
 """Groups with many files that set little: their options are listed by name and first comment."""
 INTRODUCTION = """\

@@ -19,6 +19,7 @@ epo - energy-based potential games for multi-agent motion forecasting
   epo predict run=<run folder> out=<folder>  write and draw forecasts
   epo explore run=<run folder>               change inferred games on a page and see what follows
   epo export run=<run folder> out=<file>     write a forecaster as a program that runs without this package
+  epo drive run=<run folder> out=<folder>    plan for one agent in closed loop while the others react
   epo report rpi_main                        write the table with the paper's values, figures, and one HTML page
   epo config experiment=rpi/v_lstm_epo       print the resolved configuration
   epo config check experiment=...            check it, without loading anything
@@ -51,6 +52,7 @@ VERBS = {
     "predict": "write and draw a run's forecasts",
     "explore": "a page on which a run's inferred games are changed by hand and solved anew",
     "export": "write a run's forecaster as a program that runs without this package",
+    "drive": "plan with a run for one agent in closed loop while the others react",
     "report": "tables and figures of evaluated runs",
     "config": "print or check a resolved configuration",
 }

@@ -51,6 +51,19 @@ FLOORS = {
         "refinement",
     },
     "explore": {"scene", "registry", "schema", "forecasters", "game", "metrics", "solvers"},
+    "drive": {
+        "scene",
+        "registry",
+        "checks",
+        "data",
+        "game",
+        "solvers",
+        "refinement",
+        "forecasters",
+        "metrics",
+        "report",
+        "run_folder",
+    },
     "report": {"scene", "registry", "metrics", "run_folder", "identity", "masking"},
 }
 """Top-level modules that each one may import besides itself; `experiment` and `cli` may import all."""

@@ -12,6 +12,7 @@ from typing import Any
 
 from epo_lightning import pretrained
 from epo_lightning.experiment.config.settings import (
+    DriveSettings,
     EvaluateSettings,
     ExploreSettings,
     ExportSettings,
@@ -30,6 +31,7 @@ SCHEMAS: dict[str, type] = {
     "predict": PredictSettings,
     "explore": ExploreSettings,
     "export": ExportSettings,
+    "drive": DriveSettings,
     "report": ReportSettings,
 }
 HEADLINE = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp")
@@ -191,6 +193,14 @@ def export_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     print(f"wrote {file} ({size:.1f} MB); its outputs differ from the forecaster's by {difference:.1g} at most")
 
 
+def drive_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
+    """Drive episodes in closed loop, and print a line per planner and the paths of the files."""
+    settings = check_settings("drive", config)
+    from epo_lightning.experiment.drive import drive
+
+    print("\n".join(f"wrote {path}" for path in drive(settings, print)))
+
+
 def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Write tables and figures of all evaluated runs below a folder, and print the path of the page."""
     settings = check_settings("report", config)
@@ -225,5 +235,6 @@ RUN: dict[str, Callable[[dict[str, Any], Sequence[str]], Any]] = {
     "predict": predict_and_print,
     "explore": explore_and_print,
     "export": export_and_print,
+    "drive": drive_and_print,
     "report": report_and_print,
 }

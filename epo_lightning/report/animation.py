@@ -66,7 +66,7 @@ def animate(scene: Scene, forecast: JointForecast, path: str | Path, title: str 
         draw_road(axes, view)
         frames = _moving(axes, view, future, parts)
         with whole_file(path, ending) as temporary:
-            write = _write_gif if ending == ".gif" else _write_mp4
+            write = write_gif if ending == ".gif" else _write_mp4
             write(figure, frames, view.dt / parts, temporary)
     return path
 
@@ -116,7 +116,8 @@ def _until(
     )
 
 
-def _write_gif(figure: Figure, frames: Iterator[float], seconds: float, path: Path) -> None:
+def write_gif(figure: Figure, frames: Iterator[float], seconds: float, path: Path) -> None:
+    """Write a GIF of a figure that is drawn anew for every entry of ``frames``, shown for so many ``seconds`` each."""
     from PIL import Image
 
     figure.set_dpi(ANIMATION_DPI)

@@ -336,6 +336,44 @@ class ExportSettings(ForecastSettings):
     scenes: int | None = 4
 
 
+@dataclass(frozen=True, kw_only=True)
+class DriveSettings:
+    """Configuration of ``epo drive``."""
+
+    run: str | Sequence[str]
+    world: Literal["rpi"] = "rpi"
+    others: Sequence[str] | None = None
+    ways: Sequence[Literal["own", "warm", "alone", "respond"]] = ("own", "warm", "alone", "respond")
+    baselines: Sequence[Literal["constant_velocity", "best_response", "joint"]] = (
+        "constant_velocity",
+        "best_response",
+        "joint",
+    )
+    mode: Literal["likely", "nearest"] = "likely"
+    episodes: int = 500
+    seed: int = 0
+    timed: int = 5
+    film: int | None = 0
+    checkpoint: str = "best"
+    out: str = "drive"
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ConfigError(f"episodes must be 1 or more, not {self.episodes}")
+        for name in ("seed", "timed"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
+        if self.film is not None and not 0 <= self.film < self.episodes:
+            raise ConfigError(f"film must be an episode from 0 to {self.episodes - 1}, or null, not {self.film}")
+        if not self.run or not (self.ways or self.baselines):
+            raise ConfigError("nothing drives: name a run and one of ways, or one of baselines")
+
+    @property
+    def runs(self) -> list[str]:
+        """The runs, also if there is only one."""
+        return [self.run] if isinstance(self.run, str) else list(self.run)
+
+
 @dataclass(frozen=True)
 class ReportSettings:
     """Configuration of ``epo report``."""

@@ -98,11 +98,22 @@ def overlapping_pairs(
     Raises:
         ConfigError: an unknown shape.
     """
+    return overlaps(states, size, agent_mask, shape).any(-1)
+
+
+def overlaps(
+    states: Float[Tensor, "B N K 4"], size: Float[Tensor, "B N 2"], agent_mask: Bool[Tensor, "B N"], shape: str = "disc"
+) -> Bool[Tensor, "B P K"]:
+    """Steps at which pairs i < j overlap; see :func:`overlapping_pairs`.
+
+    Raises:
+        ConfigError: an unknown shape.
+    """
     check_choice("shape", shape, get_args(Shape))
     first, second = torch.triu_indices(states.shape[1], states.shape[1], 1, device=states.device)
     overlap = _discs_overlap if shape == "disc" else _boxes_overlap
     at_step = overlap(states[:, first], states[:, second], size[:, first, None], size[:, second, None])
-    return at_step.any(-1) & agent_mask[:, first] & agent_mask[:, second]
+    return at_step & (agent_mask[:, first] & agent_mask[:, second])[..., None]
 
 
 def _discs_overlap(

@@ -77,7 +77,7 @@ def equilibrium(energy: Energy, scene: Scene, forecast: JointForecast) -> Equili
         return _finite(scene.agent_mask, solution.tables, solution.assignment, mode, initial)
     if GRADIENT not in energy.offers:
         return None
-    descend: Descend = _descend_features if FEATURES in energy.offers else _descend_any
+    descend: Descend = descend_features if FEATURES in energy.offers else _descend_any
     if isinstance(energy, torch.nn.Module):
         energy = copy.deepcopy(energy).double()
     return _smooth(
@@ -126,8 +126,17 @@ def _smooth(
     )
 
 
-def _descend_features(energy: Energy, scene: Scene, game: GameParameters, agent: Int[Tensor, " W"] | None) -> Descent:
-    """Damped Gauss-Newton and Newton steps; J_i is the energy of a game in which only i and its pairs have weights."""
+def descend_features(energy: Energy, scene: Scene, game: GameParameters, agent: Int[Tensor, " W"] | None) -> Descent:
+    """Minimisation of E over all controls, or of J_i over one agent's controls in every world, from the initial strategies.
+
+    Damped Gauss-Newton and then Newton steps, until no step lowers the value by more than rounding. J_i is the energy of a
+    game in which only agent i and its pairs have weights, so the result is a local best response of that agent.
+
+    Args:
+        energy: an energy of named features.
+        scene, game: the worlds, with one mode each, in float64.
+        agent: the agent that moves in each world; the others keep their initial strategies. None for all agents.
+    """
     assert isinstance(energy, FeatureEnergy)
     start = game.initial_controls
     held = None

@@ -1,0 +1,149 @@
+"""Measures of episodes, with intervals over episodes.
+
+All worlds of one seed have the same episodes, so two planners are compared by the differences of the same episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import stats
+from torch import Tensor
+
+from epo_lightning.drive.episodes import Episodes
+from epo_lightning.drive.world import EGO
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.metrics.functional.overlap import overlaps
+from epo_lightning.scene import ACCELERATION, SPEED, TURN_RATE
+
+SOON = 5.0
+"""Longest time to collision [s] that is looked for; episodes without a shorter one count with it."""
+_STEP = 0.1
+STILL, LONG = 0.05, 2.0
+"""Speed [m/s] below which an agent stands, and time [s] from which standing before the goal is a deadlock."""
+RESAMPLES, CONFIDENCE = 2000, 0.95
+RATES = ("collision", "deadlock", "fallback")
+"""Measures that are 0 or 1 in an episode."""
+UNITS: Mapping[str, str] = {
+    "collision": "%",
+    "deadlock": "%",
+    "fallback": "%",
+    "distance": "m",
+    "time_to_collision": "s",
+    "progress": "m",
+    "jerk": "m/s³",
+    "lateral": "m/s²",
+}
+"""Unit of every measure; those of a world have none."""
+
+
+def measure(
+    episodes: Episodes, shape: str, arrived: float, further: Mapping[str, Tensor]
+) -> dict[str, Float[Tensor, " B"]]:
+    """Measures of every episode.
+
+    - ``collision``: whether the bodies of the planned agent and another one overlap at any step.
+    - ``distance``: smallest distance [m] between the centres of the planned agent and another one.
+    - ``time_to_collision``: smallest time [s] until bodies would overlap if all agents kept their velocities, at most
+      :data:`SOON`.
+    - ``progress``: how far the planned agent comes [m].
+    - ``jerk``, ``lateral``: mean absolute change of acceleration per second, and mean absolute lateral acceleration, the
+      speed times the turn rate.
+    - ``deadlock``: whether the planned agent stands for :data:`LONG` seconds although its progress is below ``arrived``.
+    - ``fallback``: whether no plan was found at any step, so that an earlier plan was followed.
+
+    Args:
+        episodes: what happened.
+        shape: shape of the bodies, ``disc`` or ``box``.
+        arrived: progress [m] from which an agent that stands has arrived.
+        further: measures of the world.
+    """
+    controls, dt = episodes.controls, episodes.dt
+    speed = episodes.states[:, EGO, :, SPEED]
+    still = (speed.abs() < STILL) & (episodes.progress < arrived)
+    window = min(round(LONG / dt), still.shape[1])
+    with_ego = episodes.agent_mask & episodes.agent_mask[:, EGO, None]
+    offset = (episodes.states[:, 1:, :, :2] - episodes.states[:, :1, :, :2]).norm(dim=-1)
+    offset = offset.where(with_ego[:, 1:], torch.inf)
+    return {
+        "collision": _touches(episodes, shape).double(),
+        "distance": offset.amin((1, 2)),
+        "time_to_collision": _time_to_collision(episodes, shape),
+        "progress": episodes.progress[:, -1],
+        "jerk": controls[..., ACCELERATION].diff(dim=1).abs().mean(1) / dt,
+        "lateral": (speed[:, :-1] * controls[..., TURN_RATE]).abs().mean(1),
+        "deadlock": still.unfold(1, window, 1).all(-1).any(1).double(),
+        "fallback": (~episodes.found).any(1).double(),
+        **further,
+    }
+
+
+def _of_ego(agents: int) -> Tensor:
+    """Mask of the pairs that the planned agent is one of."""
+    first, second = torch.triu_indices(agents, agents, 1)
+    return (first == EGO) | (second == EGO)
+
+
+def _touches(episodes: Episodes, shape: str) -> Tensor:
+    batch, agents, steps = episodes.agent_mask.shape
+    states = episodes.states.transpose(1, 2).reshape(batch * steps, agents, 1, 4)
+    mask = episodes.agent_mask.transpose(1, 2).reshape(batch * steps, agents)
+    touch = overlaps(states, episodes.size.repeat_interleave(steps, 0), mask, shape)
+    return touch[:, _of_ego(agents)].flatten(1).any(1).view(batch, steps).any(1)
+
+
+def _time_to_collision(episodes: Episodes, shape: str) -> Float[Tensor, " B"]:
+    """Smallest time [s] to an overlap at constant velocities over all steps, found in steps of a tenth of a second."""
+    count = round(SOON / _STEP)
+    agents = episodes.states.shape[1]
+    standing = torch.zeros(count, 2, dtype=episodes.states.dtype)
+    least = torch.full((len(episodes.states),), SOON, dtype=episodes.states.dtype)
+    for t in range(episodes.states.shape[2]):
+        now = episodes.states[:, :, t]
+        ahead = Unicycle().rollout(now, standing.expand(*now.shape[:2], -1, -1), _STEP)
+        touch = overlaps(ahead, episodes.size, episodes.agent_mask[:, :, t], shape)[:, _of_ego(agents)].any(1)
+        first = torch.where(touch.any(1), (touch.to(torch.int8).argmax(1) + 1) * _STEP, SOON)
+        least = least.minimum(first.to(least))
+    return least
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over episodes with its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def estimate(values: Float[Tensor, " B"], rate: bool = False) -> Estimate:
+    """Mean over episodes: Wilson's interval for values of 0 and 1, else the bootstrap's percentiles.
+
+    Args:
+        values: the values of the episodes.
+        rate: whether the values are 0 and 1.
+    """
+    mean, count = float(values.mean()), len(values)
+    if rate and bool(((values == 0) | (values == 1)).all()):
+        interval = stats.binomtest(int(values.sum()), count).proportion_ci(CONFIDENCE, method="wilson")
+        return Estimate(mean, float(interval.low), float(interval.high))
+    draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+    means = values.numpy()[draws].mean(1)
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Estimate(mean, float(low), float(high))
+
+
+def estimates(measures: Mapping[str, Float[Tensor, " B"]]) -> dict[str, Estimate]:
+    """The estimate of every measure."""
+    return {name: estimate(values, name in RATES) for name, values in measures.items()}
+
+
+def differences(
+    one: Mapping[str, Float[Tensor, " B"]], other: Mapping[str, Float[Tensor, " B"]]
+) -> dict[str, Estimate]:
+    """The mean of one minus other over the same episodes, for every measure."""
+    return {name: estimate(values - other[name]) for name, values in one.items()}

@@ -1,0 +1,96 @@
+"""Measures of episodes made by hand, and intervals with known values."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from epo_lightning.drive.episodes import Episodes
+from epo_lightning.drive.measures import SOON, differences, estimate, measure
+
+DT, STEPS = 0.1, 40
+
+
+def meeting(gap: float, speed: float = 1.0) -> Episodes:
+    """A robot that drives along x at 1 m/s, and an agent that stands beside its way at a distance of ``gap``."""
+    times = DT * torch.arange(STEPS + 1, dtype=torch.double)
+    states = torch.zeros(1, 2, STEPS + 1, 4, dtype=torch.double)
+    states[0, 0, :, 0], states[0, 0, :, 3] = speed * times, speed
+    states[0, 1, :, 0], states[0, 1, :, 1] = 2.0, gap
+    return Episodes(
+        dt=DT,
+        states=states,
+        controls=torch.zeros(1, STEPS, 2, dtype=torch.double),
+        agent_mask=torch.ones(1, 2, STEPS + 1, dtype=torch.bool),
+        size=torch.full((1, 2, 2), 0.5, dtype=torch.double),
+        found=torch.ones(1, STEPS, dtype=torch.bool),
+        progress=states[:, 0, :, 0],
+    )
+
+
+def values(episodes: Episodes, shape: str = "disc") -> dict[str, float]:
+    return {name: float(value[0]) for name, value in measure(episodes, shape, 10.0, {}).items()}
+
+
+def test_contact_and_distance() -> None:
+    assert values(meeting(0.4))["collision"] == 1.0
+    assert values(meeting(0.6))["collision"] == 0.0
+    assert values(meeting(0.6))["distance"] == pytest.approx(0.6)
+    apart = meeting(0.4)
+    apart.agent_mask[:, 1] = False
+    assert values(apart)["collision"] == 0.0
+    assert values(apart)["time_to_collision"] == SOON
+    turned = meeting(0.55)
+    turned.states[:, 1, :, 2] = torch.pi / 4  # the corner of a box reaches further than its side
+    assert [values(turned, shape)["collision"] for shape in ("disc", "box")] == [0.0, 1.0]
+
+
+def test_time_to_collision_is_the_smallest_over_the_way() -> None:
+    begun = meeting(0.0)
+    early = dataclasses.replace(
+        begun, states=begun.states[:, :, :6], controls=begun.controls[:, :5], agent_mask=begun.agent_mask[:, :, :6]
+    )
+    early = dataclasses.replace(early, found=early.found[:, :5], progress=early.progress[:, :6])
+    # After 0.5 s the robot is 1.5 m away, and discs of 0.25 m touch after 1 s.
+    assert values(early)["time_to_collision"] == pytest.approx(1.1, abs=0.11)
+    assert values(meeting(0.6))["time_to_collision"] == SOON
+
+
+def test_comfort_progress_and_deadlocks() -> None:
+    episodes = meeting(1.0)
+    episodes.controls[0, ::2, 0] = 0.1
+    episodes.controls[0, :, 1] = -0.2
+    found = values(episodes)
+    assert found["jerk"] == pytest.approx(0.1 / DT)
+    assert found["lateral"] == pytest.approx(0.2)
+    assert found["progress"] == pytest.approx(4.0)
+    assert found["deadlock"] == 0.0
+    assert values(meeting(1.0, speed=0.0))["deadlock"] == 1.0
+    standing = meeting(1.0, speed=0.0)
+    assert float(measure(standing, "disc", 0.0, {})["deadlock"][0]) == 0.0, "it has arrived"
+    standing.states[:, 0, ::15, 3] = 1.0
+    assert values(standing)["deadlock"] == 0.0, "it never stands for two seconds"
+
+
+def test_one_step_without_a_plan_counts() -> None:
+    episodes = meeting(1.0)
+    assert values(episodes)["fallback"] == 0.0
+    episodes.found[0, 3] = False
+    assert values(episodes)["fallback"] == 1.0
+
+
+def test_intervals() -> None:
+    rate = estimate(torch.tensor([1.0] * 10 + [0.0] * 90, dtype=torch.double), rate=True)
+    assert (rate.mean, rate.low, rate.high) == pytest.approx((0.1, 0.0552, 0.1744), abs=1e-3)  # Wilson (1927)
+    draws = torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=torch.double)
+    mean = estimate(draws)
+    assert mean.high - mean.low == pytest.approx(2 * 1.96 * float(draws.std()) / 20, rel=0.1)
+    assert estimate(draws) == mean, "intervals are the same in every run"
+
+
+def test_differences_are_those_of_the_same_episodes() -> None:
+    base = 10 * torch.randn(200, generator=torch.Generator().manual_seed(0), dtype=torch.double)
+    found = differences({"progress": base + 1.0}, {"progress": base})["progress"]
+    assert (found.mean, found.low, found.high) == pytest.approx((1.0, 1.0, 1.0))

@@ -1,0 +1,139 @@
+"""Planners: which game they solve, from where, and what happens when they find no plan."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+import epo_lightning
+from epo_lightning.drive.planners import BRAKING, ForecastPlanner, GamePlanner, Plan, ResponsePlanner, shifted
+from epo_lightning.drive.rpi import RPIWorld
+from epo_lightning.forecasters.base import Forecaster
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import SPEED, JointForecast, Scene
+
+
+@pytest.fixture(scope="module")
+def world() -> RPIWorld:
+    return RPIWorld(3, seed=1, pedestrian="plays")
+
+
+@pytest.fixture(scope="module")
+def epo() -> Forecaster:
+    return epo_lightning.load("rpi/v_lstm_epo")
+
+
+def likely(forecast: JointForecast) -> torch.Tensor:
+    return forecast.states[torch.arange(len(forecast.states)), forecast.probabilities.argmax(1)]
+
+
+def test_a_plan_is_the_part_of_the_most_likely_mode(world: RPIWorld, epo: Forecaster) -> None:
+    scene = world.observe()
+    plan = ForecastPlanner(epo)(scene, None)
+    torch.testing.assert_close(plan.states, likely(epo.predict(scene)))
+    rolled = world.energy.dynamics.rollout(scene.current[:, 0], plan.controls.double(), scene.dt)
+    torch.testing.assert_close(rolled.float(), plan.states[:, 0], rtol=0, atol=1e-4)
+
+
+def test_the_nearest_mode_is_kept(world: RPIWorld, epo: Forecaster) -> None:
+    scene = world.observe()
+    forecast = epo.predict(scene)
+    unlikely = forecast.probabilities.argmin(1)
+    rows = torch.arange(3)
+    states = forecast.states[rows, unlikely]
+    before = torch.cat((states[:, :, :1], states[:, :, :-1]), 2)  # one step later it is the unlikely mode
+    previous = Plan(torch.zeros(3, 40, 2), before, torch.ones(3, dtype=torch.bool))
+    kept = ForecastPlanner(epo, keep=True)(scene, previous)
+    torch.testing.assert_close(kept.states, states)
+    torch.testing.assert_close(ForecastPlanner(epo)(scene, previous).states, likely(forecast))
+
+
+def test_pair_terms_and_warm_starts_change_the_solved_game(world: RPIWorld, epo: Forecaster) -> None:
+    scene = world.observe().to(torch.float32)
+    forecast = epo.predict(scene)
+    game = forecast.parameters
+    assert game is not None
+    assert forecast.solution is not None
+    mode, rows = forecast.probabilities.argmax(1), torch.arange(3)
+    alone = dataclasses.replace(game, pair_weights={name: 0 * weight for name, weight in game.pair_weights.items()})
+    wanted = epo.solve(scene, alone).states[rows, mode]
+    torch.testing.assert_close(ForecastPlanner(epo, pair_terms=False)(scene, None).states, wanted)
+    joint = torch.cat((torch.zeros_like(forecast.solution.controls[..., :1, :]), forecast.solution.controls), -2)
+    previous = Plan(torch.zeros(3, 40, 2), torch.zeros(3, 2, 40, 4), torch.ones(3, dtype=torch.bool), joint)
+    onward = dataclasses.replace(game, initial_controls=forecast.solution.controls)
+    warm = ForecastPlanner(epo, warm=True)
+    torch.testing.assert_close(warm(scene, previous).states, epo.solve(scene, onward).states[rows, mode])
+    torch.testing.assert_close(warm(scene, None).states, likely(forecast))
+
+
+def test_options_of_a_game_need_a_game() -> None:
+    baseline = epo_lightning.load("rpi/v_lstm_sc")
+    for options in ({"warm": True}, {"pair_terms": False}):
+        with pytest.raises(ConfigError, match="SceneConsistent solves no game"):
+            ForecastPlanner(baseline, **options)
+
+
+def test_forecasts_without_controls_are_tracked(world: RPIWorld, epo: Forecaster) -> None:
+    class Silent(torch.nn.Module):
+        def forward(self, scene: Scene) -> JointForecast:
+            forecast = epo.predict(scene)
+            return JointForecast(forecast.states, forecast.probabilities)
+
+    scene = world.observe()
+    plan = ForecastPlanner(Silent())(scene, None)  # type: ignore[arg-type]
+    torch.testing.assert_close(plan.controls, ForecastPlanner(epo)(scene, None).controls, rtol=0, atol=1e-3)
+
+
+def test_a_response_is_the_best_one_to_the_forecast(world: RPIWorld, epo: Forecaster) -> None:
+    scene = world.observe().to(torch.float64)
+    game = world.game(scene)
+    for forecaster in (None, epo):
+        plan = ResponsePlanner(world.energy, world.game, forecaster)(scene, None)
+        assert plan.joint is not None
+        other = plan.states[:, 1]
+        if forecaster is None:
+            straight = world.energy.dynamics.rollout(scene.current[:, 1], torch.zeros_like(plan.joint[:, 0, 1]), 0.1)
+            torch.testing.assert_close(other, straight)
+        else:
+            torch.testing.assert_close(other[:, :40].float(), likely(epo.predict(scene))[:, 1], rtol=0, atol=1e-3)
+        cost = world.energy(scene, game, plan.joint)
+        for seed in range(4):
+            noise = torch.zeros_like(plan.joint)
+            noise[:, :, 0] = 0.01 * torch.randn(noise[:, :, 0].shape, generator=torch.Generator().manual_seed(seed))
+            assert bool((world.energy(scene, game, plan.joint + noise) > cost).all())
+
+
+def test_iterated_best_responses_meet_the_joint_minimum(world: RPIWorld) -> None:
+    scene = world.observe()
+    joint, iterated = (GamePlanner(world.energy, world.game, rounds)(scene, None) for rounds in (None, 20))
+    assert float((joint.states - iterated.states)[..., :2].abs().max()) < 0.05
+
+
+def test_a_step_without_a_plan_follows_the_last_one() -> None:
+    world = RPIWorld(2, seed=1)
+    scene = world.observe()
+    controls = torch.arange(2 * 5 * 2.0).view(2, 5, 2)
+    last = Plan(controls, torch.arange(2 * 2 * 5 * 4.0).view(2, 2, 5, 4), torch.ones(2, dtype=torch.bool))
+    broken = Plan(
+        torch.full((2, 5, 2), torch.nan), torch.full((2, 2, 5, 4), torch.nan), torch.tensor([False, False]), None
+    )
+    plan = broken.or_else(last, scene)
+    torch.testing.assert_close(plan.controls, shifted(controls, 5))
+    torch.testing.assert_close(plan.states[:, :, :-1], last.states[:, :, 1:])
+    assert not plan.found.any()
+    part = dataclasses.replace(last, found=torch.tensor([True, False])).or_else(last, scene)
+    torch.testing.assert_close(part.controls[0], controls[0])
+    torch.testing.assert_close(part.controls[1], shifted(controls, 5)[1])
+    stop = broken.or_else(None, scene)
+    assert bool((stop.controls[..., 0] >= -BRAKING - 1e-9).all())
+    speed = scene.current[:, 0, SPEED] + 0.1 * stop.controls[..., 0].double().sum(1)
+    torch.testing.assert_close(speed, torch.zeros_like(speed), rtol=0, atol=0.5)
+
+
+def test_shifted_strategies_are_padded_or_cut() -> None:
+    controls = torch.arange(8.0).view(4, 2)
+    torch.testing.assert_close(shifted(controls, 3), controls[1:])
+    torch.testing.assert_close(shifted(controls, 2), controls[1:3])
+    torch.testing.assert_close(shifted(controls, 5), torch.cat((controls[1:], torch.zeros(2, 2))))

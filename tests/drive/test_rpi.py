@@ -1,0 +1,93 @@
+"""The robot-pedestrian game as a world: the same episodes for all planners, and pedestrians that play or ignore."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import pytest
+import torch
+
+from epo_lightning.data.rpi.subgames import HISTORY
+from epo_lightning.drive.episodes import play
+from epo_lightning.drive.planners import GamePlanner
+from epo_lightning.drive.rpi import RPIWorld
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import SPEED
+
+
+@pytest.fixture(scope="module", params=["plays", "ignores"])
+def world(request: pytest.FixtureRequest) -> RPIWorld:
+    return RPIWorld(3, seed=1, pedestrian=request.param)
+
+
+def moved(world: RPIWorld, control: tuple[float, float], steps: int) -> torch.Tensor:
+    """States of the pedestrian while the robot's controls are constant."""
+    own = copy.deepcopy(world)
+    for _ in range(steps):
+        own.advance(torch.tensor(control).expand(3, 2))
+    return own.observe().current[:, 1]
+
+
+def test_a_seed_names_the_episodes(world: RPIWorld) -> None:
+    again, other = (RPIWorld(2, seed, world.pedestrian).observe() for seed in (1, 2))
+    torch.testing.assert_close(again.history, world.observe().history[:2], rtol=0, atol=0)
+    assert not torch.allclose(again.history, other.history)
+
+
+def test_a_scene_shows_the_past_alone(world: RPIWorld) -> None:
+    scene = world.observe()
+    assert scene.future is None
+    assert scene.history.shape == (3, 2, HISTORY + 1, 4)
+    assert bool((scene.history[:, :, 0, SPEED] == 0).all()), "an episode is planned as soon as a history is complete"
+    assert scene.game_steps is not None
+    assert scene.game_steps.tolist() == [82] * 3
+
+
+def test_only_a_pedestrian_who_plays_answers_the_robot(world: RPIWorld) -> None:
+    straight, turned = moved(world, (0.0, 0.0), 12), moved(world, (0.5, 0.8), 12)
+    assert torch.equal(straight, turned) == (world.pedestrian == "ignores")
+
+
+def test_the_true_game_against_itself_stays_on_the_begun_mode() -> None:
+    world = RPIWorld(3, seed=1, pedestrian="plays")
+    planned = torch.tensor(world._x.copy())[:, HISTORY:]
+    episodes = play(world, GamePlanner(world.energy, world.game))
+    assert episodes.found.all()
+    reached = episodes.states.transpose(1, 2).flatten(2)
+    assert float((reached - planned)[..., [0, 1, 4, 5]].abs().max()) < 0.02
+
+
+def test_the_cost_is_that_of_the_true_game() -> None:
+    world = RPIWorld(2, seed=1, pedestrian="plays")
+    episodes = play(world, GamePlanner(world.energy, world.game))
+    weight, c = world.weight, world.constants
+    robot = episodes.states[:, 0, 1:]
+    own = 5 * episodes.controls.square().sum((1, 2)) + 15 * robot[..., SPEED].square().sum(1)
+    own += 50 * (episodes.controls[..., 1].abs() - c.turn_limit).clamp_min(0).square().sum(1)
+    goal = torch.tensor([3.0, 0.0, 0.0], dtype=torch.double)
+    own += 150 * (robot[:, -1, :3] - goal).square().sum(-1)
+    distance = (episodes.states[:, 0, 1:, :2] - episodes.states[:, 1, 1:, :2]).norm(dim=-1)
+    pair = weight * (c.radius - distance).clamp_min(0).square().sum(1)
+    torch.testing.assert_close(world.measures()["cost"], own + pair, rtol=1e-6, atol=1e-6)
+
+
+def test_the_last_step_has_a_game(world: RPIWorld) -> None:
+    own = copy.deepcopy(world)
+    own.now = own.constants.steps - 1
+    plan = GamePlanner(own.energy, own.game)(own.observe(), None)
+    assert bool(plan.found.all())
+    assert plan.controls.shape[1] == 2
+
+
+def test_mistakes_are_named() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'plays'"):
+        RPIWorld(1, pedestrian="play")
+    with pytest.raises(ConfigError, match="episodes must be a whole number, 1 or more, not 0"):
+        RPIWorld(0)
+
+
+def test_a_world_is_not_changed_by_its_scenes(world: RPIWorld) -> None:
+    scene = world.observe()
+    scene.history.zero_()
+    assert dataclasses.replace(world.observe()).history.abs().sum() > 0

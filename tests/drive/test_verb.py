@@ -1,0 +1,64 @@
+"""``epo drive``: files, films, and mistakes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from experiment.conftest import epo  # noqa: F401 - a fixture
+
+from epo_lightning.run_folder import read_json
+
+SMALL = ["episodes=2", "timed=1", "others=[ignores]"]
+
+
+def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -> None:  # noqa: F811
+    words = ["run=[rpi/v_lstm_epo,rpi/v_lstm_sc]", "ways=[own,warm]", "baselines=[constant_velocity]"]
+    assert epo("drive", *words, *SMALL, f"out={tmp_path}/driven") == 0
+    results = read_json(tmp_path / "driven" / "results.json")
+    planners = results["worlds"]["ignores"]["planners"]
+    row, baseline = "V-LSTM + EPO, relaxed", "response to constant velocity"
+    assert list(planners) == [row, f"{row}, warm start", "V-LSTM + SC, relaxed", baseline], "+SC has no warm start"
+    assert set(planners[row]) >= {"collision", "time_to_collision", "progress", "jerk", "lateral", "deadlock", "cost"}
+    difference = results["worlds"]["ignores"]["differences"][f"{row} - {baseline}"]["progress"]
+    wanted = planners[row]["progress"]["mean"] - planners[baseline]["progress"]["mean"]
+    assert difference["mean"] == pytest.approx(wanted)
+    assert results["milliseconds"][row]["plans"] == 81
+    assert (tmp_path / "driven" / "film-ignores.gif").read_bytes()[:3] == b"GIF"
+    table = (tmp_path / "driven" / "table.md").read_text()
+    assert table.count(f"| {baseline} |") == 2
+    assert json.dumps(results)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run=highway_sim/hivt_m_epo"], "was trained on data=highway_sim, and world=rpi takes runs of data=rpi"),
+        (["run=rpi/v_lstm_epo", "others=[play]"], "did you mean 'plays'"),
+        (["run=rpi/v_lstm_epo", "film=2", "episodes=2"], "film must be an episode from 0 to 1, or null, not 2"),
+        (["run=rpi/v_lstm_epo", "episodes=0", "film=null"], "episodes must be 1 or more, not 0"),
+        (["run=rpi/v_lstm_epo", "ways=[]", "baselines=[]"], "nothing drives"),
+    ],
+)
+def test_mistakes_are_named(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    message: str,
+) -> None:
+    assert epo("drive", *words, f"out={tmp_path}/driven") == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "driven").exists()
+
+
+def test_results_are_not_overwritten(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "results.json").write_text("{}")
+    assert epo("drive", "run=rpi/v_lstm_epo", f"out={tmp_path}") == 2
+    assert "holds results already" in capsys.readouterr().err
