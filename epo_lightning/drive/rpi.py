@@ -4,8 +4,8 @@ Every episode is a main game of its own (:mod:`epo_lightning.data.rpi.game`), wi
 pedestrian that no training set has. For the first 1.8 s, the history that forecasters need, both agents follow their parts
 of a mode of the main game. Then the robot is planned until the game ends after 10 s. The pedestrian
 
-- ``plays``: every 0.1 s it solves the rest of the true game anew from the present states, from the shifted rest of its last
-  solution and from the same with a robot that keeps its velocity, and takes its part of the cheaper solution; or
+- ``plays``: every 0.1 s it solves the rest of the true game anew from the present states and the rest of its last solution,
+  and follows its part of it. Every 0.5 s it also starts from a robot that keeps its velocity, and takes the cheaper solution;
 - ``ignores``: it follows the solution of its own costs alone, from the start on, whatever the robot does.
 """
 
@@ -31,6 +31,8 @@ from epo_lightning.scene import GameParameters, Scene
 PEDESTRIANS = ("plays", "ignores")
 SEEDS = 1_000_000
 """Added to seeds of episodes, so that their games are none of those of a data set."""
+RECONSIDERED = 5
+"""Steps after which a pedestrian who plays looks for a better solution than that near its plan."""
 _SETTINGS = PotentialSettings().array()
 _BOTH = np.ones(AGENTS)
 ENERGY = FeatureEnergy(
@@ -151,11 +153,14 @@ class RPIWorld:
         self.now += 1
 
     def _solution(self, x: Array, plan: Array, game: MainGame) -> Array:
-        """The cheaper one of the solutions [K, 4] of the rest of the game, from the plan and from a robot going straight."""
-        straight = plan.copy()
-        straight[:, :2] = 0.0
+        """Solution [K, 4] of the rest of the game from the plan; at times, the cheaper one of this and a second solution."""
+        starts = [plan]
+        if (self.now - HISTORY) % RECONSIDERED == 0:
+            straight = plan.copy()
+            straight[:, :2] = 0.0
+            starts.append(straight)
         found: list[tuple[float, Array]] = []
-        for start in (plan, straight):
+        for start in starts:
             states, controls, _, _ = solve_potential(x, start, self._c, game.goals, game.weight, _BOTH, _SETTINGS)
             found.append((sum(costs(states, controls, self._c, game.goals, game.weight)), controls))
         return min(found, key=lambda pair: pair[0])[1]
