@@ -5,7 +5,7 @@ pedestrian that no training set has. For the first 1.8 s, the history that forec
 of a mode of the main game. Then the robot is planned until the game ends after 10 s. The pedestrian
 
 - ``plays``: every 0.1 s it solves the rest of the true game anew from the present states and the rest of its last solution,
-  and follows its part of it. Every 0.5 s it also starts from a robot that keeps its velocity, and takes the cheaper solution;
+  and follows its part of it. Every 0.5 s it also starts from a robot that goes on straight, and takes the cheaper one;
 - ``ignores``: it follows the solution of its own costs alone, from the start on, whatever the robot does.
 """
 
