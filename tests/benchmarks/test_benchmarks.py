@@ -14,6 +14,7 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import (
     dashboards,
+    decentralised,
     epo_layer,
     explore,
     extraction,
@@ -148,6 +149,27 @@ def test_refinements_of_runs_are_scored_and_timed(capsys, tmp_path):
     assert [line.split()[3] for line in lines[1:-1] if " all " in line] == ["given", "tracked", "refined"]
     assert lines[-1].startswith("CPU ms per scene of 4 agents and 5 modes: ")
     assert "'circles' is not name=number" in refused(refinement.main, run.path, "--weights", "circles")
+
+
+@pytest.mark.slow
+def test_best_responses_come_close_to_the_central_solution(capsys, tmp_path):
+    words = [
+        "data=drawn",
+        "data.scenes=32",
+        "data.batch_size=4",
+        "data.like=highway",
+        "budget=smoke",
+        "callbacks.progress=none",
+    ]
+    run = train.train(compose("train", ["experiment=highway/v_lstm_epo_equilibrium", *words, f"runs={tmp_path}"]))
+    decentralised.main([str(run.path)])
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[0] for row in rows] == ["central", *["in_turn"] * 6, *["at_once"] * 6]
+    near = [float(row[2].removesuffix("%")) for row in rows[1:]]
+    assert near[5] >= near[0]
+    assert near[11] >= near[6]
+    marginal = train.train(compose("train", ["experiment=highway/v_lstm", *words, f"runs={tmp_path}"]))
+    assert "infers no game of features" in refused(decentralised.main, marginal.path)
 
 
 def test_refinements_name_what_is_no_run(tmp_path):

@@ -20,6 +20,17 @@ class TestBothSides(SolverSuite):
     config = {"name": "both_sides"}
 
 
+class TestBestResponseAtOnce(SolverSuite):
+    config = {"name": "best_response", "order": "at_once"}
+    converged = {"rounds": 400, "tolerance": 0.0}
+
+
+class TestBestResponseInTurn(SolverSuite):
+    config = {"name": "best_response"}
+    converged = {"rounds": 200, "tolerance": 0.0}
+    test_solutions_are_equivariant_to_the_order_of_agents = None  # the order of agents is that of their turns
+
+
 class TestGradientDescent(SolverSuite):
     config = {"name": "gradient_descent", "steps": 4, "step_size": 0.05}
     converged = {"steps": 200}
