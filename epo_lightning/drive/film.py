@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -19,7 +20,9 @@ from epo_lightning.report.animation import write_gif
 from epo_lightning.report.style import style
 from epo_lightning.run_folder import whole_file
 
-COLUMNS = 4
+COLUMNS = 3
+LETTERS = 32
+"""Letters in a line of a title."""
 EGO_COLOR, OTHER_COLOR = "#c1272d", "#0055a4"
 
 
@@ -38,11 +41,11 @@ def film(played: Mapping[str, Episodes], episode: int, shape: str, path: Path) -
     columns = min(COLUMNS, len(played))
     rows = math.ceil(len(played) / columns)
     with style():
-        figure = Figure(figsize=(2.2 * columns, 2.35 * rows), layout="constrained")
+        figure = Figure(figsize=(2.2 * columns, 2.5 * rows), layout="constrained")
         axes = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
         first = next(iter(played.values()))
         for name, axis in zip(played, axes, strict=False):
-            axis.set_title(name, fontsize=8)
+            axis.set_title(textwrap.fill(name, LETTERS), fontsize=7)
             _frame(axis, played, episode)
         for axis in axes[len(played) :]:
             axis.set_axis_off()
@@ -80,7 +83,7 @@ def _moving(axes: np.ndarray, played: Mapping[str, Episodes], episode: int, shap
             distance = np.hypot(*(states[1:, t, :2] - states[0, t, :2]).T).min() if shape == "disc" else np.inf
             if distance < sizes[0, 0] and name not in touched:
                 touched.add(name)
-                axis.set_title(f"{name}: contact", fontsize=8, color=EGO_COLOR)
+                axis.set_title(textwrap.fill(f"{name}: contact", LETTERS), fontsize=7, color=EGO_COLOR)
         yield t * next(iter(played.values())).dt
         for artist in drawn:
             artist.remove()

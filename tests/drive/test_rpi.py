@@ -8,6 +8,7 @@ import dataclasses
 import pytest
 import torch
 
+import epo_lightning
 from epo_lightning.data.rpi.subgames import HISTORY
 from epo_lightning.drive.episodes import play
 from epo_lightning.drive.planners import GamePlanner
@@ -91,3 +92,12 @@ def test_a_world_is_not_changed_by_its_scenes(world: RPIWorld) -> None:
     scene = world.observe()
     scene.history.zero_()
     assert dataclasses.replace(world.observe()).history.abs().sum() > 0
+
+
+def test_a_pedestrian_who_ignores_the_robot_makes_the_inferred_pair_term_small(world: RPIWorld) -> None:
+    game = epo_lightning.load("rpi/v_lstm_epo_game_refined").predict(world.observe()).parameters
+    # Scale: the weight of accelerations is the square root of `effort` in the true game.
+    unit = world.constants.effort / game.own_weights["acc"][:, 0, 0].square()
+    inferred = game.pair_weights["clearance"][:, 0, 0].square() / 2 * unit
+    share = float((inferred / world.weight).median())
+    assert share < 0.2 if world.pedestrian == "ignores" else 0.8 < share < 1.25
