@@ -61,7 +61,8 @@ class LSTMHistory(nn.Module):
         """
         vectors, observed = (part.flatten(0, 1) for part in history_vectors(scene, self.scale))
         # A stable sort moves the observed vectors to the front. The LSTM is causal, so the vectors after them do not matter.
-        order = (~observed).to(torch.uint8).argsort(dim=1, stable=True)
+        steps = torch.arange(observed.shape[1], device=observed.device)
+        order = torch.where(observed, steps, steps + observed.shape[1]).argsort(dim=1)
         states, _ = self.lstm(vectors.gather(1, order[..., None].expand_as(vectors)))
         last = observed.sum(1) - 1
         return states[torch.arange(last.shape[0], device=last.device), last].view(*scene.agent_mask.shape, self.width)

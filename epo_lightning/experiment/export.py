@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import io
-import json
+import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -18,11 +19,12 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import ExportSettings, Settings
 from epo_lightning.experiment.opening import open_checkpoint
 from epo_lightning.experiment.predict import MEANING, scenes_of
+from epo_lightning.experiment.program_files import FORMATS, Format, Run, Tensors
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.forecasters.refined import Refined
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_file
+from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import FIELDS, Scene
 from epo_lightning.schema import read
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -35,8 +37,6 @@ TOLERANCE = 1e-5
 """Largest difference between the outputs of a program and those of its forecaster, divided by values above 1.
 
 Positions of 150 m have a resolution of 1.5e-5 m in single precision."""
-
-Tensors = dict[str, Tensor]
 
 
 class Program(nn.Module):
@@ -54,52 +54,72 @@ class Program(nn.Module):
 def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Path, float]:
     """Write a run's forecaster as a program (``torch.export``), for any number of scenes.
 
-    The file also has ``about.json``: title, time step, and :func:`describe`. Other sizes are those of the example.
+    The file also says its title, time step, and what :func:`describe` says. Other sizes are those of the example.
 
     Args:
         settings: the run, the scenes that are the example, and the file.
         overrides: the user's overrides; settings of other data that they name do not follow the run.
 
     Returns:
-        the file, and the largest difference between the program and the forecaster on the example.
+        the file, and the largest difference between the program in it and the forecaster on the example.
 
     Raises:
-        ConfigError: a run that cannot be opened, a forecaster that cannot be exported, a file that exists, or a program
-            that differs from its forecaster.
+        ConfigError: a run that cannot be opened, a forecaster that cannot be exported, a file that exists, a package that is
+            missing, or a program that differs from its forecaster.
     """
-    file = Path(settings.out).expanduser()
-    if file.exists():
-        raise ConfigError(f"{file} exists: nothing is overwritten; choose another out=<file>")
+    form = FORMATS[settings.format]
+    file = Path(settings.out or f"forecaster{form.suffix}").expanduser()
+    check_file(file, form)
     assembly.quiet()
     run = RunFolder.open(settings.run)
     of_run = read(Settings, run.config())
     forecaster: Forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
-    check_exportable(forecaster, of_run.title)
+    check_exportable(forecaster, of_run.title, form)
     scenes = scenes_of(run, of_run, settings, forecaster, overrides).scenes
     forecast = forecaster.predict(scenes)
     wanted = {name: getattr(forecast, name) for name in OUTPUTS}
     tensors = inputs_of(forecaster, scenes)
     program = program_of(forecaster, tensors, scenes.dt)
-    difference = largest_difference(program.module(), tensors, wanted)
-    if not difference <= TOLERANCE:
-        raise ConfigError(
-            f"the program of {of_run.title} differs from its forecaster by {difference:.2g}: it is not written"
-        )
-    about = {"title": of_run.title, "dt": scenes.dt, **describe(program)}
-    content = io.BytesIO()
-    torch.export.save(program, content, extra_files={"about.json": json.dumps(about)})
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_file(file, content.getbuffer())
+    with TemporaryDirectory(dir=file.parent, prefix=".export-") as folder:
+        unchecked = Path(folder) / file.name
+        form.write(program, {"title": of_run.title, "dt": scenes.dt, **describe(program)}, unchecked)
+        difference = largest_difference(form.load(unchecked), tensors, wanted)
+        if not difference <= TOLERANCE:
+            raise ConfigError(
+                f"the program of {of_run.title} differs from its forecaster by {difference:.2g}: it is not written"
+            )
+        unchecked.replace(file)
     return file, difference
 
 
-def check_exportable(forecaster: Forecaster, title: str) -> None:
-    """Refuse forecasters with a number of steps that depends on values, such as solvers that stop at convergence.
+def check_file(file: Path, form: Format) -> None:
+    """Refuse a file that exists or has another format's suffix, and a format whose packages are missing.
+
+    Raises:
+        ConfigError: see above; the message names the file or the package.
+    """
+    if file.exists():
+        raise ConfigError(f"{file} exists: nothing is overwritten; choose another out=<file>")
+    if file.suffix != form.suffix:
+        raise ConfigError(f"out={file} must end in {form.suffix}, as files of this format do")
+    missing = [name for name in form.packages if find_spec(name) is None]
+    if missing:
+        raise ConfigError(f"format=onnx needs {', '.join(missing)}: pip install 'epo_lightning[onnx]'")
+
+
+def check_exportable(forecaster: Forecaster, title: str, form: Format) -> None:
+    """Refuse forecasters with a number of steps that depends on values, and those with operations that the format lacks.
 
     Raises:
         ConfigError: see above; the message names the part.
     """
-    for game in games_of(forecaster):
+    games = games_of(forecaster)
+    if games and not form.games:
+        raise ConfigError(
+            f"{title} cannot be exported as ONNX, which has no Cholesky factorisation: use format=pt2 or format=aoti"
+        )
+    for game in games:
         if isinstance(game, EPO) and game.calibration is not None:
             part = "its calibration"
         elif not isinstance(game.solver, LevenbergMarquardt) or game.solver.adaptive:
@@ -147,13 +167,18 @@ def program_of(forecaster: Forecaster, example: Tensors, dt: float) -> ExportedP
         return torch.export.export(program, (seven,), dynamic_shapes=(shapes,), strict=False)
 
 
-def largest_difference(run: Callable[[Tensors], Tensors], given: Tensors, wanted: Tensors) -> float:
-    """Largest |found - wanted| / max(1, |wanted|) for all scenes and for the first one alone; NaN if an output is NaN."""
+def largest_difference(run: Run, given: Tensors, wanted: Tensors) -> float:
+    """Largest |found - wanted| / max(1, |wanted|) for all scenes and for the first one alone.
+
+    Infinity for outputs of another shape, as those of a program for one number of scenes; NaN if an output is NaN.
+    """
     differences = []
     for scenes in (slice(None), slice(1)):
         found = run({name: value[scenes] for name, value in given.items()})
         for name in wanted:
             expected = wanted[name][scenes]
+            if found[name].shape != expected.shape:
+                return math.inf
             differences.append(((found[name] - expected).abs() / expected.abs().clamp(min=1.0)).max())
     return float(torch.stack(differences).max())
 

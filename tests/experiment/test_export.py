@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,11 +18,13 @@ import epo_lightning
 from epo_lightning import pretrained
 from epo_lightning.decoders import goals
 from epo_lightning.experiment.config.settings import ExportSettings
-from epo_lightning.experiment.export import check_exportable, export, inputs_of, largest_difference
+from epo_lightning.experiment.export import check_exportable, check_file, export, inputs_of, largest_difference
+from epo_lightning.experiment.program_files import FORMATS
 from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
+EXAMPLE = Path(__file__).parents[2] / "examples" / "cpp"
 ELSEWHERE = """
 import sys, torch
 about = {"about.json": ""}
@@ -87,17 +90,73 @@ def test_a_program_gives_the_forecasts_of_its_forecaster_in_another_process(
         export(settings)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
+def test_onnx_gives_the_forecasts_of_the_forecaster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    monkeypatch.setenv("EPO_CACHE", str(tmp_path))
+    name = "rpi/v_lstm_sc"
+    file, _ = export(ExportSettings(run=name, format="onnx", out=str(tmp_path / "it.onnx")))
+    forecaster, scenes = epo_lightning.load(name), pretrained.examples(name)[slice(3)]
+    inputs = with_absent_agents(inputs_of(forecaster, scenes))
+    session = runtime.InferenceSession(file)
+    states, _ = session.run(["states", "probabilities"], {name: value.numpy() for name, value in inputs.items()})
+    wanted = forecaster.predict(Scene(**inputs, dt=scenes.dt))
+    torch.testing.assert_close(torch.from_numpy(states), wanted.states, atol=1e-5, rtol=1e-5)
+    about = json.loads(session.get_modelmeta().custom_metadata_map["about"])
+    assert about["inputs"]["history"]["shape"] == ["B", "N", *scenes.history.shape[2:]]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("name", ["rpi/v_lstm_sc", "rpi/v_lstm_epo"])
+def test_the_cpp_example_gives_the_forecasts_of_the_forecaster(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if shutil.which("cmake") is None:
+        pytest.skip("no CMake on this machine")
+    build = tmp_path / "build"
+    prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
+    subprocess.run(["cmake", "-S", str(EXAMPLE), "-B", str(build), prefix], check=True)
+    subprocess.run(["cmake", "--build", str(build)], check=True)
+    monkeypatch.setenv("EPO_CACHE", str(tmp_path))
+    export(ExportSettings(run=name, format="aoti", out=str(tmp_path / "it.pt2")))
+    forecaster, scenes = epo_lightning.load(name), pretrained.examples(name)
+    for count in (1, 5):
+        torch.save(inputs_of(forecaster, scenes[slice(count)]), tmp_path / "scenes.pt")
+        words = [str(build / "forecast"), *(str(tmp_path / name) for name in ("it.pt2", "scenes.pt", "found.pt"))]
+        printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+        assert f"one call for {count} scene(s)" in printed
+        states, probabilities = torch.load(tmp_path / "found.pt")
+        wanted = forecaster.predict(scenes[slice(count)])
+        torch.testing.assert_close(states, wanted.states, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(probabilities, wanted.probabilities, atol=1e-5, rtol=1e-5)
+
+
 def test_what_takes_as_many_steps_as_the_values_need_is_refused() -> None:
     forecaster = epo_lightning.load("rpi/v_lstm_epo")
-    check_exportable(forecaster, "two steps")
+    check_exportable(forecaster, "two steps", FORMATS["aoti"])
     forecaster.solver = replace(forecaster.solver, adaptive=True)
     with pytest.raises(
         ConfigError, match=r"solved cannot be exported: its solver \(LevenbergMarquardt\) takes as many steps"
     ):
-        check_exportable(forecaster, "solved")
+        check_exportable(forecaster, "solved", FORMATS["pt2"])
     forecaster.calibration = object()
     with pytest.raises(ConfigError, match=r"calibrated cannot be exported: its calibration takes as many steps"):
-        check_exportable(forecaster, "calibrated")
+        check_exportable(forecaster, "calibrated", FORMATS["pt2"])
+    with pytest.raises(ConfigError, match=r"game cannot be exported as ONNX, .*: use format=pt2 or format=aoti"):
+        check_exportable(forecaster, "game", FORMATS["onnx"])
+
+
+def test_a_file_has_the_suffix_of_its_format_and_packages_that_are_missing_are_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("epo_lightning.experiment.export.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"out=it\.pt2 must end in \.onnx"):
+        check_file(Path("it.pt2"), FORMATS["onnx"])
+    with pytest.raises(ConfigError, match=r"needs onnx, onnxscript, onnxruntime: pip install 'epo_lightning\[onnx\]'"):
+        check_file(Path("it.onnx"), FORMATS["onnx"])
 
 
 def test_differences_are_relative_for_large_values_and_nan_is_one() -> None:
@@ -105,6 +164,7 @@ def test_differences_are_relative_for_large_values_and_nan_is_one() -> None:
     assert largest_difference(lambda given: given, given, given) == 0.0
     assert largest_difference(lambda given: {"x": given["x"] + 0.25}, given, given) == 0.25
     assert largest_difference(lambda given: {"x": given["x"] * 1.5}, given, given) == 0.5
+    assert largest_difference(lambda _: given, given, given) == torch.inf  # two scenes, also where one is given
     assert not largest_difference(lambda given: {"x": given["x"] * torch.nan}, given, given) <= 1e-5
 
 

@@ -332,7 +332,8 @@ class ExploreSettings(ForecastSettings):
 class ExportSettings(ForecastSettings):
     """Configuration of ``epo export``."""
 
-    out: str = "forecaster.pt2"
+    format: Literal["pt2", "aoti", "onnx"] = "pt2"
+    out: str | None = None
     scenes: int | None = 4
 
 

@@ -182,10 +182,11 @@ class _Parts:
         by_axis = later.view(batch, count, 2, self.size, width)
         unknowns = count * width
         filled = -(-unknowns // _ALIGNED) * _ALIGNED
-        left, right = moves.new_zeros(2, batch, filled, width).unbind(0)
+        both = moves.new_zeros(2, batch, filled, width)
+        left, right = both[0], both[1]  # views that a compiler can write to, unlike those of `unbind`
         product = left[:, :unknowns].view(batch, count, 2, self.size, width)
-        torch.mul(moves[:, :, :, 0, :, None], by_axis[:, :, None, 0], out=product)
-        product.addcmul_(moves[:, :, :, 1, :, None], by_axis[:, :, None, 1])
+        for axis in range(2):
+            product.addcmul_(moves[:, :, :, axis, :, None], by_axis[:, :, None, axis])
         apart = right[:, :unknowns].view(batch, count, 2, self.size, 2, self.size)
         apart.diagonal(dim1=3, dim2=5).copy_(moves)
         # Column-major, for in-place factorisations and triangular solves.
