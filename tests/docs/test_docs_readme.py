@@ -31,7 +31,7 @@ NOT_RUN = {
     "make test": "these tests",
     "epo train resume=runs/rpi/v_lstm_epo/long-s0": "the run is finished here; tests/experiment/test_resume.py kills one",
     ". .venv/bin/activate": "tests run in an environment",
-    "epo explore run=rpi/v_lstm_epo": "serves a page until Ctrl-C; tests/explore opens it in a browser",
+    "epo explore run=rpi/v_lstm_epo_game_refined": "serves a page until Ctrl-C; tests/explore opens it in a browser",
     "epo generate data=highway_sim": "minutes of simulation; tests/data/simulate",
     "epo train experiment=highway/vibes_epo data=highway_sim budget=short": "needs that set; make smoke trains the row",
     "epo train experiment=urban/v_lstm_epo data=interaction data.folder=data/interaction": "needs those recordings",
