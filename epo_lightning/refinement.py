@@ -107,10 +107,14 @@ def refine(
         >>> bool(apart(given[None, None]) < 0.1), bool(apart(refined.states) > 2.0)
         (True, True)
     """
+    scene.validate_values()
     check_forecast(states, probabilities, scene)
     check_number("noise", noise, zero=True)
-    if not torch.as_tensor(inverse_temperature >= 0).all():
-        raise ValueError(f"inverse_temperature must be 0 or more, not {inverse_temperature}")
+    if isinstance(inverse_temperature, Tensor):
+        if inverse_temperature.dim() or not inverse_temperature.isfinite() or inverse_temperature < 0:
+            raise ValueError(f"inverse_temperature must be one finite number, 0 or more, not {inverse_temperature}")
+    else:
+        check_number("inverse_temperature", inverse_temperature, zero=True)
     weights, margins = dict(WEIGHTS if weights is None else weights), dict(margins or {})
     learned = (*weights.values(), *margins.values(), inverse_temperature)
     with torch.set_grad_enabled(torch.is_grad_enabled() and any(_requires_grad(value) for value in learned)):
@@ -265,6 +269,12 @@ def check_forecast(states: Tensor, probabilities: Tensor, scene: Scene) -> None:
             f"states{at} is {states[tuple(at)].tolist()}, which is not finite: leave the scene out, or mark the agent as "
             "absent (scene.agent_mask)"
         )
+    lost = ~scene.current.isfinite().all(-1) & scene.agent_mask
+    if lost.any():
+        at = lost.nonzero()[0].tolist()
+        raise ValueError(
+            f"the present state scene.history[{at[0]}, {at[1]}, -1] is not finite: mark the agent as absent"
+        )
     bad = ~(probabilities >= 0).all(1) | ((probabilities.sum(1) - 1).abs() > SUM_TOLERANCE)
     if bad.any():
         where = int(bad.nonzero()[0])
@@ -318,6 +328,8 @@ def _expanded(what: str, value: float | Tensor, shape: tuple[int, int, int], lik
         if not is_number(value) or not math.isfinite(value):
             raise ValueError(f"{what} must be a finite number or a tensor, not {value!r}")
         return like.new_full((), float(value)).expand(shape)
+    if not value.isfinite().all():
+        raise ValueError(f"{what} has entries that are not finite")
     try:
         return value.to(like).expand(shape)
     except RuntimeError:

@@ -191,7 +191,7 @@ class Scene(_Batch):
             ValueError: a length or width that is not positive, or the index of a reference line that does not exist.
         """
         if self.size is not None:
-            bad = (self.size <= 0).any(-1) & self.agent_mask
+            bad = ~(self.size > 0).all(-1) & self.agent_mask
             if bad.any():
                 scene, agent = bad.nonzero()[0].tolist()
                 raise ValueError(

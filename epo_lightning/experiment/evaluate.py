@@ -222,9 +222,13 @@ def _digest(checkpoint: Path) -> str:
 def _readable(file: Path) -> bool:
     """Whether a file holds scores. The caller replaces a missing or damaged file."""
     try:
-        return isinstance(read_json(file).get("metrics"), dict)
+        content = read_json(file)
     except ConfigError:
         return False
+    return all(
+        isinstance(scores, dict) and all(isinstance(value, int | float) for value in scores.values())
+        for scores in (content.get("metrics"), content.get("truth", {}))
+    )
 
 
 def _same(

@@ -77,7 +77,7 @@ def compare(costs: dict[str, Tensor]) -> dict[str, float]:
     """Scores of inferred costs.
 
     Returns:
-        ``pair_rank``, the rank correlation of inferred and true w (Spearman's); ``pair_error``,
+        ``pair_rank``, the rank correlation of inferred and true w (Spearman's), unless one is constant; ``pair_error``,
         ``goal_error`` and ``vel_error``, medians of the relative error |inferred / true - 1|.
     """
     constants = GameConstants()
@@ -88,5 +88,7 @@ def compare(costs: dict[str, Tensor]) -> dict[str, float]:
         if name in costs
     }
     if "pair" in costs:
-        scores["pair_rank"] = float(stats.spearmanr(costs["pair"].numpy(), costs["true"].numpy()).statistic)
+        inferred, true = costs["pair"].numpy(), costs["true"].numpy()
+        if len({*inferred}) > 1 and len({*true}) > 1:  # constants have no rank correlation
+            scores["pair_rank"] = float(stats.spearmanr(inferred, true).statistic)
     return scores

@@ -12,6 +12,8 @@ import torch
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import GameParameters, Scene
 
+FARTHEST = 1e4
+"""Largest size of a coordinate, angle or speed: farther away, single precision has no digits left for the game."""
 LARGEST = 1000.0
 """Largest factor of a weight. The energy squares weights, so larger ones have no use, and lose digits."""
 
@@ -45,10 +47,10 @@ class Edit:
                 raise ConfigError(f"factors.{name} must be a number from 0 to {LARGEST:g}, not {factor!r}")
         for key, size, what in (("goals", 2, "[x, y] in m"), ("states", 4, "[x, y, heading, speed] in m, rad and m/s")):
             for agent, values in getattr(self, key).items():
-                if not agent.isdecimal():
+                if not agent.isdecimal() or str(int(agent[:9])) != agent:
                     raise ConfigError(f"{key}.{agent} must have the number of an agent as its name, such as {key}.0")
-                if len(values) != size or not all(math.isfinite(value) for value in values):
-                    raise ConfigError(f"{key}.{agent} must be {what}, finite numbers, not {list(values)}")
+                if len(values) != size or not all(abs(value) <= FARTHEST for value in values):
+                    raise ConfigError(f"{key}.{agent} must be {what}, at most {FARTHEST:g} in size, not {list(values)}")
 
     def check(self, scene: Scene, modes: int, names: Sequence[str]) -> None:
         """Check that the changes fit a scene of one batch entry.

@@ -45,7 +45,7 @@ def application(session: Session) -> Starlette:
     async def solve(request: Request) -> Response:
         try:
             values = json.loads(await request.body())
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             return _refusal(f"the request is no JSON: {error}")
         if not isinstance(values, dict):
             return _refusal(f"the request must be an object with the changes of a game, not {values!r}")

@@ -8,6 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
+from epo_lightning.checks import is_number
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
@@ -164,23 +165,29 @@ def read_other(run: Records) -> list[tuple[EvaluatedRun, Mapping[str, Any]]]:
 
 
 def read_parts(run: Records) -> list[EvaluatedRun]:
-    """Scores of one run on a part of its own data (``data.share``), of each part the ones that were written last.
+    """Scores of the best checkpoint of one run on a part of its own data (``data.share``), of each part the ones that were
+    written last.
 
     Raises:
         ConfigError: as :func:`read_run`.
     """
-    found: dict[str, EvaluatedRun] = {}
+    found: dict[tuple[str, str], EvaluatedRun] = {}
     for one, content in read_other(run):
         if is_part(one, content):
-            part = f"{one.data}, {content['settings']['share']:.0%} of the scenes"
-            found[part] = replace(one, data=part)
+            part = f"{one.data}, {100 * content['settings']['share']:.10g}% of the scenes"
+            found[part, one.split] = replace(one, data=part)
     return list(found.values())
 
 
 def is_part(run: EvaluatedRun, content: Mapping[str, Any]) -> bool:
-    """Whether scores are those of a part of the run's own data: the same recordings and windows, fewer scenes."""
-    share = content.get("settings", {}).get("share", 1)
-    return run.data_digest == run.trained_digest and share < run.config["data"].get("share", 1)
+    """Whether scores are those of the best checkpoint on a part of the run's own data: the same windows, fewer scenes."""
+    settings = content.get("settings")
+    shares = [
+        section.get("share", 1) if isinstance(section, Mapping) else 1 for section in (settings, run.config["data"])
+    ]
+    known = all(is_number(share) for share in shares)
+    same = run.checkpoint == "best" and run.data_digest == run.trained_digest
+    return known and same and 0 < shares[0] < shares[1]
 
 
 def scored_elsewhere(run: Records) -> list[str]:
@@ -209,7 +216,10 @@ def _evaluated(
     metrics = _entry(result, file, again, "metrics")
     if not isinstance(metrics, Mapping) or not all(isinstance(value, int | float) for value in metrics.values()):
         raise ConfigError(f"{file}: metrics must be numbers by name; {again}")
-    of_costs = {f"{TRUE}{name}": value for name, value in result.get("truth", {}).items()}
+    truth = result.get("truth", {})
+    if not isinstance(truth, Mapping) or not all(isinstance(value, int | float) for value in truth.values()):
+        raise ConfigError(f"{file}: truth must be numbers by name; {again}")
+    of_costs = {f"{TRUE}{name}": value for name, value in truth.items()}
     if result.get("split", split) != split:
         raise ConfigError(f"{file} holds scores of the {result['split']} split, was it renamed? {again}")
     digest = str(_entry(result, file, again, "data_digest"))

@@ -134,7 +134,7 @@ def test_every_edit_gives_finite_numbers(session: Session, edit: Edit) -> None:
         ({"mode": 2}, "mode must be a number from 0 to 1, not 2"),
         ({"factors": {"gaol": 1.0}}, "no feature 'gaol': did you mean 'goal'"),
         ({"factors": {"goal": -1.0}}, "factors.goal must be a number from 0 to 1000, not -1.0"),
-        ({"goals": {"0": [1.0]}}, r"goals.0 must be \[x, y\] in m, finite numbers"),
+        ({"goals": {"0": [1.0]}}, r"goals.0 must be \[x, y\] in m, at most 10000 in size"),
         ({"goals": {"first": [1.0, 2.0]}}, "goals.first must have the number of an agent"),
         ({"goals": {"7": [1.0, 2.0]}}, r"goals: the scene has the agents \[0, 1\], not 7"),
         ({"states": {"0": [0.0, 0.0, 0.0, math.inf]}}, r"states.0 must be \[x, y, heading, speed\]"),

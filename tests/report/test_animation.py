@@ -137,7 +137,7 @@ def test_a_failed_animation_leaves_no_file(tmp_path: Path, monkeypatch: pytest.M
     def full(*_: object, **__: object) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr(animation, "_write_gif", full)
+    monkeypatch.setattr(animation, "write_gif", full)
     with pytest.raises(OSError, match="no space"):
         animate(traffic(), forecast(traffic()), tmp_path / "scene.gif")
     assert list(tmp_path.iterdir()) == []

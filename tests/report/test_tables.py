@@ -441,3 +441,12 @@ def test_errors_of_inferred_costs_are_a_table_without_ranks(tmp_path: Path) -> N
     assert [column.label for column in found.columns] == ["w: rank correlation", "w: median error"]
     assert [cell.mean for cell in (row.cells["true_pair_rank"] for row in found.rows)] == [0.1, 0.99]
     assert not any(row.cells[column.metric].rank for row in found.rows for column in found.columns)
+
+
+@pytest.mark.parametrize("truth", [None, [], 3, {"pair_rank": None}, {"pair_rank": "high"}])
+def test_damaged_errors_of_costs_are_one_message(tmp_path: Path, truth: Any) -> None:
+    run = make_run(tmp_path / "sc", "SC", "scene_consistent", scores(1.0))
+    content = json.loads((run.path / "metrics.json").read_text())
+    write_json(run.path / "metrics.json", {**content, "truth": truth})
+    with pytest.raises(ConfigError, match=r"metrics.json: truth must be numbers by name; epo evaluate"):
+        collect(tmp_path)

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, write_report
+from epo_lightning.report.runs import read_parts
 from epo_lightning.report.transfer import labels_of, transfer_sheets, transfers, transfers_to_csv
 from epo_lightning.run_folder import RunFolder, write_json
 
@@ -94,6 +95,34 @@ def test_scores_on_a_part_of_the_own_data_are_tables_of_their_own(tmp_path: Path
     assert "| SC | 2 | 4.000 ± 1.414 |" in table
     assert "| SC | a, 50% of the scenes, test split | reduced | 0, 1 |" in text.partition("## How this was made")[2]
     assert transfer_sheets(transfers(report.runs))[0].header[3:] == ("b, test",)
+
+
+def test_parts_are_told_apart_by_split_share_and_checkpoint(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "sc", "SC", "scene_consistent", None, data="a", digest="A")
+    for place, (split, share, checkpoint) in enumerate(
+        (
+            ("test", 0.101, "best"),
+            ("test", 0.104, "best"),
+            ("val", 0.104, "best"),
+            ("test", 0.101, "last"),
+            ("test", -1, "best"),
+        )
+    ):
+        settings = {"settings": {"share": share}, "split": split, "checkpoint": checkpoint, "test": f"test-{place}"}
+        on(run, "a", 1.0 + place, data_digest="A", name=f"-{place}", **settings)
+    found = {(one.data, one.split): one.metrics["minSADE"] for one in read_parts(run)}
+    assert found == {
+        ("a, 10.1% of the scenes", "test"): 1.0,
+        ("a, 10.4% of the scenes", "test"): 2.0,
+        ("a, 10.4% of the scenes", "val"): 3.0,
+    }
+
+
+@pytest.mark.parametrize("settings", [[1], {"share": None}, {"share": "0.5"}])
+def test_damaged_settings_of_a_test_make_no_part(tmp_path: Path, settings: Any) -> None:
+    run = make_run(tmp_path / "sc", "SC", "scene_consistent", None, data="a", digest="A")
+    on(run, "a", 1.0, split="test", data_digest="A", settings=settings)
+    assert read_parts(run) == []
 
 
 def test_rows_of_several_data_sets_share_the_columns_of_the_same_scenes(tmp_path: Path) -> None:
