@@ -21,9 +21,12 @@ from epo_lightning.experiment.other_data import OtherData, keys_of, open_other
 from epo_lightning.experiment.truth import TruthTest
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.columns import TRUE
 from epo_lightning.run_folder import OTHER, RunFolder, discover, read_json, write_json
 from epo_lightning.schema import read
 
+SECTIONS = ("metrics", "truth")
+"""Sections of a file of scores that hold numbers by name."""
 TOLERANCE = 1e-5
 """Relative difference below which two scores are the same: machines and batch sizes change the last digits."""
 
@@ -115,15 +118,16 @@ def score(
     loader = split_of(data, settings.own_split)
     truths = TruthTest(data.records(settings.own_split)["weight"]) if isinstance(data, RPIData) else None
     metrics, costs = _test(run, of_run, forecaster, loader, machine, devices, truths)
+    shown = {**metrics, **{f"{TRUE}{name}": value for name, value in costs.items()}}
     if pretrained.ships(run.path):
-        return run.metrics_file(settings.own_split), metrics
+        return run.metrics_file(settings.own_split), shown
     scored = {"split": settings.own_split, "data_digest": data.digest, "checkpoint": which, "metrics": metrics}
     if costs:
         scored["truth"] = costs
     file = keep(run, scored, checkpoint)
     if file == run.metrics_file():
         logs.publish(run)
-    return file, metrics
+    return file, shown
 
 
 def _test(
@@ -204,8 +208,10 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
             write_json(file, scored)
         stored = read_json(file)
         if _same(stored, scored):
-            completed = {**scored, **stored, "metrics": {**scored["metrics"], **stored["metrics"]}}
-            if completed.keys() != stored.keys() or completed["metrics"].keys() != stored["metrics"].keys():
+            completed = {**scored, **stored}
+            for section in (name for name in SECTIONS if name in completed):
+                completed[section] = {**scored.get(section, {}), **stored.get(section, {})}
+            if completed != stored:
                 write_json(file, completed)
             return file
     digest = _digest(checkpoint)
@@ -237,7 +243,11 @@ def _same(
     """Whether new scores are of the same data and checkpoint as stored ones, and equal them up to the last digits."""
     if any(stored.get(key) != scored[key] for key in keys):
         return False
-    pairs = [(value, scored["metrics"].get(name, math.inf)) for name, value in stored["metrics"].items()]
+    pairs = [
+        (value, scored.get(section, {}).get(name, math.inf))
+        for section in SECTIONS
+        for name, value in stored.get(section, {}).items()
+    ]
     return all(
         math.isclose(one, other, rel_tol=TOLERANCE, abs_tol=1e-9) or (math.isnan(one) and math.isnan(other))
         for one, other in pairs

@@ -144,11 +144,16 @@ def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     """Score runs, and print the headline metrics."""
     settings = check_settings("evaluate", config)
     from epo_lightning.experiment.evaluate import evaluate
+    from epo_lightning.report.columns import TRUTH
 
     own = settings.data is None
     for run, file, metrics in evaluate(config, overrides):
         shown = ", ".join(f"{name} {metrics[name]:.4f}" for name in HEADLINE if name in metrics)
         print(f"{run.path} ({settings.own_split if own else _tested_on(file)}): {shown}")
+        if costs := ", ".join(
+            f"{column.label} {metrics[column.metric]:.3f}" for column in TRUTH if column.metric in metrics
+        ):
+            print(f"  inferred against true costs: {costs}")
         if own and file != run.metrics_file(settings.own_split):
             name = run.metrics_file(settings.own_split).name
             print(f"  in {file}: {name} is for the best checkpoint, and is never replaced")

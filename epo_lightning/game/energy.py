@@ -40,7 +40,9 @@ def check_names(key: str, names: Any, known: Collection[str], what: str) -> None
         ConfigError: an unknown name (the message suggests the nearest known one), a repeated name, or no list.
     """
     if isinstance(names, str) or not isinstance(names, Sequence):
-        raise ConfigError(f"energy.{key} must be a list of names, not {names!r}")
+        raise ConfigError(
+            f"energy.{key} must be a list of names, not {names!r}; on a command line, energy.{key}=[name]"
+        )
     if not all(isinstance(name, str) for name in names):
         raise ConfigError(f"energy.{key} must be a list of names, not {list(names)}")
     if not set(names) <= set(known):

@@ -8,7 +8,6 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from epo_lightning.checks import is_number
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
@@ -185,7 +184,7 @@ def is_part(run: EvaluatedRun, content: Mapping[str, Any]) -> bool:
     shares = [
         section.get("share", 1) if isinstance(section, Mapping) else 1 for section in (settings, run.config["data"])
     ]
-    known = all(is_number(share) for share in shares)
+    known = all(isinstance(share, int | float) for share in shares)
     same = run.checkpoint == "best" and run.data_digest == run.trained_digest
     return known and same and 0 < shares[0] < shares[1]
 
