@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 from epo_lightning.experiment import truth
+from epo_lightning.experiment.evaluate import keep
+from epo_lightning.run_folder import RunFolder, read_json, write_json
 from epo_lightning.scene import GameParameters
 
 
@@ -57,3 +60,25 @@ def test_games_without_a_pair_term_have_no_pair_cost() -> None:
     costs = truth.inferred_costs(alone, torch.zeros(1).long())
     assert set(costs) == {"goal", "vel"}
     assert set(truth.compare({"true": torch.tensor([10.0]).double(), **costs})) == {"goal_error", "vel_error"}
+
+
+def test_stored_errors_of_costs_are_completed_and_never_replaced(tmp_path: Path) -> None:
+    run, checkpoint = RunFolder(tmp_path), tmp_path / "best.ckpt"
+    checkpoint.write_bytes(b"weights")
+    scored = {"split": "test", "data_digest": "a", "checkpoint": "best", "metrics": {"minSADE": 1.0}}
+    assert keep(run, {**scored, "truth": {"pair_error": 0.1}}, checkpoint) == run.metrics_file()
+    assert keep(run, {**scored, "truth": {"pair_error": 0.1, "goal_error": 0.2}}, checkpoint) == run.metrics_file()
+    assert read_json(run.metrics_file())["truth"] == {"pair_error": 0.1, "goal_error": 0.2}
+    other = keep(run, {**scored, "truth": {"pair_error": 0.9, "goal_error": 0.2}}, checkpoint)
+    assert other != run.metrics_file()
+    assert read_json(run.metrics_file())["truth"]["pair_error"] == 0.1
+    write_json(run.metrics_file(), {**scored, "metrics": {"minSADE": None}})  # damaged: written again
+    assert keep(run, {**scored, "truth": {"pair_error": 0.1}}, checkpoint) == run.metrics_file()
+    assert read_json(run.metrics_file())["metrics"] == {"minSADE": 1.0}
+
+
+def test_constant_costs_have_no_rank_correlation() -> None:
+    one = torch.ones(3, dtype=torch.double)
+    found = truth.compare({"true": torch.arange(1.0, 4.0).double(), "pair": one, "goal": 300 * one})
+    assert "pair_rank" not in found
+    assert found["goal_error"] == pytest.approx(0.0)
