@@ -5,8 +5,8 @@
 Every game is solved from its decoded strategies in float64: centrally (adaptive Gauss-Newton steps of all agents, then
 Newton steps), and by best responses (``solver=best_response``), in turn and all at once, for several numbers of rounds. For
 each: the share of games whose energy is at most 1 % above the central one, the median and the largest relative difference of
-energies, the median over scenes of the relative Nash gap of the mode with the lowest energy, plans that were sent per scene,
-and CPU time per scene of all agents together. Nothing is written.
+energies, the median over scenes of the relative Nash gap of the mode with the lowest energy, the largest number of plans
+sent per scene, and CPU time per scene of all agents together. Nothing is written.
 """
 
 from __future__ import annotations

@@ -128,6 +128,8 @@ def report(
     for label, refinement in (("given", plain), ("tracked", tracked), ("refined", refined)):
         found = scores(given, subsets, shape, refinement)
         for group, prefix in groups:
+            if f"{prefix}minSADE" not in found:  # the data have no scene of this subset
+                continue
             values = [found[prefix + key] * (100 if key == "overlap_jfp" else 1) for key in SCORES]
             row = f"{settings.title}, seed {settings.seed}"
             print(f"{row:<28}{label:<9}{group:<13}" + "".join(f"{value:>9.4f}" for value in values), flush=True)

@@ -193,7 +193,7 @@ def refined(
 
 
 def _of_game(scene: Scene, dtype: torch.dtype) -> Scene:
-    """What the game takes from a scene, which ends with the forecast: histories, maps and ``game_steps`` are left out."""
+    """The scene of the game, which ends with the forecast: histories, maps and ``game_steps`` are left out."""
 
     def floats(value: Tensor | None) -> Tensor | None:
         return None if value is None else value.to(dtype)

@@ -17,7 +17,7 @@ from epo_lightning.scene import Scene
 
 @dataclass
 class Episodes:
-    """What happened in B episodes of T planned steps.
+    """The record of B episodes of T planned steps.
 
     Attributes:
         dt: time step [s].

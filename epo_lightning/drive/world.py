@@ -35,7 +35,7 @@ class World(Protocol):
         ...
 
     def observe(self) -> Scene:
-        """What a planner may know: histories up to now, goals and sizes. There is no future in it."""
+        """The scenes that a planner may know: histories up to now, goals and sizes, without any future."""
         ...
 
     def game(self, scene: Scene) -> GameParameters:

@@ -39,7 +39,7 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str] = ()) -> list[tupl
         overrides: the user's overrides; settings of other data that they name do not follow the run.
 
     Returns:
-        run, file and scores of every run.
+        run, file and scores of every run, with the errors of inferred costs where the true ones are known.
 
     Raises:
         ConfigError: no run, a run that is not finished, changed data, or a checkpoint that does not fit. Among several

@@ -50,7 +50,7 @@ class Session:
         self._inferred = lru_cache(maxsize=64)(self._infer_index)
 
     def describe(self, index: int) -> dict[str, Any]:
-        """What a page draws of a scene whatever the game is: agents, their past and future, lanes, names of features.
+        """The parts of a scene that no change of the game alters: agents, their past and future, lanes, names of features.
 
         Raises:
             ConfigError: no scene with this index.

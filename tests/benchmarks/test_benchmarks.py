@@ -131,17 +131,20 @@ def test_true_games_are_measured(capsys, tmp_path):
     assert "data=rpi" in refused(true_game.main, "data=drawn")
 
 
+TINY = (
+    "data=drawn",
+    "data.scenes=32",
+    "data.batch_size=4",
+    "data.like=highway",
+    "budget=smoke",
+    "callbacks.progress=none",
+)
+"""Overrides of a training of seconds on scenes that are drawn at random."""
+
+
 @pytest.mark.slow
 def test_refinements_of_runs_are_scored_and_timed(capsys, tmp_path):
-    words = [
-        "data=drawn",
-        "data.scenes=32",
-        "data.batch_size=4",
-        "data.like=highway",
-        "budget=smoke",
-        "callbacks.progress=none",
-    ]
-    run = train.train(compose("train", ["experiment=highway/v_lstm", *words, f"runs={tmp_path}"]))
+    run = train.train(compose("train", ["experiment=highway/v_lstm", *TINY, f"runs={tmp_path}"]))
     refinement.main(
         [str(run.path), "--weights", "accref=1", "turnrref=20", "circles=10", "headway=1", "--margins", "headway=0"]
     )
@@ -153,22 +156,14 @@ def test_refinements_of_runs_are_scored_and_timed(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_best_responses_come_close_to_the_central_solution(capsys, tmp_path):
-    words = [
-        "data=drawn",
-        "data.scenes=32",
-        "data.batch_size=4",
-        "data.like=highway",
-        "budget=smoke",
-        "callbacks.progress=none",
-    ]
-    run = train.train(compose("train", ["experiment=highway/v_lstm_epo_equilibrium", *words, f"runs={tmp_path}"]))
+    run = train.train(compose("train", ["experiment=highway/v_lstm_epo_equilibrium", *TINY, f"runs={tmp_path}"]))
     decentralised.main([str(run.path)])
     rows = [line.split() for line in capsys.readouterr().out.splitlines()[2:]]
     assert [row[0] for row in rows] == ["central", *["in_turn"] * 6, *["at_once"] * 6]
     near = [float(row[2].removesuffix("%")) for row in rows[1:]]
     assert near[5] >= near[0]
     assert near[11] >= near[6]
-    marginal = train.train(compose("train", ["experiment=highway/v_lstm", *words, f"runs={tmp_path}"]))
+    marginal = train.train(compose("train", ["experiment=highway/v_lstm", *TINY, f"runs={tmp_path}"]))
     assert "infers no game of features" in refused(decentralised.main, marginal.path)
 
 

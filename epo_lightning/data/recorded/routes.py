@@ -135,6 +135,7 @@ def _direction(line: Polyline, at_end: bool) -> Float[np.ndarray, " 2"]:
 
 
 def polyline_length(line: Polyline) -> float:
+    """Length [m] along a line."""
     return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
 
 

@@ -7,7 +7,8 @@ keep their last plans. E is a potential of the game: what such a step takes from
 
 it takes from E (Theorem 1), and where no agent can improve, the strategies are an open-loop Nash equilibrium. In turn
 (Gauss-Seidel), E falls with every step. All at once (Jacobi), a round is one exchange of plans, but agents that answer the
-same old plans may both give way: together they go the largest share 1, 1/2, 1/4, .. of their steps with which E falls.
+same old plans may both give way: together they go the largest share 1, 1/2, 1/4, .. of their steps with which E falls, for
+which they add up their parts of E.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ ORDERS = ("in_turn", "at_once")
 _HALVINGS = 8
 """Largest number of times that a joint step is halved."""
 _QUIET = 2
-"""Number of rounds without a fall of the energy after which a game counts as solved; the damping rises in between."""
+"""Number of rounds in a row without a fall of the energy after which a game counts as solved. The first may have had too
+little damping, which rises before the second."""
 
 
 @register("solver", "best_response")
@@ -44,7 +46,7 @@ _QUIET = 2
 class BestResponse(Minimiser):
     """Rounds of best responses to the others' last plans; solutions are constants, so learn with ``backward=implicit``.
 
-    A scene of N agents exchanges N plans per round, in either order.
+    A scene of N agents exchanges at most N plans per round, in either order.
 
     Attributes:
         rounds: largest number of rounds; a game ends earlier when its energy falls no more.
@@ -87,8 +89,7 @@ class BestResponse(Minimiser):
         if start.numel() == 0:
             return descent.nothing(start)
         game = _Game(energy, scene, parameters.for_every_mode(start.shape[1]), self.backend)
-        first = game.at(start)
-        value = first.energy
+        value = game.at(start).energy
         damping = start.new_full(start.shape[:3], self.damping)
         now = _Plans(start, value, damping)
         quiet = torch.where(value.isfinite(), 0, _QUIET)
