@@ -265,11 +265,15 @@ def _evaluated(
 def data_name(section: Mapping[str, Any]) -> str:
     """Name of a data set in tables and captions, from the ``data`` section of a configuration.
 
-    RPI's hard split is ``rpi_hard``; scenes drawn in the shapes of two tasks are two data sets.
+    RPI's hard split is ``rpi_hard``, a training on a share of the games is not compared with one on all of them, and scenes
+    drawn in the shapes of two tasks are two data sets.
     """
     name = str(section.get("dataset") or section["name"])
     if section.get("split") == "hard":
-        return f"{name}_hard"
+        name = f"{name}_hard"
+    share = section.get("games_share", 1)
+    if isinstance(share, int | float) and share < 1:
+        return f"{name}, {100 * share:.10g}% of the training games"
     return f"{name} ({section['like']})" if name == "drawn" and "like" in section else name
 
 

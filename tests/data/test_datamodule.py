@@ -23,6 +23,8 @@ def records(count=50):
         "modes": torch.randint(1, 3, (count,), generator=generator),
         "phi": torch.rand(count, generator=generator),
         "step": torch.randint(18, 61, (count,), generator=generator),
+        "game": torch.arange(count) % 5,
+        "placement": torch.arange(count) % 4,
     }
     headings = torch.stack((torch.zeros(count), made["phi"]), -1)
     return {**made, "goal_headings": headings, "game_steps": 100 - made["step"]}
@@ -87,6 +89,30 @@ def test_targets_are_both_modes_the_executed_or_a_sampled_one(targets):
         assert not torch.equal(again.subset, seen.subset)
         dataset.set_epoch(0)
         assert torch.equal(dataset[torch.arange(200)].subset, seen.subset)
+
+
+def test_a_share_of_the_games_has_whole_games_within_larger_shares_and_only_in_training(data):
+    rows, chosen = records(50), []
+    game = (rows["game"] * 10 + rows["placement"]).tolist()  # 20 games of two or three records
+    for share in (0.01, 0.1, 0.5):
+        module = data(targets="executed", games_share=share)
+        module.setup("fit")
+        train = module.dataset("train")
+        index = [(rows["history"] == history).flatten(1).all(1).nonzero().item() for history in train.history]
+        games = {game[i] for i in index}
+        assert len(games) == max(1, 20 * share)
+        assert sorted(index) == [i for i in range(50) if game[i] in games]
+        assert len(module.dataset("val")) == 21
+        chosen.append(games)
+    assert chosen[0] <= chosen[1] <= chosen[2]
+    assert len({data(games_share=share).digest for share in (0.01, 0.1, 1.0)}) == 3
+    assert data(games_share=1.0).digest == data().digest
+
+
+@pytest.mark.parametrize("share", [0.0, 1.5])
+def test_a_share_of_the_games_outside_of_0_and_1_is_refused(data, share):
+    with pytest.raises(ConfigError, match=f"data.games_share is {share}"):
+        data(games_share=share)
 
 
 def test_sampled_targets_follow_the_seed_of_the_data(data):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Integer
 from torch import Tensor
 
 from epo_lightning.checks import check_whole
@@ -79,6 +80,13 @@ class RPIDataset:
         )
 
 
+def in_share(game: Integer[Tensor, "records 2"], share: float) -> Bool[Tensor, " records"]:
+    """Records of a share of the games, at least one, in an order of the games that is drawn once for every share."""
+    games, of_record = game.unique(dim=0, return_inverse=True)
+    drawn = torch.randperm(len(games), generator=torch.Generator().manual_seed(0))
+    return torch.isin(of_record, drawn[: max(1, round(share * len(games)))])
+
+
 @register("data", "rpi")
 class RPIData(SceneDataModule):
     """The robot-pedestrian interaction data: generated once by ``epo generate``, then read from the cache.
@@ -95,6 +103,8 @@ class RPIData(SceneDataModule):
         targets: ``both``, ``executed`` or ``sampled``; see :class:`RPIDataset`.
         batch_size: scenes per batch.
         share: share of the scenes of every split that is used, drawn once.
+        games_share: share of the training split's games that is used, drawn once; a game is a start of the pedestrian in a
+            main game. Smaller shares are contained in larger ones; validation and test stay whole.
     """
 
     task = Task(horizon=40, dt=0.1, subsets=SUBSETS)
@@ -112,8 +122,14 @@ class RPIData(SceneDataModule):
         targets: str = "both",
         batch_size: int = 32,
         share: float = 1.0,
+        games_share: float = 1.0,
     ) -> None:
         super().__init__(batch_size, seed, share)
+        if not 0 < games_share <= 1:
+            raise ConfigError(
+                f"data.games_share is {games_share}, expected a number in (0, 1]: the share of the training games"
+            )
+        self.games_share = games_share
         self.root = Path(root).expanduser() if root else cache.default_root()
         check_whole("data.games", games, least=3)  # training, validation and test have main games of their own
         check_whole("data.placements", placements)
@@ -144,8 +160,9 @@ class RPIData(SceneDataModule):
 
     @property
     def digest(self) -> str:
-        """Hash of the data set and the selection of its modes."""
-        return cache.digest({"set": self.config, "targets": self.targets})[:16]
+        """Hash of the data set and the selection of its games and modes."""
+        few = {} if self.games_share == 1 else {"games_share": self.games_share}
+        return cache.digest({"set": self.config, "targets": self.targets, **few})[:16]
 
     @property
     def command(self) -> str:
@@ -192,8 +209,12 @@ class RPIData(SceneDataModule):
             cache.CacheError: the data set is missing, broken, of another configuration, or holds numbers that are not
                 finite.
         """
-        names = ("history", "goals", "states", "modes", "phi", "step")
+        few = split == "train" and self.games_share < 1
+        names = ("history", "goals", "states", "modes", "phi", "step", *(("game", "placement") if few else ()))
         records = cache.load(self.folder, split, names, self.command, self.config)
+        if few:
+            chosen = in_share(torch.stack((records["game"], records["placement"]), -1), self.games_share)
+            records = {name: column[chosen] for name, column in records.items()}
         # Robot and pedestrian want to arrive with the headings with which they start, 0 and phi (`game.py`); `step` is the
         # step of the main game at t0.
         phi = records["phi"]
