@@ -55,7 +55,7 @@ class BestResponse(Minimiser):
         damping: lambda of an agent's first step. It is divided by 10 after an accepted step, and multiplied by 10 after a
             rejected one.
         tolerance: relative fall of the energy in a round that counts as none.
-        backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it supports the game.
+        backend: that of :class:`~.levenberg_marquardt.LevenbergMarquardt`.
     """
 
     needs_from_energy = frozenset({FEATURES})

@@ -46,7 +46,7 @@ class BothSides(Minimiser):
         newton_steps: number of steps with the Hessian that follow.
         damping: lambda of the first step. With too little of it, a reflection may jump back across the other agent.
         reflections: numbers gamma, one solution each.
-        backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it supports the game.
+        backend: that of :class:`~.levenberg_marquardt.LevenbergMarquardt`.
         modes: number M of modes; :meth:`for_modes` sets it.
     """
 

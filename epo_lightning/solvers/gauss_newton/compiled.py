@@ -42,9 +42,15 @@ from epo_lightning.solvers.general import descent
 
 def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
     """Reason why the kernel cannot solve a game; None where it can."""
+    device = parameters.initial_controls.device
+    if device.type != "cpu":
+        return f"the compiled layer runs on CPUs, and these tensors are on {device}"
+    return unsupported(energy, scene, parameters)
+
+
+def unsupported(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
+    """Reason why the kernel cannot solve a game whose tensors are on the CPU, or are copied there; None where it can."""
     controls = parameters.initial_controls
-    if controls.device.type != "cpu":
-        return f"the compiled layer runs on CPUs, and these tensors are on {controls.device}"
     if controls.dtype not in (torch.float32, torch.float64):
         return f"the compiled layer takes float32 and float64, not {controls.dtype}"
     if energy.dynamics.integrator != "euler":
@@ -79,14 +85,15 @@ def solve(
     damping: Float[Tensor, "B M *agents"],
     keep_iterates: bool = False,
     exact: bool = False,
+    threads: int | None = None,
 ) -> Solution:
     """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
 
     The solution is differentiable with respect to weights, margins, goals, their headings, reference controls
     and initial controls. Problems
-    are shared out among ``torch.get_num_threads()`` threads; results do not depend on the number of threads.
+    are shared out among ``threads`` threads, by default ``torch.get_num_threads()``; results do not depend on their number.
     """
-    call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact)
+    call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact, threads=threads)
     if call.record:
         controls, states, *iterates = _Steps.apply(call, parameters.initial_controls, *call.inputs)
     else:
@@ -113,13 +120,16 @@ def descend(
     step_size: float,
     damping: Float[Tensor, "B M"],
     exact: bool = False,
+    threads: int | None = None,
 ) -> tuple[Solution, Float[Tensor, "B M"]]:
     """S adaptive steps in one call, without a derivative; see :class:`~.levenberg_marquardt.LevenbergMarquardt`.
 
     Returns:
         the solution, and the damping to continue with.
     """
-    call = _Call(energy, scene, parameters, steps, step_size, damping, False, exact=exact, adaptive=True)
+    call = _Call(
+        energy, scene, parameters, steps, step_size, damping, False, exact=exact, adaptive=True, threads=threads
+    )
     call.run()
     assert call.states is not None
     solution = Solution(
@@ -134,7 +144,12 @@ def descend(
 
 
 def attach(
-    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"], exact: bool
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    controls: Float[Tensor, "B M N K 2"],
+    exact: bool,
+    threads: int | None = None,
 ) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
     """The controls of a solution with their implicit derivative, and a status; see :func:`.implicit.attach`.
 
@@ -143,7 +158,7 @@ def attach(
     """
     game = dataclasses.replace(parameters, initial_controls=controls.double())
     none = game.initial_controls.new_zeros(controls.shape[:2])
-    call = _Call(energy, scene, game, 1, 1.0, none, False, exact=exact)
+    call = _Call(energy, scene, game, 1, 1.0, none, False, exact=exact, threads=threads)
     if not call.record:
         call.run()
         return controls, _definite(call)
@@ -177,8 +192,10 @@ class _Call:
         keep_iterates: bool,
         exact: bool = False,
         adaptive: bool = False,
+        threads: int | None = None,
     ) -> None:
         controls = parameters.initial_controls
+        self.threads = threads or torch.get_num_threads()
         self.controls, self.steps, self.keep_iterates = controls, steps, keep_iterates
         self.exact, self.adaptive = exact, adaptive
         self.doubles = controls.dtype == torch.float64
@@ -297,8 +314,8 @@ class _Call:
         Raises:
             MemoryError: the library could not allocate its memory.
         """
-        threads, tape = torch.get_num_threads(), self.tape.address
-        _check(interface.library().epo_solve(self.doubles, self.game, self.arguments, threads, tape))
+        tape = self.tape.address
+        _check(interface.library().epo_solve(self.doubles, self.game, self.arguments, self.threads, tape))
 
     def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor | None]:
         """Gradients by ``inputs``, for cotangents of the final controls, of all iterates and of the states.

@@ -2,9 +2,11 @@
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
 modes are solved at once and independently of each other. If a matrix cannot be factorised, its problem (one scene
-and mode) keeps its last good iterate; on a CPU, the factorisation is first repeated with more damping. Two backends compute
-the steps (:mod:`~epo_lightning.solvers.gauss_newton.compiled` and :mod:`~epo_lightning.solvers.gauss_newton.structured`);
-this module chooses the backend and, with adaptive damping, accepts or rejects steps.
+and mode) keeps its last good iterate; on a CPU, the factorisation is first repeated with more damping. Three backends
+compute the steps: :mod:`~epo_lightning.solvers.gauss_newton.compiled` on CPUs,
+:mod:`~epo_lightning.solvers.gauss_newton.hosted`, which copies games from a GPU to it, and
+:mod:`~epo_lightning.solvers.gauss_newton.structured` anywhere. This module chooses the backend and, with adaptive damping,
+accepts or rejects steps.
 """
 
 from __future__ import annotations
@@ -19,11 +21,10 @@ from torch import Tensor
 from epo_lightning.checks import check_number, check_whole, is_number
 from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
-from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton import compiled, hosted, structured
 from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, MOST_DAMPING
 from epo_lightning.solvers.general import descent
 
@@ -32,7 +33,9 @@ Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bo
 
 An agent with infinite damping keeps its controls exactly; its trajectory is then a constant for the other agents."""
 
-BACKENDS = ("auto", "pytorch", "compiled")
+DESCENTS = {compiled.solve: compiled.descend, hosted.solve: hosted.descend}
+"""For backends that take all adaptive steps in one call: the function that does, which has no derivative."""
+BACKENDS = ("auto", "pytorch", "compiled", "host")
 LARGEST_DAMPING = 1e30
 
 
@@ -61,7 +64,8 @@ class LevenbergMarquardt(Stepwise):
         test_steps: number of steps outside training; None for the same number.
         newton_steps: number of adaptive Newton steps, with the exact Hessian, after the S Gauss-Newton steps. Near a minimum
             they converge quadratically, and Gauss-Newton steps linearly. They have no derivative: use ``backward=implicit``.
-        backend: ``pytorch``; ``compiled``, the kernel for CPUs; or ``auto``, the kernel wherever it supports the game.
+        backend: ``pytorch``; ``compiled``, the kernel for CPUs; ``host``, the same kernel for tensors on a GPU, which are
+            copied; or ``auto``, one of these two wherever it supports the game.
     """
 
     needs_from_energy = frozenset({FEATURES})
@@ -160,8 +164,8 @@ class LevenbergMarquardt(Stepwise):
         solve = choose_backend(self.backend, energy, scene, parameters)
         if not self.adaptive:
             return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates, exact), damping
-        if solve is compiled.solve and not torch.is_grad_enabled() and not self.keep_iterates:
-            return compiled.descend(energy, scene, parameters, steps, self.step_size, damping, exact)
+        if solve in DESCENTS and not torch.is_grad_enabled() and not self.keep_iterates:
+            return DESCENTS[solve](energy, scene, parameters, steps, self.step_size, damping, exact)
         solution = solve(energy, scene, parameters, 0, self.step_size, damping, True, False)
         for _ in range(steps):
             here = dataclasses.replace(parameters, initial_controls=solution.controls)
@@ -175,23 +179,26 @@ class LevenbergMarquardt(Stepwise):
 
 
 def choose_backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Backend:
-    """The function that computes the steps of a game: ``solve`` of :mod:`.compiled` or of :mod:`.structured`.
+    """The function that computes the steps of a game: ``solve`` of one of the backends.
 
     Args:
-        name: the setting ``backend``.
+        name: the setting ``backend``. ``auto`` is ``compiled`` for tensors on a CPU and ``host`` for others, or ``pytorch``
+            where this backend cannot solve the game.
         energy, scene, parameters: the game.
 
     Raises:
-        ValueError: ``name`` is ``compiled``, and the kernel cannot solve this game.
+        ValueError: the backend of this name cannot solve the game.
     """
     if name == "pytorch":
         return structured.solve
-    obstacle = compiled.obstacle(energy, scene, parameters)
+    on_host = name == "host" or (name == "auto" and parameters.initial_controls.device.type != "cpu")
+    chosen = hosted if on_host else compiled
+    obstacle = chosen.obstacle(energy, scene, parameters)
     if obstacle is None:
-        return compiled.solve
-    if name == "compiled":
-        raise ValueError(f"solver.backend is 'compiled', but {obstacle}; 'auto' and 'pytorch' can solve this game")
-    if readable(parameters.initial_controls):
+        return chosen.solve
+    if name != "auto":
+        raise ValueError(f"solver.backend is {name!r}, but {obstacle}; 'auto' and 'pytorch' can solve this game")
+    if not torch.compiler.is_exporting():
         compiled.say_once(obstacle)
     return structured.solve
 
