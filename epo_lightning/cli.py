@@ -142,6 +142,7 @@ def _help(arguments: Arguments) -> None:
                 "data",
                 "backbone",
                 "forecaster",
+                "gate",
                 "dynamics",
                 "energy",
                 "solver",

@@ -57,6 +57,7 @@ _HOMES = {
     "energy": "game",
     "format": "data",
     "forecaster": "forecasters",
+    "gate": "decoders",
     "objective": "objectives",
     "optimizer": "optimizers",
     "solver": "solvers",

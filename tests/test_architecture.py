@@ -30,7 +30,7 @@ FLOORS = {
     "predictions": {"scene", "registry", "run_folder", "refinement"},
     "encoders": {"scene"},
     "metrics": {"scene", "registry"},
-    "decoders": {"scene", "registry", "game", "host"},
+    "decoders": {"scene", "registry", "checks", "game", "host"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
     "data": {"scene", "registry", "schema", "checks", "task", "metrics"},
     "objectives": {"scene", "registry", "game", "solvers", "decoders", "losses"},

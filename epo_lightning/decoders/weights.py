@@ -75,13 +75,19 @@ class SharedWeights(nn.Module):
         self.logarithms = nn.Parameter(torch.zeros(len(self.features)))
 
     def forward(
-        self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"] | None = None
+        self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B R"] | None = None
     ) -> dict[str, Float[Tensor, "B M R"]]:
-        """Weights by feature name, of R = N agents or R = P pairs; neither ``z`` nor ``mask`` changes them."""
+        """Weights by feature name, of R = N agents or R = P pairs; ``z`` does not change them.
+
+        Weights of pairs outside of the mask are zero; weights of agents do not depend on it.
+        """
         weights = (self.start * self.logarithms.exp()).unbind()
         agents = z.shape[1]
         shape = z.shape[0], self.games, agents * (agents - 1) // 2 if self.of_pairs else agents
-        return {name: weight.expand(shape) for name, weight in zip(self.features, weights, strict=True)}
+        found = {name: weight.expand(shape) for name, weight in zip(self.features, weights, strict=True)}
+        if mask is None or not self.of_pairs:
+            return found
+        return {name: torch.where(mask[:, None], weight, 0.0) for name, weight in found.items()}
 
 
 class PairWeights(nn.Module):
@@ -115,16 +121,27 @@ class PairWeights(nn.Module):
         self.symmetric, self.positive = symmetric, positive
         self.mlp = MLP(2 * width, 64, games * len(self.features), norm="layer") if self.features else None
 
-    def forward(self, z: Float[Tensor, "B N D"]) -> dict[str, Float[Tensor, "B M P"]]:
-        """Weights by feature name."""
+    def forward(
+        self, z: Float[Tensor, "B N D"], chosen: Bool[Tensor, "B P"] | None = None
+    ) -> dict[str, Float[Tensor, "B M P"]]:
+        """Weights by feature name; zero for pairs that are not ``chosen``, for which nothing is computed."""
         if self.mlp is None:
             return {}
         first, second = pairs(z.shape[1], z.device)
-        weights = self.mlp(torch.cat((z[:, first], z[:, second]), -1))
-        if self.symmetric:
-            weights = 0.5 * (weights + self.mlp(torch.cat((z[:, second], z[:, first]), -1)))
-        weights = self.start * weights.exp() if self.positive else self.start + weights
+        if chosen is None:
+            return _by_name(self._between(z[:, first], z[:, second]), self.features, self.games)
+        scene, pair = chosen.nonzero(as_tuple=True)
+        decoded = self._between(z[scene, first[pair]], z[scene, second[pair]])
+        weights = decoded.new_zeros(*chosen.shape, decoded.shape[-1]).index_put((scene, pair), decoded)
         return _by_name(weights, self.features, self.games)
+
+    def _between(self, first: Float[Tensor, "*batch D"], second: Float[Tensor, "*batch D"]) -> Tensor:
+        """Weights of all features and games from the features of both agents of each pair."""
+        assert self.mlp is not None
+        weights = self.mlp(torch.cat((first, second), -1))
+        if self.symmetric:
+            weights = 0.5 * (weights + self.mlp(torch.cat((second, first), -1)))
+        return self.start * weights.exp() if self.positive else self.start + weights
 
 
 class Margins(nn.Module):
@@ -148,6 +165,8 @@ class Margins(nn.Module):
         self.outputs = PairWeights(width, games, features, math.log(start / (largest - start)), symmetric)
         self.largest = largest
 
-    def forward(self, z: Float[Tensor, "B N D"]) -> dict[str, Float[Tensor, "B M P"]]:
-        """Margins by feature name."""
-        return {name: self.largest * output.sigmoid() for name, output in self.outputs(z).items()}
+    def forward(
+        self, z: Float[Tensor, "B N D"], chosen: Bool[Tensor, "B P"] | None = None
+    ) -> dict[str, Float[Tensor, "B M P"]]:
+        """Margins by feature name; of pairs that are not ``chosen``, ``largest / 2``, which has no effect."""
+        return {name: self.largest * output.sigmoid() for name, output in self.outputs(z, chosen).items()}

@@ -124,6 +124,11 @@ def check_exportable(forecaster: Forecaster, title: str, form: Format) -> None:
             part = "its calibration"
         elif not isinstance(game.solver, LevenbergMarquardt) or game.solver.adaptive:
             part = f"its solver ({type(game.solver).__name__})"
+        elif isinstance(game, EPO) and game.gate is not None:
+            raise ConfigError(
+                f"{title} cannot be exported: its gate chooses pairs by their values, and a program has a fixed sequence of "
+                "operations. Rows without forecaster.gate can"
+            )
         else:
             continue
         raise ConfigError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,6 +30,7 @@ from epo_lightning.forecasters.epo_settings import (
     check_calibration,
     check_choice,
     check_decodes_probabilities,
+    check_gate,
     check_horizon,
     check_initial,
     check_margin,
@@ -40,7 +42,7 @@ from epo_lightning.forecasters.epo_settings import (
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
-from epo_lightning.registry import ConfigError, register
+from epo_lightning.registry import ConfigError, build, register
 from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import SAMPLES, TABLES, Minimiser
@@ -94,6 +96,8 @@ class EPO(Forecaster):
             (:mod:`~epo_lightning.decoders.probabilities`).
         margin: ``largest`` margin [m] of pair features with a decoded margin, and the margin before training, ``start``;
             2 m and 0.5 m by default. Margins that the energy fixes are not decoded.
+        gate: name and settings of a :class:`~epo_lightning.decoders.gates.Gate`, which chooses the pairs of agents that
+            interact; None for all pairs.
 
     Raises:
         ConfigError: parts that do not work together, with the changes that would work; or a value out of its range.
@@ -122,6 +126,7 @@ class EPO(Forecaster):
         one_game: bool = False,
         probabilities: str = "linear",
         margin: Mapping[str, float] | None = None,
+        gate: Mapping[str, Any] | None = None,
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         check_needs(energy, task)
@@ -134,6 +139,7 @@ class EPO(Forecaster):
         check_choice("own_weights", own_weights, WEIGHTS)
         check_choice("pair_weights", pair_weights, WEIGHTS)
         check_calibration(calibration, energy, solver)
+        check_gate(gate, energy)
         # The network decodes probabilities, except where they follow from energies of candidates (TABLES) or from orders.
         defined = TABLES in solver.provides or energy.pair_order is not None
         check_probabilities(probabilities)
@@ -184,10 +190,12 @@ class EPO(Forecaster):
             self.goals = NoGoals()
         self.orders = None if order is None else Orders(width, variants, order.symmetric)
         self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, task.horizon, scale)
-        # Built last: a decoder of margins must not change the initial weights of the networks above.
+        # Built last: decoders of margins and gates must not change the initial weights of the networks above.
         limits = check_margin(margin)
         names = energy.decoded_margins
         self.margins = Margins(width, games, names, **limits, symmetric=symmetric_pairs) if names else None
+        ahead = task.horizon * task.dt
+        self.gate = None if gate is None else build("gate", gate, ahead=ahead, width=width, scale=scale)
 
     def forward(self, scene: Scene) -> JointForecast:
         """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 2."""
@@ -257,7 +265,7 @@ class EPO(Forecaster):
                 "the energy has a feature of the headings wanted at goals, but scene.goal_headings [B, N, G] is None: "
                 "leave the feature out of energy.own, or choose data with goal headings"
             )
-        own_weights, pair_weights = self.own_weights(z, scene.agent_mask), self.pair_weights(z)
+        own_weights, (pair_weights, margins) = self.own_weights(z, scene.agent_mask), self._of_pairs(z, scene)
         if orders is not None:
             # One set of weights may be that of all orders.
             variants = orders.order.shape[1]
@@ -278,9 +286,19 @@ class EPO(Forecaster):
             context=z if "context" in self.energy.needs else None,
             order=None if orders is None else orders.order,
             goal_headings=goals.headings,
-            margins={} if self.margins is None else self.margins(z),
+            margins=margins,
             reference_controls=strategies if "reference_controls" in self.energy.needs else None,
         )
+
+    def _of_pairs(self, z: Tensor, scene: Scene) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Weights and margins by pair feature; weights are zero for pairs that the gate leaves out."""
+        if self.gate is None:
+            return self.pair_weights(z), {} if self.margins is None else self.margins(z)
+        chosen, factor = self.gate(z, scene)
+        weights = self.pair_weights(z, chosen)
+        if factor is not None:
+            weights = {name: weight * factor[:, None] for name, weight in weights.items()}
+        return weights, {} if self.margins is None else self.margins(z, chosen)
 
     @property
     def _minimiser(self) -> Minimiser:

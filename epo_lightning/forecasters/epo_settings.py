@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.objectives.base import Objective
 from epo_lightning.registry import ConfigError, nearest
@@ -120,6 +121,23 @@ def check_calibration(calibration: Mapping[str, float] | None, energy: Energy, s
             "forecaster.calibration needs a solver that leads to a minimum, such as both_sides, game or converging; set "
             "it to null for this one"
         )
+
+
+def check_gate(gate: Mapping[str, Any] | None, energy: Energy) -> None:
+    """Refuse a gate for energies without pair features, and for those whose pairs do not vanish with their weight.
+
+    Raises:
+        ConfigError: see above.
+    """
+    if gate is None:
+        return
+    if FEATURES not in energy.offers:
+        raise ConfigError(
+            "forecaster.gate leaves pairs out of an energy of named features, such as energy=exid, rpi or pedestrians; "
+            "set it to null for this one"
+        )
+    if not energy.pair:
+        raise ConfigError("forecaster.gate chooses pairs, but energy.pair is empty: set forecaster.gate to null")
 
 
 def check_decodes_probabilities(probabilities: str, energy: Energy, solver: Minimiser) -> None:

@@ -37,7 +37,7 @@ MOST_BESIDE = 0.5
 """Largest share of positions of moving vehicles on no lane; above it, the map does not belong to the tracks."""
 AGREE = 0.2
 """Smallest length of the mean of the agents' unit directions; below it, they have no common direction."""
-MOST_AGENTS, MOST_LINES, LONGEST_SMOOTHING = 32, 64, 10.0
+MOST_AGENTS, MOST_LINES, LONGEST_SMOOTHING = 64, 64, 10.0
 """Largest numbers of agents of a scene and of lines of an agent, and largest length [s] of the smoothing window."""
 MOMENTS, AT_ENDS = "agents at steps of the clock", "near the beginning or end of a track"
 """Names of counts: possible windows, one per agent and step, and those whose agent is not observed in the whole window."""
