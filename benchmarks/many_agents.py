@@ -1,4 +1,4 @@
-"""Gates in scenes of many agents: cost and accuracy of games of which only chosen pairs interact, for several numbers of agents.
+"""Gates in scenes of many agents: cost and accuracy of games of which only chosen pairs interact.
 
     python -m benchmarks.many_agents data=highway_sim_dense data.recordings=1 data.minutes=5 data.windows.agents=64 \\
         data.windows.least_agents=12 data.windows.radius=null data.windows.lane_change=false data.windows.complete=false \\
@@ -22,6 +22,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -143,7 +144,7 @@ def measured(scene: Scene, shape: str, chosen: dict[str, Gate | None], repeats: 
             mask = None if gate is None else gate(z, scene).chosen
             found = solve()
             spent = milliseconds(solve, batch, repeats)
-            decoded = milliseconds(lambda mask=mask: decoder(z, mask), batch, repeats)
+            decoded = milliseconds(partial(decoder, z, mask), batch, repeats)
         assert found.solution is not None
         assert found.parameters is not None
         assert found.controls is not None

@@ -23,6 +23,9 @@ from epo_lightning.game.neighbours import closest_approach, grouped, nearest, wi
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 
+UNTRAINED = 0.01
+"""Factor of the usual initial weights of keys. Zero would hold the queries' gradient at zero as well."""
+
 
 class Gated(NamedTuple):
     """The pairs that interact.
@@ -111,8 +114,8 @@ class AttentionGate(Gate):
         s_ij = (q_i . k_j + q_j . k_i) / (2 sqrt(D)),    q = Q z, k = K z,
 
     an agent keeps the k others with the largest s_ij - c_ij / scale, and the weights of a pair are multiplied by
-    2 sigmoid(s_ij). K starts at zero, so that an untrained gate is a :class:`NearestGate`. The choice has no gradient; the
-    factor teaches the scores.
+    2 sigmoid(s_ij). K starts near zero, so that an untrained gate is nearly a :class:`NearestGate`. The choice has no
+    gradient; the factor teaches the scores.
 
     Args:
         neighbours: k.
@@ -136,7 +139,8 @@ class AttentionGate(Gate):
         check_whole("gate.size", size, least=1)
         self.neighbours, self.scale = neighbours, scale
         self.query, self.key = nn.Linear(width, size, bias=False), nn.Linear(width, size, bias=False)
-        nn.init.zeros_(self.key.weight)
+        with torch.no_grad():
+            self.key.weight.mul_(UNTRAINED)
 
     def choose(self, distance: Float[Tensor, "B P"], z: Float[Tensor, "B N D"]) -> Gated:
         agents = z.shape[1]

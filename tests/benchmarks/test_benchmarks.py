@@ -20,6 +20,7 @@ from benchmarks import (
     extraction,
     figures,
     generation,
+    many_agents,
     reading,
     refinement,
     scaling,
@@ -165,6 +166,16 @@ def test_best_responses_come_close_to_the_central_solution(capsys, tmp_path):
     assert near[11] >= near[6]
     marginal = train.train(compose("train", ["experiment=highway/v_lstm", *TINY, f"runs={tmp_path}"]))
     assert "infers no game of features" in refused(decentralised.main, marginal.path)
+
+
+def test_gates_are_compared_and_missing_data_is_one_line(capsys, tmp_path):
+    many_agents.main(["data=drawn", "--agents", "3", "4", "--scenes", "2", "--repeats", "1", "--ahead", "0"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:5] for line in lines if line.startswith("N =")] == ["N = 3", "N = 4"]
+    everyone = [line.split()[1:] for line in lines if line.startswith("all")]
+    assert [row[0] for row in everyone] == ["2", "3"]  # pairs per agent
+    assert [row[5:8] for row in everyone] == [["1", "0", "0"]] * 2  # no difference to itself
+    assert str(tmp_path) in refused(many_agents.main, "data=ucy", f"data.folder={tmp_path}")
 
 
 def test_refinements_name_what_is_no_run(tmp_path):

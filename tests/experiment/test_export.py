@@ -17,6 +17,7 @@ import torch
 import epo_lightning
 from epo_lightning import pretrained
 from epo_lightning.decoders import goals
+from epo_lightning.decoders.gates import NearestGate
 from epo_lightning.experiment.config.settings import ExportSettings
 from epo_lightning.experiment.export import check_exportable, check_file, export, inputs_of, largest_difference
 from epo_lightning.experiment.program_files import FORMATS
@@ -137,6 +138,10 @@ def test_the_cpp_example_gives_the_forecasts_of_the_forecaster(
 def test_what_takes_as_many_steps_as_the_values_need_is_refused() -> None:
     forecaster = epo_lightning.load("rpi/v_lstm_epo")
     check_exportable(forecaster, "two steps", FORMATS["aoti"])
+    forecaster.gate = NearestGate()
+    with pytest.raises(ConfigError, match=r"gated cannot be exported: its gate chooses pairs by their values"):
+        check_exportable(forecaster, "gated", FORMATS["pt2"])
+    forecaster.gate = None
     forecaster.solver = replace(forecaster.solver, adaptive=True)
     with pytest.raises(
         ConfigError, match=r"solved cannot be exported: its solver \(LevenbergMarquardt\) takes as many steps"
