@@ -54,6 +54,7 @@ FLOORS = {
     "drive": {
         "scene",
         "registry",
+        "schema",
         "checks",
         "data",
         "game",

@@ -5,7 +5,7 @@ All worlds of one seed have the same episodes, so two planners are compared by t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,16 +15,16 @@ from scipy import stats
 from torch import Tensor
 
 from epo_lightning.drive.episodes import Episodes
-from epo_lightning.drive.world import EGO
+from epo_lightning.drive.world import EGO, Outcome, World
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.metrics.functional.overlap import overlaps
+from epo_lightning.metrics.functional.overlap import overlaps_with
 from epo_lightning.scene import ACCELERATION, SPEED, TURN_RATE
 
 SOON = 5.0
 """Longest time to collision [s] that is looked for; episodes without a shorter one count with it."""
 _STEP = 0.1
-STILL, LONG = 0.05, 2.0
-"""Speed [m/s] below which an agent stands, and time [s] from which standing before the goal is a deadlock."""
+STILL = 0.05
+"""Speed [m/s] below which an agent stands."""
 RESAMPLES, CONFIDENCE = 2000, 0.95
 RATES = ("collision", "deadlock", "fallback")
 """Measures that are 0 or 1 in an episode."""
@@ -41,9 +41,7 @@ UNITS: Mapping[str, str] = {
 """Unit of every measure; those of a world have none."""
 
 
-def measure(
-    episodes: Episodes, shape: str, arrived: float, further: Mapping[str, Tensor]
-) -> dict[str, Float[Tensor, " B"]]:
+def measure(episodes: Episodes, world: World) -> dict[str, Float[Tensor, " B"]]:
     """Measures of every episode.
 
     - ``collision``: whether the bodies of the planned agent and another one overlap at any step.
@@ -53,59 +51,57 @@ def measure(
     - ``progress``: how far the planned agent comes [m].
     - ``jerk``, ``lateral``: mean absolute change of acceleration per second, and mean absolute lateral acceleration, the
       speed times the turn rate.
-    - ``deadlock``: whether the planned agent stands for :data:`LONG` seconds although its progress is below ``arrived``.
+    - ``deadlock``: whether the planned agent stands for ``world.patience`` although its progress is below ``world.arrived``.
     - ``fallback``: whether no plan was found at any step, so that an earlier plan was followed.
+    - the measures of the world.
 
     Args:
         episodes: what happened.
-        shape: shape of the bodies, ``disc`` or ``box``.
-        arrived: progress [m] from which an agent that stands has arrived.
-        further: measures of the world.
+        world: the world in which it happened.
     """
-    controls, dt = episodes.controls, episodes.dt
-    speed = episodes.states[:, EGO, :, SPEED]
-    still = (speed.abs() < STILL) & (episodes.progress < arrived)
-    window = min(round(LONG / dt), still.shape[1])
-    with_ego = episodes.agent_mask & episodes.agent_mask[:, EGO, None]
-    offset = (episodes.states[:, 1:, :, :2] - episodes.states[:, :1, :, :2]).norm(dim=-1)
+    controls, dt, happened = episodes.controls, episodes.dt, episodes.outcome
+    speed = happened.states[:, EGO, :, SPEED]
+    still = (speed.abs() < STILL) & (happened.progress < world.arrived)
+    window = round(world.patience / dt)
+    stood = still.unfold(1, window, 1).all(-1).any(1) if window <= still.shape[1] else torch.zeros_like(still[:, 0])
+    with_ego = happened.agent_mask & happened.agent_mask[:, EGO, None]
+    offset = (happened.states[:, 1:, :, :2] - happened.states[:, :1, :, :2]).norm(dim=-1)
     offset = offset.where(with_ego[:, 1:], torch.inf)
     return {
-        "collision": _touches(episodes, shape).double(),
+        "collision": _touches(happened, world.shape).double(),
         "distance": offset.amin((1, 2)),
-        "time_to_collision": _time_to_collision(episodes, shape),
-        "progress": episodes.progress[:, -1],
-        "jerk": controls[..., ACCELERATION].diff(dim=1).abs().mean(1) / dt,
-        "lateral": (speed[:, :-1] * controls[..., TURN_RATE]).abs().mean(1),
-        "deadlock": still.unfold(1, window, 1).all(-1).any(1).double(),
+        "time_to_collision": _time_to_collision(happened, world.shape),
+        "progress": happened.progress[:, -1],
+        "jerk": _mean(controls[..., ACCELERATION].diff(dim=1).abs()) / dt,
+        "lateral": _mean((speed[:, :-1] * controls[..., TURN_RATE]).abs()),
+        "deadlock": stood.double(),
         "fallback": (~episodes.found).any(1).double(),
-        **further,
+        **happened.measures,
     }
 
 
-def _of_ego(agents: int) -> Tensor:
-    """Mask of the pairs that the planned agent is one of."""
-    first, second = torch.triu_indices(agents, agents, 1)
-    return (first == EGO) | (second == EGO)
+def _mean(values: Float[Tensor, "B T"]) -> Float[Tensor, " B"]:
+    """Mean over time; zero for an episode without steps."""
+    return values.mean(1) if values.shape[1] else values.new_zeros(len(values))
 
 
-def _touches(episodes: Episodes, shape: str) -> Tensor:
-    batch, agents, steps = episodes.agent_mask.shape
-    states = episodes.states.transpose(1, 2).reshape(batch * steps, agents, 1, 4)
-    mask = episodes.agent_mask.transpose(1, 2).reshape(batch * steps, agents)
-    touch = overlaps(states, episodes.size.repeat_interleave(steps, 0), mask, shape)
-    return touch[:, _of_ego(agents)].flatten(1).any(1).view(batch, steps).any(1)
+def _touches(happened: Outcome, shape: str) -> Tensor:
+    batch, agents, steps = happened.agent_mask.shape
+    states = happened.states.transpose(1, 2).reshape(batch * steps, agents, 1, 4)
+    mask = happened.agent_mask.transpose(1, 2).reshape(batch * steps, agents)
+    touch = overlaps_with(EGO, states, happened.size.repeat_interleave(steps, 0), mask, shape)
+    return touch.flatten(1).any(1).view(batch, steps).any(1)
 
 
-def _time_to_collision(episodes: Episodes, shape: str) -> Float[Tensor, " B"]:
+def _time_to_collision(happened: Outcome, shape: str) -> Float[Tensor, " B"]:
     """Smallest time [s] to an overlap at constant velocities over all steps, found in steps of a tenth of a second."""
     count = round(SOON / _STEP)
-    agents = episodes.states.shape[1]
-    standing = torch.zeros(count, 2, dtype=episodes.states.dtype)
-    least = torch.full((len(episodes.states),), SOON, dtype=episodes.states.dtype)
-    for t in range(episodes.states.shape[2]):
-        now = episodes.states[:, :, t]
+    standing = torch.zeros(count, 2, dtype=happened.states.dtype)
+    least = torch.full((len(happened.states),), SOON, dtype=happened.states.dtype)
+    for t in range(happened.states.shape[2]):
+        now = happened.states[:, :, t]
         ahead = Unicycle().rollout(now, standing.expand(*now.shape[:2], -1, -1), _STEP)
-        touch = overlaps(ahead, episodes.size, episodes.agent_mask[:, :, t], shape)[:, _of_ego(agents)].any(1)
+        touch = overlaps_with(EGO, ahead, happened.size, happened.agent_mask[:, :, t], shape).any(1)
         first = torch.where(touch.any(1), (touch.to(torch.int8).argmax(1) + 1) * _STEP, SOON)
         least = least.minimum(first.to(least))
     return least
@@ -137,9 +133,9 @@ def estimate(values: Float[Tensor, " B"], rate: bool = False) -> Estimate:
     return Estimate(mean, float(low), float(high))
 
 
-def estimates(measures: Mapping[str, Float[Tensor, " B"]]) -> dict[str, Estimate]:
-    """The estimate of every measure."""
-    return {name: estimate(values, name in RATES) for name, values in measures.items()}
+def estimates(measures: Mapping[str, Float[Tensor, " B"]], rates: Container[str] = RATES) -> dict[str, Estimate]:
+    """The estimate of every measure, of which ``rates`` are 0 or 1."""
+    return {name: estimate(values, name in rates) for name, values in measures.items()}
 
 
 def differences(

@@ -20,19 +20,23 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from epo_lightning.drive.world import EGO
+from epo_lightning.drive.world import EGO, Search
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.refinement import NOISE, track
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import SPEED, GameParameters, JointForecast, Scene, Solution, Status
+from epo_lightning.scene import HEADING, SPEED, GameParameters, JointForecast, Scene, Solution, Status
 from epo_lightning.solvers.base import TABLES
 from epo_lightning.solvers.diagnostics.equilibrium import descend_features
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 BRAKING = 2.0
 """Deceleration [m/s^2] of the plan that is followed where there is no earlier plan to fall back to."""
+
+KEEPING, HOLDING = ("accref", "turnrref"), 1e3
+"""Features of deviations from given controls, and their weight for agents that are held."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,19 @@ class Plan:
             joint=joint,
         )
 
+    def seen_from(self, before: Scene, now: Scene) -> Plan:
+        """This plan in the frame of the next scene, for scenes whose frames move with their agents."""
+        if before.frame is None or now.frame is None:
+            return self
+        (here, there), like = (frame.double() for frame in (before.frame, now.frame)), self.states
+        turn = here[:, 2] - there[:, 2]
+        shift = turned(here[:, :2] - there[:, :2], -there[:, 2]).to(like)
+        position = turned(self.states[..., :2], turn.to(like)[:, None, None]) + shift[:, None, None]
+        heading = self.states[..., HEADING] + turn.to(like)[:, None, None]
+        return dataclasses.replace(
+            self, states=torch.cat((position, heading[..., None], self.states[..., SPEED, None]), -1)
+        )
+
     def rest(self, steps: int) -> tuple[Float[Tensor, "B K 2"], Float[Tensor, "B N K 4"]]:
         """Controls and joint states of this plan one step later, with controls of zero at the end."""
         states = torch.cat((self.states[:, :, 1:], self.states[:, :, -1:].expand(-1, -1, steps, -1)), 2)[:, :, :steps]
@@ -78,12 +95,25 @@ def shifted(controls: Float[Tensor, "*batch K 2"], steps: int) -> Float[Tensor, 
     return F.pad(rest, (0, 0, 0, max(0, steps - rest.shape[-2])))[..., :steps, :]
 
 
+def turned(vector: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch 2"]:
+    """Vectors turned to the left by an angle [rad]."""
+    (x, y), cosine, sine = vector.unbind(-1), angle.cos(), angle.sin()
+    return torch.stack((cosine * x - sine * y, sine * x + cosine * y), -1)
+
+
+def constant(speed: Float[Tensor, " B"], acceleration: float, steps: int, dt: float) -> Float[Tensor, "B K 2"]:
+    """Controls of agents that accelerate constantly, or brake until they stand."""
+    change = acceleration * dt * torch.arange(steps + 1)
+    left = speed[:, None].abs() + change.to(speed)
+    along = left.clamp_min(0.0) * torch.where(speed < 0, -1.0, 1.0)[:, None]
+    rate = along.diff(dim=1) / dt
+    return torch.stack((rate, torch.zeros_like(rate)), -1)
+
+
 def _stop(scene: Scene, plan: Plan) -> tuple[Tensor, Tensor]:
     """A plan that brakes until the agent stands, with all agents drawn where they are."""
     steps = plan.controls.shape[1]
-    speed = scene.current[:, EGO, SPEED, None]
-    left = (speed.abs() - BRAKING * scene.dt * torch.arange(steps + 1)).clamp_min(0.0) * speed.sign()
-    braking = torch.stack((left.diff(dim=1) / scene.dt, torch.zeros_like(left[:, 1:])), -1)
+    braking = constant(scene.current[:, EGO, SPEED], -BRAKING, steps, scene.dt)
     return braking, scene.current[:, :, None].expand(-1, -1, steps, -1)
 
 
@@ -177,10 +207,13 @@ class _OfGame:
     Args:
         energy: the energy of the games.
         game: the game of a scene; its initial strategies are those of the first step.
+        search: how minima are searched.
     """
 
-    def __init__(self, energy: FeatureEnergy, game: Callable[[Scene], GameParameters]) -> None:
-        self.energy, self.game = energy, game
+    def __init__(
+        self, energy: FeatureEnergy, game: Callable[[Scene], GameParameters], search: Search | None = None
+    ) -> None:
+        self.energy, self.game, self.search = energy, game, search or Search()
 
     def _start(self, scene: Scene, previous: Plan | None) -> tuple[GameParameters, Float[Tensor, "B 1 N K 2"]]:
         """The game, and its warm start: the strategies of the last step, shifted."""
@@ -193,9 +226,39 @@ class _OfGame:
         self, scene: Scene, game: GameParameters, start: Tensor, agent: int | None
     ) -> tuple[Float[Tensor, "B 1 N K 2"], Bool[Tensor, " B"]]:
         """Strategies after the minimisation over those of one agent, or of all; and whether a minimum was found."""
+        if self.search.steps is not None:
+            return self._descend_shortly(scene, game, start, agent, self.search.steps)
         moves = None if agent is None else torch.full((len(start),), agent)
         result = descend_features(self.energy, scene, dataclasses.replace(game, initial_controls=start), moves)
         return result.controls, result.found
+
+    def _descend_shortly(
+        self, scene: Scene, game: GameParameters, start: Tensor, agent: int | None, steps: int
+    ) -> tuple[Float[Tensor, "B 1 N K 2"], Bool[Tensor, " B"]]:
+        """The same by a fixed number of steps of the layer, from several starts in one call."""
+        held = torch.zeros(start.shape[2], dtype=torch.bool)
+        if agent is not None:
+            held = torch.arange(len(held)) != agent
+            usual = torch.zeros_like(start) if game.reference_controls is None else game.reference_controls
+            game = dataclasses.replace(
+                game,
+                own_weights={
+                    name: torch.where(held, HOLDING if name in KEEPING else 0.0, weight)
+                    for name, weight in game.own_weights.items()
+                },
+                reference_controls=torch.where(held[:, None, None], start, usual),
+            )
+        starts = [start]
+        for acceleration in () if held[EGO] else self.search.accelerations:
+            other = start.clone()
+            other[:, 0, EGO] = constant(scene.current[:, EGO, SPEED], acceleration, start.shape[-2], scene.dt).to(start)
+            starts.append(other)
+        solver = LevenbergMarquardt(steps=steps, step_size=1.0, damping=1.0, adaptive=True)
+        solution = solver(self.energy, scene, dataclasses.replace(game, initial_controls=torch.cat(starts, 1)))
+        found = solution.energy.isfinite() & (solution.status != Status.STOPPED)
+        best, rows = solution.energy.masked_fill(~found, torch.inf).argmin(1), torch.arange(len(start))
+        controls = solution.controls[rows, best][:, None]
+        return torch.where(held[:, None, None], start, controls), found[rows, best]
 
     def _plan(self, scene: Scene, controls: Float[Tensor, "B 1 N K 2"], found: Bool[Tensor, " B"]) -> Plan:
         states = self.energy.dynamics.rollout(self.energy.current_states(scene), controls, scene.dt)[:, 0]
@@ -208,7 +271,8 @@ class ResponsePlanner(_OfGame):
     Args:
         energy, game: the planned agent's costs.
         forecaster: forecast of the others, by its most likely joint mode; after its horizon they keep their velocity.
-            None for others that keep their velocity from the start.
+            None for others that keep going from the start, as the game's ``reference_controls`` say, or straight on.
+        search: how minima are searched.
     """
 
     def __init__(
@@ -216,8 +280,9 @@ class ResponsePlanner(_OfGame):
         energy: FeatureEnergy,
         game: Callable[[Scene], GameParameters],
         forecaster: Forecaster | None = None,
+        search: Search | None = None,
     ) -> None:
-        super().__init__(energy, game)
+        super().__init__(energy, game, search)
         self.forecast = None if forecaster is None else ForecastPlanner(forecaster)
 
     @torch.no_grad()
@@ -225,7 +290,7 @@ class ResponsePlanner(_OfGame):
         scene = scene.to(torch.float64)
         game, controls = self._start(scene, previous)
         others = torch.arange(controls.shape[2]) != EGO
-        controls[:, :, others] = 0.0
+        controls[:, :, others] = 0.0 if game.reference_controls is None else game.reference_controls[:, :, others]
         if self.forecast is not None:
             told = self.forecast.controls_of_all(scene)
             told = F.pad(told, (0, 0, 0, max(0, controls.shape[-2] - told.shape[-2])))[..., : controls.shape[-2], :]
@@ -240,12 +305,17 @@ class GamePlanner(_OfGame):
         energy, game: the game.
         rounds: number of best responses of every agent in turn (iterated best response); None for the joint minimum of the
             potential, which is a Nash equilibrium.
+        search: how minima are searched.
     """
 
     def __init__(
-        self, energy: FeatureEnergy, game: Callable[[Scene], GameParameters], rounds: int | None = None
+        self,
+        energy: FeatureEnergy,
+        game: Callable[[Scene], GameParameters],
+        rounds: int | None = None,
+        search: Search | None = None,
     ) -> None:
-        super().__init__(energy, game)
+        super().__init__(energy, game, search)
         self.rounds = rounds
 
     @torch.no_grad()

@@ -11,9 +11,10 @@ of a mode of the main game. Then the robot is planned until the game ends after 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.checks import check_whole
@@ -23,7 +24,7 @@ from epo_lightning.data.rpi.modes import cheapest
 from epo_lightning.data.rpi.scenes import DISC_DIAMETER
 from epo_lightning.data.rpi.solve import PotentialSettings, solve, solve_potential
 from epo_lightning.data.rpi.subgames import HISTORY, by_agent, main_starts
-from epo_lightning.drive.world import EGO
+from epo_lightning.drive.world import EGO, Outcome, Search
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import GameParameters, Scene
@@ -75,10 +76,10 @@ def true_game(weight: Tensor, goals: Tensor, headings: Tensor, steps: int) -> Ga
 
 
 class RPIWorld:
-    """Episodes of the robot-pedestrian game.
+    """Episodes of the robot-pedestrian game; all of them may be begun together, and are begun at once.
 
     Args:
-        episodes: number of episodes B.
+        episodes: number of episodes.
         seed: seed of their games; the same seed gives the same episodes.
         pedestrian: ``plays`` or ``ignores``.
 
@@ -89,7 +90,8 @@ class RPIWorld:
     shape = "disc"
     energy = ENERGY
     arrived = 5.0
-    names = ("robot", "pedestrian")
+    patience = 2.0
+    search = Search()
 
     def __init__(self, episodes: int, seed: int = 0, pedestrian: str = "plays") -> None:
         check_whole("episodes", episodes)
@@ -97,12 +99,20 @@ class RPIWorld:
             raise ConfigError(f"unknown pedestrian {pedestrian!r}: {nearest(str(pedestrian), PEDESTRIANS)}")
         self.constants, self.pedestrian = GameConstants(), pedestrian
         self._c = self.constants.array()
-        self.games = [main_game(SEEDS + seed, index, 0, 1, self.constants) for index in range(episodes)]
+        self._games = [main_game(SEEDS + seed, index, 0, 1, self.constants) for index in range(episodes)]
+        self._begun = [self._start(game, seed) for game in self._games]
+        self.together = episodes
+        self.reset(range(episodes))
+
+    def __len__(self) -> int:
+        return len(self._games)
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        self.games = [self._games[episode] for episode in episodes]
         self.weight = torch.tensor([game.weight for game in self.games], dtype=torch.double)
         self._goals = torch.tensor(np.stack([game.goals for game in self.games]))
-        started = [self._start(game, seed) for game in self.games]
-        self._x = np.stack([x for x, _ in started])
-        self._u = np.stack([u for _, u in started])
+        self._x = np.stack([self._begun[episode][0] for episode in episodes])
+        self._u = np.stack([self._begun[episode][1] for episode in episodes])
         self.now = HISTORY
 
     def _start(self, game: MainGame, seed: int) -> tuple[Array, Array]:
@@ -143,7 +153,9 @@ class RPIWorld:
         steps = max(2, self.constants.steps - self.now)  # an energy takes two steps or more; `game_steps` ends the game
         return true_game(self.weight[scene.id], goals[..., :2], goals[..., 2], steps)
 
-    def advance(self, controls: Float[Tensor, "B 2"]) -> None:
+    def advance(self, controls: Tensor | None) -> None:
+        if controls is None:
+            raise ConfigError("world=rpi has no driver of its own: the robot needs a planner")
         for b, (game, control) in enumerate(zip(self.games, controls.double().numpy(), strict=True)):
             x, u = self._x[b, self.now], self._u[b]
             if self.pedestrian == "plays":
@@ -165,15 +177,23 @@ class RPIWorld:
             found.append((sum(costs(states, controls, self._c, game.goals, game.weight)), controls))
         return min(found, key=lambda pair: pair[0])[1]
 
-    def progress(self, states: Float[Tensor, "B T 4"]) -> Float[Tensor, "B T"]:
-        """Distance [m] by which the robot is nearer to its goal than at its start."""
-        goal = self._goals[:, EGO, None, :2]
-        return 2 * self.constants.circle - (states[..., :2].double() - goal).norm(dim=-1)
+    def close(self) -> None:
+        """Does nothing: the game is simulated here."""
 
-    def measures(self) -> dict[str, Tensor]:
-        """The robot's cost in the true game [B] since it was planned, with the proximity cost counted in full."""
-        values = []
+    def outcome(self) -> Outcome:
+        """States, the distance by which the robot is nearer to its goal than at its start, and its ``cost`` in the true game
+        since it was planned, with the proximity cost counted in full."""
+        states = torch.tensor(by_agent(self._x[:, HISTORY : self.now + 1]))
+        batch, agents, steps = states.shape[:3]
+        costs_of_robot = []
         for x, u, game in zip(self._x, self._u, self.games, strict=True):
             robot, _, pair = costs(x[HISTORY : self.now + 1], u[HISTORY : self.now], self._c, game.goals, game.weight)
-            values.append(robot + pair)
-        return {"cost": torch.tensor(values, dtype=torch.double)}
+            costs_of_robot.append(robot + pair)
+        left = (states[:, EGO, :, :2] - self._goals[:, EGO, None, :2]).norm(dim=-1)
+        return Outcome(
+            states=states,
+            agent_mask=torch.ones(batch, agents, steps, dtype=torch.bool),
+            size=states.new_full((batch, agents, 2), DISC_DIAMETER),
+            progress=2 * self.constants.circle - left,
+            measures={"cost": torch.tensor(costs_of_robot, dtype=torch.double)},
+        )

@@ -1,33 +1,88 @@
-"""Worlds: batches of episodes in which one agent is planned and the others act by themselves."""
+"""Worlds: episodes in which one agent is planned and the others act by themselves."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene
 
 EGO = 0
-"""Index of the planned agent in the scenes of a world."""
+"""Index of the planned agent in the scenes and outcomes of a world."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What happened in B episodes, from the first planned moment on.
+
+    Attributes:
+        states: states of all agents, in one frame for the whole episode.
+        agent_mask: agents that exist at each of these times.
+        size: length and width of every agent [m].
+        progress: how far the planned agent has come [m].
+        measures: further measures of the episodes, by name; those in ``rates`` are 0 or 1.
+        rates: names of the further measures that are shares of the episodes.
+        lines: lines of the road, for films.
+    """
+
+    states: Float[Tensor, "B N T+1 4"]
+    agent_mask: Bool[Tensor, "B N T+1"]
+    size: Float[Tensor, "B N 2"]
+    progress: Float[Tensor, "B T+1"]
+    measures: Mapping[str, Float[Tensor, " B"]]
+    rates: frozenset[str] = frozenset()
+    lines: tuple[Float[Tensor, "_ 2"], ...] = ()
+
+
+@dataclass(frozen=True)
+class Search:
+    """How minima of known costs are searched.
+
+    Attributes:
+        steps: number of steps of the layer, for energies with the features ``accref`` and ``turnrref``; None to descend
+            until no step lowers the costs.
+        accelerations: accelerations [m/s^2] of the planned agent, until it stands, at which the layer starts as well as at
+            the last plan. A descent from a plan that drives through another agent may stay there.
+    """
+
+    steps: int | None = None
+    accelerations: tuple[float, ...] = ()
 
 
 class World(Protocol):
-    """The interface of worlds: a batch of B episodes, moved together by steps of ``scene.dt``.
+    """The interface of worlds: episodes, of which some are begun together and moved by steps of ``scene.dt``.
 
-    The planned agent has index :data:`EGO`.
+    The same arguments make the same episodes, and an episode may be begun any number of times. The planned agent has
+    index :data:`EGO`.
 
     Attributes:
         energy: the energy of :meth:`game`.
         shape: shape of the agents' bodies in tests of contact, ``disc`` or ``box``.
         arrived: progress [m] from which an agent that stands has arrived.
+        patience: time [s] from which standing before that is a deadlock.
+        together: largest number of episodes that can be begun together.
+        search: how planners search minima of the costs of :meth:`game`.
     """
 
     energy: FeatureEnergy
     shape: str
     arrived: float
+    patience: float
+    together: int
+    search: Search
+
+    def __len__(self) -> int:
+        """The number of episodes."""
+        ...
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        """Begin some episodes."""
+        ...
 
     @property
     def finished(self) -> bool:
@@ -39,18 +94,24 @@ class World(Protocol):
         ...
 
     def game(self, scene: Scene) -> GameParameters:
-        """The games [B, 1, ...] in which the planned agent's own costs are known, over the rest of the episode, with
-        controls of zero as initial strategies."""
+        """The games [B, 1, ...] in which the planned agent's own costs are known, over the time that is planned, with
+        controls of zero as initial strategies. ``reference_controls`` are what agents do who keep going, if not zero."""
         ...
 
-    def advance(self, controls: Float[Tensor, "B 2"]) -> None:
-        """Apply controls of the planned agent (acceleration [m/s^2], turn rate [rad/s]) for one step; all others act."""
+    def advance(self, controls: Float[Tensor, "B 2"] | None) -> None:
+        """Apply controls of the planned agent (acceleration [m/s^2], turn rate [rad/s]) for one step; all others act.
+
+        None lets the world's own driver drive the planned agent.
+
+        Raises:
+            ConfigError: None in a world without a driver of its own.
+        """
         ...
 
-    def progress(self, states: Float[Tensor, "B T 4"]) -> Float[Tensor, "B T"]:
-        """How far the planned agent has come [m] in each of its states."""
+    def outcome(self) -> Outcome:
+        """What has happened in the begun episodes."""
         ...
 
-    def measures(self) -> dict[str, Float[Tensor, " B"]]:
-        """Further measures of the episodes so far, by name."""
+    def close(self) -> None:
+        """End whatever simulates the world."""
         ...

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
+import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from epo_lightning.drive.episodes import Episodes, play, times
+from epo_lightning.drive.episodes import play, times
 from epo_lightning.drive.film import film
 from epo_lightning.drive.measures import RATES, UNITS, Estimate, differences, estimate, estimates, measure
 from epo_lightning.drive.planners import ForecastPlanner, GamePlanner, Planner, ResponsePlanner
-from epo_lightning.drive.rpi import PEDESTRIANS, RPIWorld
 from epo_lightning.drive.world import World
+from epo_lightning.drive.worlds import BEST_RESPONSE, CONSTANT_VELOCITY, DRIVER, Place, place
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import DriveSettings, Settings
 from epo_lightning.experiment.opening import open_checkpoint
@@ -28,129 +29,202 @@ from epo_lightning.schema import read
 
 ROUNDS = 3
 """Best responses of every agent in turn."""
-TIMED_SEED = 500_000
-"""Added to the seed for the episodes whose plans are timed."""
 OWN, WARM, ALONE, RESPOND = "own", "warm", "alone", "respond"
 WAYS = {OWN: "{}", WARM: "{}, warm start", ALONE: "{}, without pair term", RESPOND: "response to {}"}
-BASELINES = {
-    "constant_velocity": "response to constant velocity",
-    "best_response": "iterated best response, true game",
-    "joint": "true game",
-}
-Make = Callable[[World], Planner]
+EVERY = 10
+"""Number of chunks of episodes between two lines about progress."""
+Make = Callable[[World], Planner | None]
+Measured = dict[str, dict[str, list[float]]]
 
 
 def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
     """Drive the same episodes with every planner, and write ``results.json``, ``table.md`` and films.
 
+    What was driven is kept in ``episodes.jsonl``; the same command continues there after it was killed.
+
     Args:
         settings: runs, world and planners.
-        tell: called with a line per planner as soon as it has driven.
+        tell: called with a line from time to time, and per planner.
 
     Returns:
         the files that were written.
 
     Raises:
-        ConfigError: a run, checkpoint or kind of others that does not exist, a run that cannot drive in this world, or
-            results in ``out`` that would be overwritten.
+        ConfigError: a run, checkpoint, world or kind of others that does not exist, a run that cannot drive in this world,
+            a world whose extra is not installed, or results in ``out`` that would be overwritten.
     """
     assembly.quiet()
     torch.set_num_threads(1)
     out = Path(settings.out).expanduser()
     if (out / "results.json").exists():
         raise ConfigError(f"{out} holds results already: nothing is overwritten; choose another out=<folder>")
-    kinds = PEDESTRIANS if settings.others is None else tuple(settings.others)
-    for kind in kinds:
-        if kind not in PEDESTRIANS:
-            raise ConfigError(f"unknown others {kind!r} of world={settings.world}: {nearest(kind, PEDESTRIANS)}")
-    planners = dict(_planners(settings))
-    results: dict[str, Any] = {"settings": dataclasses.asdict(settings), "worlds": {}}
+    where = place(settings.world)
+    kinds = where.kinds if settings.others is None else tuple(settings.others)
+    where.check_kinds(settings.world, kinds)
+    planners = dict(_planners(settings, where))
+    done = _Done(out / "episodes.jsonl", json.loads(json.dumps(dataclasses.asdict(settings))))
+    results: dict[str, Any] = {"settings": done.settings, "worlds": {}, "milliseconds": {}}
     tables, films = [], []
-    out.mkdir(parents=True, exist_ok=True)
     for kind in kinds:
-        world = RPIWorld(settings.episodes, settings.seed, kind)
-        played: dict[str, Episodes] = {}
-        measured: dict[str, dict[str, Tensor]] = {}
-        for name, make in planners.items():
-            began, own = time.perf_counter(), copy.deepcopy(world)
-            episodes = play(own, make(own), keep_plans=settings.film is not None)
-            measured[name] = measure(episodes, own.shape, own.arrived, own.measures())
+        with closing(where.make(settings.episodes, settings.seed, kind)) as world:
+            made = {name: make(world) for name, make in planners.items()}
+            rates = _drive(world, kind, made, done, tell)
+            measured = done.measured(kind)
+            results["worlds"][kind] = _results(measured, rates)
+            tables.append(_table(kind, measured, rates))
+            if settings.timed:
+                results["milliseconds"][kind] = _milliseconds(world, kind, made, done, settings.timed)
+                tables.append(_times_table(results["milliseconds"][kind]))
             if settings.film is not None:
-                played[name] = _only(episodes, settings.film)
-            collisions = float(measured[name]["collision"].mean())
-            tell(f"{kind:8} {name}: {100 * collisions:.1f} % collisions, {time.perf_counter() - began:.0f} s")
-        results["worlds"][kind] = _results(measured)
-        tables.append(_table(kind, measured))
-        if settings.film is not None:
-            films.append(film(played, 0, world.shape, out / f"film-{kind}.gif"))
-    if settings.timed:
-        results["milliseconds"] = _timed(settings, planners, kinds[0])
-        tables.append(_times_table(results["milliseconds"]))
+                played = {
+                    name: play(world, planner, [settings.film], keep_plans=True) for name, planner in made.items()
+                }
+                films.append(film(played, world.shape, out / f"film-{kind}.gif"))
     write_file(out / "table.md", "\n".join(tables))
     write_json(out / "results.json", results)
     return [out / "results.json", out / "table.md", *films]
 
 
-def _planners(settings: DriveSettings) -> Iterator[tuple[str, Make]]:
+def _drive(
+    world: World, kind: str, planners: Mapping[str, Planner | None], done: _Done, tell: Callable[[str], None]
+) -> set[str]:
+    """Drive all episodes of a world with all planners, and return the names of the measures that are 0 or 1."""
+    rates, seconds = set(RATES), dict.fromkeys(planners, 0.0)
+    chunks = [range(first, min(first + world.together, len(world))) for first in range(0, len(world), world.together)]
+    for count, chunk in enumerate(chunks, 1):
+        for name, planner in planners.items():
+            if done.has(kind, name, chunk):
+                continue
+            began = time.perf_counter()
+            episodes = play(world, planner, chunk)
+            rates |= episodes.outcome.rates
+            done.add(kind, name, chunk, measure(episodes, world), episodes.wall, episodes.processor)
+            seconds[name] += time.perf_counter() - began
+        if count % EVERY == 0:
+            tell(f"{kind:8} {chunk.stop} of {len(world)} episodes, {sum(seconds.values()):.0f} s")
+    for name, values in done.measured(kind).items():
+        collisions = float(values["collision"].mean())
+        tell(f"{kind:8} {name}: {100 * collisions:.1f} % collisions, {seconds[name]:.0f} s")
+    return rates
+
+
+class _Done:
+    """The file of what was driven: a line of settings, then a line per planner and chunk of episodes.
+
+    Args:
+        path: the file, which is continued.
+        settings: the settings that it belongs to.
+
+    Raises:
+        ConfigError: the file belongs to other settings.
+    """
+
+    def __init__(self, path: Path, settings: dict[str, Any]) -> None:
+        self.path, self.settings = path, settings
+        self._rows: dict[str, dict[str, dict[int, dict[str, Any]]]] = {}
+        lines = path.read_text().splitlines() if path.exists() else []
+        if lines and json.loads(lines[0]) != settings:
+            raise ConfigError(
+                f"{path} was begun with other settings: nothing is mixed; choose another out=<folder>, or delete it"
+            )
+        for line in lines[1:]:
+            try:
+                self._take(json.loads(line))
+            except json.JSONDecodeError:
+                continue  # the last line of a command that was killed
+
+    def _take(self, row: dict[str, Any]) -> None:
+        self._rows.setdefault(row["kind"], {}).setdefault(row["planner"], {})[row["episodes"][0]] = row
+
+    def has(self, kind: str, planner: str, chunk: Sequence[int]) -> bool:
+        """Whether a planner has driven some episodes."""
+        return chunk[0] in self._rows.get(kind, {}).get(planner, {})
+
+    def add(
+        self,
+        kind: str,
+        planner: str,
+        chunk: Sequence[int],
+        measures: Mapping[str, Tensor],
+        wall: Sequence[float],
+        processor: Sequence[float],
+    ) -> None:
+        """Append what a planner has driven."""
+        row = {
+            "kind": kind,
+            "planner": planner,
+            "episodes": list(chunk),
+            "measures": {name: values.tolist() for name, values in measures.items()},
+            "wall": wall,
+            "processor": processor,
+        }
+        self._take(row)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("a") as file:
+            if not file.tell():
+                file.write(json.dumps(self.settings) + "\n")
+            file.write(json.dumps(row) + "\n")
+
+    def measured(self, kind: str) -> dict[str, dict[str, Tensor]]:
+        """Measures of all episodes by planner."""
+        return {
+            planner: {
+                name: torch.tensor(
+                    [value for _, row in sorted(rows.items()) for value in row["measures"][name]], dtype=torch.double
+                )
+                for name in next(iter(rows.values()))["measures"]
+            }
+            for planner, rows in self._rows[kind].items()
+        }
+
+    def seconds(self, kind: str, planner: str) -> tuple[list[float], list[float]]:
+        """Seconds of the plans of single scenes, by the clock and of processor time; each episode's first plan warms up."""
+        rows = [row for row in self._rows[kind][planner].values() if len(row["episodes"]) == 1]
+        return [s for row in rows for s in row["wall"][1:]], [s for row in rows for s in row["processor"][1:]]
+
+
+def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make]]:
     """Planners by name, made for a world."""
     for path in settings.runs if settings.ways else ():
         run = RunFolder.open(path)
         of_run = read(Settings, run.config())
         forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
-        _check(of_run, path)
+        if reason := where.refuse(of_run.data):
+            raise ConfigError(f"{path} was trained on data={of_run.data['name']}, and world={settings.world} {reason}")
         for way in settings.ways:
             try:
                 make = _of_run(forecaster, way, settings.mode == "nearest")
             except ConfigError:
                 continue  # a forecaster without a game has no warm start and no pair terms
             yield WAYS[way].format(of_run.title), make
-    for name in settings.baselines:
-        yield BASELINES[name], _baseline(name)
+    for name in where.baselines if settings.baselines is None else settings.baselines:
+        if name not in where.baselines:
+            known = tuple(where.baselines)
+            raise ConfigError(f"unknown baseline {name!r} of world={settings.world}: {nearest(name, known)}")
+        yield where.baselines[name], _baseline(name)
 
 
 def _of_run(forecaster: Forecaster, way: str, keep: bool) -> Make:
     if way == RESPOND:
-        return lambda world: ResponsePlanner(world.energy, world.game, forecaster)
+        return lambda world: ResponsePlanner(world.energy, world.game, forecaster, world.search)
     planner = ForecastPlanner(forecaster, pair_terms=way != ALONE, warm=way == WARM, keep=keep)
     return lambda world: planner
 
 
 def _baseline(name: str) -> Make:
-    if name == "constant_velocity":
-        return lambda world: ResponsePlanner(world.energy, world.game)
-    return lambda world: GamePlanner(world.energy, world.game, ROUNDS if name == "best_response" else None)
+    if name == DRIVER:
+        return lambda world: None
+    if name == CONSTANT_VELOCITY:
+        return lambda world: ResponsePlanner(world.energy, world.game, None, world.search)
+    rounds = ROUNDS if name == BEST_RESPONSE else None
+    return lambda world: GamePlanner(world.energy, world.game, rounds, world.search)
 
 
-def _check(of_run: Settings, path: str) -> None:
-    """Refuse a run that was not trained on RPI.
-
-    Raises:
-        ConfigError: another data set.
-    """
-    if of_run.data["name"] != "rpi":
-        raise ConfigError(
-            f"{path} was trained on data={of_run.data['name']}, and world=rpi takes runs of data=rpi, such as rpi/v_lstm_epo"
-        )
-
-
-def _only(episodes: Episodes, index: int) -> Episodes:
-    """One episode with its plans."""
-    one = slice(index, index + 1)
-    return dataclasses.replace(
-        episodes,
-        **{
-            name: getattr(episodes, name)[one]
-            for name in ("states", "controls", "agent_mask", "size", "found", "progress")
-        },
-        plans=[plan[one] for plan in episodes.plans],
-    )
-
-
-def _results(measured: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Any]:
+def _results(measured: Mapping[str, Mapping[str, Tensor]], rates: Collection[str]) -> dict[str, Any]:
     """Estimates of all planners, and paired differences of the first from the others."""
     first, *others = measured
     return {
-        "planners": {name: _plain(estimates(values)) for name, values in measured.items()},
+        "planners": {name: _plain(estimates(values, rates)) for name, values in measured.items()},
         "differences": {f"{first} - {name}": _plain(differences(measured[first], measured[name])) for name in others},
     }
 
@@ -159,12 +233,13 @@ def _plain(values: Mapping[str, Estimate]) -> dict[str, dict[str, float]]:
     return {name: dataclasses.asdict(value) for name, value in values.items()}
 
 
-def _table(kind: str, measured: Mapping[str, Mapping[str, Tensor]]) -> str:
+def _table(kind: str, measured: Mapping[str, Mapping[str, Tensor]], rates: Collection[str]) -> str:
     names = list(next(iter(measured.values())))
-    heads = [f"{name.replace('_', ' ')}{f' [{UNITS[name]}]' if name in UNITS else ''}" for name in names]
+    units = {**dict.fromkeys(rates, "%"), **UNITS}
+    heads = [f"{name.replace('_', ' ')}{f' [{units[name]}]' if name in units else ''}" for name in names]
     lines = [f"### others: {kind}", "", "| planner | " + " | ".join(heads) + " |", "|:--|" + "--:|" * len(names)]
     for planner, values in measured.items():
-        cells = [_cell(estimate(values[name], name in RATES), name in RATES) for name in names]
+        cells = [_cell(estimate(values[name], name in rates), name in rates) for name in names]
         lines.append(f"| {planner} | " + " | ".join(cells) + " |")
     return "\n".join([*lines, ""])
 
@@ -176,17 +251,21 @@ def _cell(value: Estimate, rate: bool) -> str:
     return f"{value.mean:.{digits}f} ({value.low:.{digits}f} to {value.high:.{digits}f})"
 
 
-def _timed(settings: DriveSettings, planners: Mapping[str, Make], kind: str) -> dict[str, dict[str, float]]:
-    """Milliseconds of a plan of one scene: median and 99th percentile, by the clock and of processor time."""
-    worlds = [RPIWorld(1, TIMED_SEED + settings.seed + index, kind) for index in range(settings.timed)]
+def _milliseconds(
+    world: World, kind: str, planners: Mapping[str, Planner | None], done: _Done, timed: int
+) -> dict[str, dict[str, float]]:
+    """Milliseconds of a plan of one scene: median and 99th percentile, by the clock and of processor time.
+
+    Worlds that begin episodes one by one have timed all plans already; in others some episodes are driven once more, alone.
+    """
     found = {}
-    for name, make in planners.items():
-        wall: list[float] = []
-        processor: list[float] = []
-        for world in copy.deepcopy(worlds):
-            by_clock, worked = times([world], make(world))
-            wall += by_clock
-            processor += worked
+    for name, planner in planners.items():
+        if planner is None:
+            continue
+        if world.together == 1:
+            wall, processor = done.seconds(kind, name)
+        else:
+            wall, processor = times(world, planner, range(min(timed, len(world))))
         found[name] = {
             f"{title} {label}": 1e3 * float(torch.tensor(values).quantile(share))
             for title, values in (("clock", wall), ("processor", processor))

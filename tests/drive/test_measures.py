@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import torch
 
 from epo_lightning.drive.episodes import Episodes
 from epo_lightning.drive.measures import SOON, differences, estimate, measure
+from epo_lightning.drive.world import Outcome, World
 
 DT, STEPS = 0.1, 40
 
@@ -19,19 +22,24 @@ def meeting(gap: float, speed: float = 1.0) -> Episodes:
     states = torch.zeros(1, 2, STEPS + 1, 4, dtype=torch.double)
     states[0, 0, :, 0], states[0, 0, :, 3] = speed * times, speed
     states[0, 1, :, 0], states[0, 1, :, 1] = 2.0, gap
-    return Episodes(
-        dt=DT,
+    outcome = Outcome(
         states=states,
-        controls=torch.zeros(1, STEPS, 2, dtype=torch.double),
         agent_mask=torch.ones(1, 2, STEPS + 1, dtype=torch.bool),
         size=torch.full((1, 2, 2), 0.5, dtype=torch.double),
-        found=torch.ones(1, STEPS, dtype=torch.bool),
         progress=states[:, 0, :, 0],
+        measures={"height": torch.ones(1, dtype=torch.double)},
+    )
+    return Episodes(
+        dt=DT,
+        outcome=outcome,
+        controls=torch.zeros(1, STEPS, 2, dtype=torch.double),
+        found=torch.ones(1, STEPS, dtype=torch.bool),
     )
 
 
-def values(episodes: Episodes, shape: str = "disc") -> dict[str, float]:
-    return {name: float(value[0]) for name, value in measure(episodes, shape, 10.0, {}).items()}
+def values(episodes: Episodes, shape: str = "disc", arrived: float = 10.0) -> dict[str, float]:
+    world = cast(World, SimpleNamespace(shape=shape, arrived=arrived, patience=2.0))
+    return {name: float(value[0]) for name, value in measure(episodes, world).items()}
 
 
 def test_contact_and_distance() -> None:
@@ -39,20 +47,24 @@ def test_contact_and_distance() -> None:
     assert values(meeting(0.6))["collision"] == 0.0
     assert values(meeting(0.6))["distance"] == pytest.approx(0.6)
     apart = meeting(0.4)
-    apart.agent_mask[:, 1] = False
+    apart.outcome.agent_mask[:, 1] = False
     assert values(apart)["collision"] == 0.0
     assert values(apart)["time_to_collision"] == SOON
     turned = meeting(0.55)
-    turned.states[:, 1, :, 2] = torch.pi / 4  # the corner of a box reaches further than its side
+    turned.outcome.states[:, 1, :, 2] = torch.pi / 4  # the corner of a box reaches further than its side
     assert [values(turned, shape)["collision"] for shape in ("disc", "box")] == [0.0, 1.0]
 
 
 def test_time_to_collision_is_the_smallest_over_the_way() -> None:
     begun = meeting(0.0)
-    early = dataclasses.replace(
-        begun, states=begun.states[:, :, :6], controls=begun.controls[:, :5], agent_mask=begun.agent_mask[:, :, :6]
+    happened = begun.outcome
+    happened = dataclasses.replace(
+        happened,
+        states=happened.states[:, :, :6],
+        agent_mask=happened.agent_mask[:, :, :6],
+        progress=happened.progress[:, :6],
     )
-    early = dataclasses.replace(early, found=early.found[:, :5], progress=early.progress[:, :6])
+    early = dataclasses.replace(begun, outcome=happened, controls=begun.controls[:, :5], found=begun.found[:, :5])
     # After 0.5 s the robot is 1.5 m away, and discs of 0.25 m touch after 1 s.
     assert values(early)["time_to_collision"] == pytest.approx(1.1, abs=0.11)
     assert values(meeting(0.6))["time_to_collision"] == SOON
@@ -67,10 +79,11 @@ def test_comfort_progress_and_deadlocks() -> None:
     assert found["lateral"] == pytest.approx(0.2)
     assert found["progress"] == pytest.approx(4.0)
     assert found["deadlock"] == 0.0
+    assert found["height"] == 1.0, "a measure of the world"
     assert values(meeting(1.0, speed=0.0))["deadlock"] == 1.0
     standing = meeting(1.0, speed=0.0)
-    assert float(measure(standing, "disc", 0.0, {})["deadlock"][0]) == 0.0, "it has arrived"
-    standing.states[:, 0, ::15, 3] = 1.0
+    assert values(standing, arrived=0.0)["deadlock"] == 0.0, "it has arrived"
+    standing.outcome.states[:, 0, ::15, 3] = 1.0
     assert values(standing)["deadlock"] == 0.0, "it never stands for two seconds"
 
 

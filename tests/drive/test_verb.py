@@ -25,7 +25,7 @@ def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -
     difference = results["worlds"]["ignores"]["differences"][f"{row} - {baseline}"]["progress"]
     wanted = planners[row]["progress"]["mean"] - planners[baseline]["progress"]["mean"]
     assert difference["mean"] == pytest.approx(wanted)
-    assert results["milliseconds"][row]["plans"] == 81
+    assert results["milliseconds"]["ignores"][row]["plans"] == 81
     assert (tmp_path / "driven" / "film-ignores.gif").read_bytes()[:3] == b"GIF"
     table = (tmp_path / "driven" / "table.md").read_text()
     assert table.count(f"| {baseline} |") == 2
@@ -40,6 +40,13 @@ def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -
         (["run=rpi/v_lstm_epo", "film=2", "episodes=2"], "film must be an episode from 0 to 1, or null, not 2"),
         (["run=rpi/v_lstm_epo", "episodes=0", "film=null"], "episodes must be 1 or more, not 0"),
         (["run=rpi/v_lstm_epo", "ways=[]", "baselines=[]"], "nothing drives"),
+        (["run=rpi/v_lstm_epo", "world=sum"], "unknown world 'sum': did you mean 'sumo'"),
+        (
+            ["run=rpi/v_lstm_epo", "world=sumo"],
+            "was trained on data=rpi, and world=sumo takes runs of recorded traffic",
+        ),
+        (["run=highway_sim/hivt_m_epo", "world=sumo", "others=[dens]"], "did you mean 'dense'"),
+        (["run=rpi/v_lstm_epo", "baselines=[driver]"], "unknown baseline 'driver' of world=rpi"),
     ],
 )
 def test_mistakes_are_named(
@@ -52,6 +59,26 @@ def test_mistakes_are_named(
     assert epo("drive", *words, f"out={tmp_path}/driven") == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "driven").exists()
+
+
+def test_a_command_that_was_killed_is_continued(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "driven"
+    words = ["run=rpi/v_lstm_epo", "ways=[own]", "baselines=[constant_velocity]", "film=null", "timed=0", *SMALL[::2]]
+    assert epo("drive", *words, f"out={out}") == 0
+    whole, lines = (out / "results.json").read_text(), (out / "episodes.jsonl").read_text().splitlines(keepends=True)
+    assert len(lines) == 3, "settings, and a line per planner"
+    (out / "results.json").unlink()
+    half = lines[1].replace('"collision": [0.0', '"collision": [1.0') if '"collision": [0.0' in lines[1] else lines[1]
+    (out / "episodes.jsonl").write_text(lines[0] + half + lines[2][:50])
+    assert epo("drive", *words, f"out={out}") == 0
+    assert ((out / "results.json").read_text() == whole) == (half == lines[1]), "what was driven is not driven again"
+    (out / "results.json").unlink()
+    assert epo("drive", *words, "seed=1", f"out={out}") == 2
+    assert "was begun with other settings" in capsys.readouterr().err
 
 
 def test_results_are_not_overwritten(

@@ -22,6 +22,8 @@ Values = Float[np.ndarray, " *n"]
 
 GRID = 0.25
 """Spacing [m] at which the reference curve is integrated; linear interpolation in between is accurate to 0.01 mm."""
+COARSE, STEPS = 10.0, 4
+"""Spacing [m] of the points from which positions on the reference curve are searched, and number of Newton steps."""
 CLEARANCE = 20.0
 """Length [m] at the beginning or end of a lane beside others that is not driven on, so that vehicles change inside it."""
 SWING = 80.0
@@ -121,6 +123,25 @@ class Layout:
         angle = np.interp(s, grid, heading)
         return np.stack([np.interp(s, grid, x) - d * np.sin(angle), np.interp(s, grid, y) + d * np.cos(angle)], -1)
 
+    def project(self, points: Float[np.ndarray, "*n 2"]) -> tuple[Values, Values]:
+        """Positions s along the reference curve and d to its left [m] of points near the road.
+
+        This is the inverse of :meth:`locate`: Newton steps from the nearest point of the curve on a coarse
+        grid.
+        """
+        grid, _, heading, x, y = self._curve
+        coarse = slice(None, None, round(COARSE / GRID))
+        away = (points[..., :1] - x[coarse]) ** 2 + (points[..., 1:] - y[coarse]) ** 2
+        s = grid[coarse][away.argmin(-1)]
+        d = np.zeros_like(s)
+        for _ in range(STEPS):
+            angle = np.interp(s, grid, heading)
+            way = points - self.locate(s, np.zeros_like(s))
+            d = way[..., 1] * np.cos(angle) - way[..., 0] * np.sin(angle)
+            ahead = way[..., 0] * np.cos(angle) + way[..., 1] * np.sin(angle)
+            s = s + ahead / self.stretch(s, d)
+        return s, d
+
     @property
     def course(self) -> tuple[Values, Values]:
         """Values of s and the heading of the reference curve at them, for interpolation."""
@@ -137,10 +158,13 @@ class Layout:
 
     def direction(self, strip: Strip, s: Values) -> Values:
         """Heading of a strip's centreline [rad]."""
-        grid, curvature, heading, _, _ = self._curve
+        grid, _, heading, _, _ = self._curve
         slope = self._swing_slope(strip.join - s) - self._swing_slope(s - strip.leave)
-        stretch = 1.0 - np.interp(s, grid, curvature) * self.offset(strip, s)
-        return np.interp(s, grid, heading) + np.arctan2(slope, stretch)
+        return np.interp(s, grid, heading) + np.arctan2(slope, self.stretch(s, self.offset(strip, s)))
+
+    def stretch(self, s: Values, d: Values) -> Values:
+        """Metres that a point at d moves along the road while s increases by a metre."""
+        return 1.0 - np.interp(s, self._curve[0], self._curve[1]) * d
 
     def along(self, strip: Strip, s: Values) -> Values:
         """Distance along a strip's centreline from its beginning [m]."""

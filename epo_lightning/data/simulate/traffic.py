@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import subprocess
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -106,14 +107,15 @@ def simulator() -> tuple[ModuleType, Path]:
         import sumo
     except ImportError as error:
         raise ConfigError(
-            f"simulated recordings need the traffic simulator SUMO ({error}): install it with "
-            "`pip install 'epo_lightning[sim]'`"
+            f"simulated traffic needs the simulator SUMO ({error}): install it with `pip install 'epo_lightning[sim]'`"
         ) from None
     return libsumo, Path(sumo.SUMO_HOME) / "bin"
 
 
 @dataclass(frozen=True)
-class _Edge:
+class Edge:
+    """A section of a carriageway."""
+
     name: str
     road: str
     begin: float
@@ -122,7 +124,7 @@ class _Edge:
     """Indices into ``layout.lanes``, from right to left."""
 
 
-def _edges(layout: Layout) -> list[_Edge]:
+def _edges(layout: Layout) -> list[Edge]:
     """The edges of the network: one per section and carriageway, in downstream order."""
     lanes = layout.lanes
     cuts = [s for strip in lanes for s in (*strip.driven, strip.join, strip.leave)]
@@ -133,7 +135,7 @@ def _edges(layout: Layout) -> list[_Edge]:
         for index, strip in sorted(enumerate(lanes), key=lambda item: item[1].place):
             if strip.driven[0] < middle < strip.driven[1]:
                 roads.setdefault(strip.road(middle), []).append(index)
-        edges += [_Edge(f"{road}_{number}", road, begin, end, tuple(strips)) for road, strips in roads.items()]
+        edges += [Edge(f"{road}_{number}", road, begin, end, tuple(strips)) for road, strips in roads.items()]
     return edges
 
 
@@ -145,13 +147,13 @@ def _xml(path: Path, tag: str, children: Iterable[tuple[str, dict[str, Any]]]) -
     return path
 
 
-def _network(layout: Layout, edges: list[_Edge], programs: Path, folder: Path) -> Path:
+def _network(layout: Layout, edges: list[Edge], programs: Path, folder: Path) -> Path:
     """Path of SUMO's network of a layout. Edges are straight; vehicles pass from the end of one to the start of the next."""
     height = {road: -50.0 * row for row, road in enumerate(dict.fromkeys(edge.road for edge in edges))}
     height["main"] = 0.0
 
     # Ramp and road share a node where they meet; elsewhere they are drawn apart.
-    def node(edge: _Edge, s: float) -> tuple[str, float]:
+    def node(edge: Edge, s: float) -> tuple[str, float]:
         meeting = [other for other in edges if s in (other.begin, other.end) and set(other.strips) & set(edge.strips)]
         road = "main" if any(other.road == "main" for other in meeting) else edge.road
         return f"{road}@{s:g}", height[road]
@@ -282,7 +284,7 @@ def _drivers(random: np.random.Generator, layout: Layout) -> list[dict[str, Any]
 
 
 def _demand(
-    layout: Layout, edges: list[_Edge], random: np.random.Generator, until: float, path: Path, style: Style
+    layout: Layout, edges: list[Edge], random: np.random.Generator, until: float, path: Path, style: Style
 ) -> list[dict[str, Any]]:
     """Write the flows of vehicles between edges, and return the vehicle types."""
     drivers = _drivers(random, layout)
@@ -326,9 +328,10 @@ def _demand(
     return drivers
 
 
-def _brake(libsumo: ModuleType, names: Iterable[str], style: Style, rate: int, random: np.random.Generator) -> None:
-    """Let some drivers brake, so that on average each does so once in ``style.every`` seconds."""
-    assert style.every is not None
+def brake(libsumo: ModuleType, names: Iterable[str], style: Style, rate: int, random: np.random.Generator) -> None:
+    """Let some drivers brake, so that on average each does so once in ``style.every`` seconds; none do so without it."""
+    if style.every is None:
+        return
     for name in names:
         if random.random() < 1 / (style.every * rate):
             seconds = random.uniform(*style.lasting)
@@ -336,10 +339,32 @@ def _brake(libsumo: ModuleType, names: Iterable[str], style: Style, rate: int, r
             libsumo.vehicle.slowDown(name, max(slower, 0.0), seconds)
 
 
-def simulate(
+@dataclass(frozen=True)
+class Simulation:
+    """SUMO while it runs in this process.
+
+    Attributes:
+        libsumo: its module.
+        random: the generator that the simulation continues to draw from.
+        edges: edges of the network, in downstream order.
+        where: strip, an index into ``layout.lanes``, and s of the beginning [m] of every lane of the network.
+        drivers: the vehicle types, by id.
+    """
+
+    libsumo: ModuleType
+    random: np.random.Generator
+    edges: list[Edge]
+    where: dict[str, tuple[int, float]]
+    drivers: dict[str, dict[str, Any]]
+
+
+@contextmanager
+def running(
     layout: Layout, seed: Sequence[int], seconds: float, folder: Path, rate: int = RATE, style: Style = STYLES["free"]
-) -> Traffic:
-    """Simulated traffic of ``seconds`` after the warm-up.
+) -> Iterator[Simulation]:
+    """A simulation at its first moment, with traffic for some time after the warm-up; it is closed at the end.
+
+    SUMO keeps its state in global variables, so there is one simulation in a process at a time.
 
     Args:
         layout: the road.
@@ -356,12 +381,9 @@ def simulate(
     random = np.random.default_rng(seed)
     edges = _edges(layout)
     net = _network(layout, edges, programs, folder)
-    warm_up = round(WARM_UP * rate)
-    steps = warm_up + round((seconds + MARGIN) * rate)
+    steps = round(WARM_UP * rate) + round((seconds + MARGIN) * rate)
     drivers = _demand(layout, edges, random, steps / rate, folder / "routes.xml", style)
     where = {f"{edge.name}_{lane}": (strip, edge.begin) for edge in edges for lane, strip in enumerate(edge.strips)}
-    constants = libsumo.constants
-    variables = (constants.VAR_LANE_ID, constants.VAR_LANEPOSITION, constants.VAR_LANEPOSITION_LAT)
     command = [
         "sumo",
         f"--net-file={net}",
@@ -376,14 +398,38 @@ def simulate(
         "--xml-validation=never",
         f"--seed={random.integers(2**31)}",
     ]
+    try:
+        libsumo.start(command)
+        yield Simulation(libsumo, random, edges, where, {row["id"]: row for row in drivers})
+    except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+        raise ConfigError(f"SUMO fails on layout {layout.name} with seed {list(seed)}: {error}") from None
+    finally:
+        libsumo.close()
+
+
+def kind_of(type_id: str) -> int:
+    """Class of the vehicles of a type, an index into CLASSES."""
+    return CLASSES.index(type_id.rstrip("0123456789"))
+
+
+def simulate(
+    layout: Layout, seed: Sequence[int], seconds: float, folder: Path, rate: int = RATE, style: Style = STYLES["free"]
+) -> Traffic:
+    """Simulated traffic of ``seconds`` after the warm-up; see :func:`running`.
+
+    Raises:
+        ConfigError: SUMO is not installed or fails.
+    """
+    warm_up = round(WARM_UP * rate)
+    first = warm_up - round(MARGIN * rate)
     rows = array("d")  # a list of tuples would need a gigabyte for a quarter of an hour
     numbers: dict[str, int] = {}
     types: list[str] = []
     crashed: set[str] = set()
-    first = warm_up - round(MARGIN * rate)
-    try:
-        libsumo.start(command)
-        for step in range(steps):
+    with running(layout, seed, seconds, folder, rate, style) as run:
+        libsumo, constants = run.libsumo, run.libsumo.constants
+        variables = (constants.VAR_LANE_ID, constants.VAR_LANEPOSITION, constants.VAR_LANEPOSITION_LAT)
+        for step in range(warm_up + round((seconds + MARGIN) * rate)):
             libsumo.simulationStep()
             for name in libsumo.simulation.getDepartedIDList():
                 libsumo.vehicle.subscribe(name, variables)
@@ -391,22 +437,18 @@ def simulate(
                 types.append(libsumo.vehicle.getTypeID(name))
             for hit in libsumo.simulation.getCollisions():
                 crashed |= {hit.collider, hit.victim}
-            if style.every is not None:
-                _brake(libsumo, libsumo.vehicle.getIDList(), style, rate, random)
+            brake(libsumo, libsumo.vehicle.getIDList(), style, rate, run.random)
             if step >= first:
                 for name, values in libsumo.vehicle.getAllSubscriptionResults().items():
                     lane, position, aside = (values[variable] for variable in variables)
-                    strip, begin = where[lane]
+                    strip, begin = run.where[lane]
                     rows.extend((numbers[name], step - warm_up, strip, begin, position, aside))
-    except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-        raise ConfigError(f"SUMO fails on layout {layout.name} with seed {list(seed)}: {error}") from None
-    finally:
-        libsumo.close()
+        drivers = run.drivers
     return _sorted(np.array(rows).reshape(-1, 6), rate, drivers, types, {numbers[name] for name in crashed})
 
 
 def _sorted(
-    rows: Float[np.ndarray, "T 6"], rate: int, drivers: list[dict[str, Any]], types: list[str], crashed: set[int]
+    rows: Float[np.ndarray, "T 6"], rate: int, drivers: dict[str, dict[str, Any]], types: list[str], crashed: set[int]
 ) -> Traffic:
     """Rows sorted by vehicle, without vehicles that collide or jump."""
     rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
@@ -417,7 +459,6 @@ def _sorted(
     jumps = same & ((np.diff(step) != 1) | (forward < -0.01) | (forward > FASTEST / rate))
     jumped = set(vehicle[1:][jumps].tolist())
     kept = ~np.isin(vehicle, list(crashed | jumped))
-    described = {row["id"]: row for row in drivers}
     return Traffic(
         rate=rate,
         vehicle=vehicle[kept],
@@ -425,7 +466,7 @@ def _sorted(
         strip=strip[kept],
         front=front[kept],
         aside=aside[kept],
-        size=np.array([[described[name]["length"], described[name]["width"]] for name in types]),
-        kind=np.array([CLASSES.index(name.rstrip("0123456789")) for name in types]),
+        size=np.array([[drivers[name]["length"], drivers[name]["width"]] for name in types]),
+        kind=np.array([kind_of(name) for name in types]),
         dropped={"collision": len(crashed), "jump": len(jumped - crashed)},
     )

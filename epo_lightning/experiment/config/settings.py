@@ -342,14 +342,10 @@ class DriveSettings:
     """Configuration of ``epo drive``."""
 
     run: str | Sequence[str]
-    world: Literal["rpi"] = "rpi"
+    world: str = "rpi"
     others: Sequence[str] | None = None
     ways: Sequence[Literal["own", "warm", "alone", "respond"]] = ("own", "warm", "alone", "respond")
-    baselines: Sequence[Literal["constant_velocity", "best_response", "joint"]] = (
-        "constant_velocity",
-        "best_response",
-        "joint",
-    )
+    baselines: Sequence[str] | None = None
     mode: Literal["likely", "nearest"] = "likely"
     episodes: int = 500
     seed: int = 0
@@ -366,7 +362,7 @@ class DriveSettings:
                 raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
         if self.film is not None and not 0 <= self.film < self.episodes:
             raise ConfigError(f"film must be an episode from 0 to {self.episodes - 1}, or null, not {self.film}")
-        if not self.run or not (self.ways or self.baselines):
+        if not self.run or not (self.ways or self.baselines or self.baselines is None):
             raise ConfigError("nothing drives: name a run and one of ways, or one of baselines")
 
     @property

@@ -116,6 +116,27 @@ def overlaps(
     return at_step & (agent_mask[:, first] & agent_mask[:, second])[..., None]
 
 
+def overlaps_with(
+    agent: int,
+    states: Float[Tensor, "B N K 4"],
+    size: Float[Tensor, "B N 2"],
+    agent_mask: Bool[Tensor, "B N"],
+    shape: str = "disc",
+) -> Bool[Tensor, "B P K"]:
+    """Steps at which one agent overlaps each of the others, P = N - 1; see :func:`overlapping_pairs`.
+
+    Raises:
+        ConfigError: an unknown shape.
+    """
+    check_choice("shape", shape, get_args(Shape))
+    others = torch.arange(states.shape[1], device=states.device) != agent
+    overlap = _discs_overlap if shape == "disc" else _boxes_overlap
+    one = states[:, agent, None].expand(-1, states.shape[1] - 1, -1, -1)
+    size_of_one = size[:, agent, None, None].expand(-1, states.shape[1] - 1, -1, -1)
+    at_step = overlap(one, states[:, others], size_of_one, size[:, others, None])
+    return at_step & (agent_mask[:, others] & agent_mask[:, agent, None])[..., None]
+
+
 def _discs_overlap(
     a: Float[Tensor, "B P K 4"],
     b: Float[Tensor, "B P K 4"],

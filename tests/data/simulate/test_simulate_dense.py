@@ -36,7 +36,7 @@ def test_drivers_brake_as_often_as_long_and_as_hard_as_the_style_says() -> None:
     sumo, random = Vehicles(), np.random.default_rng(0)
     names = [str(number) for number in range(100)]
     for _ in range(2000):  # 100 drivers for 200 s: 1000 times
-        traffic._brake(sumo, names, style, RATE, random)  # type: ignore[arg-type]
+        traffic.brake(sumo, names, style, RATE, random)  # type: ignore[arg-type]
     assert len(sumo.braked) == pytest.approx(1000, rel=0.1)
     seconds = np.array([lasting for _, _, lasting in sumo.braked])
     slower = np.array([20.0 - speed for _, speed, _ in sumo.braked])
@@ -51,7 +51,7 @@ def test_drivers_brake_as_often_as_long_and_as_hard_as_the_style_says() -> None:
 def test_no_vehicle_is_asked_to_drive_backwards() -> None:
     sumo = Vehicles()
     sumo.vehicle.getSpeed = lambda name: 0.5
-    traffic._brake(sumo, ["a"], Style(every=1e-9), RATE, np.random.default_rng(0))  # type: ignore[arg-type]
+    traffic.brake(sumo, ["a"], Style(every=1e-9), RATE, np.random.default_rng(0))  # type: ignore[arg-type]
     assert sumo.braked[0][1] == 0.0
 
 

@@ -1,0 +1,107 @@
+"""Scenes on roads: the same as those of recorded data, and the costs that planners are told there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from epo_lightning.data.recorded.scenes import RecordedScenes
+from epo_lightning.data.recorded.windows import WindowConfig, extract
+from epo_lightning.drive.planners import ResponsePlanner
+from epo_lightning.drive.road_game import ENERGY, keep_going, road_game
+from epo_lightning.drive.road_scenes import RoadScenes
+from epo_lightning.drive.traffic import TrafficWorld
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.registry import lookup
+from epo_lightning.scene import Scene
+
+RECORDINGS = Path(__file__).parents[1] / "fixtures" / "exid_sim"
+
+
+@pytest.fixture(scope="module")
+def recorded() -> tuple[RecordedScenes, RoadScenes, np.ndarray]:
+    """Scenes of a recording, the maker of scenes for its map, and the origins of the recorded ones."""
+    source = lookup("format", "exid")(RECORDINGS)[0]
+    recording = source.read()
+    config = WindowConfig(horizon=10, lane_change=False)
+    tables, _ = extract(recording, config)
+    assert tables is not None
+    assert recording.lanes is not None
+    columns = {name: torch.as_tensor(values) for name, values in tables.columns().items()}
+    return RecordedScenes(columns, config.dt, "aligned", ("",)), RoadScenes(recording.lanes, config), tables.origin[0]
+
+
+def test_scenes_are_those_of_recorded_data(recorded: tuple[RecordedScenes, RoadScenes, np.ndarray]) -> None:
+    scenes, make, origin = recorded
+    for index in (0, len(scenes) // 2, len(scenes) - 1):
+        wanted = scenes[torch.tensor([index])]
+        rows = scenes.tables["agents"][index].long()
+        history = scenes.tables["history"][rows].double().numpy()
+        history[..., :2] += origin
+        made = make(
+            history,
+            wanted.history_mask[0].numpy(),
+            wanted.agent_mask[0].numpy(),
+            scenes.tables["size"][rows].numpy(),
+            scenes.tables["kind"][rows].numpy(),
+        )
+        for name in ("history", "size", "lanes", "goal_candidates", "references", "reference_speed", "frame"):
+            torch.testing.assert_close(getattr(made, name), getattr(wanted, name), rtol=1e-5, atol=2e-4)
+        for name in (
+            "history_mask",
+            "agent_mask",
+            "kind",
+            "lane_mask",
+            "goal_mask",
+            "goal_reference",
+            "reference_mask",
+        ):
+            assert torch.equal(getattr(made, name), getattr(wanted, name)), name
+        assert made.future is None
+
+
+def test_agents_that_keep_going_stay_on_their_lanes() -> None:
+    radius, speed = 400.0, 20.0
+    angle = torch.linspace(-0.02, 0.25, 24, dtype=torch.double)
+    line = radius * torch.stack((angle.sin(), 1.0 - angle.cos()), -1)
+    history = torch.tensor([[[[0.0, 0.0, 0.0, speed]]]], dtype=torch.double)
+    scene = Scene(history=history, dt=0.2, references=line.expand(1, 1, 3, -1, -1))
+    controls = keep_going(scene, 20)
+    assert bool((controls[..., 0] == 0).all())
+    assert float(controls[..., 1].mean()) == pytest.approx(speed / radius, rel=0.02)
+    end = Unicycle().rollout(scene.current, controls, scene.dt)[0, 0, -1, :2]
+    assert float((end - torch.tensor([0.0, radius])).norm()) == pytest.approx(radius, abs=0.5), (
+        "straight on it were 8 m"
+    )
+
+
+def queue(gap: float) -> Scene:
+    """A vehicle at 20 m/s on a straight lane, and one that stands ``gap`` metres ahead of it."""
+    history = torch.tensor([[[[0.0, 0.0, 0.0, 20.0]], [[gap, 0.0, 0.0, 0.0]]]], dtype=torch.double)
+    line = torch.stack((torch.linspace(-5.0, 300.0, 24), torch.zeros(24)), -1).double()
+    beside = torch.tensor([0.0, 3.5], dtype=torch.double)
+    return Scene(
+        history=history,
+        dt=0.2,
+        size=torch.tensor([[[4.5, 1.8], [4.5, 1.8]]], dtype=torch.double),
+        references=torch.stack((line + beside, line, line - beside), 0).expand(1, 2, -1, -1, -1),
+        reference_speed=torch.full((1, 2), 25.0, dtype=torch.double),
+    )
+
+
+def test_a_planned_vehicle_brakes_for_a_queue_and_changes_lanes_when_it_wants_to() -> None:
+    def plan(scene: Scene, line: int) -> torch.Tensor:
+        return ResponsePlanner(ENERGY, lambda scene: road_game(scene, line, 20), None, TrafficWorld.search)(
+            scene, None
+        ).states[0]
+
+    free = plan(queue(300.0), 1)
+    assert float(free[0, -1, 3]) > 20.0, "it approaches the reference speed"
+    braked = plan(queue(60.0), 1)
+    assert float(braked[0, -1, 0]) < 60.0 - 4.5
+    assert float(braked[1, :, 3].abs().max()) == 0.0, "who stands keeps standing"
+    left = plan(queue(300.0), 0)
+    assert float(left[0, -1, 1]) > 2.0

@@ -1,0 +1,113 @@
+"""SUMO's ramps as a world: the same episodes for all planners, and drivers that react."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+import epo_lightning
+from epo_lightning.data.simulate.layout import LAYOUTS, Layout
+from epo_lightning.drive.episodes import play
+from epo_lightning.drive.measures import measure
+from epo_lightning.drive.planners import ForecastPlanner, Plan, Planner, ResponsePlanner
+from epo_lightning.drive.traffic import TrafficWorld
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import Scene
+
+pytest.importorskip("libsumo", reason="the extra `sim` is not installed")
+
+from epo_lightning.drive.sumo import SumoSimulator, sumo_world
+
+
+@pytest.fixture(scope="module")
+def world() -> Iterator[TrafficWorld]:
+    world = sumo_world(4, seed=1, style="free")
+    world.simulator.steps = 12
+    yield world
+    world.close()
+
+
+def keeps(control: float) -> Planner:
+    """A planner with constant acceleration."""
+
+    def planner(scene: Scene, previous: Plan | None) -> Plan:
+        controls = torch.zeros(1, 20, 2)
+        controls[..., 0] = control
+        return Plan(controls, scene.current[:, :, None].expand(-1, -1, 20, -1), torch.ones(1, dtype=torch.bool))
+
+    return planner
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
+def test_positions_on_a_road_are_found_again(layout: Layout) -> None:
+    random = np.random.default_rng(0)
+    s, d = random.uniform(50, layout.length - 50, 200), random.uniform(-15, 12, 200)
+    found = layout.project(layout.locate(s, d))
+    np.testing.assert_allclose(found, (s, d), atol=2e-3)
+
+
+def test_an_episode_is_the_same_again_until_the_vehicle_is_driven_otherwise(world: TrafficWorld) -> None:
+    own, again = (play(world, None, [1]).outcome for _ in range(2))
+    assert torch.equal(own.states, again.states), "an episode can be begun again, after others as well"
+    braked, hurried = (play(world, keeps(control), [1]).outcome for control in (-4.0, 1.0))
+    assert torch.equal(braked.states[:, 0, 0], own.states[:, 0, 0]), "they begin alike"
+    ego = [outcome.states[0, 0, -1, 3] for outcome in (braked, hurried)]
+    assert float(ego[1] - ego[0]) == pytest.approx(12 * 0.2 * 5.0, abs=0.1)
+
+
+def test_episodes_differ_and_begin_on_the_ramp(world: TrafficWorld) -> None:
+    begun = []
+    for episode in range(4):
+        world.reset([episode])
+        scene = world.observe()
+        begun.append(scene.history.clone())
+        assert scene.history.shape == (1, 4, 10, 4)
+        assert scene.future is None
+        assert bool(scene.history_mask[:, 0].all())
+        simulator = world.simulator
+        assert isinstance(simulator, SumoSimulator)
+        s, _ = simulator.layout.project(world._log[-1].states[0, :2])
+        assert 40.0 < simulator._ramp.join - float(s) <= 60.0
+    assert not any(torch.equal(a, b) for a, b in pairwise(begun))
+
+
+def test_drivers_behind_react_to_the_planned_vehicle(world: TrafficWorld) -> None:
+    """A vehicle that stops in front of others makes them brake."""
+
+    def slowest_behind(control: float) -> float:
+        outcome = play(world, keeps(control), [0]).outcome
+        end = outcome.states[0, :, -1]
+        ahead = outcome.states[0, 0, 0, 2]
+        along = (end[:, 0] - end[0, 0]) * ahead.cos() + (end[:, 1] - end[0, 1]) * ahead.sin()
+        behind = outcome.agent_mask[0, :, -1] & (along < -1.0)
+        return float(end[behind, 3].sum())
+
+    world.simulator.steps = 25
+    try:
+        assert slowest_behind(-4.0) != slowest_behind(0.0)
+    finally:
+        world.simulator.steps = 12
+
+
+def test_a_forecaster_and_a_response_drive(world: TrafficWorld) -> None:
+    forecaster = epo_lightning.load("highway_sim/hivt_m_epo")
+    for planner in (ForecastPlanner(forecaster), ResponsePlanner(world.energy, world.game, forecaster)):
+        episodes = play(world, planner, [2], keep_plans=True)
+        found = measure(episodes, world)
+        assert bool(episodes.found.all())
+        assert {"arrived", "off_road", "hit_from_behind", "speed"} <= set(found)
+        assert float(found["progress"][0]) > 10.0
+        ego = episodes.plans[0][0, 0]
+        here = episodes.outcome.states[0, 0, 0, :2]
+        assert float((ego[0] - here).norm()) < 10.0, "plans are kept in the world's frame"
+
+
+def test_mistakes_are_named() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'dense'"):
+        sumo_world(1, style="dens")
+    with pytest.raises(ConfigError, match="episodes must be a whole number, 1 or more, not 0"):
+        sumo_world(0)
