@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import measure, scaling
+from benchmarks import devices, measure, scaling
 from benchmarks.comparison import Measurement, measurements
 from benchmarks.games import LANE_POINTS, SETTINGS, Game, activity, make
 from benchmarks.implementations import NAMES, Missing, prepare
@@ -97,6 +97,14 @@ def _arguments(given: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--threads", type=measure.positive, default=1, help="threads of PyTorch and of the kernel")
     for name, meaning in zip("BMNKS", ("scenes", "modes", "agents", "time steps", "solver steps"), strict=True):
         parser.add_argument(f"--{name}", type=measure.positive, help=f"{meaning}, instead of the setting's own number")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="cuda: what runs on a GPU")
+    parser.add_argument(
+        "--batches",
+        type=measure.positive,
+        nargs="+",
+        default=list(devices.BATCHES),
+        help="batch sizes of --device cuda",
+    )
     parser.add_argument("--json", type=Path, help="append a line per measurement to this file")
     parser.add_argument("--scaling", action="store_true", help="grow N, M and K instead of comparing at one size")
     parser.add_argument("--plot", type=Path, help="where --scaling draws its curves (PNG)")
@@ -111,7 +119,14 @@ def main(given: Sequence[str] | None = None) -> None:
     warnings.filterwarnings("ignore", message=".*sparse.*|.*cholmod.*|.*baspacho.*")
     console = Console(width=max(Console().width, 128))
     sizes: dict[str, Any] = {name: getattr(arguments, name) for name in "BMNKS"}
+    device = devices.require(arguments.device)
     try:
+        if device.type == "cuda":
+            others = {name: sizes[name] for name in "MNKS"}
+            devices.run(
+                device, arguments.settings, arguments.batches, arguments.repeats, arguments.json, console, **others
+            )
+            return
         _measure(arguments, sizes, console)
     except ConfigError as error:
         raise SystemExit(str(error)) from error

@@ -1,4 +1,4 @@
-"""CPU time of a training step by stage: ``python -m benchmarks.training_step [override ...]``.
+"""Time of a training step by stage: ``python -m benchmarks.training_step [--device cuda] [override ...]``.
 
 It measures the forecasters of the paper's RPI experiments on batches of 32 scenes, composed as by `epo train` but without
 Lightning's own bookkeeping. Overrides are those of `epo train`, for example ``solver.backend=pytorch``.
@@ -7,6 +7,7 @@ Lightning's own bookkeeping. Overrides are those of `epo train`, for example ``s
 from __future__ import annotations
 
 import argparse
+import itertools
 import statistics
 import time
 from collections.abc import Iterator, Sequence
@@ -18,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
+from benchmarks.devices import device_name, require
 from benchmarks.measure import positive
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
@@ -44,24 +46,37 @@ STAGES = (
 )
 WARM_UP = 5
 """Rounds before the first one that counts."""
+RESIDENT = 64
+"""Batches that are held on a GPU, and taken in turn."""
 GOAL = 0.15
 """Goal for the layer's share of a step."""
 
 
 class Clock:
-    """CPU time [s] by stage; the time of a nested stage does not count for the outer one."""
+    """Time [s] by stage: CPU time of the process, or on a GPU elapsed time until it is idle.
 
-    def __init__(self) -> None:
+    The time of a nested stage does not count for the outer one.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.on_gpu = device.type == "cuda"
         self.spent = dict.fromkeys(STAGES, 0.0)
         self._inner = 0.0
+
+    def now(self) -> float:
+        """The time [s]."""
+        if not self.on_gpu:
+            return time.process_time()
+        torch.cuda.synchronize()
+        return time.perf_counter()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Count the time within this context for ``name``."""
         outer, self._inner = self._inner, 0.0
-        start = time.process_time()
+        start = self.now()
         yield
-        elapsed = time.process_time() - start
+        elapsed = self.now() - start
         self.spent[name] += elapsed - self._inner
         self._inner = outer + elapsed
 
@@ -123,12 +138,12 @@ class Edges:
 class Step:
     """A forecaster with its data and optimizer, instrumented to time its training steps."""
 
-    def __init__(self, experiment: str, overrides: Sequence[str]) -> None:
+    def __init__(self, experiment: str, overrides: Sequence[str], device: torch.device) -> None:
         settings = read(Settings, compose("train", [f"experiment=rpi/{experiment}", *overrides]))
         data = assembly.build_data(settings.data)
         model = assembly.build_model(settings, data)
         assert isinstance(model, Forecaster)
-        self.model = model.train()
+        self.model = model.to(device).train()
         self.title, self.made_up = settings.title, False
         try:
             data.setup("fit")
@@ -136,8 +151,10 @@ class Step:
         except ConfigError:
             self.made_up = True
             self.batches = _random_scenes(data.batch_size, data.task.horizon, data.task.dt)
+        if device.type == "cuda":  # batches that are on the device already, as a data set that fits into its memory
+            self.batches = itertools.cycle([next(self.batches).to(device) for _ in range(RESIDENT)])
         self.optimizer = self.model.optimizer.configure(self.model.parameters(), 1000)["optimizer"]
-        self.clock = Clock()
+        self.clock = Clock(device)
         self.cut: Cut | None = None
         if isinstance(self.model, EPO):
             self.cut = Cut(self.model.differentiable_solve, self.clock)
@@ -211,16 +228,19 @@ def main(given: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.training_step", description=__doc__)
     parser.add_argument("overrides", nargs="*", help="as for `epo train`")
     parser.add_argument("--repeats", type=positive, default=50, help="training steps; the median counts")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="where the forecasters are trained")
     arguments = parser.parse_args(given)
+    device = require(arguments.device)
     torch.set_num_threads(1)
     assembly.quiet()
     try:
-        steps = [Step(experiment, arguments.overrides) for experiment in EXPERIMENTS]
+        steps = [Step(experiment, arguments.overrides, device) for experiment in EXPERIMENTS]
     except ConfigError as error:
         raise SystemExit(str(error)) from error
     found = measure(steps, arguments.repeats)
     source = "random scenes: no data in the cache" if steps[0].made_up else "RPI data"
-    table = Table(title=f"a training step, one thread, CPU time in ms; {source}")
+    where = f"{device_name(device)}, elapsed" if device.type == "cuda" else "one thread, CPU"
+    table = Table(title=f"a training step, {where} time in ms; {source}")
     table.add_column("")
     for step in steps:
         table.add_column(step.title, justify="right")

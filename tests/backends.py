@@ -14,6 +14,7 @@ import torch
 from games import ALL, BOUNDS, leaves_of, nearest_points_held, pad, random_game, random_scene, widen
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Status
@@ -26,6 +27,20 @@ STATE_PAIRS = (
     ("time_to_conflict",),
 )
 """Pair features of states, some of them with a feature of the distance."""
+
+
+class HostMustNotWait(TorchDispatchMode):
+    """Fails on every operation whose result the host has to wait for."""
+
+    WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "item", "equal", "is_nonzero", "unique", "bincount")
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function._schema.name.removeprefix("aten::")
+        assert not name.startswith(self.WAITING), f"{name} makes the host wait"
+        if name in ("index", "index_put", "index_put_", "_index_put_impl_"):
+            chosen = [index for index in args[1] if index is not None]
+            assert all(index.dtype != torch.bool for index in chosen), "an index of truth values makes the host wait"
+        return function(*args, **(kwargs or {}))
 
 
 def stacked(energy, scene, parameters, controls):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import sys
 from pathlib import Path
 
 import pytest
+import torch
+from rich.console import Console
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
@@ -15,6 +18,7 @@ sys.path.insert(0, str(ROOT))
 from benchmarks import (
     dashboards,
     decentralised,
+    devices,
     epo_layer,
     explore,
     extraction,
@@ -68,6 +72,29 @@ def test_epo_layer_reports_times_over_sizes(tmp_path, capsys, monkeypatch):
     shown = capsys.readouterr().out
     assert all(f"{title}: {axis} = 3: pytorch" in shown for title, _, axis, _ in axes)
     assert plot.stat().st_size > 1000
+
+
+def test_batches_on_a_device_are_timed(tmp_path, capsys, monkeypatch):
+    """On the CPU, with the backends that it has; on a GPU, the host backend and CUDA graphs come in addition."""
+    monkeypatch.setattr(devices, "implementations", lambda device: ("peer", "pytorch", "compiled"))
+    monkeypatch.setattr(devices, "lane_changes", functools.partial(devices.lane_changes, batch=4, most=10))
+    sizes = {"M": 1, "K": 4, "S": 1}
+    devices.run(torch.device("cpu"), ["rpi"], [2, 4], 1, tmp_path / "lines", Console(width=200), **sizes)
+    shown = capsys.readouterr().out
+    assert "lane change, T=20, B=4, compiled: " in shown
+    lines = [json.loads(line) for line in (tmp_path / "lines").read_text().splitlines()]
+    ours = [(line["implementation"], line["B"]) for line in lines if line["implementation"] != "peer"]
+    assert ours == [("pytorch", 2), ("compiled", 2), ("pytorch", 4), ("compiled", 4)]
+    assert all(line["games_per_s"] > 0 and line["millijoules"] is None for line in lines)
+    monkeypatch.setattr(devices, "disagreement", lambda name, game: float("nan"))
+    with pytest.raises(SystemExit, match=r"nothing was measured: .* differs from the reference by nan"):
+        devices.run(torch.device("cpu"), ["rpi"], [2], 1, None, Console(), **sizes)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+@pytest.mark.parametrize("main", [epo_layer.main, training_step.main])
+def test_a_missing_gpu_is_one_line(main):
+    assert refused(main, "--device", "cuda").startswith("--device cuda: PyTorch sees no GPU on this machine")
 
 
 def test_epo_layer_refuses_invalid_sizes(capsys):

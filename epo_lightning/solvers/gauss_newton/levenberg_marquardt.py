@@ -2,9 +2,10 @@
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
 modes are solved at once and independently of each other. If a matrix cannot be factorised, its problem (one scene
-and mode) keeps its last good iterate; on a CPU, the factorisation is first repeated with more damping. Three backends
+and mode) keeps its last good iterate; on a CPU, the factorisation is first repeated with more damping. Four backends
 compute the steps: :mod:`~epo_lightning.solvers.gauss_newton.compiled` on CPUs,
-:mod:`~epo_lightning.solvers.gauss_newton.hosted`, which copies games from a GPU to it, and
+:mod:`~epo_lightning.solvers.gauss_newton.hosted`, which copies games from a GPU to it,
+:mod:`~epo_lightning.solvers.gauss_newton.fused` on GPUs, and
 :mod:`~epo_lightning.solvers.gauss_newton.structured` anywhere. This module chooses the backend and, with adaptive damping,
 accepts or rejects steps.
 """
@@ -24,7 +25,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
-from epo_lightning.solvers.gauss_newton import compiled, hosted, structured
+from epo_lightning.solvers.gauss_newton import compiled, fused, hosted, structured
 from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, MOST_DAMPING
 from epo_lightning.solvers.general import descent
 
@@ -35,7 +36,7 @@ An agent with infinite damping keeps its controls exactly; its trajectory is the
 
 DESCENTS = {compiled.solve: compiled.descend, hosted.solve: hosted.descend}
 """For backends that take all adaptive steps in one call: the function that does, which has no derivative."""
-BACKENDS = ("auto", "pytorch", "compiled", "host")
+BACKENDS = ("auto", "pytorch", "compiled", "host", "warp")
 LARGEST_DAMPING = 1e30
 
 
@@ -65,7 +66,7 @@ class LevenbergMarquardt(Stepwise):
         newton_steps: number of adaptive Newton steps, with the exact Hessian, after the S Gauss-Newton steps. Near a minimum
             they converge quadratically, and Gauss-Newton steps linearly. They have no derivative: use ``backward=implicit``.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; ``host``, the same kernel for tensors on a GPU, which are
-            copied; or ``auto``, one of these two wherever it supports the game.
+            copied; ``auto``, one of these two wherever it supports the game; or ``warp``, fused kernels on a GPU.
     """
 
     needs_from_energy = frozenset({FEATURES})
@@ -97,6 +98,11 @@ class LevenbergMarquardt(Stepwise):
             )
         if self.backend not in BACKENDS:
             raise ConfigError(f"unknown solver.backend {self.backend!r}: {nearest(str(self.backend), BACKENDS)}")
+        if self.backend == "warp" and self.newton_steps:
+            raise ConfigError(
+                "solver.backend=warp has no Newton steps: set solver.newton_steps=0, or choose solver.backend=auto, "
+                "compiled, host (on a GPU) or pytorch"
+            )
 
     def for_test(self) -> Stepwise:
         """The solver to use outside training."""
@@ -191,8 +197,9 @@ def choose_backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: G
     """
     if name == "pytorch":
         return structured.solve
-    on_host = name == "host" or (name == "auto" and parameters.initial_controls.device.type != "cpu")
-    chosen = hosted if on_host else compiled
+    on_cpu = parameters.initial_controls.device.type == "cpu"
+    automatic = compiled if on_cpu else hosted
+    chosen = {"compiled": compiled, "host": hosted, "warp": fused}.get(name, automatic)
     obstacle = chosen.obstacle(energy, scene, parameters)
     if obstacle is None:
         return chosen.solve

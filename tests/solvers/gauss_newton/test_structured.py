@@ -7,11 +7,10 @@ from functools import partial
 
 import pytest
 import torch
-from backends import BackendSuite
+from backends import BackendSuite, HostMustNotWait
 from games import ALL, BOUNDS, leaves_of, pad, random_game, random_scene, widen
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
@@ -166,20 +165,6 @@ def test_components_are_those_of_the_active_pairs():
     assert set(found) == expected
     assert len(found) == len(expected)
     assert {group.size for group in groups} >= {1, 2}
-
-
-class HostMustNotWait(TorchDispatchMode):
-    """Fails on every operation whose result the host has to wait for."""
-
-    WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "item", "equal", "is_nonzero", "unique", "bincount")
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        name = function._schema.name.removeprefix("aten::")
-        assert not name.startswith(self.WAITING), f"{name} makes the host wait"
-        if name in ("index", "index_put", "index_put_", "_index_put_impl_"):
-            chosen = [index for index in args[1] if index is not None]
-            assert all(index.dtype != torch.bool for index in chosen), "an index of truth values makes the host wait"
-        return function(*args, **(kwargs or {}))
 
 
 @pytest.mark.parametrize(("integrator", "pair"), [("euler", "proximity"), ("heun", "proximity"), ("euler", "circles")])

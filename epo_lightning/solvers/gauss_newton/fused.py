@@ -1,0 +1,338 @@
+"""The fused backend in NVIDIA Warp: one launch takes all steps of all games, and another one computes their adjoint.
+
+A game is solved by one warp of a GPU, whose 32 threads share out the entries of each matrix; see
+:mod:`~epo_lightning.solvers.gauss_newton.fused_kernel`. The same source is compiled for CPUs, where it is meant for tests.
+The host never waits: statuses stay on the device, and after a first call (which compiles the kernels) a call can be captured
+in a CUDA graph. ``pip install 'epo_lightning[gpu]'`` brings Warp; it is imported when this backend is first used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.util
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
+
+MOST_AGENTS = 64
+"""Largest number of agents; the memory of a game grows with its square."""
+SHARED = (4, 8)
+"""Numbers of agents up to which the matrices of a game are in shared memory, each with kernels of its own; those of larger
+games are in global memory."""
+RESIDENT = 32 * 132
+"""Blocks of a launch that records nothing: at most as many as an H100 can hold. Each solves several games in turn."""
+
+
+def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
+    """Reason why the fused kernels cannot solve a game; None where they can."""
+    controls = parameters.initial_controls
+    agents = scene.agent_mask.shape[1]
+    if importlib.util.find_spec("warp") is None:
+        return "the fused kernels need NVIDIA Warp: pip install 'epo_lightning[gpu]'"
+    if controls.device.type not in ("cpu", "cuda"):
+        return f"the fused kernels run on CUDA devices and CPUs, and these tensors are on {controls.device}"
+    if controls.dtype not in (torch.float32, torch.float64):
+        return f"the fused kernels take float32 and float64, not {controls.dtype}"
+    if energy.dynamics.integrator != "euler":
+        return f"the fused kernels integrate by euler, not {energy.dynamics.integrator}"
+    for name in (*energy.own, *energy.pair):
+        if name not in (*OWN, *PAIR):
+            return f"the fused kernels do not know the feature {name!r}"
+    if energy.bounded_by_kind:
+        return f"the fused kernels take bounds of all agents, not bounds of {energy.bounded_by_kind[0]!r} by kind"
+    if agents > MOST_AGENTS:
+        return f"the fused kernels take up to {MOST_AGENTS} agents, not {agents}"
+    return None
+
+
+def solve(
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    steps: int,
+    step_size: float,
+    damping: Float[Tensor, "B M *agents"],
+    keep_iterates: bool = False,
+    exact: bool = False,
+) -> Solution:
+    """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
+
+    The solution is differentiable with respect to weights, margins, goals, their headings, reference controls and
+    initial controls.
+
+    Raises:
+        ValueError: ``exact``: these kernels have no Newton steps.
+    """
+    if exact:
+        raise ValueError(
+            "solver.backend is 'warp', which has no Newton steps; 'compiled', 'host' (on a GPU) and 'pytorch' have them"
+        )
+    call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates)
+    if call.record:
+        controls, states, *iterates = _Steps.apply(call, parameters.initial_controls, *call.inputs)
+    else:
+        call.run()
+        iterates = list(call.iterates.unbind(0))
+        controls, states = iterates[-1], call.states
+    return Solution(
+        controls=controls,
+        states=states,
+        initial_energy=call.initial_energy,
+        energy=call.energy,
+        gradient_norm=call.gradient_norm,
+        status=call.status,
+        iterates=tuple(iterates) if keep_iterates else None,
+    )
+
+
+@functools.cache
+def warp() -> Any:
+    """Warp, set up for kernels without derivatives of its own.
+
+    Raises:
+        ImportError: it is not installed.
+    """
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    return wp
+
+
+def kernels(dtype: torch.dtype, agents: int, device: torch.device) -> SimpleNamespace:
+    """The kernels for a type of numbers and a number of agents."""
+    warp()
+    from epo_lightning.solvers.gauss_newton.fused_kernel.kernels import make
+
+    on_gpu = device.type == "cuda"
+    # On a CPU, where all memory is alike, kernels for the largest number do for all: fewer of them have to be compiled.
+    fits = [most for most in (SHARED if on_gpu else SHARED[-1:]) if agents <= most]
+    return make(dtype == torch.float64, fits[0] if fits else 0, on_gpu)
+
+
+class _Call:
+    """One call of the kernels: the tensors that they read and write, and the structures that describe them."""
+
+    def __init__(
+        self,
+        energy: FeatureEnergy,
+        scene: Scene,
+        parameters: GameParameters,
+        steps: int,
+        step_size: float,
+        damping: Tensor,
+        keep_iterates: bool,
+    ) -> None:
+        controls = parameters.initial_controls
+        self.steps, self.keep_iterates, self.dtype = steps, keep_iterates, controls.dtype
+        self.shape = tuple(controls.shape)
+        self.own = [parameters.own_weights[name] for name in energy.own]
+        self.pair = [parameters.pair_weights[name] for name in energy.pair]
+        self.margins = [parameters.margins[name] for name in energy.decoded_margins]
+        goals = parameters.goals if energy.needs_goals else None
+        headings = parameters.goal_headings if energy.needs_goal_headings else None
+        references = parameters.reference_controls if energy.needs_reference_controls else None
+        self.others = {"goals": goals, "headings": headings, "reference_controls": references}
+        self.inputs = (*self.own, *self.pair, *self.margins, *(x for x in self.others.values() if x is not None))
+        self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs))
+        self.kernels = kernels(self.dtype, self.shape[2], controls.device)
+        with torch.no_grad():
+            self.kept: list[Tensor] = []
+            self._describe(energy, scene, parameters, step_size, damping)
+            self._reserve(controls)
+
+    def _array(self, tensor: Tensor, dtype: torch.dtype | None = None) -> Any:
+        """A tensor as a flat array of Warp; it lives as long as this call."""
+        tensor = tensor.detach().to(self.dtype if dtype is None else dtype).contiguous()
+        self.kept.append(tensor)
+        return _flat(tensor)
+
+    def _describe(
+        self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, step_size: float, damping: Tensor
+    ) -> None:
+        """Fill the kernels' description of the games."""
+        batch, modes, agents, horizon, _ = self.shape
+        game = self.game = self.kernels.Game()
+        game.G, game.M, game.N, game.K = batch * modes, modes, agents, horizon
+        game.dt, game.step_size = scene.dt, step_size
+        game.pair_stride, game.slides = min(energy.pair_stride, horizon + 1), int(energy.lane_slides)
+        coupled = agents > 1
+        fixed = [name for name in energy.pair if name in energy.margins] if coupled else []
+        game.own_slot = _slots(OWN, energy.own, game.own_slot)
+        game.pair_slot = _slots(PAIR, energy.pair if coupled else (), game.pair_slot)
+        game.margin_slot = _slots(PAIR, (*energy.decoded_margins, *fixed) if coupled else (), game.margin_slot)
+        bounds = [0.0] * (2 * len(SIGNALS))
+        for index, name in enumerate(SIGNALS):
+            if not isinstance(bound := energy.bounds.get(name, {}), Mapping):
+                bounds[2 * index : 2 * index + 2] = bound
+        game.bounds = type(game.bounds)(*bounds)
+        game.initial = self._array(scene.current)
+        game.present = self._array(scene.agent_mask, torch.uint8)
+        size = scene.current.new_zeros(batch, agents, 2) if scene.size is None else scene.size
+        game.size = self._array(size)
+        game.own = self._array(torch.stack(self.own)) if self.own else self._array(size)
+        if coupled and self.pair:
+            game.pair = self._array(torch.stack(self.pair))
+            pairs = (batch, modes, agents * (agents - 1) // 2)
+            margins = [*self.margins, *(energy.margin(scene, parameters, name).expand(pairs) for name in fixed)]
+            if margins:
+                game.margins = self._array(torch.stack([margin.to(self.dtype) for margin in margins]))
+        for name, tensor in self.others.items():
+            if tensor is not None:
+                setattr(game, name, self._array(tensor))
+        if scene.game_steps is not None:
+            game.cut, game.ends = 1, self._array(scene.game_steps, torch.int64)
+        if "lane" in energy.own:
+            assert scene.references is not None
+            assert scene.reference_mask is not None
+            assert parameters.reference is not None
+            game.references = self._array(scene.references)
+            game.exists = self._array(scene.reference_mask, torch.uint8)
+            game.reference = self._array(parameters.reference, torch.int64)
+            game.lines, game.points = scene.references.shape[2:4]
+        if "velref" in energy.own:
+            assert scene.reference_speed is not None
+            game.speeds = self._array(scene.reference_speed)
+        each = damping if damping.dim() == 3 else damping[..., None]
+        game.damping = self._array(each.expand(-1, -1, agents))
+
+    def _reserve(self, controls: Tensor) -> None:
+        """Allocate what the kernels write: results, and what the adjoint reads of all steps if they are recorded."""
+        from epo_lightning.solvers.gauss_newton.fused_kernel import threads
+
+        batch, modes, agents, horizon, _ = shape = self.shape
+        games, new = batch * modes, controls.new_empty
+        stacked = self.record or self.keep_iterates
+        on_gpu = controls.device.type == "cuda"
+        self.blocks = (games if self.record else min(games, RESIDENT)) if on_gpu else 1
+        stages, each = (self.steps, games) if self.record else (1, self.blocks)
+        self.iterates = new((self.steps + 1 if stacked else 1, *shape))
+        self.directions = new((max(self.steps, 1) if self.record else 1, *shape))
+        self.states: Tensor | None = new((*shape[:-1], 4))
+        self.initial_energy, self.energy, self.gradient_norm = new((3, batch, modes)).unbind(0)
+        self.status = torch.empty(shape[:2], dtype=torch.int64, device=controls.device)
+        self.factors = new(max(stages, 1) * each * 16 * agents**2 * horizon)
+        self.nearest = new((stages + 1) * each * 4 * agents * (horizon + 1))
+        self.taken = torch.empty(max(stages, 1) * games, dtype=torch.int32, device=controls.device)
+        self.start = controls.detach().contiguous()
+        self.memory = threads.work_numbers(agents, horizon) + threads.fast_numbers(max(agents, *SHARED))
+        run = self.arguments = self.kernels.Run()
+        run.steps, run.record, run.blocks, run.work_numbers = self.steps, int(self.record), self.blocks, self.memory
+        run.iterate_stride = controls.numel() if stacked else 0
+        run.direction_stride = controls.numel() if self.record else 0
+        for name in (
+            "start",
+            "iterates",
+            "directions",
+            "states",
+            "initial_energy",
+            "energy",
+            "gradient_norm",
+            "status",
+        ):
+            setattr(run, name, _flat(getattr(self, name)))
+        for name in ("factors", "nearest", "taken"):
+            setattr(run, name, _flat(getattr(self, name)))
+
+    def _launch(self, kernel: Any, *inputs: Any) -> None:
+        """Launch a kernel on PyTorch's current stream, with memory for its blocks."""
+        wp, device = warp(), self.iterates.device
+        # Kept until the kernel is enqueued only: PyTorch's allocator hands it out in the order of the stream.
+        work = self.iterates.new_empty(self.blocks * self.memory)
+        numbers = torch.empty(self.blocks * (2 * self.shape[2] + 2), dtype=torch.int32, device=device)
+        self.arguments.work, self.arguments.numbers = _flat(work), _flat(numbers)
+        stream: Any = contextlib.nullcontext()
+        if device.type == "cuda":
+            stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+        with stream:
+            wp.launch_tiled(
+                kernel,
+                dim=[self.blocks],
+                inputs=[self.game, self.arguments, *inputs],
+                block_dim=32,
+                device=wp.device_from_torch(device),
+            )
+
+    def run(self) -> None:
+        """Take all steps; fills the results."""
+        self._launch(self.kernels.solve)
+
+    def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor | None]:
+        """Gradients by ``inputs``, for cotangents of the final controls, of all iterates and of the states.
+
+        ``controls`` is overwritten: on return it holds the gradient by the initial controls.
+        """
+        batch, modes, agents = self.shape[:3]
+        new = controls.new_zeros
+        own = new((max(len(self.own), 1), batch, modes, agents))
+        pairs = (batch, modes, agents * (agents - 1) // 2)
+        pair, margins = new((len(self.pair), *pairs)), new((len(self.margins) + len(self.pair), *pairs))
+        others = {name: None if tensor is None else new(tensor.shape) for name, tensor in self.others.items()}
+        by = self.kernels.Gradients()
+        by.controls, by.own, by.pair, by.margins = _flat(controls), _flat(own), _flat(pair), _flat(margins)
+        for name, gradient in others.items():
+            if gradient is not None:
+                setattr(by, name, _flat(gradient))
+        if iterates is not None:
+            by.along_iterates, by.iterates = 1, _flat(iterates)
+        if states is not None:
+            by.along_states, by.states = 1, _flat(states)
+        self._launch(self.kernels.differentiate, by)
+        count = len(self.own)
+        found = [*own[:count].unbind(0), *pair.unbind(0), *margins[: len(self.margins)].unbind(0)]
+        return [*found, *(gradient for gradient in others.values() if gradient is not None)]
+
+
+def _flat(tensor: Tensor) -> Any:
+    """A contiguous tensor as a flat array of Warp in the same memory; None for an empty one."""
+    return warp().from_torch(tensor.view(-1), requires_grad=False) if tensor.numel() else None
+
+
+def _slots(known: tuple[str, ...], names: Any, like: Any) -> Any:
+    """For every known feature its position among ``names``, or -1."""
+    names = list(names)
+    return type(like)(*(names.index(name) if name in names else -1 for name in known))
+
+
+class _Steps(torch.autograd.Function):
+    """Autograd function of all steps; returns controls, states and, with ``keep_iterates``, every iterate."""
+
+    @staticmethod
+    def forward(ctx: Any, call: _Call, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+        call.run()
+        ctx.call = call
+        # Because they are saved, autograd raises an error if a tensor that the kernel reads again was changed in place.
+        ctx.save_for_backward(*inputs, *call.kept)
+        ctx.set_materialize_grads(False)
+        iterates = [iterate.clone() for iterate in call.iterates] if call.keep_iterates else []
+        # The autograd node would hold its own output, a reference cycle, which only the garbage collector could free.
+        states, call.states = call.states, None
+        return call.iterates[-1].clone(), states, *iterates
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, controls: Tensor | None, states: Tensor | None, *iterates: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        call: _Call = ctx.call
+        _ = ctx.saved_tensors
+        bar = (
+            torch.zeros_like(call.start) if controls is None else controls.clone(memory_format=torch.contiguous_format)
+        )
+        along = None
+        if any(iterate is not None for iterate in iterates):
+            along = torch.stack([torch.zeros_like(bar) if iterate is None else iterate for iterate in iterates])
+        if states is not None:
+            states = states.contiguous()
+        gradients = call.differentiate(bar, along, states)
+        return None, bar, *gradients

@@ -1,0 +1,132 @@
+"""The fused kernels on Warp's CPU device, and their machine code for GPUs."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+
+import pytest
+import torch
+from backends import STATE_PAIRS, BackendSuite, HostMustNotWait, gradients
+from games import ALL, BOUNDS, leaves_of, random_game, random_scene
+
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.features import PAIR_FEATURES
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import Status
+from epo_lightning.solvers.gauss_newton import fused, structured
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt, choose_backend
+
+pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install 'epo_lightning[gpu]'")
+from epo_lightning.solvers.gauss_newton.fused_kernel import ahead_of_time
+
+
+class TestFused(BackendSuite):
+    solve = staticmethod(fused.solve)
+
+
+def assert_same_as_pytorch(energy, scene, game, damping, steps=3):
+    ours, theirs = leaves_of(game), leaves_of(game)
+    found = fused.solve(energy, scene, ours, steps, 0.3, damping, keep_iterates=True)
+    expected = structured.solve(energy, scene, theirs, steps, 0.3, damping, keep_iterates=True)
+    for name in ("controls", "states", "initial_energy", "energy", "gradient_norm", "status"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-9, msg=name)
+    weigh = torch.randn_like(expected.states)
+    ((found.states * weigh).sum() + found.iterates[1].square().sum()).backward()
+    ((expected.states * weigh).sum() + expected.iterates[1].square().sum()).backward()
+    exact, by = gradients(theirs), gradients(ours)
+    for name, gradient in exact.items():
+        scale = gradient.abs().max().clamp_min(1.0) if gradient.numel() else 1.0
+        torch.testing.assert_close(by[name] / scale, gradient / scale, rtol=0, atol=1e-9, msg=name)
+    return found
+
+
+@pytest.mark.parametrize("pair", [("proximity",), *STATE_PAIRS, tuple(PAIR_FEATURES)])
+@pytest.mark.parametrize("agents", [2, 5, 8])
+def test_games_of_different_lengths_are_those_of_pytorch(pair, agents):
+    """With absent agents, fixed margins, strides and lines that slide."""
+    scene = random_scene(4, agents, history=2, size=1.5, dtype=torch.float64)
+    scene.size[..., 1] *= 0.4
+    scene.agent_mask[1, 0] = False
+    scene = dataclasses.replace(scene, game_steps=torch.tensor([6, 3, 1, 5]))
+    margins = {"clearance": 0.3} if "clearance" in pair else {}
+    energy = FeatureEnergy(ALL, pair, BOUNDS, pair_stride=2, margins=margins, lane_slides=True)
+    game = random_game(scene, 2, 6, pair=pair)
+    found = assert_same_as_pytorch(energy, scene, game, torch.full((4, 2), 10.0, dtype=torch.float64))
+    assert (found.controls[2, :, :, 1:] == game.initial_controls[2, :, :, 1:]).all(), "after the end of a game"
+
+
+def test_agents_with_infinite_damping_keep_their_controls_exactly():
+    scene, energy = random_scene(3, 4, history=2, size=2.0, dtype=torch.float64), FeatureEnergy(ALL, bounds=BOUNDS)
+    game = random_game(scene, 2, 6)
+    damping = torch.where(torch.arange(4) == 1, torch.inf, 1.0).to(torch.float64).expand(3, 2, 4)
+    found = assert_same_as_pytorch(energy, scene, game, damping)
+    assert torch.equal(found.controls[:, :, 1], game.initial_controls[:, :, 1])
+    assert not torch.equal(found.controls[:, :, 0], game.initial_controls[:, :, 0])
+
+
+@pytest.mark.slow
+def test_games_that_are_too_large_for_shared_memory_are_solved():
+    scene = random_scene(2, fused.SHARED[-1] + 1, history=2, size=1.5, dtype=torch.float64)
+    energy = FeatureEnergy(ALL, bounds=BOUNDS)
+    assert_same_as_pytorch(energy, scene, random_game(scene, 2, 5), torch.full((2, 2), 10.0, dtype=torch.float64))
+
+
+def test_the_host_does_not_wait_for_the_device():
+    """On a CPU it can only be seen that PyTorch is asked for nothing that waits; Warp's launches do not either."""
+    scene, energy = random_scene(3, 3, history=2, size=2.0), FeatureEnergy(ALL, bounds=BOUNDS)
+    scene = dataclasses.replace(scene, game_steps=torch.tensor([7, 2, 5]))
+    leaves = leaves_of(random_game(scene))
+    with HostMustNotWait():
+        fused.solve(energy, scene, leaves, 2, 0.3, torch.full((3, 2), 10.0)).states.sum().backward()
+    assert leaves.initial_controls.grad.isfinite().all()
+
+
+def test_the_backend_warp_takes_the_steps_of_the_layer():
+    scene, energy = (
+        random_scene(3, 2, history=2, size=1.0, dtype=torch.float64),
+        FeatureEnergy(["goal", "acc", "turnr"]),
+    )
+    game = random_game(scene, 2, 6)
+    for adaptive in (False, True):
+        found = LevenbergMarquardt(4, 1.0, 1.0, adaptive=adaptive, backend="warp")(energy, scene, game)
+        expected = LevenbergMarquardt(4, 1.0, 1.0, adaptive=adaptive, backend="pytorch")(energy, scene, game)
+        torch.testing.assert_close(found.controls, expected.controls, rtol=0, atol=1e-9)
+    reference = game.reference.clone()
+    reference[1, 0, 1] = 99
+    game, energy = dataclasses.replace(game, reference=reference), FeatureEnergy(["lane", "acc", "turnr"])
+    solution = fused.solve(energy, scene, game, 2, 0.3, torch.full((3, 2), 10.0, dtype=torch.float64))
+    assert solution.status.tolist() == [[0, 0], [Status.STOPPED, 0], [0, 0]], "a line that does not exist"
+
+
+def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
+    scene = random_scene(2, 2, history=2)
+    game, energy = random_game(scene), FeatureEnergy(["acc"], dynamics=Unicycle("heun"))
+    with pytest.raises(
+        ValueError, match="backend is 'warp', but the fused kernels integrate by euler, not heun; 'auto' and"
+    ):
+        choose_backend("warp", energy, scene, game)
+    wide = random_scene(1, 65, history=2)
+    assert "up to 64 agents, not 65" in fused.obstacle(FeatureEnergy(["acc"]), wide, random_game(wide, own=("acc",)))
+    assert "not torch.float16" in fused.obstacle(FeatureEnergy(["acc"]), scene, game.to(torch.float16))
+    with pytest.raises(ValueError, match=r"no Newton steps; 'compiled', 'host' .on a GPU. and 'pytorch' have them"):
+        fused.solve(FeatureEnergy(["acc"]), scene, game, 1, 1.0, torch.ones(2, 2), exact=True)
+    with pytest.raises(ConfigError, match=r"solver\.backend=warp has no Newton steps: set solver\.newton_steps=0"):
+        LevenbergMarquardt(backend="warp", adaptive=True, newton_steps=2)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"the fused kernels need NVIDIA Warp: pip install 'epo_lightning\[gpu\]'"):
+        choose_backend("warp", FeatureEnergy(["acc"]), scene, game)
+
+
+@pytest.mark.parametrize("architecture", ahead_of_time.ARCHITECTURES)
+def test_machine_code_for_gpus_is_made_without_one(architecture, tmp_path):
+    found = ahead_of_time.compile_for(architecture, False, 4, tmp_path)
+    for name, resources in found.items():
+        assert 32 < resources.registers <= 255, name
+        assert resources.stack < 1024, "values that do not fit into registers"
+        fast = 4 * 1030
+        assert fast <= resources.shared <= fast + 2048, "matrices in shared memory, and what the device itself reserves"
+        assert resources.code > 10_000, name
+    with pytest.raises(ValueError, match="does not begin as an ELF file"):
+        ahead_of_time.resources(b"no machine code")
