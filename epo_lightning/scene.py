@@ -355,6 +355,23 @@ class Tables(_Batch):
 
 
 @dataclass(frozen=True)
+class Constraints(_Batch):
+    """Hard constraints h <= 0 of a solution, for solvers that have any.
+
+    Attributes:
+        multipliers: lambda >= 0 by constraint, for every pair or agent and step.
+        penalty: mu of the last round.
+        violation: the largest h, or zero where all constraints are met; [m] for pairs, the unit of the signal for bounds.
+        rounds: number of updates of the multipliers.
+    """
+
+    multipliers: Mapping[str, Float[Tensor, "B M _ _"]]
+    penalty: Float[Tensor, "B M"]
+    violation: Float[Tensor, "B M"]
+    rounds: Int[Tensor, "B M"]
+
+
+@dataclass(frozen=True)
 class Solution(_Batch):
     """Joint strategies found by a solver, with their energy and status.
 
@@ -368,6 +385,8 @@ class Solution(_Batch):
         tables: energies of the candidates, for solvers that choose among candidates; the joint modes are then the most
             likely choices.
         assignment: index of the candidate that each agent takes in each mode, for the same solvers.
+        constraints: multipliers and violation of hard constraints, for solvers with any; ``gradient_norm`` is then that of
+            the Lagrangian.
     """
 
     controls: Float[Tensor, "B M N K 2"]
@@ -379,6 +398,7 @@ class Solution(_Batch):
     iterates: tuple[Float[Tensor, "B M N K 2"], ...] | None = None
     tables: Tables | None = None
     assignment: Int[Tensor, "B M N"] | None = None
+    constraints: Constraints | None = None
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,9 @@ class Implicit(Backward):
         if not torch.is_grad_enabled() or solution.controls.numel() == 0:
             return solution
         exact, games = self.hessian == "exact", parameters.for_every_mode(solution.controls.shape[1])
-        if isinstance(energy, FeatureEnergy):
+        if (own := minimiser.attach(energy, scene, games, solution, exact)) is not None:
+            controls, status = own
+        elif isinstance(energy, FeatureEnergy):
             backend = getattr(minimiser, "backend", "auto")
             controls, status = implicit.attach(energy, scene, games, solution.controls, exact, backend)
         else:

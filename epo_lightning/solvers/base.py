@@ -11,6 +11,8 @@ import dataclasses
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
+from torch import Tensor
+
 from epo_lightning.game.energy import Energy
 from epo_lightning.scene import GameParameters, Scene, Solution
 
@@ -42,6 +44,21 @@ class Minimiser(ABC):
         Raises:
             ValueError: scene and parameters do not fit together.
         """
+
+    def attach(
+        self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
+    ) -> tuple[Tensor, Tensor] | None:
+        """The controls of a solution with their implicit derivative, and a status, for solutions that are no minima of E.
+
+        Args:
+            energy, scene, parameters: the game.
+            solution: the solution of the game.
+            exact: whether second derivatives of residuals are part of the Hessian.
+
+        Returns:
+            None for minima of E, the usual case: then :mod:`~epo_lightning.solvers.backward` knows the derivative.
+        """
+        return None
 
     def for_test(self) -> Minimiser:
         """The minimiser to use outside training."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import re
@@ -24,6 +25,7 @@ from benchmarks import (
     extraction,
     figures,
     generation,
+    hard_constraints,
     many_agents,
     reading,
     refinement,
@@ -36,6 +38,7 @@ from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import train
 from epo_lightning.experiment.config.compose import compose
+from epo_lightning.scene import Scene
 
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
 SMALL = ["--B", "2", "--M", "1", "--K", "4", "--S", "1", "--repeats", "1"]
@@ -203,6 +206,18 @@ def test_gates_are_compared_and_missing_data_is_one_line(capsys, tmp_path):
     assert [row[0] for row in everyone] == ["2", "3"]  # pairs per agent
     assert [row[5:8] for row in everyone] == [["1", "0", "0"]] * 2  # no difference to itself
     assert str(tmp_path) in refused(many_agents.main, "data=ucy", f"data.folder={tmp_path}")
+
+
+def test_hard_constraints_are_kept_and_soft_ones_are_not(capsys):
+    current = torch.tensor([[[-2.0, 0.1, 0.0, 1.0], [2.0, -0.1, torch.pi, 1.0]]], dtype=torch.float64)
+    size = torch.full((1, 2, 2), 0.5, dtype=torch.float64)
+    scene = Scene(current[:, :, None], dt=0.4, size=size, future=current[:, :, None].expand(-1, -1, 8, -1))
+    hard_constraints.report(scene)
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [row[0] for row in rows[-5:]] == ["soft,"] * 4 + ["hard"]
+    assert float(rows[-5][3]) > 0.01 > 0.001 >= float(rows[-1][2])
+    with pytest.raises(SystemExit, match="no scene whose constraints can be met"):
+        hard_constraints.report(dataclasses.replace(scene, size=8 * size))
 
 
 def test_refinements_name_what_is_no_run(tmp_path):

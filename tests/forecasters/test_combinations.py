@@ -19,14 +19,14 @@ OPTIONS = {
     "energy": ("rpi", "augmented_rpi", "neural", "collision", "convex"),
     "solver": (
         *("levenberg_marquardt", "gradient_descent", "newton", "lbfgs", "langevin"),
-        *("both_sides", "best_response", "enumeration", "sum_product"),
+        *("both_sides", "best_response", "augmented_lagrangian", "enumeration", "sum_product"),
     ),
     "backward": ("unrolled", "truncated", "implicit", "implicit backward.hessian=gauss_newton", "detached"),
     "objective": ("imitation", "contrastive", "laplace", "conditional"),
 }
 DIFFERENTIABLE = ("rpi", "augmented_rpi", "neural", "convex")
 STEPS = ("levenberg_marquardt", "gradient_descent")
-MINIMA = (*STEPS, "newton", "lbfgs", "both_sides", "best_response")
+MINIMA = (*STEPS, "newton", "lbfgs", "both_sides", "best_response", "augmented_lagrangian")
 TABLES = ("enumeration", "sum_product")
 
 
@@ -34,6 +34,7 @@ CHANGES = {
     ("solver", "newton"): {"steps": 4},
     ("solver", "lbfgs"): {"steps": 4},
     ("solver", "best_response"): {"rounds": 2},
+    ("solver", "augmented_lagrangian"): {"rounds": 20},
     ("solver", "gradient_descent"): {"steps": 3, "step_size": 1e-4},
     ("solver", "langevin"): {"steps": 3, "delta": 1e-2},
 }
@@ -49,7 +50,7 @@ def section(kind: str, option: str) -> dict[str, Any]:
 
 def works(energy: str, solver: str, backward: str, objective: str) -> bool:
     """Table 1 and its empty cells, written out once more."""
-    if solver in ("levenberg_marquardt", "both_sides", "best_response") and energy != "rpi":
+    if solver in ("levenberg_marquardt", "both_sides", "best_response", "augmented_lagrangian") and energy != "rpi":
         return False  # knows the structure of features alone
     if solver not in TABLES and energy not in DIFFERENTIABLE:
         return False

@@ -77,7 +77,7 @@ class Edges:
         start = agents * problem
         return cls(start + first[within], start + second[within], pair, batch * modes, agents, every=False)
 
-    def of_pairs(self, values: Float[Tensor, " pairs"]) -> Float[Tensor, " E"]:
+    def of_pairs(self, values: Float[Tensor, "pairs *rest"]) -> Float[Tensor, "E *rest"]:
         """The values of these edges, from those of all pairs of all problems."""
         return values if self.every else values.index_select(0, self.pair)
 

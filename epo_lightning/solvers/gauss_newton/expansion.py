@@ -304,8 +304,13 @@ def _add_undeclared(sums: _Sums, name: str) -> None:
         sums.own_dense = block if sums.own_dense is None else sums.own_dense + block
 
 
-def _by_edge(at: Iterate, edges: Edges, values: Float[Tensor, "B _ P"]) -> Float[Tensor, "E 1"]:
-    """Values of pairs by edge; those that are the same in all modes may have a dimension of 1 for modes."""
+def _by_edge(at: Iterate, edges: Edges, values: Float[Tensor, "B _ P *steps"]) -> Float[Tensor, "E _"]:
+    """Values of pairs by edge, one for all steps or one per step.
+
+    Those that are the same in all modes may have a dimension of 1 for modes.
+    """
+    if values.dim() == 4:
+        return edges.of_pairs(values.expand(-1, at.modes, -1, -1).flatten(0, 2))
     return edges.of_pairs(values.expand(-1, at.modes, -1).flatten())[:, None]
 
 

@@ -136,7 +136,7 @@ def attach(
     with torch.no_grad():
         matrix = (hessian if exact else gauss_newton)(energy, scene, parameters, controls)
         factor, definite = factorise(matrix)
-    scene, parameters = _silenced(scene, parameters, definite)
+    scene, parameters = silenced(scene, parameters, definite)
     with torch.enable_grad():
         value, slope = gradient(energy, scene, parameters, torch.where(_wide(definite, controls), controls, 0.0))
         flat = slope.detach().flatten(2)
@@ -187,7 +187,7 @@ def _wide(mask: Bool[Tensor, "B M"], like: Tensor) -> Tensor:
     return mask.view(*mask.shape, *[1] * (like.dim() - 2))
 
 
-def _silenced(scene: Scene, parameters: GameParameters, kept: Bool[Tensor, "B M"]) -> tuple[Scene, GameParameters]:
+def silenced(scene: Scene, parameters: GameParameters, kept: Bool[Tensor, "B M"]) -> tuple[Scene, GameParameters]:
     """The kept games, and zeros in place of the others, so that NaN in them reaches no gradient."""
 
     def silence(tensor: Tensor) -> Tensor:

@@ -1,0 +1,461 @@
+"""Hard constraints by an augmented Lagrangian around the layer (Nocedal and Wright 2006, chapter 17).
+
+The paper's collision terms and bounds are soft: how much they are violated depends on their weights. Here they are
+constraints h(u) <= 0 of the game,
+
+    min_u E(u)    subject to    R_ij - |p_i,k - p_j,k| <= 0,    lower <= s_i,k <= upper,
+
+with E made of all other features. Each round minimises, by the layer's steps,
+
+    L_A(u) = E(u) + mu / 2 sum_c max(0, h_c(u) + lambda_c / mu)^2,
+
+whose terms are those of the soft features with the weight sqrt(mu) and with limits that are moved by lambda_c / mu, for
+every pair, agent and step. Then
+
+    lambda_c <- max(0, lambda_c + mu h_c(u)),
+
+and mu grows where the violation has not become much smaller. At the end the conditions of Karush, Kuhn and Tucker hold:
+grad E + sum_c lambda_c grad h_c = 0, h <= 0, lambda >= 0 and lambda_c h_c = 0. Constraints of pairs count once for both
+agents, so a solution is a generalised Nash equilibrium in which both have the same multiplier.
+
+The derivative of the solution is that of these conditions on the active set (lambda_c > 0), by the implicit function
+theorem.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+from epo_lightning.checks import check_number, check_whole
+from epo_lightning.game.circles import separation
+from epo_lightning.game.energy import FEATURES, Energy
+from epo_lightning.game.feature_derivatives import Bounds, signal_and_change
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.pairs import pairs
+from epo_lightning.host import readable
+from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.scene import Constraints, GameParameters, Scene, Solution, Status
+from epo_lightning.solvers.base import STATIONARY, Minimiser
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+from epo_lightning.solvers.general import dense, descent
+
+DISCS = ("proximity", "clearance")
+"""Pair features that can be constraints: the distance of two discs has a sign."""
+SUFFICIENT = 0.5
+"""A round in which the violation falls to less than this share needs no larger penalty."""
+LARGEST_PENALTY = 1e8
+NEAR = 1e-4
+"""Gradient, relative to the first one, up to which strategies count as a minimum for an update of the multipliers."""
+_SINGULAR = 1e-10
+"""Added to the diagonal of the active constraints' matrix, relative to its largest entry: constraints of neighbouring steps
+may be dependent."""
+
+
+@register("solver", "augmented_lagrangian")
+@dataclass(frozen=True)
+class AugmentedLagrangian(Minimiser):
+    """Rounds of the layer and of updates of multipliers; solutions are constants, so learn with ``backward=implicit``.
+
+    A constraint holds for the agents and pairs whose weight of its feature is not zero; its value has no effect. A sample
+    whose constraints are violated by more than the tolerance at the end has the status STOPPED: they may be impossible to
+    meet, such as those of agents that overlap from the beginning. ``Solution.constraints`` says how much is missing.
+
+    Attributes:
+        constraints: names of the features that are constraints, ``proximity``, ``clearance`` and bounds (``velb``, ``accb``,
+            ...); None for all of these that the energy has.
+        rounds: largest number of rounds. Multipliers are updated in those that end near a minimum.
+        steps: adaptive Gauss-Newton steps of the first round.
+        newton_steps: adaptive steps with the Hessian, in every round.
+        damping: lambda of the first step.
+        penalty: mu of the first round.
+        growth: factor of mu after a round without sufficient progress.
+        tolerance: largest violation at the end, in the unit of the feature: [m] for pairs. The slack of a constraint with a
+            multiplier is as small.
+    """
+
+    needs_from_energy = frozenset({FEATURES})
+    provides = frozenset({STATIONARY})
+
+    constraints: Sequence[str] | None = None
+    rounds: int = 100
+    steps: int = 10
+    newton_steps: int = 3
+    damping: float = 1.0
+    penalty: float = 10.0
+    growth: float = 4.0
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        check_whole("solver.rounds", self.rounds, least=1)
+        check_number("solver.penalty", self.penalty)
+        check_number("solver.tolerance", self.tolerance)
+        check_number("solver.growth", self.growth)
+        if self.growth < 1:
+            raise ConfigError(f"solver.growth must be 1 or more, not {self.growth}: the penalty does not fall")
+        if self.constraints is not None and not self.constraints:
+            raise ConfigError("solver.constraints is empty: name features, or null for all that can be constraints")
+        self.inner()  # checks its settings
+
+    def inner(self) -> LevenbergMarquardt:
+        """The steps of the rounds. Limits that differ from step to step are known to the PyTorch backend alone."""
+        return LevenbergMarquardt(
+            steps=self.steps,
+            step_size=1.0,
+            damping=self.damping,
+            adaptive=True,
+            newton_steps=self.newton_steps,
+            backend="pytorch",
+        )
+
+    def hard(self, energy: FeatureEnergy) -> tuple[str, ...]:
+        """Names of the energy's features that are constraints.
+
+        Raises:
+            ValueError: a name that the energy does not have or that cannot be a constraint, none at all, or no other
+                feature.
+        """
+        bounded = [name for name, feature in energy.own_features.items() if feature.bounded]
+        can = (*bounded, *(name for name in energy.pair if name in DISCS))
+        chosen = can if self.constraints is None else tuple(self.constraints)
+        for name in chosen:
+            if name not in can:
+                raise ValueError(
+                    f"solver.constraints: {name!r} is no feature of this energy that can be a constraint, which are "
+                    f"proximity, clearance and bounds such as velb; {nearest(name, can)}"
+                )
+        if not chosen:
+            raise ValueError(
+                "solver=augmented_lagrangian needs an energy with constraints: proximity or clearance in energy.pair, or "
+                "bounds such as velb in energy.own"
+            )
+        if not (set(energy.own) | set(energy.pair)) - set(chosen):
+            raise ValueError("solver=augmented_lagrangian needs a feature besides the constraints, which is minimised")
+        return chosen
+
+    @torch.no_grad()
+    def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
+        """Rounds until the constraints of all games are met.
+
+        Raises:
+            ValueError: as :meth:`hard`, or scene and parameters do not fit together.
+        """
+        if not isinstance(energy, FeatureEnergy):
+            raise ValueError(f"solver=augmented_lagrangian takes energy=features, not {type(energy).__name__}")
+        names = self.hard(energy)
+        scene, controls = descent.begin(energy, scene, parameters)
+        if controls.numel() == 0:
+            return descent.nothing(controls)
+        game = _Game(energy, names, scene, parameters.for_every_mode(controls.shape[1]))
+        initial = energy(scene, game.parameters, controls)
+        rounds = _Rounds.begin(self, game, controls, initial)
+        for _ in range(self.rounds):
+            if descent.ended(~rounds.open):
+                break
+            rounds.advance()
+        controls = rounds.controls
+        violation = _largest({name: value.clamp_min(0.0) for name, value in game.excess(controls).items()})
+        met = initial.isfinite() & (violation <= self.tolerance)
+        return Solution(
+            controls=controls,
+            states=energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt),
+            initial_energy=initial,
+            energy=energy(scene, game.parameters, controls),
+            gradient_norm=rounds.norm,
+            status=torch.where(met, int(Status.SOLVED), int(Status.STOPPED)),
+            constraints=Constraints(rounds.multipliers, rounds.penalty, violation, rounds.count),
+        )
+
+    def attach(
+        self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
+    ) -> tuple[Tensor, Tensor]:
+        """The controls of a solution with the derivative of the optimality conditions on the active set, and a status.
+
+        With the Hessian H of the Lagrangian, the Jacobian A of the active constraints and the derivatives f and c of grad L
+        and of these constraints by a parameter,
+
+            H du + A^T dlambda = -f,    A du = -c.
+
+        Samples of which a constraint is not met, or at which H + mu A^T A is not positive definite, are STOPPED and get no
+        gradient. It is computed with dense matrices in float64.
+        """
+        assert isinstance(energy, FeatureEnergy)
+        assert solution.constraints is not None
+        names, met = self.hard(energy), solution.status != Status.STOPPED
+        state = solution.constraints.to(torch.float64)
+        game = _Game(energy, names, scene.to(torch.float64), parameters.to(torch.float64))
+        controls = torch.where(descent.wide(met), solution.controls, 0.0).detach().double()
+        multipliers = torch.cat([value.flatten(2) for value in state.multipliers.values()], -1)
+        with torch.no_grad():
+            matrix = (
+                game.hessian(multipliers, controls)
+                if exact
+                else dense.gauss_newton(game.objective, game.scene, game.parameters, controls)
+            )
+            active = multipliers > 0
+            most = int(active.sum(-1).max()) if active.numel() else 0
+            real, rows = active.to(torch.int8).topk(most, -1)
+            jacobian = torch.take_along_dim(game.jacobian(controls), rows[..., None], 2) * real[..., None]
+            penalty = state.penalty[..., None, None]
+            factor, definite = dense.factorise(matrix + jacobian.mT @ (penalty * jacobian))
+            solved = torch.cholesky_solve(jacobian.mT, factor)
+            schur = jacobian @ solved
+            if most:
+                floor = _SINGULAR * schur.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
+                schur = schur + torch.diag_embed(1.0 - real + floor)
+            pivots = torch.linalg.lu_factor_ex(schur)
+            definite = definite & met & (pivots.info == 0) & pivots.LU.flatten(2).isfinite().all(-1)
+            # Zeros in place of what is not finite, because zero times NaN is NaN.
+            kept = definite[..., None, None]
+            jacobian, solved = torch.where(kept, jacobian, 0.0), torch.where(kept, solved, 0.0)
+            lower_upper = torch.where(kept, pivots.LU, torch.eye(most, dtype=schur.dtype))
+        with torch.enable_grad():
+            quiet, heard = dense.silenced(game.scene, game.parameters, definite)
+            taught = dataclasses.replace(game, scene=quiet, parameters=heard)
+            slope = taught.slope(multipliers, controls)
+            excess = torch.cat([value.flatten(2) for value in taught.excess(controls).values()], -1)
+            excess = torch.where(real > 0, torch.take_along_dim(excess, rows, -1), 0.0)
+            change, moved = (slope - slope.detach()).flatten(2)[..., None], (excess - excess.detach())[..., None]
+            free = -torch.cholesky_solve(change + jacobian.mT @ (penalty * moved), factor)
+            pushed = torch.linalg.lu_solve(lower_upper, pivots.pivots, jacobian @ free + moved) if most else moved
+            step = (free - solved @ pushed)[..., 0].view_as(controls)
+            attached = solution.controls.detach() + torch.where(descent.wide(definite), step, 0.0).to(solution.controls)
+        return attached, torch.where(definite, int(Status.SOLVED), int(Status.STOPPED))
+
+
+@dataclass(frozen=True)
+class _Game:
+    """The games of a batch with their constraints."""
+
+    energy: FeatureEnergy
+    names: Sequence[str]
+    scene: Scene
+    parameters: GameParameters
+
+    def of(self, rows: Tensor) -> _Game:
+        """The games of some scenes."""
+        return dataclasses.replace(self, scene=self.scene[rows], parameters=self.parameters[rows])
+
+    @property
+    def objective(self) -> FeatureEnergy:
+        """The energy without the features that are constraints."""
+        own, pair = ([name for name in part if name not in self.names] for part in (self.energy.own, self.energy.pair))
+        return dataclasses.replace(self.energy, own=own, pair=pair)
+
+    def excess(self, controls: Tensor) -> dict[str, Float[Tensor, "B M R S"]]:
+        """h by constraint, positive where it is violated, and -inf where there is none; a bound has two entries."""
+        return {name: value for name, value, _ in self._signals(controls, controls.new_zeros(0, *controls.shape))}
+
+    def jacobian(self, controls: Tensor) -> Float[Tensor, "B M C n"]:
+        """dh/du of all constraints, in the order of :meth:`excess`; zero where there is none."""
+        count = controls.shape[2:].numel()
+        units = torch.eye(count, dtype=controls.dtype).view(count, 1, 1, *controls.shape[2:])
+        signals = self._signals(controls, units.expand(-1, *controls.shape[:2], -1, -1, -1))
+        return torch.cat([change.flatten(3) for *_, change in signals], -1).permute(1, 2, 3, 0)
+
+    def _signals(self, controls: Tensor, directions: Tensor) -> list[tuple[str, Tensor, Tensor]]:
+        """Name, h, and its changes along directions of controls, of every constraint."""
+        energy, scene, parameters = self.energy, self.scene, self.parameters
+        states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
+        change = energy.dynamics.tangent(states, directions, scene.dt)
+        around, found = energy.surroundings(scene, parameters), []
+        for name in self.names:
+            if name in energy.own:
+                feature = energy.own_features[name]
+                signal, along = signal_and_change(feature, states, controls, change, directions, around)
+                exists = (energy.own_weight(scene, parameters, name) != 0)[..., None]
+                mask = energy.residual_mask(scene, feature, controls.shape[3])
+                exists = exists if mask is None else exists & mask
+                lower, upper = around.bounds[feature.signal]
+                found.append((f"{name}, lower", *_where(exists, lower - signal, -along)))
+                found.append((f"{name}, upper", *_where(exists, signal - upper, along)))
+            else:
+                first, second = pairs(controls.shape[2], controls.device)
+                at, moving = energy.at_pair_steps(states[..., :2]), energy.at_pair_steps(change[..., :2])
+                distance, normal = separation(at[:, :, first], at[:, :, second])
+                closing = (normal * (moving[:, :, :, first] - moving[:, :, :, second])).sum(-1)
+                exists = (energy.pair_weight(scene, parameters, name) != 0)[..., None]
+                exists = exists & energy.pair_exists(scene, energy.pair_features[name], distance.shape[-1])
+                reach = energy.reach(scene, parameters, name)[..., None]
+                found.append((name, *_where(exists, reach - distance, -closing)))
+        return found
+
+    def slope(self, multipliers: Tensor, controls: Tensor) -> Float[Tensor, "B M N K 2"]:
+        """The gradient by the controls of E + sum of lambda h, differentiable."""
+        with torch.enable_grad():
+            leaf = controls if controls.requires_grad else controls.detach().requires_grad_()
+            excess = torch.cat([value.flatten(2) for value in self.excess(leaf).values()], -1)
+            pushing = (multipliers * torch.where(multipliers > 0, excess, 0.0)).sum()
+            value = self.objective(self.scene, self.parameters, leaf).sum() + pushing
+            return torch.autograd.grad(value, leaf, create_graph=True)[0]
+
+    def hessian(self, multipliers: Tensor, controls: Tensor) -> Float[Tensor, "B M n n"]:
+        """The Hessian of E + sum of lambda h, with ones on the diagonal for absent agents."""
+        leaf, count = controls.detach().requires_grad_(), controls.shape[2:].numel()
+        slope = self.slope(multipliers, leaf)
+        units = (
+            torch.eye(count, dtype=controls.dtype).view(count, 1, 1, *controls.shape[2:]).expand(count, *controls.shape)
+        )
+        rows = torch.autograd.grad(slope, leaf, units, is_grads_batched=True, materialize_grads=True)[0]
+        absent = ~self.scene.agent_mask.repeat_interleave(2 * controls.shape[3], 1)[:, None]
+        return rows.flatten(3).movedim(0, 2) + torch.diag_embed(absent.to(controls.dtype))
+
+    def augmented(
+        self, multipliers: Mapping[str, Tensor], penalty: Tensor, controls: Tensor
+    ) -> tuple[FeatureEnergy, Scene, GameParameters]:
+        """The game of a round: its energy is the augmented Lagrangian, but for a constant."""
+        weight = penalty.sqrt()[..., None]
+
+        def weights(given: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {
+                name: torch.where(value != 0, weight, 0.0) if name in self.names else value
+                for name, value in given.items()
+            }
+
+        shifts = {name: value / _wide(penalty) for name, value in multipliers.items()}
+        energy = _Shifted(
+            **{one.name: getattr(self.energy, one.name) for one in dataclasses.fields(self.energy)}, shifts=shifts
+        )
+        parameters = dataclasses.replace(
+            self.parameters,
+            own_weights=weights(self.parameters.own_weights),
+            pair_weights=weights(self.parameters.pair_weights),
+            initial_controls=controls,
+        )
+        return energy, self.scene, parameters
+
+
+@dataclass
+class _Rounds:
+    """The state of the rounds of a batch, which :meth:`advance` changes.
+
+    Attributes:
+        solver, game: what is solved.
+        controls: the strategies.
+        damping: that of the layer's steps, by sample, as all that follows.
+        multipliers, penalty: lambda by constraint, and mu.
+        before: violation (or slack with a multiplier) after the last update.
+        steepest, norm: norm of the gradient of E at the start, plus one; and of the augmented Lagrangian.
+        open, count: whether a sample is not solved yet, and its number of rounds.
+    """
+
+    solver: AugmentedLagrangian
+    game: _Game
+    controls: Tensor
+    damping: Tensor
+    multipliers: dict[str, Tensor]
+    penalty: Tensor
+    before: Tensor
+    steepest: Tensor
+    norm: Tensor
+    open: Tensor
+    count: Tensor
+
+    @classmethod
+    def begin(cls, solver: AugmentedLagrangian, game: _Game, controls: Tensor, initial: Tensor) -> _Rounds:
+        """The state after the Gauss-Newton steps of the first round; ``initial`` is E [B, M] at the start."""
+        multipliers = {name: torch.zeros_like(value) for name, value in game.excess(controls).items()}
+        penalty, finite = torch.full_like(initial, solver.penalty), initial.isfinite()
+        slope = dense.gradient(game.energy, game.scene, game.parameters, controls)[1].flatten(2).norm(dim=-1)
+        found, damping = solver.inner().run(*game.augmented(multipliers, penalty, controls), solver.steps)
+        return cls(
+            solver,
+            game,
+            torch.where(descent.wide(finite), found.controls, controls),
+            damping,
+            multipliers,
+            penalty,
+            torch.full_like(initial, torch.inf),
+            1.0 + slope,
+            found.gradient_norm,
+            finite,
+            torch.zeros_like(initial, dtype=torch.long),
+        )
+
+    def advance(self) -> None:
+        """One round of the scenes with an open sample: steps, and an update of multipliers or penalty near a minimum."""
+        rows = torch.arange(len(self.open), device=self.open.device)
+        if readable(self.open):
+            rows = rows[self.open.any(1)]
+        solver, game, was_open = self.solver, self.game.of(rows), self.open[rows]
+        multipliers, penalty = {name: value[rows] for name, value in self.multipliers.items()}, self.penalty[rows]
+        augmented = game.augmented(multipliers, penalty, self.controls[rows])
+        found, damping = solver.inner().run(*augmented, solver.newton_steps, self.damping[rows], exact=True)
+        controls = torch.where(descent.wide(was_open), found.controls, self.controls[rows])
+        norm = torch.where(was_open, found.gradient_norm, self.norm[rows])
+        excess = game.excess(controls)
+        # Above a multiplier's slack, h counts; far below, the multiplier itself does, which the update removes.
+        missing = _largest({name: h.maximum(-multipliers[name] / _wide(penalty)) for name, h in excess.items()})
+        met, flat = missing <= solver.tolerance, math.sqrt(torch.finfo(norm.dtype).eps)
+        # The update is that of a minimum: far from one, more steps are taken first.
+        near = torch.where(met, flat, max(flat, NEAR)) * self.steepest[rows]
+        settled = was_open & (norm <= near)
+        for name, multiplier in multipliers.items():
+            updated = (multiplier + _wide(penalty) * excess[name]).clamp_min(0.0)
+            self.multipliers[name][rows] = torch.where(_wide(settled), updated, multiplier)
+        slow = settled & (missing > SUFFICIENT * self.before[rows])
+        hopeless = slow & ~met & (penalty >= LARGEST_PENALTY)
+        self.penalty[rows] = torch.where(slow & ~met, (solver.growth * penalty).clamp_max(LARGEST_PENALTY), penalty)
+        self.before[rows] = torch.where(settled, missing, self.before[rows])
+        self.controls[rows], self.damping[rows], self.norm[rows] = controls, damping, norm
+        self.count[rows] += was_open.long()
+        self.open[rows] = was_open & ~(settled & met) & ~hopeless
+
+
+@dataclass(frozen=True)
+class _Shifted(FeatureEnergy):
+    """A feature energy whose limits are moved inwards, for every pair, agent and step.
+
+    Attributes:
+        shifts: by constraint, how far.
+    """
+
+    shifts: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
+        """Nothing: the game was checked before its limits were moved."""
+
+    @property
+    def bounded_by_kind(self) -> Sequence[str]:
+        return [name.partition("b, ")[0] for name in self.shifts if name.endswith("lower")]
+
+    def _bounds_of(self, scene: Scene) -> Bounds:
+        found = dict(super()._bounds_of(scene))
+        for name in self.bounded_by_kind:
+            lower, upper = found[name]
+            down, up = self.shifts[f"{name}b, lower"], self.shifts[f"{name}b, upper"]
+            upper = upper - up
+            # Of limits that have passed each other, the one with a multiplier counts.
+            lower = torch.where(up > 0, (lower + down).minimum(upper), lower + down)
+            found[name] = lower, upper.maximum(lower)
+        return found
+
+    def reach(self, scene: Scene, parameters: GameParameters, name: str) -> Tensor:
+        reach = super().reach(scene, parameters, name)
+        return reach[..., None] + self.shifts[name] if name in self.shifts else reach
+
+    def extent(self, scene: Scene) -> Tensor | None:
+        extent = super().extent(scene)
+        moved = [self.shifts[name].amax() for name in self.pair if name in self.shifts and self.shifts[name].numel()]
+        return extent if extent is None or not moved else extent + torch.stack(moved).amax() / 2
+
+
+def _where(exists: Tensor, value: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
+    """h and its changes, with -inf and zero where there is no constraint."""
+    return torch.where(exists, value, -torch.inf), torch.where(exists, change, 0.0)
+
+
+def _wide(samples: Shaped[Tensor, "B M"]) -> Shaped[Tensor, "B M 1 1"]:
+    return samples[..., None, None]
+
+
+def _largest(values: Mapping[str, Tensor]) -> Float[Tensor, "B M"]:
+    """Largest absolute entry of every sample; zero where there is none."""
+    flat = torch.cat([value.flatten(2) for value in values.values()], -1).abs()
+    return flat.amax(-1) if flat.shape[-1] else flat.sum(-1)

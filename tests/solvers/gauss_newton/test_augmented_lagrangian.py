@@ -1,0 +1,244 @@
+"""Hard constraints by an augmented Lagrangian: closed forms, SciPy's solver, optimality conditions, derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+
+import pytest
+import torch
+from scipy.optimize import minimize
+
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.registry import ConfigError, build
+from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.solvers.backward import Implicit
+from epo_lightning.solvers.gauss_newton.augmented_lagrangian import AugmentedLagrangian, _Game
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+
+OWN = {"goal": 3.0, "vel": 0.5, "acc": 1.0, "turnr": 1.0, "accb": 5.0}
+ENERGY = FeatureEnergy(own=list(OWN), pair=["proximity"], bounds={"acc": (-0.3, 0.25)})
+EXACT = AugmentedLagrangian(tolerance=1e-8)
+
+
+def meeting(agents: int = 2, steps: int = 8, modes: int = 1, side: float = 0.05) -> tuple[Scene, GameParameters]:
+    """Agents on a circle of 1 m that walk to the other side, each a little beside the middle."""
+    angle = 2 * math.pi * torch.arange(agents, dtype=torch.double) / agents
+    place = torch.stack((angle.cos(), angle.sin()), -1)
+    left = torch.stack((-angle.sin(), angle.cos()), -1)
+    place = place + side * left
+    current = torch.cat((place, (angle + math.pi)[:, None], torch.ones(agents, 1, dtype=torch.double)), -1)
+    scene = Scene(current[None, :, None], dt=0.25, size=torch.full((1, agents, 2), 0.6, dtype=torch.double))
+    given = {
+        name: torch.full((1, modes, agents), weight, dtype=torch.double) * (1 + 0.1 * torch.arange(agents))
+        for name, weight in OWN.items()
+    }
+    pairs = agents * (agents - 1) // 2
+    return scene, GameParameters(
+        own_weights=given,
+        pair_weights={"proximity": torch.full((1, modes, pairs), 5.0, dtype=torch.double)},
+        goals=-(place - 2 * side * left).expand(1, modes, -1, -1).clone(),
+        initial_controls=torch.zeros(1, modes, agents, steps, 2, dtype=torch.double),
+    )
+
+
+def least_distance(states: torch.Tensor) -> float:
+    position = states[..., :2]
+    apart = (position[:, :, :, None] - position[:, :, None]).norm(dim=-1)
+    return float(apart[:, :, *torch.triu_indices(states.shape[2], states.shape[2], 1)].min())
+
+
+def test_a_bound_has_the_multiplier_of_the_closed_form():
+    """min 1/2 w^2 (a - 2)^2 with a <= 0.5: a = 0.5 and lambda = w^2 (2 - 0.5)."""
+    energy = FeatureEnergy(own=["accref", "turnrref", "accb"], pair=[], bounds={"acc": (-1.0, 0.5)})
+    scene = Scene(torch.zeros(1, 1, 1, 4, dtype=torch.double), dt=0.1)
+    weight = {name: torch.full((1, 1, 1), 3.0, dtype=torch.double) for name in energy.own}
+    wanted = torch.tensor([2.0, 0.0], dtype=torch.double).expand(1, 1, 1, 4, 2)
+    game = GameParameters(weight, {}, torch.zeros_like(wanted), reference_controls=wanted)
+    found = EXACT(energy, scene, game)
+    torch.testing.assert_close(found.controls[..., 0], torch.full((1, 1, 1, 4), 0.5, dtype=torch.double))
+    multipliers = found.constraints.multipliers
+    torch.testing.assert_close(multipliers["accb, upper"], torch.full((1, 1, 1, 4), 13.5, dtype=torch.double))
+    assert (multipliers["accb, lower"] == 0).all()
+
+
+@pytest.mark.parametrize("agents", [2, 3])
+def test_the_solution_is_the_one_of_scipy(agents):
+    """SLSQP on the same objective and constraints, with gradients by automatic differentiation, from the same start."""
+    scene, parameters = meeting(agents)
+    found = EXACT(ENERGY, scene, parameters)
+    assert (found.status == Status.SOLVED).all()
+    game, shape = _Game(ENERGY, EXACT.hard(ENERGY), scene, parameters), parameters.initial_controls.shape
+
+    def objective(flat):
+        leaf = torch.tensor(flat).view(shape).requires_grad_()
+        value = game.objective(scene, parameters, leaf).sum()
+        value.backward()
+        return value.item(), leaf.grad.flatten().numpy()
+
+    def slack(flat):
+        return -torch.cat([h.flatten() for h in game.excess(torch.tensor(flat).view(shape)).values()]).numpy()
+
+    def slopes(flat):
+        return -game.jacobian(torch.tensor(flat).view(shape))[0, 0].numpy()
+
+    with warnings.catch_warnings(action="ignore"):
+        theirs = minimize(
+            objective,
+            found.controls.flatten().numpy() * 0.9,
+            jac=True,
+            method="SLSQP",
+            constraints={"type": "ineq", "fun": slack, "jac": slopes},
+            options={"maxiter": 300, "ftol": 1e-13},
+        )
+    assert theirs.success
+    assert game.objective(scene, parameters, found.controls).item() == pytest.approx(theirs.fun, rel=1e-7)
+    torch.testing.assert_close(found.controls.flatten(), torch.tensor(theirs.x), rtol=0, atol=1e-4)
+
+
+def test_the_optimality_conditions_hold():
+    scene, parameters = meeting(3, steps=10)
+    found = EXACT(ENERGY, scene, parameters)
+    game = _Game(ENERGY, EXACT.hard(ENERGY), scene, parameters)
+    excess = torch.cat([h.flatten(2) for h in game.excess(found.controls).values()], -1)
+    multipliers = torch.cat([value.flatten(2) for value in found.constraints.multipliers.values()], -1)
+    assert excess.max() <= 1e-8
+    assert (multipliers >= 0).all()
+    assert (multipliers > 0).sum() > 3
+    assert (multipliers * excess).abs().max() < 1e-6
+    leaf = found.controls.clone().requires_grad_()
+    game.objective(scene, parameters, leaf).sum().backward()
+    pushed = (game.jacobian(found.controls).mT @ multipliers[..., None])[..., 0]
+    assert (leaf.grad.flatten(2) + pushed).abs().max() < 1e-6
+
+
+def test_the_jacobian_of_the_constraints_is_that_of_automatic_differentiation():
+    scene, parameters = meeting(3, steps=5)
+    energy = dataclasses.replace(
+        ENERGY, own=[*OWN, "jerkb", "velb"], bounds={"acc": (-1, 1), "jerk": (-1, 1), "vel": (0, 1)}
+    )
+    more = {name: torch.ones(1, 1, 3, dtype=torch.double) for name in ("jerkb", "velb")}
+    parameters = dataclasses.replace(parameters, own_weights={**parameters.own_weights, **more})
+    game = _Game(energy, AugmentedLagrangian().hard(energy), scene, parameters)
+    controls = 0.3 * torch.randn(1, 1, 3, 5, 2, dtype=torch.double, generator=torch.Generator().manual_seed(0))
+
+    def values(given):
+        return torch.cat([h.flatten() for h in game.excess(given.view_as(controls)).values()])
+
+    expected = torch.autograd.functional.jacobian(values, controls.flatten())
+    torch.testing.assert_close(game.jacobian(controls)[0, 0], expected)
+
+
+def test_agents_keep_apart_where_soft_ones_overlap():
+    scene, parameters = meeting(4, steps=10)
+    soft = LevenbergMarquardt(steps=40, step_size=1.0, damping=1.0, adaptive=True, newton_steps=20)
+    with torch.no_grad():
+        before = soft(ENERGY, scene, parameters)
+    after = AugmentedLagrangian()(ENERGY, scene, parameters)
+    assert least_distance(before.states) < 0.58
+    assert least_distance(after.states) > 0.599
+    assert after.controls[..., 0].max() < 0.251
+    assert after.constraints.violation.max() <= 1e-3
+    torch.testing.assert_close(after.energy, ENERGY(scene, parameters, after.controls))
+
+
+def test_the_derivative_is_that_of_finite_differences():
+    scene, parameters = meeting(2)
+    energy = dataclasses.replace(ENERGY, pair=["clearance"])
+    margin = torch.full((1, 1, 1), 0.05, dtype=torch.double)
+    weights = parameters.pair_weights["proximity"]
+    parameters = dataclasses.replace(parameters, pair_weights={"clearance": weights}, margins={"clearance": margin})
+    generator = torch.Generator().manual_seed(0)
+    solve = AugmentedLagrangian(tolerance=1e-10)
+    leaves = parameters.map(lambda tensor: tensor.clone().requires_grad_())
+    found = Implicit()(solve, energy, scene, leaves)
+    assert sum((value > 0).sum() for value in found.constraints.multipliers.values()) >= 2
+    cotangent = torch.randn(found.states.shape, dtype=torch.double, generator=generator)
+    (found.states * cotangent).sum().backward()
+    near, step = dataclasses.replace(parameters, initial_controls=found.controls.detach()), 1e-5
+    along = parameters.map(lambda tensor: torch.randn(tensor.shape, dtype=torch.double, generator=generator))
+    slope = torch.zeros((), dtype=torch.double)
+    for taught, way in (
+        *((leaves.own_weights[name], along.own_weights[name]) for name in OWN if name != "accb"),
+        (leaves.margins["clearance"], along.margins["clearance"]),
+        (leaves.goals, along.goals),
+    ):
+        slope += (taught.grad * way).sum()
+
+    def total(sign):
+        own = {name: value + sign * step * along.own_weights[name] for name, value in near.own_weights.items()}
+        margins = {"clearance": near.margins["clearance"] + sign * step * along.margins["clearance"]}
+        goals = near.goals + sign * step * along.goals
+        moved = dataclasses.replace(near, own_weights=own, margins=margins, goals=goals)
+        return (solve(energy, scene, moved).states * cotangent).sum()
+
+    torch.testing.assert_close(slope, (total(1) - total(-1)) / (2 * step), rtol=1e-4, atol=0)
+    assert leaves.pair_weights["clearance"].grad is None or not leaves.pair_weights["clearance"].grad.any()
+
+
+def test_a_game_in_which_no_constraint_binds_is_that_of_the_layer():
+    scene, parameters = meeting(2, side=1.0)
+    parameters = dataclasses.replace(parameters, goals=parameters.goals / 4)
+    free = dataclasses.replace(ENERGY, bounds={"acc": (-30.0, 30.0)})
+    leaves = [parameters.map(lambda tensor: tensor.clone().requires_grad_()) for _ in range(2)]
+    soft = LevenbergMarquardt(steps=40, step_size=1.0, damping=1.0, adaptive=True, newton_steps=20)
+    one, other = (Implicit()(solver, free, scene, given) for solver, given in zip((EXACT, soft), leaves, strict=True))
+    torch.testing.assert_close(one.controls, other.controls, rtol=0, atol=1e-6)
+    for solution in (one, other):
+        solution.states.square().sum().backward()
+    for name in ("goal", "acc"):
+        torch.testing.assert_close(
+            leaves[0].own_weights[name].grad, leaves[1].own_weights[name].grad, rtol=1e-5, atol=1e-8
+        )
+
+
+def test_agents_that_overlap_from_the_beginning_are_stopped_and_disturb_no_other_scene():
+    scene, parameters = meeting(2, side=0.05)
+    history = scene.history.clone()
+    history[..., :2] *= 0.1
+    both = Scene(torch.cat((scene.history, history)), dt=scene.dt, size=scene.size.expand(2, -1, -1))
+    doubled = parameters.map(lambda tensor: torch.cat((tensor, tensor)).requires_grad_())
+    solve = AugmentedLagrangian(rounds=15)
+    found = Implicit()(solve, ENERGY, both, doubled)
+    assert found.status.flatten().tolist() == [Status.SOLVED, Status.STOPPED]
+    assert found.constraints.violation[1] > 0.1
+    alone = solve(ENERGY, scene, parameters)
+    torch.testing.assert_close(found.controls[:1], alone.controls, rtol=0, atol=1e-9)
+    found.states.sum().backward()
+    assert doubled.own_weights["goal"].grad[0].abs().sum() > 0
+    assert not doubled.own_weights["goal"].grad[1].any()
+
+
+def test_absent_agents_and_pairs_without_weight_have_no_constraint():
+    scene, parameters = meeting(3)
+    expected = AugmentedLagrangian()(ENERGY, *meeting(3))
+    off = dataclasses.replace(parameters, pair_weights={"proximity": 0.0 * parameters.pair_weights["proximity"]})
+    free = AugmentedLagrangian()(ENERGY, scene, off)
+    assert least_distance(free.states) < 0.55 < 0.599 < least_distance(expected.states)
+    mask = torch.tensor([[True, True, False]])
+    poisoned = scene.history.clone()
+    poisoned[:, 2] = torch.nan
+    absent = AugmentedLagrangian()(ENERGY, dataclasses.replace(scene, history=poisoned, agent_mask=mask), parameters)
+    assert absent.controls.isfinite().all()
+    assert (absent.status == Status.SOLVED).all()
+    assert (absent.constraints.multipliers["proximity"][:, :, 1:] == 0).all()
+
+
+def test_settings_and_games_that_cannot_be_used_are_refused():
+    scene, parameters = meeting(2)
+    for setting, message in (
+        ({"penalty": 0.0}, "penalty"),
+        ({"growth": 0.5}, "growth"),
+        ({"constraints": []}, "empty"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            AugmentedLagrangian(**setting)
+    with pytest.raises(ValueError, match=r"'goal' is no feature .* that can be a constraint"):
+        AugmentedLagrangian(constraints=["goal"])(ENERGY, scene, parameters)
+    plain = FeatureEnergy(own=["goal", "vel"], pair=["circles"])
+    with pytest.raises(ValueError, match="needs an energy with constraints"):
+        AugmentedLagrangian()(plain, scene, parameters)
+    with pytest.raises(ValueError, match="a feature besides the constraints"):
+        AugmentedLagrangian()(FeatureEnergy(own=[], pair=["proximity"]), scene, parameters)
+    assert isinstance(build("solver", {"name": "augmented_lagrangian"}), AugmentedLagrangian)
