@@ -246,6 +246,8 @@ class _Call:
 
     def _launch(self, kernel: Any, *inputs: Any) -> None:
         """Launch a kernel on PyTorch's current stream, with memory for its blocks."""
+        from epo_lightning.solvers.gauss_newton.fused_kernel import threads
+
         wp, device = warp(), self.iterates.device
         # Kept until the kernel is enqueued only: PyTorch's allocator hands it out in the order of the stream.
         work = self.iterates.new_empty(self.blocks * self.memory)
@@ -259,7 +261,7 @@ class _Call:
                 kernel,
                 dim=[self.blocks],
                 inputs=[self.game, self.arguments, *inputs],
-                block_dim=32,
+                block_dim=threads.THREADS,
                 device=wp.device_from_torch(device),
             )
 

@@ -18,8 +18,8 @@ from epo_lightning.scene import Status
 from epo_lightning.solvers.gauss_newton import fused, structured
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt, choose_backend
 
-pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install 'epo_lightning[gpu]'")
-from epo_lightning.solvers.gauss_newton.fused_kernel import ahead_of_time
+warp = pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install 'epo_lightning[gpu]'")
+from epo_lightning.solvers.gauss_newton.fused_kernel import ahead_of_time, kernels
 
 
 class TestFused(BackendSuite):
@@ -64,6 +64,30 @@ def test_agents_with_infinite_damping_keep_their_controls_exactly():
     found = assert_same_as_pytorch(energy, scene, game, damping)
     assert torch.equal(found.controls[:, :, 1], game.initial_controls[:, :, 1])
     assert not torch.equal(found.controls[:, :, 0], game.initial_controls[:, :, 0])
+
+
+@pytest.mark.parametrize("backwards", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_threads_of_a_game_need_no_barrier_that_is_missing(backwards, monkeypatch):
+    """Warp runs blocks of 32 threads on a CPU, each from barrier to barrier: results are those of one thread, bit for bit.
+
+    Without a barrier, a thread would read what a later one has yet to write; in the opposite order, what an earlier one has.
+    """
+    scene = random_scene(3, 8, history=2, size=1.5, dtype=torch.float64)
+    scene.agent_mask[1, :4] = False
+    energy, pair = FeatureEnergy(ALL, tuple(PAIR_FEATURES), BOUNDS), tuple(PAIR_FEATURES)
+    game, damping = random_game(scene, 1, 5, pair=pair), torch.full((3, 1), 10.0, dtype=torch.float64)
+    results = []
+    for block in (False, True):
+        monkeypatch.setattr(warp.config, "enable_cpu_blocks", block)
+        monkeypatch.setattr(fused, "kernels", lambda *_, b=block: kernels.make(True, 8, False, backwards and b))
+        leaves = leaves_of(game)
+        solution = fused.solve(energy, scene, leaves, 2, 0.3, damping, keep_iterates=True)
+        (solution.states.square().sum() + solution.iterates[1].square().sum()).backward()
+        results.append((solution, gradients(leaves)))
+    (one, by_one), (many, by_many) = results
+    for name in ("controls", "states", "initial_energy", "energy", "gradient_norm", "status"):
+        assert torch.equal(getattr(many, name), getattr(one, name)), name
+    assert all(torch.equal(by_many[name], by_one[name]) for name in by_one)
 
 
 @pytest.mark.slow

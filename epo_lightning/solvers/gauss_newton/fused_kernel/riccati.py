@@ -6,7 +6,7 @@ of the step before:  p+ = p + Z z,  z+ = z + dt c,  c+ = c.  A step eliminates i
     L L' = H_cc,   G = L^-1 H_cx,   P = H_xx - G' G.
 
 P is the lower triangle of a [3m, 3m] array in the order (p, z, c). L [m, m] holds reciprocals on its diagonal; G is [m, 3m].
-All arrays are parts of ``fast``, at the places that ``at`` names (``Layout`` in `kernels.py`). Threads share out their
+All arrays are parts of ``fast``, at the places that ``at`` names (``Layout`` in `games.py`). Threads share out their
 entries, and a barrier separates what writes an entry from what reads it.
 """
 
