@@ -45,6 +45,7 @@ ENERGY = FeatureEnergy(
 )
 SOFT = LevenbergMarquardt(steps=20, step_size=1.0, damping=1.0, adaptive=True, newton_steps=30)
 HARD = AugmentedLagrangian()
+NOTHING = "benchmarks.hard_constraints: there is no scene whose constraints can be met; choose other data"
 NOTICED = 0.01
 """Violation that counts [m, m/s^2]."""
 
@@ -81,6 +82,8 @@ def report(scene: Scene) -> None:
     total = len(scene.history)
     scene = scene[(closest_approach(scene, 0.0) > CLEARANCE).all(1)]
     apart = len(scene.history)
+    if not apart:
+        raise SystemExit(NOTHING)
     hard, spent = solved(HARD, scene, parameters_of(scene, 1.0))
     kept = (hard.status != Status.STOPPED).all(1)
     print(f"{total} scenes, {total - apart} of which start too close, {apart - int(kept.sum())} without a solution")
