@@ -75,7 +75,7 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
         adjoint.pull_states,
     )
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def solve(g: Game, run: Run):
         block, _ = wp.tid()
         row = g.N * g.K * 2
@@ -169,7 +169,7 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
                     run.states[to + q] = work[trace(at, n, g.K, q, i) + k + 1]
             sync()
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def differentiate(g: Game, run: Run, by: Gradients):
         block, _ = wp.tid()
         row = g.N * g.K * 2
