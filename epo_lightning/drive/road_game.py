@@ -25,7 +25,7 @@ ENERGY = FeatureEnergy(
 """The energy of the games on roads."""
 _OWN = {
     "lane": 0.5,
-    "velref": 0.04,
+    "velref": 1.0,
     "accref": 0.5,
     "turnrref": 10.0,
     "jerk": 0.15,
@@ -50,12 +50,14 @@ def road_game(scene: Scene, line: int, steps: int) -> GameParameters:
     batch, agents = scene.agent_mask.shape
     mine = torch.arange(agents) == EGO
     keeping = keep_going(scene, steps)
+    assert scene.reference_speed is not None
+    scale = {"velref": scene.reference_speed[:, None].clamp_min(1.0)}  # the share of the reference speed counts
     reference = torch.where(mine, line, OWN_LINE).expand(batch, 1, -1)
     # The planned vehicle's controls are costly in themselves, those of others where they differ from keeping going.
     usual = torch.where(mine[:, None, None], 0.0, keeping)
     return GameParameters(
         own_weights={
-            name: torch.where(mine, weight, _OTHERS[name]).double().expand(batch, 1, -1)
+            name: (torch.where(mine, weight, _OTHERS[name]) / scale.get(name, 1.0)).double().expand(batch, 1, -1)
             for name, weight in _OWN.items()
         },
         pair_weights={

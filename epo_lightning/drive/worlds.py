@@ -64,6 +64,12 @@ def _sumo(episodes: int, seed: int, kind: str) -> World:
     return sumo_world(episodes, seed, kind)
 
 
+def _highway_env(episodes: int, seed: int, kind: str) -> World:
+    from epo_lightning.drive.highway_env import highway_env_world  # the extra `drive`
+
+    return highway_env_world(episodes, seed, kind)
+
+
 _ASSUMED = {
     CONSTANT_VELOCITY: "response to constant velocity",
     BEST_RESPONSE: "iterated best response, assumed game",
@@ -85,6 +91,12 @@ WORLDS: Mapping[str, Place] = {
         make=_sumo,
         refuse=_of_roads,
         baselines={DRIVER: "SUMO's driver", **_ASSUMED},
+    ),
+    "highway_env": Place(
+        kinds=("merge", "roundabout"),
+        make=_highway_env,
+        refuse=_of_roads,
+        baselines={DRIVER: "highway-env's driver", **_ASSUMED},
     ),
 }
 """The worlds by their names in ``world``."""

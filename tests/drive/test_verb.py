@@ -46,6 +46,7 @@ def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -
             "was trained on data=rpi, and world=sumo takes runs of recorded traffic",
         ),
         (["run=highway_sim/hivt_m_epo", "world=sumo", "others=[dens]"], "did you mean 'dense'"),
+        (["run=highway_sim/hivt_m_epo", "world=highway_env", "others=[merging]"], "did you mean 'merge'"),
         (["run=rpi/v_lstm_epo", "baselines=[driver]"], "unknown baseline 'driver' of world=rpi"),
     ],
 )

@@ -1,0 +1,243 @@
+"""highway-env's merge and roundabout as worlds: the other vehicles drive by its IDM and react.
+
+- ``merge``: the planned vehicle is the one on the ramp, which has to change to the motorway before its lane ends.
+- ``roundabout``: the planned vehicle is that of the environment. It enters from the south and leaves to the north.
+
+For the first 1.8 s the planned vehicle is driven by the environment's IDM, too. Coordinates are mirrored, because
+highway-env's y axis points to the right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from epo_lightning.checks import check_whole
+from epo_lightning.data.recorded.lanes import LANE, LaneGraph, Polylines
+from epo_lightning.drive.traffic import WINDOWS, Moment, Position, TrafficWorld
+from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.scene import HEADING, KINDS
+
+SEEDS = 1_000_000
+"""Added to seeds of episodes."""
+SUBSTEPS = 3
+"""Steps of 1/15 s, those of the environments, in one step of a planner."""
+SPACING = 2.0
+"""Largest distance [m] between two points of a line of the map."""
+ASIDE = 0.3
+"""Distance [m] of the centre from the lanes at which a vehicle is off the road."""
+MIRROR = np.array([1.0, -1.0])
+Lane = tuple[str, str, int]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What an episode in an environment is.
+
+    Attributes:
+        environment: its name in gymnasium.
+        vehicle: index of the planned vehicle in the environment's list.
+        back: distance [m] by which it starts farther back, because it is planned 1.8 s later.
+        route: nodes of the network that it passes.
+        beyond: distance [m] behind the last node at which it has arrived; negative before it.
+        speed: speed limit [m/s], what the traffic on the road drives at.
+        seconds: longest duration.
+        gap: largest gap [m] between the ends of lanes that follow one another.
+    """
+
+    environment: str
+    vehicle: int
+    back: float
+    route: tuple[str, ...]
+    beyond: float
+    speed: float
+    seconds: float
+    gap: float
+
+
+SETTINGS = {
+    "merge": Setting("merge-v1", -1, 0.0, ("j", "k", "b", "c", "d"), -90.0, 30.0, 20.0, 1.0),
+    "roundabout": Setting(
+        "roundabout-v1", 0, 15.0, ("ser", "ses", "se", "ex", "ee", "nx", "nxs", "nxr"), -117.5, 12.0, 24.0, 8.0
+    ),
+}
+"""The environments by their names in ``others``."""
+
+
+def highway_env_world(episodes: int, seed: int = 0, place: str = "merge") -> TrafficWorld:
+    """Episodes in an environment of highway-env.
+
+    Args:
+        episodes: number of episodes.
+        seed: seed of their traffic; the same seed gives the same episodes.
+        place: ``merge`` or ``roundabout``.
+
+    Raises:
+        ConfigError: a value out of its range, or highway-env is not installed.
+    """
+    return TrafficWorld(HighwayEnvSimulator(episodes, seed, place))
+
+
+class HighwayEnvSimulator:
+    """An environment of highway-env as a simulator of episodes.
+
+    Args:
+        episodes, seed, place: as in :func:`highway_env_world`.
+    """
+
+    def __init__(self, episodes: int, seed: int, place: str) -> None:
+        check_whole("episodes", episodes)
+        if place not in SETTINGS:
+            raise ConfigError(f"unknown place {place!r} of highway-env: {nearest(str(place), tuple(SETTINGS))}")
+        self._episodes, self._seed, self._setting = episodes, (SEEDS + seed) * 1000, SETTINGS[place]
+        self._environment = _environment(self._setting.environment)
+        self._environment.reset(seed=self._seed)
+        network = self._environment.road.network
+        keys = keys_of(network)
+        self.lanes = lanes_of(network, self._setting)
+        # A lane that ends although its road goes on has to be left.
+        self._ending = {
+            place
+            for place, (_, node, _) in enumerate(keys)
+            if not self.lanes.successors[place] and network.graph.get(node)
+        }
+        self.steps = round(self._setting.seconds / WINDOWS.dt)
+        legs = [network.get_lane((a, b, 0)) for a, b in pairwise(self._setting.route)]
+        self._way = Polylines([np.concatenate([_line(leg, 0.0) for leg in legs])])
+
+    def __len__(self) -> int:
+        return self._episodes
+
+    def begin(self, episode: int) -> list[Moment]:
+        from highway_env.vehicle.behavior import IDMVehicle
+
+        self._environment.reset(seed=self._seed + episode)
+        road = self._environment.road
+        road.vehicles = [
+            vehicle if isinstance(vehicle, IDMVehicle) else IDMVehicle.create_from(vehicle) for vehicle in road.vehicles
+        ]
+        ego = road.vehicles[self._setting.vehicle]
+        if self._setting.back:
+            lane = road.network.get_lane(ego.lane_index)
+            ego.position = lane.position(lane.local_coordinates(ego.position)[0] - self._setting.back, 0.0)
+            ego.on_state_update()
+        road.vehicles.remove(ego)
+        self._vehicles: Sequence[Any] = [ego, *road.vehicles]
+        road.vehicles = list(self._vehicles)
+        history = [self._moment(), *(self.step(None) for _ in range(WINDOWS.history - 1))]
+        self._from = self._along(history[-1].states[0])
+        return history
+
+    def step(self, way: tuple[Float[np.ndarray, " 4"], Float[np.ndarray, " 4"]] | None) -> Moment:
+        road, ego = self._environment.road, self._vehicles[0]
+        for substep in range(1, SUBSTEPS + 1):
+            road.act()
+            road.step(WINDOWS.dt / SUBSTEPS)
+            if way is not None:
+                x, y, heading, speed = way[0] + substep / SUBSTEPS * (way[1] - way[0])
+                ego.position, ego.heading, ego.speed = np.array([x, -y]), -heading, speed
+                ego.on_state_update()
+        moment = self._moment()
+        if way is not None:
+            moment.states[0] = way[1]
+        return moment
+
+    def _moment(self) -> Moment:
+        vehicles = self._vehicles
+        states = np.array([[*(vehicle.position * MIRROR), -vehicle.heading, vehicle.speed] for vehicle in vehicles])
+        return Moment(
+            names=[str(number) for number in range(len(vehicles))],
+            states=states,
+            size=np.array([[vehicle.LENGTH, vehicle.WIDTH] for vehicle in vehicles], dtype=float),
+            kind=np.full(len(vehicles), KINDS.index("car")),
+        )
+
+    def _along(self, state: Float[np.ndarray, " 4"]) -> float:
+        """Position [m] along the route."""
+        along, _ = self._way.project(np.zeros(1, dtype=int), state[None, :2])
+        return float(along[0])
+
+    def position(self, state: Float[np.ndarray, " 4"]) -> Position:
+        along = self._along(state)
+        located = self.lanes.locate(state[None, :2], state[None, HEADING])
+        lane = int(located.lane[0])
+        off = lane < 0
+        if not off:
+            width = float(np.linalg.norm(self.lanes.left[lane][0] - self.lanes.right[lane][0]))
+            beyond = located.along[0] - self.lanes.centrelines.length[lane]
+            off = abs(float(located.offset[0])) > width / 2 + ASIDE or (beyond > ASIDE and lane in self._ending)
+        merging = lane in self._ending
+        return Position(
+            progress=along - getattr(self, "_from", along),
+            arrived=along >= self._way.length[0] + self._setting.beyond and not merging and not off,
+            off_road=off,
+            line=0 if merging else 1,
+        )
+
+    def close(self) -> None:
+        """End the environment."""
+        self._environment.close()
+
+
+def _environment(name: str) -> Any:
+    try:
+        import gymnasium
+        import highway_env  # noqa: F401 - registers its environments
+    except ImportError as error:
+        raise ConfigError(
+            f"world=highway_env needs highway-env ({error}): install it with `pip install 'epo_lightning[drive]'`"
+        ) from None
+    return gymnasium.make(name).unwrapped
+
+
+def _line(lane: Any, aside: float) -> Float[np.ndarray, "n 2"]:
+    """Points of a lane, or of a line beside it, to the right [m]."""
+    along = np.linspace(0.0, lane.length, max(2, round(lane.length / SPACING) + 1))
+    return np.array([lane.position(s, aside) for s in along], dtype=float) * MIRROR
+
+
+def keys_of(network: Any) -> list[Lane]:
+    """The lanes of a network, in the order of the map."""
+    return [(a, b, i) for a, ends in network.graph.items() for b, lanes in ends.items() for i in range(len(lanes))]
+
+
+def lanes_of(network: Any, setting: Setting) -> LaneGraph:
+    """The map of a network. Where the planned vehicle's route goes on, a lane leads there alone."""
+    keys = keys_of(network)
+    index = {key: place for place, key in enumerate(keys)}
+    lanes = [network.get_lane(key) for key in keys]
+    centre = [_line(lane, 0.0) for lane in lanes]
+    onward = dict(pairwise(setting.route))
+    successors = []
+    for place, (_, node, _) in enumerate(keys):
+        follow = network.graph.get(node, {})
+        follow = {onward[node]: follow[onward[node]]} if onward.get(node) in follow else follow
+        found = []
+        for end, beside in follow.items():
+            gaps = [
+                float(np.linalg.norm(centre[index[node, end, i]][0] - centre[place][-1])) for i in range(len(beside))
+            ]
+            if min(gaps) < setting.gap:
+                found.append(index[node, end, int(np.argmin(gaps))])
+        successors.append(tuple(found))
+    left = np.array([index.get((a, b, i - 1), -1) for a, b, i in keys])
+    right = np.array([index.get((a, b, i + 1), -1) for a, b, i in keys])
+    open_right = np.array([other if other >= 0 and not lanes[other].forbidden else -1 for other in right])
+    return LaneGraph(
+        ids=np.arange(len(keys)),
+        left=[_line(lane, -lane.width_at(0.0) / 2) for lane in lanes],
+        right=[_line(lane, lane.width_at(0.0) / 2) for lane in lanes],
+        centre=centre,
+        successors=successors,
+        left_of=left,
+        right_of=open_right,
+        adjacent_left=left,
+        adjacent_right=right,
+        speed_limit=np.full(len(keys), setting.speed),
+        kind=np.full(len(keys), LANE),
+    ).check("highway-env")
