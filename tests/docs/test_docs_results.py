@@ -13,7 +13,7 @@ from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import report
 from epo_lightning.report import build_tables
 from epo_lightning.report.results import read_results
-from epo_lightning.report.runs import read_other
+from epo_lightning.report.runs import EvaluatedRun, read_other, read_parts
 from epo_lightning.report.tables import distinct
 
 ROOT = Path(__file__).parents[2]
@@ -171,3 +171,50 @@ def test_the_page_of_rpi_has_the_steps() -> None:
         mean, spread = numbers(line)[1].split(" ± ")
         for text, value in ((mean, cells["minSADE"].mean), (spread, cells["minSADE"].deviation)):
             assert text == short(value, len(text) - 1)
+
+
+HIGHWAYS = (ROOT / "docs" / "highway_results.md").read_text(encoding="utf-8")
+BACKBONES = ("V-LSTM", "VIBES", "HiVT-M")
+ON_HIGHWAYS = pytest.mark.parametrize(("heading", "file"), [("Simulated highways", "highway_sim"), ("US-101", "us101")])
+
+
+def lines_of_highways(heading: str) -> list[str]:
+    return HIGHWAYS.partition(f"\n## {heading}\n")[2].partition("\n## ")[0].splitlines()
+
+
+def on_highways(file: str) -> dict[str, dict[int, EvaluatedRun]]:
+    """The runs of a file by title and seed, with their scores on the test split or on a part of it."""
+    saved = read_results(ROOT / "results" / f"{file}.json")
+    found: dict[str, dict[int, EvaluatedRun]] = {}
+    for run in [*saved.evaluated, *(part for one in saved.runs for part in read_parts(one))]:
+        found.setdefault(run.name, {})[run.seed] = run
+    return found
+
+
+@ON_HIGHWAYS
+def test_the_page_of_highways_has_the_scores_of_its_files(heading: str, file: str) -> None:
+    section, found = lines_of_highways(heading), on_highways(file)
+    for title, runs in found.items():
+        assert sorted(runs) == [0, 1, 2]
+        line = next(line for line in section if line.startswith(f"| {title} |"))
+        for cell, metric in zip(numbers(line), ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp"), strict=False):
+            values = [run.metrics[metric] for run in runs.values()]
+            spread = f" ± {short(stdev(values), 3)}" if stdev(values) else ""
+            assert cell == f"{short(fmean(values), 3)}{spread}", (title, metric)
+
+
+@ON_HIGHWAYS
+@pytest.mark.parametrize("unit", ["all nine pairs", "three seeds, each the mean of its backbones"])
+def test_the_page_of_highways_has_the_differences_of_its_files(heading: str, file: str, unit: str) -> None:
+    found = on_highways(file)
+    line = next(line for line in lines_of_highways(heading) if line.startswith(f"| +EPO - +SC, {unit} |"))
+    for cell, metric in zip(numbers(line), ("minSADE", "minSFDE", "overlap_jfp"), strict=False):
+        pairs = [
+            [found[f"{b} + EPO"][seed].metrics[metric] - found[f"{b} + SC"][seed].metrics[metric] for b in BACKBONES]
+            for seed in range(3)
+        ]
+        values = [fmean(pair) for pair in pairs] if unit.startswith("three") else [v for pair in pairs for v in pair]
+        half = student.ppf(0.975, len(values) - 1) * stdev(values) / sqrt(len(values))
+        mean = fmean(values)
+        low, middle, high = (f"{v:+.3f}".replace("0.", ".", 1) for v in (mean - half, mean, mean + half))
+        assert cell == f"{middle} ({low} to {high})"
