@@ -17,8 +17,8 @@ MODULES = {"hydra-core": "hydra", "pillow": "PIL", "protobuf": "google"}
 """Packages that are imported under another name."""
 OF_DEPENDENCIES = {"yaml", "hatchling"}
 """PyYAML comes with OmegaConf."""
-ON_DEMAND = {"epo_lightning.explore.server": "starlette"}
-"""Modules of an extra, which only functions import, and the package that they need."""
+ON_DEMAND = {"epo_lightning.explore.server": "starlette", "epo_lightning.solvers.gauss_newton.fused_kernel": "warp"}
+"""Modules and packages of an extra, which only functions import, and the package that they need."""
 
 
 def imported_at_once(tree: ast.AST) -> Iterator[str]:
@@ -43,8 +43,10 @@ def test_modules_import_without_optional_dependencies() -> None:
     foreign = set()
     for path in PACKAGE.rglob("*.py"):
         module = ".".join(("epo_lightning", *path.relative_to(PACKAGE).with_suffix("").parts))
+        of_extra = next((own for own in ON_DEMAND if f"{module}.".startswith(f"{own}.")), None)
         for name in imported_at_once(ast.parse(path.read_text())):
             package = name.partition(".")[0]
-            if name in ON_DEMAND or (package not in known and package != ON_DEMAND.get(module)):
+            on_demand = next((own for own in ON_DEMAND if f"{name}.".startswith(f"{own}.")), None)
+            if on_demand != (on_demand and of_extra) or (package not in known and package != ON_DEMAND.get(of_extra)):
                 foreign.add(f"{module}: {name}")
     assert not foreign

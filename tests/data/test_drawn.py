@@ -97,7 +97,7 @@ def test_scenes_depend_on_the_seed_and_the_split():
     ("options", "message"),
     [
         ({"like": "highways"}, "did you mean 'highway'"),
-        ({"agents": 0}, "data.agents must be between 1 and 32"),
+        ({"agents": 0}, "data.agents must be between 1 and 64"),
         ({"scenes": 0}, "data.scenes must be 1 or more"),
     ],
 )

@@ -31,6 +31,15 @@ class TestBestResponseInTurn(SolverSuite):
     test_solutions_are_equivariant_to_the_order_of_agents = None  # the order of agents is that of their turns
 
 
+class TestAugmentedLagrangian(SolverSuite):
+    """At its solutions the gradient of the Lagrangian vanishes, and not that of the energy, which may rise where a
+    constraint is met (`gauss_newton/test_augmented_lagrangian.py`)."""
+
+    config = {"name": "augmented_lagrangian"}
+    test_a_solution_is_consistent_and_has_less_energy_than_its_start = None
+    test_the_gradient_vanishes_at_converged_solutions = None
+
+
 class TestGradientDescent(SolverSuite):
     config = {"name": "gradient_descent", "steps": 4, "step_size": 0.05}
     converged = {"steps": 200}

@@ -391,7 +391,7 @@ def test_joined_scenes_are_the_same_scenes():
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("agents", 33, "agents must be 32 or less"),
+        ("agents", 65, "agents must be 64 or less"),
         ("horizon", 1, "horizon must be 2 or more"),
         ("smoothing", 1e9, "smoothing must be 10 s or less"),
         ("history", 1, "data.windows.history must be 2 or more"),
