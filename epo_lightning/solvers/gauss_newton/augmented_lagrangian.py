@@ -63,9 +63,10 @@ may be dependent."""
 class AugmentedLagrangian(Minimiser):
     """Rounds of the layer and of updates of multipliers; solutions are constants, so learn with ``backward=implicit``.
 
-    A constraint holds for the agents and pairs whose weight of its feature is not zero; its value has no effect. A sample
-    whose constraints are violated by more than the tolerance at the end has the status STOPPED: they may be impossible to
-    meet, such as those of agents that overlap from the beginning. ``Solution.constraints`` says how much is missing.
+    A constraint holds for the agents and pairs whose weight of its feature is not zero; its value has no effect on the
+    strategies. A sample is SOLVED if its constraints are met to the tolerance at a minimum of the augmented Lagrangian.
+    Others are STOPPED at the end: their constraints may be impossible to meet, such as those of agents that overlap from the
+    beginning, or the rounds were too few. ``Solution.constraints`` says how much is missing.
 
     Attributes:
         constraints: names of the features that are constraints, ``proximity``, ``clearance`` and bounds (``velb``, ``accb``,
@@ -95,6 +96,10 @@ class AugmentedLagrangian(Minimiser):
     def __post_init__(self) -> None:
         check_whole("solver.rounds", self.rounds, least=1)
         check_number("solver.penalty", self.penalty)
+        if self.penalty > LARGEST_PENALTY:
+            raise ConfigError(
+                f"solver.penalty must be at most {LARGEST_PENALTY:g}, not {self.penalty:g}: it only grows"
+            )
         check_number("solver.tolerance", self.tolerance)
         check_number("solver.growth", self.growth)
         if self.growth < 1:
@@ -161,14 +166,13 @@ class AugmentedLagrangian(Minimiser):
             rounds.advance()
         controls = rounds.controls
         violation = _largest({name: value.clamp_min(0.0) for name, value in game.excess(controls).items()})
-        met = initial.isfinite() & (violation <= self.tolerance)
         return Solution(
             controls=controls,
             states=energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt),
             initial_energy=initial,
             energy=energy(scene, game.parameters, controls),
             gradient_norm=rounds.norm,
-            status=torch.where(met, int(Status.SOLVED), int(Status.STOPPED)),
+            status=torch.where(rounds.solved, int(Status.SOLVED), int(Status.STOPPED)),
             constraints=Constraints(rounds.multipliers, rounds.penalty, violation, rounds.count),
         )
 
@@ -214,7 +218,7 @@ class AugmentedLagrangian(Minimiser):
             # Zeros in place of what is not finite, because zero times NaN is NaN.
             kept = definite[..., None, None]
             jacobian, solved = torch.where(kept, jacobian, 0.0), torch.where(kept, solved, 0.0)
-            lower_upper = torch.where(kept, pivots.LU, torch.eye(most, dtype=schur.dtype))
+            lower_upper = torch.where(kept, pivots.LU, torch.eye(most, dtype=schur.dtype, device=schur.device))
         with torch.enable_grad():
             quiet, heard = dense.silenced(game.scene, game.parameters, definite)
             taught = dataclasses.replace(game, scene=quiet, parameters=heard)
@@ -255,7 +259,7 @@ class _Game:
     def jacobian(self, controls: Tensor) -> Float[Tensor, "B M C n"]:
         """dh/du of all constraints, in the order of :meth:`excess`; zero where there is none."""
         count = controls.shape[2:].numel()
-        units = torch.eye(count, dtype=controls.dtype).view(count, 1, 1, *controls.shape[2:])
+        units = torch.eye(count, dtype=controls.dtype, device=controls.device).view(count, 1, 1, *controls.shape[2:])
         signals = self._signals(controls, units.expand(-1, *controls.shape[:2], -1, -1, -1))
         return torch.cat([change.flatten(3) for *_, change in signals], -1).permute(1, 2, 3, 0)
 
@@ -300,7 +304,9 @@ class _Game:
         leaf, count = controls.detach().requires_grad_(), controls.shape[2:].numel()
         slope = self.slope(multipliers, leaf)
         units = (
-            torch.eye(count, dtype=controls.dtype).view(count, 1, 1, *controls.shape[2:]).expand(count, *controls.shape)
+            torch.eye(count, dtype=controls.dtype, device=controls.device)
+            .view(count, 1, 1, *controls.shape[2:])
+            .expand(count, *controls.shape)
         )
         rows = torch.autograd.grad(slope, leaf, units, is_grads_batched=True, materialize_grads=True)[0]
         absent = ~self.scene.agent_mask.repeat_interleave(2 * controls.shape[3], 1)[:, None]
@@ -342,7 +348,9 @@ class _Rounds:
         multipliers, penalty: lambda by constraint, and mu.
         before: violation (or slack with a multiplier) after the last update.
         steepest, norm: norm of the gradient of E at the start, plus one; and of the augmented Lagrangian.
-        open, count: whether a sample is not solved yet, and its number of rounds.
+        open: whether a sample needs more rounds.
+        solved: whether its constraints are met at a minimum.
+        count: number of its rounds.
     """
 
     solver: AugmentedLagrangian
@@ -355,6 +363,7 @@ class _Rounds:
     steepest: Tensor
     norm: Tensor
     open: Tensor
+    solved: Tensor
     count: Tensor
 
     @classmethod
@@ -362,7 +371,7 @@ class _Rounds:
         """The state after the Gauss-Newton steps of the first round; ``initial`` is E [B, M] at the start."""
         multipliers = {name: torch.zeros_like(value) for name, value in game.excess(controls).items()}
         penalty, finite = torch.full_like(initial, solver.penalty), initial.isfinite()
-        slope = dense.gradient(game.energy, game.scene, game.parameters, controls)[1].flatten(2).norm(dim=-1)
+        slope = dense.gradient(game.objective, game.scene, game.parameters, controls)[1].flatten(2).norm(dim=-1)
         found, damping = solver.inner().run(*game.augmented(multipliers, penalty, controls), solver.steps)
         return cls(
             solver,
@@ -375,6 +384,7 @@ class _Rounds:
             1.0 + slope,
             found.gradient_norm,
             finite,
+            torch.zeros_like(finite),
             torch.zeros_like(initial, dtype=torch.long),
         )
 
@@ -405,6 +415,7 @@ class _Rounds:
         self.before[rows] = torch.where(settled, missing, self.before[rows])
         self.controls[rows], self.damping[rows], self.norm[rows] = controls, damping, norm
         self.count[rows] += was_open.long()
+        self.solved[rows] |= settled & met
         self.open[rows] = was_open & ~(settled & met) & ~hopeless
 
 

@@ -193,6 +193,26 @@ def test_a_game_in_which_no_constraint_binds_is_that_of_the_layer():
         )
 
 
+def test_too_few_rounds_are_no_solution():
+    scene, parameters = meeting(2)
+    found = AugmentedLagrangian(rounds=2, penalty=1e5)(ENERGY, scene, parameters)
+    assert found.constraints.violation.item() < 1e-3
+    assert found.status.item() == Status.STOPPED
+
+
+def test_the_weight_of_a_constraint_does_not_change_the_strategies():
+    scene, parameters = meeting(2)
+    one, other = (
+        AugmentedLagrangian()(
+            ENERGY,
+            scene,
+            dataclasses.replace(parameters, pair_weights={"proximity": torch.full((1, 1, 1), weight).double()}),
+        )
+        for weight in (5.0, 1000.0)
+    )
+    assert torch.equal(one.controls, other.controls)
+
+
 def test_agents_that_overlap_from_the_beginning_are_stopped_and_disturb_no_other_scene():
     scene, parameters = meeting(2, side=0.05)
     history = scene.history.clone()
