@@ -25,6 +25,8 @@ from epo_lightning.scene import HEADING, KINDS
 
 SEEDS = 1_000_000
 """Added to seeds of episodes."""
+APART = 1000
+"""Distance of the first episodes of two consecutive seeds, and so the largest number of episodes."""
 SUBSTEPS = 3
 """Steps of 1/15 s, those of the environments, in one step of a planner."""
 SPACING = 2.0
@@ -92,9 +94,14 @@ class HighwayEnvSimulator:
 
     def __init__(self, episodes: int, seed: int, place: str) -> None:
         check_whole("episodes", episodes)
+        if episodes > APART:
+            raise ConfigError(
+                f"episodes must be {APART} or fewer in world=highway_env, not {episodes}: further ones are those of the "
+                "next seed; drive several seeds"
+            )
         if place not in SETTINGS:
             raise ConfigError(f"unknown place {place!r} of highway-env: {nearest(str(place), tuple(SETTINGS))}")
-        self._episodes, self._seed, self._setting = episodes, (SEEDS + seed) * 1000, SETTINGS[place]
+        self._episodes, self._seed, self._setting = episodes, (SEEDS + seed) * APART, SETTINGS[place]
         self._environment = _environment(self._setting.environment)
         self._environment.reset(seed=self._seed)
         network = self._environment.road.network

@@ -10,6 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import tempfile
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -92,10 +93,18 @@ class SumoSimulator:
         other.close()
         return pipe
 
-    def _answer(self) -> Any:
+    def _ask(self, message: Any) -> Any:
+        """Send a message to the process, and return its answer.
+
+        Raises:
+            ConfigError: the process ended.
+        """
+        pipe = self._pipe
         try:
-            answer = self._pipe.recv()
-        except EOFError:
+            pipe.send(message)
+            answer = pipe.recv()
+        except (EOFError, OSError):
+            self._pending = False
             raise ConfigError("the process of SUMO ended: is there enough memory?") from None
         if isinstance(answer, Exception):
             self._pending = False
@@ -115,8 +124,7 @@ class SumoSimulator:
         if branch.layout not in self._maps:
             self._maps[branch.layout] = lanes_of(self.layout)
         self.lanes = self._maps[branch.layout]
-        self._pipe.send(branch)
-        self._name, history = self._answer()
+        self._name, history = self._ask(branch)
         self._pending = True
         last: Vehicles = history[-1]
         ego = last.names.index(self._name)
@@ -128,18 +136,17 @@ class SumoSimulator:
 
     def _end(self) -> None:
         if self._pending:
-            self._pipe.send(END)
             self._pending = False
+            with suppress(OSError):  # the process ended, as the next message will tell
+                self._pipe.send(END)
 
     def step(self, way: tuple[Float[np.ndarray, " 4"], Float[np.ndarray, " 4"]] | None) -> Moment:
         if way is None:
-            self._pipe.send(OWN)
-            return self._moment(self._answer())
+            return self._moment(self._ask(OWN))
         before, after = way
         share = np.arange(1, STEP + 1)[:, None] / STEP
         s, d = self.layout.project(before[:2] + share * (after[:2] - before[:2]))
-        self._pipe.send(np.stack([s + self._half, d], 1))
-        moment = self._moment(self._answer())
+        moment = self._moment(self._ask(np.stack([s + self._half, d], 1)))
         moment.states[0] = after
         return moment
 

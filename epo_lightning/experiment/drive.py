@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from epo_lightning.drive.episodes import play, times
+from epo_lightning.drive.episodes import Episodes, play, times
 from epo_lightning.drive.film import film
 from epo_lightning.drive.measures import RATES, UNITS, Estimate, differences, estimate, estimates, measure
 from epo_lightning.drive.planners import ForecastPlanner, GamePlanner, Planner, ResponsePlanner
@@ -50,8 +50,8 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
         the files that were written.
 
     Raises:
-        ConfigError: a run, checkpoint, world or kind of others that does not exist, a run that cannot drive in this world,
-            a world whose extra is not installed, or results in ``out`` that would be overwritten.
+        ConfigError: a run, checkpoint, world or kind of others that does not exist, a run that is named twice or cannot
+            drive in this world, a world whose extra is not installed, or results in ``out`` that would be overwritten.
     """
     assembly.quiet()
     torch.set_num_threads(1)
@@ -61,20 +61,24 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
     where = place(settings.world)
     kinds = where.kinds if settings.others is None else tuple(settings.others)
     where.check_kinds(settings.world, kinds)
-    planners = dict(_planners(settings, where))
+    planners: dict[str, Make] = {}
+    for name, make in _planners(settings, where):
+        if name in planners:
+            raise ConfigError(f"two planners are called {name!r}: name each way and baseline once, and rename runs")
+        planners[name] = make
     done = _Done(out / "episodes.jsonl", json.loads(json.dumps(dataclasses.asdict(settings))))
     results: dict[str, Any] = {"settings": done.settings, "worlds": {}, "milliseconds": {}}
     tables, films = [], []
     for kind in kinds:
         with closing(where.make(settings.episodes, settings.seed, kind)) as world:
             made = {name: make(world) for name, make in planners.items()}
-            rates = _drive(world, kind, made, done, tell)
-            measured = done.measured(kind)
+            _drive(world, kind, made, done, tell)
+            measured, rates = done.measured(kind, planners), done.rates(kind)
             results["worlds"][kind] = _results(measured, rates)
             tables.append(_table(kind, measured, rates))
-            if settings.timed:
-                results["milliseconds"][kind] = _milliseconds(world, kind, made, done, settings.timed)
-                tables.append(_times_table(results["milliseconds"][kind]))
+            if settings.timed and (milliseconds := _milliseconds(world, kind, made, done, settings.timed)):
+                results["milliseconds"][kind] = milliseconds
+                tables.append(_times_table(milliseconds))
             if settings.film is not None:
                 played = {
                     name: play(world, planner, [settings.film], keep_plans=True) for name, planner in made.items()
@@ -87,9 +91,9 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
 
 def _drive(
     world: World, kind: str, planners: Mapping[str, Planner | None], done: _Done, tell: Callable[[str], None]
-) -> set[str]:
-    """Drive all episodes of a world with all planners, and return the names of the measures that are 0 or 1."""
-    rates, seconds = set(RATES), dict.fromkeys(planners, 0.0)
+) -> None:
+    """Drive all episodes of a world with all planners."""
+    seconds = dict.fromkeys(planners, 0.0)
     chunks = [range(first, min(first + world.together, len(world))) for first in range(0, len(world), world.together)]
     for count, chunk in enumerate(chunks, 1):
         for name, planner in planners.items():
@@ -97,19 +101,19 @@ def _drive(
                 continue
             began = time.perf_counter()
             episodes = play(world, planner, chunk)
-            rates |= episodes.outcome.rates
-            done.add(kind, name, chunk, measure(episodes, world), episodes.wall, episodes.processor)
+            done.add(kind, name, chunk, measure(episodes, world), episodes)
             seconds[name] += time.perf_counter() - began
         if count % EVERY == 0:
             tell(f"{kind:8} {chunk.stop} of {len(world)} episodes, {sum(seconds.values()):.0f} s")
-    for name, values in done.measured(kind).items():
+    for name, values in done.measured(kind, planners).items():
         collisions = float(values["collision"].mean())
         tell(f"{kind:8} {name}: {100 * collisions:.1f} % collisions, {seconds[name]:.0f} s")
-    return rates
 
 
 class _Done:
     """The file of what was driven: a line of settings, then a line per planner and chunk of episodes.
+
+    A last line without its line break was cut off by a kill, and is dropped.
 
     Args:
         path: the file, which is continued.
@@ -122,16 +126,17 @@ class _Done:
     def __init__(self, path: Path, settings: dict[str, Any]) -> None:
         self.path, self.settings = path, settings
         self._rows: dict[str, dict[str, dict[int, dict[str, Any]]]] = {}
-        lines = path.read_text().splitlines() if path.exists() else []
-        if lines and json.loads(lines[0]) != settings:
+        text = path.read_text() if path.exists() else ""
+        whole = text[: text.rfind("\n") + 1]
+        lines = whole.splitlines()
+        if lines and _parsed(lines[0]) != settings:
             raise ConfigError(
                 f"{path} was begun with other settings: nothing is mixed; choose another out=<folder>, or delete it"
             )
-        for line in lines[1:]:
-            try:
-                self._take(json.loads(line))
-            except json.JSONDecodeError:
-                continue  # the last line of a command that was killed
+        if whole != text:
+            write_file(path, whole)
+        for row in filter(None, map(_parsed, lines[1:])):
+            self._take(row)
 
     def _take(self, row: dict[str, Any]) -> None:
         self._rows.setdefault(row["kind"], {}).setdefault(row["planner"], {})[row["episodes"][0]] = row
@@ -146,8 +151,7 @@ class _Done:
         planner: str,
         chunk: Sequence[int],
         measures: Mapping[str, Tensor],
-        wall: Sequence[float],
-        processor: Sequence[float],
+        played: Episodes,
     ) -> None:
         """Append what a planner has driven."""
         row = {
@@ -155,8 +159,9 @@ class _Done:
             "planner": planner,
             "episodes": list(chunk),
             "measures": {name: values.tolist() for name, values in measures.items()},
-            "wall": wall,
-            "processor": processor,
+            "rates": sorted(played.outcome.rates),
+            "wall": played.wall,
+            "processor": played.processor,
         }
         self._take(row)
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -165,8 +170,14 @@ class _Done:
                 file.write(json.dumps(self.settings) + "\n")
             file.write(json.dumps(row) + "\n")
 
-    def measured(self, kind: str) -> dict[str, dict[str, Tensor]]:
-        """Measures of all episodes by planner."""
+    def rates(self, kind: str) -> set[str]:
+        """Names of the measures that are 0 or 1."""
+        rows = (row for rows in self._rows[kind].values() for row in rows.values())
+        return set(RATES).union(*(row.get("rates", ()) for row in rows))
+
+    def measured(self, kind: str, planners: Iterable[str]) -> dict[str, dict[str, Tensor]]:
+        """Measures of all episodes, by planner in the given order."""
+        found = {planner: self._rows[kind][planner] for planner in planners}
         return {
             planner: {
                 name: torch.tensor(
@@ -174,7 +185,7 @@ class _Done:
                 )
                 for name in next(iter(rows.values()))["measures"]
             }
-            for planner, rows in self._rows[kind].items()
+            for planner, rows in found.items()
         }
 
     def seconds(self, kind: str, planner: str) -> tuple[list[float], list[float]]:
@@ -183,11 +194,21 @@ class _Done:
         return [s for row in rows for s in row["wall"][1:]], [s for row in rows for s in row["processor"][1:]]
 
 
+def _parsed(line: str) -> Any:
+    """The contents of a line of JSON; None for a broken one."""
+    try:
+        return json.loads(line)
+    except json.JSONDecodeError:
+        return None
+
+
 def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make]]:
     """Planners by name, made for a world."""
-    for path in settings.runs if settings.ways else ():
-        run = RunFolder.open(path)
-        of_run = read(Settings, run.config())
+    paths = settings.runs if settings.ways else []
+    runs = [RunFolder.open(path) for path in paths]
+    configs = [read(Settings, run.config()) for run in runs]
+    titles = _titles(paths, [run.path.resolve() for run in runs], [of_run.title for of_run in configs])
+    for path, run, of_run, title in zip(paths, runs, configs, titles, strict=True):
         forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
         if reason := where.refuse(of_run.data):
             raise ConfigError(f"{path} was trained on data={of_run.data['name']}, and world={settings.world} {reason}")
@@ -196,12 +217,27 @@ def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make
                 make = _of_run(forecaster, way, settings.mode == "nearest")
             except ConfigError:
                 continue  # a forecaster without a game has no warm start and no pair terms
-            yield WAYS[way].format(of_run.title), make
+            yield WAYS[way].format(title), make
     for name in where.baselines if settings.baselines is None else settings.baselines:
         if name not in where.baselines:
             known = tuple(where.baselines)
             raise ConfigError(f"unknown baseline {name!r} of world={settings.world}: {nearest(name, known)}")
         yield where.baselines[name], _baseline(name)
+
+
+def _titles(paths: Sequence[str], folders: Sequence[Path], titles: Sequence[str]) -> Sequence[str]:
+    """Distinct titles of runs: where several runs share one, with the name of the run's folder, or else with its path."""
+    for number, folder in enumerate(folders):
+        if folder in folders[:number]:
+            raise ConfigError(f"the run {paths[number]} is named twice: name it once")
+    named = titles
+    for labels in ([folder.name for folder in folders], paths):
+        if len(set(named)) < len(named):
+            named = [
+                f"{title} ({label})" if titles.count(title) > 1 else title
+                for title, label in zip(titles, labels, strict=True)
+            ]
+    return named
 
 
 def _of_run(forecaster: Forecaster, way: str, keep: bool) -> Make:

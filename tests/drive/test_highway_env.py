@@ -72,6 +72,8 @@ def test_a_vehicle_that_merges_has_to_leave_its_lane() -> None:
 
 
 def test_mistakes_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match="episodes must be 1000 or fewer in world=highway_env, not 1001"):
+        highway_env_world(1001)
     with pytest.raises(ConfigError, match="did you mean 'merge'"):
         highway_env_world(1, place="merges")
     monkeypatch.setitem(__import__("sys").modules, "highway_env", None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
+from multiprocessing import Pipe
 
 import numpy as np
 import pytest
@@ -104,6 +105,16 @@ def test_a_forecaster_and_a_response_drive(world: TrafficWorld) -> None:
         ego = episodes.plans[0][0, 0]
         here = episodes.outcome.states[0, 0, 0, :2]
         assert float((ego[0] - here).norm()) < 10.0, "plans are kept in the world's frame"
+
+
+def test_the_end_of_the_process_is_told() -> None:
+    simulator = SumoSimulator(1, 0, "free")
+    simulator.__dict__["_pipe"], other = Pipe()
+    simulator._pending = True
+    other.close()
+    with pytest.raises(ConfigError, match="the process of SUMO ended: is there enough memory"):
+        simulator.step(None)
+    assert not simulator._pending, "nothing more is sent"
 
 
 def test_mistakes_are_named() -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from experiment.conftest import epo  # noqa: F401 - a fixture
 
-from epo_lightning.run_folder import read_json
+from epo_lightning.experiment.drive import _titles
+from epo_lightning.run_folder import RunFolder, read_json
 
 SMALL = ["episodes=2", "timed=1", "others=[ignores]"]
 
@@ -40,6 +42,9 @@ def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -
         (["run=rpi/v_lstm_epo", "film=2", "episodes=2"], "film must be an episode from 0 to 1, or null, not 2"),
         (["run=rpi/v_lstm_epo", "episodes=0", "film=null"], "episodes must be 1 or more, not 0"),
         (["run=rpi/v_lstm_epo", "ways=[]", "baselines=[]"], "nothing drives"),
+        (["run=rpi/v_lstm_epo", "others=[]"], "nothing drives: name one of others"),
+        (["run=[rpi/v_lstm_epo,rpi/v_lstm_epo]"], "the run rpi/v_lstm_epo is named twice"),
+        (["run=rpi/v_lstm_epo", "ways=[own,own]"], "two planners are called 'V-LSTM + EPO, relaxed'"),
         (["run=rpi/v_lstm_epo", "world=sum"], "unknown world 'sum': did you mean 'sumo'"),
         (
             ["run=rpi/v_lstm_epo", "world=sumo"],
@@ -80,6 +85,51 @@ def test_a_command_that_was_killed_is_continued(
     (out / "results.json").unlink()
     assert epo("drive", *words, "seed=1", f"out={out}") == 2
     assert "was begun with other settings" in capsys.readouterr().err
+
+
+def test_a_command_that_was_killed_in_the_middle_of_a_line_is_continued(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "driven"
+    words = ["run=rpi/v_lstm_epo", "ways=[own]", "baselines=[constant_velocity]", "film=null", "timed=0", *SMALL[::2]]
+    assert epo("drive", *words, f"out={out}") == 0
+    whole, lines = (out / "results.json").read_text(), (out / "episodes.jsonl").read_text().splitlines(keepends=True)
+    for left in (lines[0] + lines[2] + lines[1][:50], lines[0][:20]):
+        (out / "results.json").unlink()
+        (out / "episodes.jsonl").write_text(left)
+        assert epo("drive", *words, f"out={out}") == 0
+        assert (out / "results.json").read_text() == whole, "the first planner stays the first"
+        rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+        assert len(rows) == 3, "no row is lost"
+
+
+def test_what_was_driven_by_a_killed_command_gives_the_same_table(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    """Also the rates of a world, with its driver as the only planner, which has no plans to be timed."""
+    pytest.importorskip("highway_env", reason="the extra `drive` is not installed")
+    words = ["world=highway_env", "run=x", "ways=[]", "baselines=[driver]", "others=[merge]", "episodes=2", "film=null"]
+    assert epo("drive", *words, "out=driven") == 0
+    files = [tmp_path / "driven" / name for name in ("results.json", "table.md")]
+    whole = [file.read_text() for file in files]
+    assert "arrived [%]" in whole[1]
+    files[0].unlink()
+    assert epo("drive", *words, "out=driven") == 0
+    assert [file.read_text() for file in files] == whole
+
+
+def test_runs_with_one_title_are_told_apart(epo: Callable[..., int], tmp_path: Path) -> None:  # noqa: F811
+    for name in ("short-s1", "short-s2"):
+        shutil.copytree(RunFolder.open("rpi/v_lstm_epo").path, tmp_path / name)
+    words = ["ways=[own]", "baselines=[]", "film=null", "timed=0", *SMALL[::2]]
+    assert epo("drive", "run=[short-s1,short-s2,rpi/v_lstm_sc]", *words, "out=driven") == 0
+    planners = read_json(tmp_path / "driven" / "results.json")["worlds"]["ignores"]["planners"]
+    row = "V-LSTM + EPO, relaxed"
+    assert set(planners) == {f"{row} (short-s1)", f"{row} (short-s2)", "V-LSTM + SC, relaxed"}
+    paths = ["a/s1", "b/s1"]
+    assert _titles(paths, [Path("/a/s1"), Path("/b/s1")], ["x", "x"]) == ["x (a/s1)", "x (b/s1)"]
 
 
 def test_results_are_not_overwritten(

@@ -364,6 +364,8 @@ class DriveSettings:
             raise ConfigError(f"film must be an episode from 0 to {self.episodes - 1}, or null, not {self.film}")
         if not self.run or not (self.ways or self.baselines or self.baselines is None):
             raise ConfigError("nothing drives: name a run and one of ways, or one of baselines")
+        if self.others is not None and not self.others:
+            raise ConfigError("nothing drives: name one of others, or leave others out for all of them")
 
     @property
     def runs(self) -> list[str]:
