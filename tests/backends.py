@@ -12,7 +12,7 @@ from contextlib import nullcontext
 import pytest
 import torch
 from games import ALL, BOUNDS, leaves_of, nearest_points_held, pad, random_game, random_scene, widen
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -177,7 +177,13 @@ class BackendSuite:
         scene = scene.to(torch.float32)
         parameters = parameters.to(torch.float32)
         single = self.damped(energy, scene, parameters, steps=1)
-        exact = self.damped(energy, scene.to(torch.float64), parameters.to(torch.float64), steps=1)
+        wide, weights = scene.to(torch.float64), parameters.to(torch.float64)
+        exact = self.damped(energy, wide, weights, steps=1)
+        if "lane" in game.own:  # near a kink of a lane's distance, single precision may be on its other side
+            for shift in ((1e-3, 0.0), (-1e-3, 0.0), (0.0, 1e-3), (0.0, -1e-3)):
+                moved = wide.history + torch.tensor([*shift, 0.0, 0.0], dtype=torch.float64)
+                beside = self.damped(energy, dataclasses.replace(wide, history=moved), weights, steps=1)
+                assume((beside.controls - exact.controls).abs().max() < 1e-3)
         torch.testing.assert_close(single.controls.double(), exact.controls, rtol=0, atol=5e-5)
         assert single.controls.dtype == single.energy.dtype == torch.float32
 
