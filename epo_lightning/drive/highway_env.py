@@ -39,7 +39,7 @@ Lane = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class Setting:
-    """What an episode in an environment is.
+    """Setting of the episodes in an environment.
 
     Attributes:
         environment: its name in gymnasium.

@@ -151,7 +151,7 @@ class SumoSimulator:
         return moment
 
     def _moment(self, vehicles: Vehicles) -> Moment:
-        """Where vehicles are in the plane, by the rules of :func:`~epo_lightning.data.simulate.motion.move`; no filter."""
+        """Vehicles in the plane, by the rules of :func:`~epo_lightning.data.simulate.motion.move`; no filter."""
         if self._name not in vehicles.names:
             raise ConfigError("the planned vehicle left SUMO's network: the section ends before its road does")
         first = vehicles.names.index(self._name)

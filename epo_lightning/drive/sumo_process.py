@@ -54,7 +54,7 @@ PATIENCE = 120.0
 
 @dataclass(frozen=True)
 class Branch:
-    """What names an episode: layout, seed and style of its stream, and its number in it."""
+    """Name of an episode: layout, seed and style of its stream, and its number in it."""
 
     layout: int
     seed: int

@@ -56,7 +56,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class Position:
-    """Where the planned vehicle is on its way.
+    """Place of the planned vehicle on its way.
 
     Attributes:
         progress: distance [m] along the road from where it began.
@@ -95,7 +95,7 @@ class Simulator(Protocol):
         ...
 
     def position(self, state: Float[np.ndarray, " 4"]) -> Position:
-        """Where the planned vehicle is."""
+        """Place of the planned vehicle on its way."""
         ...
 
     def close(self) -> None:

@@ -18,7 +18,7 @@ EGO = 0
 
 @dataclass(frozen=True)
 class Outcome:
-    """What happened in B episodes, from the first planned moment on.
+    """Outcome of B episodes, from the first planned moment on.
 
     Attributes:
         states: states of all agents, in one frame for the whole episode.
@@ -41,7 +41,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Search:
-    """How minima of known costs are searched.
+    """Settings of the search for minima of known costs.
 
     Attributes:
         steps: number of steps of the layer, for energies with the features ``accref`` and ``turnrref``; None to descend
@@ -109,7 +109,7 @@ class World(Protocol):
         ...
 
     def outcome(self) -> Outcome:
-        """What has happened in the begun episodes."""
+        """Outcome of the begun episodes."""
         ...
 
     def close(self) -> None:

@@ -125,7 +125,7 @@ class SplitRule:
             )
 
     def _advice(self, sources: Sequence[RecordingSource], full: Collection[str]) -> str:
-        """What to change so that every split gets one of the recordings in ``full``, which have scenes."""
+        """Advice on the change by which every split gets one of the recordings in ``full``, which have scenes."""
         holding = sorted({source.group for source in sources if source.name in full})
         if self.test is not None:
             now = f"data.test={list(self.test)}, data.seed={self.seed}"

@@ -1,4 +1,4 @@
-"""What became of each recording: windows, scenes, reasons, seconds and warnings, as a table and as CSV beside a data set."""
+"""Summary of each recording: windows, scenes, reasons, seconds and warnings, as a table and as CSV beside a data set."""
 
 from __future__ import annotations
 
