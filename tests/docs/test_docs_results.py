@@ -218,3 +218,23 @@ def test_the_page_of_highways_has_the_differences_of_its_files(heading: str, fil
         mean = fmean(values)
         low, middle, high = (f"{v:+.3f}".replace("0.", ".", 1) for v in (mean - half, mean, mean + half))
         assert cell == f"{middle} ({low} to {high})"
+
+
+def test_the_page_of_rpi_has_the_scores_on_shares_of_the_games() -> None:
+    found: dict[tuple[str, float], list[float]] = {}
+    for run in read_results(ROOT / "results" / "rpi_games_share.json").evaluated:
+        share = run.config["data"].get("games_share", 1.0)
+        found.setdefault((run.experiment.removeprefix("rpi/"), share), []).append(run.metrics["minSADE"])
+    section = RPI.partition("\n## Fewer games\n")[2].partition("\n## ")[0].splitlines()
+    for start, row, digits in (
+        ("V-LSTM + SC, relaxed", "v_lstm_sc_relaxed", 4),
+        ("V-LSTM + EPO, relaxed:", "v_lstm_epo_relaxed", 4),
+        ("V-LSTM + EPO, game, refined", "v_lstm_epo_game_refined", 4),
+        ("V-LSTM + EPO, game: inferred", "v_lstm_epo_game", 5),
+    ):
+        line = numbers(next(line for line in section if line.startswith(f"| {start}")))
+        for cell, share in zip(line, (0.01, 0.1, 1.0), strict=True):
+            values = found.get((row, share), [])
+            assert len(values) in (0, 3)
+            shown = f"{short(fmean(values), digits)} ± {short(stdev(values), digits)}" if values else "-"
+            assert cell == shown, (row, share)

@@ -95,7 +95,7 @@ def solve(
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact, threads=threads)
     if call.record:
-        controls, states, *iterates = _Steps.apply(call, parameters.initial_controls, *call.inputs)
+        controls, states, *iterates = Steps.apply(call, parameters.initial_controls, *call.inputs)
     else:
         call.run()
         iterates = list(call.iterates.unbind(0))
@@ -357,11 +357,12 @@ def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:
     return "lane" in energy.own and scene.reference_mask is not None and not scene.reference_mask.all()
 
 
-class _Steps(torch.autograd.Function):
-    """Autograd function of all steps; returns controls, states and, with ``keep_iterates``, every iterate."""
+class Steps(torch.autograd.Function):
+    """Autograd function of all steps of a call, which may also be one of the fused kernels; returns controls, states and,
+    with ``keep_iterates``, every iterate."""
 
     @staticmethod
-    def forward(ctx: Any, call: _Call, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, call: Any, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         call.run()
         ctx.call = call
         # The kernel reads these tensors again in the backward pass. Because they are saved, autograd raises an error if
@@ -378,7 +379,7 @@ class _Steps(torch.autograd.Function):
     def backward(
         ctx: Any, controls: Tensor | None, states: Tensor | None, *iterates: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        call: _Call = ctx.call
+        call = ctx.call
         _ = ctx.saved_tensors
         bar = (
             torch.zeros_like(call.start) if controls is None else controls.clone(memory_format=torch.contiguous_format)

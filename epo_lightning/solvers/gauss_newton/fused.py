@@ -18,10 +18,10 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.solvers.gauss_newton.compiled import Steps
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
 
 MOST_AGENTS = 64
@@ -79,7 +79,7 @@ def solve(
         )
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates)
     if call.record:
-        controls, states, *iterates = _Steps.apply(call, parameters.initial_controls, *call.inputs)
+        controls, states, *iterates = Steps.apply(call, parameters.initial_controls, *call.inputs)
     else:
         call.run()
         iterates = list(call.iterates.unbind(0))
@@ -304,37 +304,3 @@ def _slots(known: tuple[str, ...], names: Any, like: Any) -> Any:
     """For every known feature its position among ``names``, or -1."""
     names = list(names)
     return type(like)(*(names.index(name) if name in names else -1 for name in known))
-
-
-class _Steps(torch.autograd.Function):
-    """Autograd function of all steps; returns controls, states and, with ``keep_iterates``, every iterate."""
-
-    @staticmethod
-    def forward(ctx: Any, call: _Call, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
-        call.run()
-        ctx.call = call
-        # Because they are saved, autograd raises an error if a tensor that the kernel reads again was changed in place.
-        ctx.save_for_backward(*inputs, *call.kept)
-        ctx.set_materialize_grads(False)
-        iterates = [iterate.clone() for iterate in call.iterates] if call.keep_iterates else []
-        # The autograd node would hold its own output, a reference cycle, which only the garbage collector could free.
-        states, call.states = call.states, None
-        return call.iterates[-1].clone(), states, *iterates
-
-    @staticmethod
-    @once_differentiable
-    def backward(
-        ctx: Any, controls: Tensor | None, states: Tensor | None, *iterates: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
-        call: _Call = ctx.call
-        _ = ctx.saved_tensors
-        bar = (
-            torch.zeros_like(call.start) if controls is None else controls.clone(memory_format=torch.contiguous_format)
-        )
-        along = None
-        if any(iterate is not None for iterate in iterates):
-            along = torch.stack([torch.zeros_like(bar) if iterate is None else iterate for iterate in iterates])
-        if states is not None:
-            states = states.contiguous()
-        gradients = call.differentiate(bar, along, states)
-        return None, bar, *gradients
