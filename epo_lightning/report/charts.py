@@ -18,6 +18,7 @@ from epo_lightning.report.curves import (
     steps_curves,
     steps_names,
 )
+from epo_lightning.report.efficiency import Efficiency, draw_efficiency, efficiencies
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
 from epo_lightning.report.runtime import draw_modes, heat_map
 from epo_lightning.report.tables import Table, distinct, trained_rows
@@ -63,12 +64,12 @@ class Chart:
     notes: tuple[str, ...] = ()
 
 
-LEARNING, STEPS, RUNTIMES = "Learning curves", "S curve", "Runtime"
+LEARNING, STEPS, EFFICIENCY, RUNTIMES = "Learning curves", "S curve", "Data efficiency", "Runtime"
 
 
 def charts_of(tables: Sequence[Table], timings: Sequence[Timing]) -> list[Chart]:
     """All figures that these tables and timings allow."""
-    return [*_learning(tables), *_steps(tables), *_runtimes(timings)]
+    return [*_learning(tables), *_steps(tables), *_efficiency(tables), *_runtimes(timings)]
 
 
 def _learning(tables: Sequence[Table]) -> Iterable[Chart]:
@@ -135,6 +136,31 @@ def _steps_numbers(curve: StepsCurve) -> Iterable[tuple[str, ...]]:
             f"{mean:.4f}",
             f"{initial[steps]:.4f}" if steps in initial else "-",
         )
+
+
+def _efficiency(tables: Sequence[Table]) -> Iterable[Chart]:
+    """Charts over the share of the training games, one per data set and split."""
+    found = efficiencies(distinct(tables))
+    for number, entry in enumerate(found, 1):
+        yield Chart(
+            section=EFFICIENCY,
+            name="data_efficiency" + (f"_{number}" if len(found) > 1 else ""),
+            title=f"minSADE over the share of the training games, {entry.data}",
+            caption="minSADE of rows trained on a share of the games: mean over seeds, with a band from the best "
+            "to the worst.",
+            draw=lambda size, legend, entry=entry: draw_efficiency(entry.curves, size, legend),  # type: ignore[misc]
+            wide=(8.8, 4.3),
+            narrow=(4.0, 3.5),
+            legend=tuple(Key(curve.name, look(i)[0], look(i)[1] != "-") for i, curve in enumerate(entry.curves)),
+            header=("row", "share of the games", "seeds", "minSADE [m]"),
+            numbers=tuple(_efficiency_numbers(entry)),
+        )
+
+
+def _efficiency_numbers(entry: Efficiency) -> Iterable[tuple[str, ...]]:
+    for curve, counts in zip(entry.curves, entry.seeds, strict=True):
+        for share, mean, seeds in zip(curve.x, curve.mean, counts, strict=True):
+            yield curve.name, f"{100 * share:.3g} %", str(seeds), f"{mean:.5f}"
 
 
 def _runtimes(timings: Sequence[Timing]) -> Iterable[Chart]:

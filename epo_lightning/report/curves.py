@@ -7,6 +7,7 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -30,25 +31,25 @@ DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
 
 @dataclass(frozen=True)
 class Curve:
-    """One quantity of one row, over training steps or optimisation steps.
+    """One quantity of one row, over training steps, optimisation steps or shares of the training data.
 
     Attributes:
         name: name of the row.
-        x: training or optimisation steps of the values.
+        x: steps or shares of the values.
         mean, low, high: mean, smallest and largest value over the seeds at every ``x``.
         seeds: number of seeds.
     """
 
     name: str
-    x: tuple[int, ...]
+    x: tuple[float, ...]
     mean: tuple[float, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
     seeds: int
 
     @classmethod
-    def over_seeds(cls, name: str, values: Mapping[int, Sequence[float]]) -> Curve:
-        """The curve of all values, given by step."""
+    def over_seeds(cls, name: str, values: Mapping[Any, Sequence[float]]) -> Curve:
+        """The curve of all values, given by step or share."""
         x = tuple(sorted(values))
         return cls(
             name,
@@ -144,17 +145,17 @@ def draw_learning(curves: Sequence[Curve], size: tuple[float, float] = SIZE, leg
         for i, curve in enumerate(curves):
             color, dashes = look(i)
             marker = "o" if len(curve.x) == 1 else ""
-            _line(
+            draw_line(
                 axes, curve, f"row{i}", 0.16 if len(curves) < 5 else 0.08, color=color, ls=dashes, lw=1.7, marker=marker
             )
         everything = [value for curve in curves for value in (*curve.low, *curve.high)]
         if min(everything) > 0 and max(everything) > 5 * min(everything):
-            _logarithmic(axes)
+            logarithmic(axes)
         axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
         axes.set_xlabel("training steps")
         axes.set_ylabel("minSADE, validation [m]")
         axes.margins(x=0.02)
-        _plain(axes)
+        plain_frame(axes)
         if legend:
             figure.legend(loc="outside lower center", ncols=min(3, len(curves)), fontsize=8)
         return figure
@@ -213,9 +214,9 @@ def draw_steps(curve: StepsCurve, size: tuple[float, float] = SIZE, legend: bool
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots()
         ours = {"lw": 1.9, "marker": "o", "ms": 5}
-        _line(axes, curve.optimised, "row0", 0.16, label=names[0][0], color=names[0][1], **ours)
+        draw_line(axes, curve.optimised, "row0", 0.16, label=names[0][0], color=names[0][1], **ours)
         if curve.initial is not None:
-            _line(axes, curve.initial, "row1", 0.16, label=names[1][0], color=names[1][1], **ours)
+            draw_line(axes, curve.initial, "row1", 0.16, label=names[1][0], color=names[1][1], **ours)
         if curve.paper:
             for which, (label, color, _) in enumerate(names[-2:]):
                 axes.plot(
@@ -237,7 +238,7 @@ def draw_steps(curve: StepsCurve, size: tuple[float, float] = SIZE, legend: bool
         axes.set_xlabel("optimisation steps S")
         axes.set_ylabel("minSADE [m]")
         axes.margins(x=0.06, y=0.12)
-        _plain(axes)
+        plain_frame(axes)
         if legend:
             figure.legend(loc="outside lower center", ncols=2, fontsize=8)
         return figure
@@ -249,7 +250,7 @@ def steps_names(curve: StepsCurve) -> list[tuple[str, str, bool]]:
     return ours + ([("paper, optimised", MODES[1], True), ("paper, initial", MODES[0], True)] if curve.paper else [])
 
 
-def _line(axes: Axes, curve: Curve, gid: str, shade: float, label: str | None = None, **options: object) -> Line2D:
+def draw_line(axes: Axes, curve: Curve, gid: str, shade: float, label: str | None = None, **options: object) -> Line2D:
     """Draw a mean, and its band if there are several seeds."""
     if curve.seeds > 1:
         axes.fill_between(
@@ -265,7 +266,7 @@ def _line(axes: Axes, curve: Curve, gid: str, shade: float, label: str | None = 
     return drawn[0]
 
 
-def _logarithmic(axes: Axes) -> None:
+def logarithmic(axes: Axes) -> None:
     """Set a logarithmic axis with ticks as plain numbers."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -277,5 +278,6 @@ def _logarithmic(axes: Axes) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def _plain(axes: Axes) -> None:
+def plain_frame(axes: Axes) -> None:
+    """Leave out the frame's lines at the top and on the right."""
     axes.spines[["top", "right"]].set_visible(False)

@@ -14,6 +14,7 @@ from matplotlib.text import Text
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.charts import charts_of
 from epo_lightning.report.curves import Curve, draw_learning, draw_steps, learning_curves, steps_curves, validation_log
+from epo_lightning.report.efficiency import draw_efficiency, efficiencies
 from epo_lightning.report.made import how_made
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES, STEPS
 from epo_lightning.report.runs import collect, find_runs
@@ -109,6 +110,27 @@ def test_rows_that_differ_in_more_than_steps_are_not_joined(tmp_path: Path) -> N
         settings = {"solver.steps": steps, "backbone.width": width}
         make_run(tmp_path / str(steps), "V-LSTM + EPO", "epo", scores(0.1), settings=settings)
     assert steps_curves(distinct(build_tables(collect(tmp_path)))) == []
+
+
+def test_data_efficiency_joins_rows_that_differ_only_in_the_share_of_the_games(tmp_path: Path) -> None:
+    values = {("V-LSTM + SC", None): 0.02, ("V-LSTM + SC", 0.1): 0.04, ("V-LSTM + SC", 0.01): 0.2, ("Other", 0.1): 0.5}
+    for (title, share), value in values.items():
+        settings = {} if share is None else {"data.games_share": share}
+        for seed in range(2 if share != 0.1 else 1):
+            folder = tmp_path / title / f"{share}-s{seed}"
+            make_run(folder, title, "scene_consistent", scores(value + 0.01 * seed), seed=seed, settings=settings)
+    wider = {"data.games_share": 0.1, "backbone.width": 256}
+    make_run(tmp_path / "wide", "V-LSTM + SC", "scene_consistent", scores(0.7), settings=wider)
+    tables = build_tables(collect(tmp_path))
+    (entry,) = efficiencies(distinct(tables))
+    assert entry.data == "rpi, test split"
+    (curve,) = entry.curves
+    assert (curve.name, curve.x, entry.seeds) == ("V-LSTM + SC", (0.01, 0.1, 1.0), ((2, 1, 2),))
+    assert curve.mean == pytest.approx((0.205, 0.04, 0.025))
+    (chart,) = (chart for chart in charts_of(tables, []) if chart.section == "Data efficiency")
+    assert chart.numbers[0] == ("V-LSTM + SC", "1 %", "2", "0.20500")
+    drawn = lines(draw_efficiency(entry.curves))
+    assert drawn == {"row0-line": list(zip(curve.x, curve.mean, strict=True))}
 
 
 def test_the_heat_map_shows_every_timing_and_the_papers(tmp_path: Path) -> None:
