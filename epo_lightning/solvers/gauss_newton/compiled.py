@@ -94,8 +94,13 @@ def solve(
     are shared out among ``threads`` threads, by default ``torch.get_num_threads()``; results do not depend on their number.
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact, threads=threads)
+    return take_steps(call, parameters.initial_controls)
+
+
+def take_steps(call: Any, initial_controls: Float[Tensor, "B M N K 2"]) -> Solution:
+    """The solution of a call of this kernel or of the fused ones, with its derivative if that is wanted."""
     if call.record:
-        controls, states, *iterates = Steps.apply(call, parameters.initial_controls, *call.inputs)
+        controls, states, *iterates = _Steps.apply(call, initial_controls, *call.inputs)
     else:
         call.run()
         iterates = list(call.iterates.unbind(0))
@@ -107,7 +112,7 @@ def solve(
         energy=call.energy,
         gradient_norm=call.gradient_norm,
         status=call.status,
-        iterates=tuple(iterates) if keep_iterates else None,
+        iterates=tuple(iterates) if call.keep_iterates else None,
     )
 
 
@@ -357,9 +362,8 @@ def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:
     return "lane" in energy.own and scene.reference_mask is not None and not scene.reference_mask.all()
 
 
-class Steps(torch.autograd.Function):
-    """Autograd function of all steps of a call, which may also be one of the fused kernels; returns controls, states and,
-    with ``keep_iterates``, every iterate."""
+class _Steps(torch.autograd.Function):
+    """Autograd function of all steps of a call; returns controls, states and, with ``keep_iterates``, every iterate."""
 
     @staticmethod
     def forward(ctx: Any, call: Any, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Solution
-from epo_lightning.solvers.gauss_newton.compiled import Steps
+from epo_lightning.solvers.gauss_newton.compiled import take_steps
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
 
 MOST_AGENTS = 64
@@ -78,21 +78,7 @@ def solve(
             "solver.backend is 'warp', which has no Newton steps; 'compiled', 'host' (on a GPU) and 'pytorch' have them"
         )
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates)
-    if call.record:
-        controls, states, *iterates = Steps.apply(call, parameters.initial_controls, *call.inputs)
-    else:
-        call.run()
-        iterates = list(call.iterates.unbind(0))
-        controls, states = iterates[-1], call.states
-    return Solution(
-        controls=controls,
-        states=states,
-        initial_energy=call.initial_energy,
-        energy=call.energy,
-        gradient_norm=call.gradient_norm,
-        status=call.status,
-        iterates=tuple(iterates) if keep_iterates else None,
-    )
+    return take_steps(call, parameters.initial_controls)
 
 
 @functools.cache
