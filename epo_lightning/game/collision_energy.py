@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from epo_lightning.checks import check_number, check_whole
-from epo_lightning.game.circles import disc, length_of, row_extent, row_overlap
+from epo_lightning.game.circles import disc, length_of, row_extent, row_overlap, rows_may_overlap
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.limits import Bound
 from epo_lightning.game.network_energy import NetworkEnergy
@@ -143,7 +143,8 @@ def _rows_collide(
 ) -> Bool[Tensor, "*batch"]:
     """Whether two rows of circles overlap at any step.
 
-    Rows are compared only where the discs around them overlap and no collision was found at an earlier step.
+    Rows are compared only where the discs around them overlap, neither is beside the other, and no collision was found at
+    an earlier step.
     """
     shape = torch.broadcast_shapes(first.shape[:-2], second.shape[:-2])
     reach = (row_extent(first_size) + row_extent(second_size)).expand(shape)
@@ -155,6 +156,8 @@ def _rows_collide(
         close = ((squared < squared_reach) & ~hit).nonzero()
         for some in close.split(_AT_ONCE):
             index = some.unbind(-1)
-            states = [values[index][:, None] for values in both]
-            hit[index] = row_overlap(*states)[:, 0] > 0
+            states = [values[index] for values in both]
+            near = rows_may_overlap(*states)
+            overlap = row_overlap(*(values[near, None] for values in states))
+            hit[tuple(entry[near] for entry in index)] = overlap[:, 0] > 0
     return hit

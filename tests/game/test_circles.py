@@ -14,7 +14,7 @@ from shapely import LineString, MultiPoint, Point, Polygon
 from shapely.affinity import rotate, translate
 
 from epo_lightning.experiment.config.compose import compose
-from epo_lightning.game.circles import places, row_extent, row_overlap
+from epo_lightning.game.circles import places, row_extent, row_overlap, rows_may_overlap
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import PAIR_FEATURES, Source, pair_feature
 from epo_lightning.registry import ConfigError
@@ -289,6 +289,19 @@ def test_the_extent_bounds_where_circles_are_felt(size):
     centres, radius = circles_of((0.0, 0.0, 0.7), size)
     reach = Point(0.0, 0.0).buffer(extent + 1e-6, 512)
     assert reach.buffer(1e-3).contains(LineString(centres).buffer(radius))
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10_000), dtype=st.sampled_from([torch.float32, torch.float64]))
+def test_rows_that_are_beside_each_other_do_not_overlap(seed, dtype):
+    torch.manual_seed(seed)
+    (first, second), (size, other_size) = pair_of_states(2000)
+    first[..., :2] *= 3.0
+    first, second, size, other_size = (values[:, 0].to(dtype) for values in (first, second, size, other_size))
+    may = rows_may_overlap(first, second, size, other_size)
+    overlap = row_overlap(first[:, None], second[:, None], size[:, None], other_size[:, None])[:, 0]
+    assert may[overlap > 0].all()
+    assert (may == (overlap > 0)).float().mean() > 0.7
 
 
 def test_samples_depend_on_neither_batch_nor_padding_to_the_last_bit():
