@@ -12,7 +12,7 @@ from contextlib import nullcontext
 import pytest
 import torch
 from games import ALL, BOUNDS, leaves_of, nearest_points_held, pad, random_game, random_scene, widen
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -170,22 +170,30 @@ class BackendSuite:
             scale = exact[name].abs().max().clamp_min(1.0) if exact[name].numel() else 1.0
             torch.testing.assert_close(gradient / scale, exact[name] / scale, rtol=0, atol=1e-9, msg=name)
 
+    def single_and_double(self, game):
+        """The solutions of one step in single and in double precision, of the same rounded game."""
+        energy, scene, parameters = game.make()
+        scene, parameters = scene.to(torch.float32), parameters.to(torch.float32)
+        double = scene.to(torch.float64), parameters.to(torch.float64)
+        return self.damped(energy, scene, parameters, steps=1), self.damped(energy, *double, steps=1)
+
     @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
     @given(game=games(most=4))
     def test_a_float32_step_is_close_to_float64(self, game):
-        energy, scene, parameters = game.make()
-        scene = scene.to(torch.float32)
-        parameters = parameters.to(torch.float32)
-        single = self.damped(energy, scene, parameters, steps=1)
-        wide, weights = scene.to(torch.float64), parameters.to(torch.float64)
-        exact = self.damped(energy, wide, weights, steps=1)
-        if "lane" in game.own:  # near a kink of a lane's distance, single precision may be on its other side
-            for shift in ((1e-3, 0.0), (-1e-3, 0.0), (0.0, 1e-3), (0.0, -1e-3)):
-                moved = wide.history + torch.tensor([*shift, 0.0, 0.0], dtype=torch.float64)
-                beside = self.damped(energy, dataclasses.replace(wide, history=moved), weights, steps=1)
-                assume((beside.controls - exact.controls).abs().max() < 1e-3)
-        torch.testing.assert_close(single.controls.double(), exact.controls, rtol=0, atol=5e-5)
+        single, exact = self.single_and_double(game)
+        # Metres from a line, the squared distances to a corner and to a point millimetres beside it are equal in single
+        # precision. Where the derivative follows the line, which of the two is taken decides on its direction.
+        corners = game.lane_slides and "lane" in game.own
+        torch.testing.assert_close(single.controls.double(), exact.controls, rtol=0, atol=1e-2 if corners else 5e-5)
         assert single.controls.dtype == single.energy.dtype == torch.float32
+
+    def test_few_float32_steps_are_beside_corners_of_lines(self):
+        games = [Draw(1, 20, frozenset(("lane", "vel")), (), 1, 1.0, False, 1, seed, None, True) for seed in range(50)]
+        close = 0
+        for game in games:
+            single, exact = self.single_and_double(game)
+            close += bool((single.controls.double() - exact.controls).abs().max() < 5e-5)
+        assert close >= 47
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     @pytest.mark.parametrize("agents", [1, 2, 4, 6])
