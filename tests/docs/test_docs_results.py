@@ -132,6 +132,7 @@ OF_RPI = {
     "V-LSTM + SC, relaxed": "V-LSTM + SC, relaxed",
     "V-LSTM + EPO, relaxed": "V-LSTM + EPO, relaxed",
     "V-LSTM + EPO, relaxed, no pair": "the same without its pair term, trained so",
+    "V-LSTM + EPO, game, refined by S = 2": "V-LSTM + EPO, game, refined by S = 2",
     "V-LSTM": "V-LSTM",
     "V-LSTM + SC": "V-LSTM + SC",
     "V-LSTM + EPO": "V-LSTM + EPO",
@@ -145,6 +146,7 @@ OF_RPI = {
         ("The hard split", "rpi_hard_settled", 4),
         ("Ten epochs", "rpi_hard", 4),
         ("The paper's split", "rpi_paper_split", 3),
+        ("The paper's split", "rpi_paper_split_game", 1),
         ("The paper's loss", "rpi_hard", 3),
     ],
 )
