@@ -34,19 +34,19 @@ KINDS = ("car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "o
 ACCELERATION, TURN_RATE = range(2)
 
 
-Batch = TypeVar("Batch", bound="_Batch")
+Some = TypeVar("Some", bound="Batch")
 
 
-class _Batch:
+class Batch:
     """A data class of tensors that share their leading dimension B; they are moved and indexed together."""
 
-    def map(self: Batch, function: Callable[[Tensor], Tensor]) -> Batch:
+    def map(self: Some, function: Callable[[Tensor], Tensor]) -> Some:
         """A copy with ``function`` applied to every tensor, also inside nested mappings, tuples and batches."""
 
         def visit(value: Any) -> Any:
             if isinstance(value, Tensor):
                 return function(value)
-            if isinstance(value, _Batch):
+            if isinstance(value, Batch):
                 return value.map(function)
             if isinstance(value, Mapping):
                 return {key: visit(entry) for key, entry in value.items()}
@@ -57,13 +57,13 @@ class _Batch:
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         return type(self)(**{field.name: visit(getattr(self, field.name)) for field in fields})
 
-    def to(self: Batch, target: torch.device | torch.dtype | str) -> Batch:
+    def to(self: Some, target: torch.device | torch.dtype | str) -> Some:
         """A copy on another device, or with its floating-point tensors in another precision."""
         if isinstance(target, torch.dtype):
             return self.map(lambda tensor: tensor.to(target) if tensor.is_floating_point() else tensor)
         return self.map(lambda tensor: tensor.to(target))
 
-    def __getitem__(self: Batch, index: Any) -> Batch:
+    def __getitem__(self: Some, index: Any) -> Some:
         """The chosen scenes of the batch; an integer keeps the batch dimension."""
         if isinstance(index, int):
             index = [index]
@@ -101,7 +101,7 @@ _LEAST = {"H": (1, "step; the last one is the current state, t0"), "K": (1, "ste
 
 
 @dataclass(frozen=True)
-class Scene(_Batch):
+class Scene(Batch):
     """A batch of B observed scenes: agents' histories and sizes, the map and, in training, the agents' futures.
 
     Positions are in one fixed frame for the whole scene. Masks are True where an entry is real and False for padding; the
@@ -271,7 +271,7 @@ def _check_tensor(name: str, value: Any, numbers: str, shape: tuple[str | int, .
 
 
 @dataclass(frozen=True)
-class GameParameters(_Batch):
+class GameParameters(Batch):
     """The inferred game of every scene and mode (Section 4.2), p = (w, g), and the strategies at which its solver starts.
 
     Attributes:
@@ -335,7 +335,7 @@ class Status(IntEnum):
 
 
 @dataclass(frozen=True)
-class Tables(_Batch):
+class Tables(Batch):
     """Energies of C candidate strategies per agent, and the density p(k) = exp(-E(k)) / Z over joint choices k.
 
     Attributes:
@@ -355,7 +355,7 @@ class Tables(_Batch):
 
 
 @dataclass(frozen=True)
-class Constraints(_Batch):
+class Constraints(Batch):
     """Hard constraints h <= 0 of a solution, for solvers that have any.
 
     Attributes:
@@ -372,7 +372,7 @@ class Constraints(_Batch):
 
 
 @dataclass(frozen=True)
-class Solution(_Batch):
+class Solution(Batch):
     """Joint strategies found by a solver, with their energy and status.
 
     Attributes:
@@ -402,7 +402,7 @@ class Solution(_Batch):
 
 
 @dataclass(frozen=True)
-class Equilibrium(_Batch):
+class Equilibrium(Batch):
     """Distance of a forecast's most likely joint mode from an open-loop Nash equilibrium of its game.
 
     Attributes:
@@ -426,7 +426,7 @@ class Equilibrium(_Batch):
 
 
 @dataclass(frozen=True)
-class JointForecast(_Batch):
+class JointForecast(Batch):
     """M joint futures of all agents of a scene and their probabilities.
 
     Losses use ``log_probabilities``, computed from the logits where there are any: the gradient of a log-softmax does not

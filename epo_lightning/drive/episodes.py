@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.drive.planners import Plan, Planner, turned
@@ -22,9 +22,11 @@ class Episodes:
     Attributes:
         dt: time step [s].
         outcome: what happened.
-        controls: executed controls of the planned agent; changes of its speed and heading where the world drove it.
+        controls: executed controls of the planned agent; changes of its speed and heading where the world drove it. NaN
+            after the end of an episode.
         found: whether a plan was found at each step; elsewhere the rest of an earlier plan was followed.
-        plans: positions of the joint futures that were planned at each step, for films; empty unless asked for.
+        plans: positions of the joint futures that were planned at each step, for films; empty unless asked for. NaN for
+            agents that are not there, and after the end of an episode.
         wall, processor: seconds that each plan took, by the clock and of processor time.
     """
 
@@ -46,45 +48,58 @@ def play(world: World, planner: Planner | None, episodes: Sequence[int], keep_pl
         episodes: the episodes.
         keep_plans: whether the planned futures are kept.
     """
-    world.reset(episodes)
-    scene = world.observe()
+    count = len(episodes)
     found: list[Tensor] = []
     controls: list[Tensor] = []
     plans: list[Tensor] = []
     wall: list[float] = []
     processor: list[float] = []
-    previous: Plan | None = None
-    while not world.finished:
+    last: tuple[Tensor, Scene, Plan] | None = None
+    world.reset(episodes)
+    while len(going := world.going):
         if planner is None:
             world.advance(None)
-            found.append(torch.ones(len(episodes), dtype=torch.bool))
             continue
+        scene = world.observe()
+        previous = None if last is None else _onward(*last, going, scene)
         began, worked = time.perf_counter(), time.thread_time()
         plan = planner(scene, previous).or_else(previous, scene)
         wall.append(time.perf_counter() - began)
         processor.append(time.thread_time() - worked)
         world.advance(plan.controls[:, 0])
-        controls.append(plan.controls[:, 0].double())
-        found.append(plan.found)
+        controls.append(_spread(plan.controls[:, 0].double(), going, count, torch.nan))
+        found.append(_spread(plan.found, going, count, True))
         if keep_plans:
-            plans.append(_outside(plan.states[..., :2], scene))
-        before, scene = scene, world.observe()
-        previous = plan.seen_from(before, scene)
+            plans.append(_spread(_outside(plan.states[..., :2], scene), going, count, torch.nan))
+        last = going, scene, plan
     outcome = world.outcome()
+    told = _told(outcome, world.dt)
     return Episodes(
-        dt=scene.dt,
+        dt=world.dt,
         outcome=outcome,
-        controls=torch.stack(controls, 1) if planner else _told(outcome, scene.dt),
-        found=torch.stack(found, 1),
+        controls=torch.stack(controls, 1) if controls else told,
+        found=torch.stack(found, 1) if found else torch.ones(told.shape[:2], dtype=torch.bool),
         plans=plans,
         wall=wall,
         processor=processor,
     )
 
 
+def _onward(were: Int[Tensor, " b"], before: Scene, plan: Plan, going: Int[Tensor, " b"], scene: Scene) -> Plan:
+    """The plan of the last step for the episodes that go on, in the frames of their scenes."""
+    left = torch.isin(were, going)
+    return plan[left].seen_from(before[left], scene)
+
+
+def _spread(values: Tensor, going: Int[Tensor, " b"], count: int, rest: float) -> Tensor:
+    """Values [b, ...] of some episodes as values [B, ...] of all, with ``rest`` for the others."""
+    return values.new_full((count, *values.shape[1:]), rest).index_copy_(0, going, values)
+
+
 def _told(outcome: Outcome, dt: float) -> Float[Tensor, "B T 2"]:
-    """Changes of the planned agent's speed and heading per second."""
-    return outcome.states[:, EGO][..., [SPEED, HEADING]].diff(dim=1) / dt
+    """Changes of the planned agent's speed and heading per second; NaN after the end of an episode."""
+    changes = outcome.states[:, EGO][..., [SPEED, HEADING]].diff(dim=1) / dt
+    return changes.where(outcome.agent_mask[:, EGO, 1:, None], torch.nan)
 
 
 def _outside(position: Float[Tensor, "B N K 2"], scene: Scene) -> Float[Tensor, "B N K 2"]:
@@ -93,7 +108,7 @@ def _outside(position: Float[Tensor, "B N K 2"], scene: Scene) -> Float[Tensor, 
     if scene.frame is not None:
         frame = scene.frame.double()[:, None, None]
         position = turned(position, frame[..., 2]) + frame[..., :2]
-    return position.where(scene.agent_mask[..., None, None], torch.nan)
+    return position.where(scene.agent_mask[:, : position.shape[1], None, None], torch.nan)
 
 
 def times(world: World, planner: Planner, episodes: Sequence[int]) -> tuple[list[float], list[float]]:

@@ -19,7 +19,8 @@ from jaxtyping import Float
 
 from epo_lightning.checks import check_whole
 from epo_lightning.data.recorded.lanes import LANE, LaneGraph, Polylines
-from epo_lightning.drive.traffic import WINDOWS, Moment, Position, TrafficWorld
+from epo_lightning.drive.ride import WINDOWS, Moment, Position
+from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import HEADING, KINDS
 
@@ -27,6 +28,8 @@ SEEDS = 1_000_000
 """Added to seeds of episodes."""
 APART = 1000
 """Distance of the first episodes of two consecutive seeds, and so the largest number of episodes."""
+TOGETHER = 25
+"""Number of episodes that are driven together."""
 SUBSTEPS = 3
 """Steps of 1/15 s, those of the environments, in one step of a planner."""
 SPACING = 2.0
@@ -92,6 +95,8 @@ class HighwayEnvSimulator:
         episodes, seed, place: as in :func:`highway_env_world`.
     """
 
+    together = TOGETHER
+
     def __init__(self, episodes: int, seed: int, place: str) -> None:
         check_whole("episodes", episodes)
         if episodes > APART:
@@ -104,44 +109,58 @@ class HighwayEnvSimulator:
         self._episodes, self._seed, self._setting = episodes, (SEEDS + seed) * APART, SETTINGS[place]
         self._environment = _environment(self._setting.environment)
         self._environment.reset(seed=self._seed)
-        network = self._environment.road.network
-        keys = keys_of(network)
-        self.lanes = lanes_of(network, self._setting)
-        # A lane that ends although its road goes on has to be left.
-        self._ending = {
-            place
-            for place, (_, node, _) in enumerate(keys)
-            if not self.lanes.successors[place] and network.graph.get(node)
-        }
+        self.roads = Roads(self._environment.road.network, self._setting)
         self.steps = round(self._setting.seconds / WINDOWS.dt)
-        legs = [network.get_lane((a, b, 0)) for a, b in pairwise(self._setting.route)]
-        self._way = Polylines([np.concatenate([_line(leg, 0.0) for leg in legs])])
 
     def __len__(self) -> int:
         return self._episodes
 
-    def begin(self, episode: int) -> list[Moment]:
+    def begin(self, episode: int) -> HighwayEnvSimulation:
+        self._environment.reset(
+            seed=self._seed + episode
+        )  # makes a new road with vehicles and random numbers of its own
+        return HighwayEnvSimulation(self._environment.road, self._setting, self.roads)
+
+    def close(self) -> None:
+        """End the environment."""
+        self._environment.close()
+
+
+class HighwayEnvSimulation:
+    """An episode on a road of highway-env, of which the first 1.8 s are driven when it is begun.
+
+    Args:
+        road: the road with its vehicles.
+        setting: setting of the episodes.
+        roads: its map.
+    """
+
+    def __init__(self, road: Any, setting: Setting, roads: Roads) -> None:
         from highway_env.vehicle.behavior import IDMVehicle
 
-        self._environment.reset(seed=self._seed + episode)
-        road = self._environment.road
+        self._road, self.lanes, self._roads = road, roads.lanes, roads
         road.vehicles = [
             vehicle if isinstance(vehicle, IDMVehicle) else IDMVehicle.create_from(vehicle) for vehicle in road.vehicles
         ]
-        ego = road.vehicles[self._setting.vehicle]
-        if self._setting.back:
+        ego = road.vehicles[setting.vehicle]
+        if setting.back:
             lane = road.network.get_lane(ego.lane_index)
-            ego.position = lane.position(lane.local_coordinates(ego.position)[0] - self._setting.back, 0.0)
+            ego.position = lane.position(lane.local_coordinates(ego.position)[0] - setting.back, 0.0)
             ego.on_state_update()
         road.vehicles.remove(ego)
         self._vehicles: Sequence[Any] = [ego, *road.vehicles]
         road.vehicles = list(self._vehicles)
-        history = [self._moment(), *(self.step(None) for _ in range(WINDOWS.history - 1))]
-        self._from = self._along(history[-1].states[0])
-        return history
+        self._log = [self._moment()]
+        for _ in range(WINDOWS.history - 1):
+            self.step(None)
+            self._log.append(self.moment())
+        self._from = roads.position(self._log[-1].states[0], 0.0).progress
 
-    def step(self, way: tuple[Float[np.ndarray, " 4"], Float[np.ndarray, " 4"]] | None) -> Moment:
-        road, ego = self._environment.road, self._vehicles[0]
+    def history(self) -> list[Moment]:
+        return self._log
+
+    def step(self, way: tuple[Float[np.ndarray, " 4"], Float[np.ndarray, " 4"]] | None) -> None:
+        road, ego = self._road, self._vehicles[0]
         for substep in range(1, SUBSTEPS + 1):
             road.act()
             road.step(WINDOWS.dt / SUBSTEPS)
@@ -149,9 +168,12 @@ class HighwayEnvSimulator:
                 x, y, heading, speed = way[0] + substep / SUBSTEPS * (way[1] - way[0])
                 ego.position, ego.heading, ego.speed = np.array([x, -y]), -heading, speed
                 ego.on_state_update()
+        self._way = way
+
+    def moment(self) -> Moment:
         moment = self._moment()
-        if way is not None:
-            moment.states[0] = way[1]
+        if self._way is not None:
+            moment.states[0] = self._way[1]
         return moment
 
     def _moment(self) -> Moment:
@@ -164,13 +186,36 @@ class HighwayEnvSimulator:
             kind=np.full(len(vehicles), KINDS.index("car")),
         )
 
-    def _along(self, state: Float[np.ndarray, " 4"]) -> float:
-        """Position [m] along the route."""
-        along, _ = self._way.project(np.zeros(1, dtype=int), state[None, :2])
-        return float(along[0])
-
     def position(self, state: Float[np.ndarray, " 4"]) -> Position:
-        along = self._along(state)
+        return self._roads.position(state, self._from)
+
+    def end(self) -> None:
+        """Does nothing: a road is simulated when a step is asked for."""
+
+
+class Roads:
+    """The map of an environment, and the way of the planned vehicle on it.
+
+    Args:
+        network: highway-env's network of lanes.
+        setting: setting of the episodes.
+    """
+
+    def __init__(self, network: Any, setting: Setting) -> None:
+        self.lanes = lanes_of(network, setting)
+        # A lane that ends although its road goes on has to be left.
+        self._ending = {
+            place
+            for place, (_, node, _) in enumerate(keys_of(network))
+            if not self.lanes.successors[place] and network.graph.get(node)
+        }
+        legs = [network.get_lane((a, b, 0)) for a, b in pairwise(setting.route)]
+        self._way = Polylines([np.concatenate([_line(leg, 0.0) for leg in legs])])
+        self._end = self._way.length[0] + setting.beyond
+
+    def position(self, state: Float[np.ndarray, " 4"], begin: float) -> Position:
+        """Place of the planned vehicle that was at ``begin`` [m] of its way when it began."""
+        along = float(self._way.project(np.zeros(1, dtype=int), state[None, :2])[0][0])
         located = self.lanes.locate(state[None, :2], state[None, HEADING])
         lane = int(located.lane[0])
         off = lane < 0
@@ -180,15 +225,11 @@ class HighwayEnvSimulator:
             off = abs(float(located.offset[0])) > width / 2 + ASIDE or (beyond > ASIDE and lane in self._ending)
         merging = lane in self._ending
         return Position(
-            progress=along - getattr(self, "_from", along),
-            arrived=along >= self._way.length[0] + self._setting.beyond and not merging and not off,
+            progress=along - begin,
+            arrived=along >= self._end and not merging and not off,
             off_road=off,
             line=0 if merging else 1,
         )
-
-    def close(self) -> None:
-        """End the environment."""
-        self._environment.close()
 
 
 def _environment(name: str) -> Any:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import stats
 from torch import Tensor
 
@@ -18,11 +18,11 @@ from epo_lightning.drive.episodes import Episodes
 from epo_lightning.drive.world import EGO, Outcome, World
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.metrics.functional.overlap import overlaps_with
-from epo_lightning.scene import ACCELERATION, SPEED, TURN_RATE
+from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE
 
 SOON = 5.0
 """Longest time to collision [s] that is looked for; episodes without a shorter one count with it."""
-_STEP = 0.1
+_STEP, _MANY = 0.1, 4096
 STILL = 0.05
 """Speed [m/s] below which an agent stands."""
 RESAMPLES, CONFIDENCE = 2000, 0.95
@@ -61,7 +61,7 @@ def measure(episodes: Episodes, world: World) -> dict[str, Float[Tensor, " B"]]:
     """
     controls, dt, happened = episodes.controls, episodes.dt, episodes.outcome
     speed = happened.states[:, EGO, :, SPEED]
-    still = (speed.abs() < STILL) & (happened.progress < world.arrived)
+    still = (speed.abs() < STILL) & (happened.progress < world.arrived) & happened.agent_mask[:, EGO]
     window = round(world.patience / dt)
     stood = still.unfold(1, window, 1).all(-1).any(1) if window <= still.shape[1] else torch.zeros_like(still[:, 0])
     with_ego = happened.agent_mask & happened.agent_mask[:, EGO, None]
@@ -81,8 +81,8 @@ def measure(episodes: Episodes, world: World) -> dict[str, Float[Tensor, " B"]]:
 
 
 def _mean(values: Float[Tensor, "B T"]) -> Float[Tensor, " B"]:
-    """Mean over time; zero for an episode without steps."""
-    return values.mean(1) if values.shape[1] else values.new_zeros(len(values))
+    """Mean over time, until the end of each episode; zero for an episode without steps."""
+    return values.nanmean(1).nan_to_num(0.0)
 
 
 def _touches(happened: Outcome, shape: str) -> Tensor:
@@ -95,16 +95,36 @@ def _touches(happened: Outcome, shape: str) -> Tensor:
 
 def _time_to_collision(happened: Outcome, shape: str) -> Float[Tensor, " B"]:
     """Smallest time [s] to an overlap at constant velocities over all steps, found in steps of a tenth of a second."""
-    count = round(SOON / _STEP)
-    standing = torch.zeros(count, 2, dtype=happened.states.dtype)
-    least = torch.full((len(happened.states),), SOON, dtype=happened.states.dtype)
-    for t in range(happened.states.shape[2]):
-        now = happened.states[:, :, t]
-        ahead = Unicycle().rollout(now, standing.expand(*now.shape[:2], -1, -1), _STEP)
-        touch = overlaps_with(EGO, ahead, happened.size, happened.agent_mask[:, :, t], shape).any(1)
+    states = happened.states
+    least = torch.full((len(states),), SOON, dtype=states.dtype)
+    episode, t, other = _approaching(happened).nonzero(as_tuple=True)
+    now = torch.stack((states[episode, EGO, t], states[episode, other, t]), 1)
+    size = torch.stack((happened.size[episode, EGO], happened.size[episode, other]), 1)
+    standing = torch.zeros(round(SOON / _STEP), 2, dtype=states.dtype)
+    for some in torch.arange(len(episode)).split(_MANY):
+        ahead = Unicycle().rollout(now[some], standing.expand(len(some), 2, -1, -1), _STEP)
+        there = torch.ones(len(some), 2, dtype=torch.bool)
+        touch = overlaps_with(EGO, ahead, size[some], there, shape)[:, 0]
         first = torch.where(touch.any(1), (touch.to(torch.int8).argmax(1) + 1) * _STEP, SOON)
-        least = least.minimum(first.to(least))
+        least = least.scatter_reduce(0, episode[some], first.to(least), "amin")
     return least
+
+
+def _approaching(happened: Outcome) -> Bool[Tensor, "B T+1 N"]:
+    """Mask of the agents whose centre would come so near to that of the planned agent, within :data:`SOON` at constant
+    velocities, that bodies may overlap."""
+    states = happened.states.transpose(1, 2)
+    heading, speed = states[..., HEADING], states[..., SPEED]
+    velocity = speed[..., None] * torch.stack((heading.cos(), heading.sin()), -1)
+    offset = states[..., :2] - states[:, :, EGO, None, :2]
+    closing = velocity - velocity[:, :, EGO, None]
+    slowest = torch.finfo(closing.dtype).tiny
+    time = (-(offset * closing).sum(-1) / closing.square().sum(-1).clamp_min(slowest)).clamp(0.0, SOON)
+    gap = (offset + time[..., None] * closing).norm(dim=-1)
+    reach = happened.size.norm(dim=-1) / 2
+    there = (happened.agent_mask & happened.agent_mask[:, EGO, None]).transpose(1, 2)
+    others = torch.arange(states.shape[2]) != EGO
+    return there & others & (gap <= (reach + reach[:, EGO, None])[:, None])
 
 
 @dataclass(frozen=True)

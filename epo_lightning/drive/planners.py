@@ -27,7 +27,7 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.refinement import NOISE, track
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import HEADING, SPEED, GameParameters, JointForecast, Scene, Solution, Status
+from epo_lightning.scene import FIELDS, HEADING, SPEED, Batch, GameParameters, JointForecast, Scene, Solution, Status
 from epo_lightning.solvers.base import TABLES
 from epo_lightning.solvers.diagnostics.equilibrium import descend_features
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -40,7 +40,7 @@ KEEPING, HOLDING = ("accref", "turnrref"), 1e3
 
 
 @dataclass(frozen=True)
-class Plan:
+class Plan(Batch):
     """The planned motion of one agent in B episodes, and the joint future that it belongs to.
 
     Attributes:
@@ -132,6 +132,7 @@ class ForecastPlanner:
 
     Args:
         forecaster: any forecaster.
+        agents: number of agents that it is shown, the first ones of each scene; None for all.
         pair_terms: False to switch the pair terms of the inferred games off, for forecasters with such a game.
         warm: whether the solver also starts at the shifted strategies of the last step, instead of the decoded ones.
         keep: whether the mode is the one whose plan is nearest to the last plan, instead of the most likely one.
@@ -140,8 +141,16 @@ class ForecastPlanner:
         ConfigError: options of a game for a forecaster without one, or for one that chooses among fixed candidates.
     """
 
-    def __init__(self, forecaster: Forecaster, pair_terms: bool = True, warm: bool = False, keep: bool = False) -> None:
-        self.forecaster, self.pair_terms, self.warm, self.keep = forecaster.eval(), pair_terms, warm, keep
+    def __init__(
+        self,
+        forecaster: Forecaster,
+        agents: int | None = None,
+        pair_terms: bool = True,
+        warm: bool = False,
+        keep: bool = False,
+    ) -> None:
+        self.forecaster, self.agents = forecaster.eval(), agents
+        self.pair_terms, self.warm, self.keep = pair_terms, warm, keep
         self._game = isinstance(forecaster, EPO) and TABLES not in forecaster.solver.provides
         if (warm or not pair_terms) and not self._game:
             raise ConfigError(
@@ -151,7 +160,7 @@ class ForecastPlanner:
 
     @torch.no_grad()
     def __call__(self, scene: Scene, previous: Plan | None) -> Plan:
-        scene = scene.to(torch.float32)
+        scene = first_agents(scene, self.agents).to(torch.float32)
         forecast: JointForecast = self.forecaster(scene)
         states, controls, joint = forecast.states, _controls(forecast, scene), None
         found = states.isfinite().flatten(2).all(2)
@@ -166,9 +175,9 @@ class ForecastPlanner:
         return Plan(plan, states[rows, mode], found[rows, mode], joint)
 
     @torch.no_grad()
-    def controls_of_all(self, scene: Scene) -> Float[Tensor, "B N K 2"]:
-        """Controls of all agents in the most likely joint mode."""
-        scene = scene.to(torch.float32)
+    def controls_of_all(self, scene: Scene) -> Float[Tensor, "B n K 2"]:
+        """Controls of all agents that the forecaster is shown, in the most likely joint mode."""
+        scene = first_agents(scene, self.agents).to(torch.float32)
         forecast: JointForecast = self.forecaster(scene)
         return _controls(forecast, scene)[torch.arange(len(scene.history)), forecast.probabilities.argmax(1)]
 
@@ -194,6 +203,15 @@ class ForecastPlanner:
             return forecast.probabilities.argmax(1)
         last = previous.rest(states.shape[-2])[1][:, EGO, :, :2].to(states)
         return (states[:, :, EGO, :, :2] - last[:, None]).norm(dim=-1).mean(-1).nan_to_num(torch.inf).argmin(1)
+
+
+def first_agents(scene: Scene, count: int | None) -> Scene:
+    """The scene with its first agents alone; all of them for None."""
+    if count is None or count >= scene.agent_mask.shape[1]:
+        return scene
+    of_agents = [name for name, (_, shape, _) in FIELDS.items() if shape[1:2] == ("N",)]
+    cut = {name: tensor[:, :count] for name in of_agents if (tensor := getattr(scene, name)) is not None}
+    return dataclasses.replace(scene, **cut)
 
 
 def _controls(forecast: JointForecast, scene: Scene) -> Float[Tensor, "B M N K 2"]:
@@ -273,6 +291,8 @@ class ResponsePlanner(_OfGame):
         forecaster: forecast of the others, by its most likely joint mode; after its horizon they keep their velocity.
             None for others that keep going from the start, as the game's ``reference_controls`` say, or straight on.
         search: how minima are searched.
+        agents: number of agents that the forecaster is shown, the first ones of each scene; None for all. The others keep
+            going.
     """
 
     def __init__(
@@ -281,9 +301,10 @@ class ResponsePlanner(_OfGame):
         game: Callable[[Scene], GameParameters],
         forecaster: Forecaster | None = None,
         search: Search | None = None,
+        agents: int | None = None,
     ) -> None:
         super().__init__(energy, game, search)
-        self.forecast = None if forecaster is None else ForecastPlanner(forecaster)
+        self.forecast = None if forecaster is None else ForecastPlanner(forecaster, agents)
 
     @torch.no_grad()
     def __call__(self, scene: Scene, previous: Plan | None) -> Plan:
@@ -294,7 +315,8 @@ class ResponsePlanner(_OfGame):
         if self.forecast is not None:
             told = self.forecast.controls_of_all(scene)
             told = F.pad(told, (0, 0, 0, max(0, controls.shape[-2] - told.shape[-2])))[..., : controls.shape[-2], :]
-            controls[:, 0, others] = told[:, others].nan_to_num(0.0).to(controls)
+            known = torch.arange(1, told.shape[1])
+            controls[:, 0, known] = told[:, known].nan_to_num(0.0).to(controls)
         return self._plan(scene, *self._descend(scene, game, controls, EGO))
 
 

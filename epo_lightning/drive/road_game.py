@@ -9,7 +9,7 @@ episodes of other seeds than those of the results.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from epo_lightning.drive.world import EGO
@@ -39,12 +39,12 @@ OWN_LINE = 1
 """Index of the line along an agent's own lane."""
 
 
-def road_game(scene: Scene, line: int, steps: int) -> GameParameters:
+def road_game(scene: Scene, line: Int[Tensor, " B"], steps: int) -> GameParameters:
     """The game of a scene, of one mode, in float64.
 
     Args:
         scene: scenes with reference lines.
-        line: index of the reference line that the planned vehicle follows.
+        line: index of the reference line that the planned vehicle of each scene follows.
         steps: number of steps.
     """
     batch, agents = scene.agent_mask.shape
@@ -52,7 +52,7 @@ def road_game(scene: Scene, line: int, steps: int) -> GameParameters:
     keeping = keep_going(scene, steps)
     assert scene.reference_speed is not None
     scale = {"velref": scene.reference_speed[:, None].clamp_min(1.0)}  # the share of the reference speed counts
-    reference = torch.where(mine, line, OWN_LINE).expand(batch, 1, -1)
+    reference = torch.where(mine, line[:, None], OWN_LINE)[:, None]
     # The planned vehicle's controls are costly in themselves, those of others where they differ from keeping going.
     usual = torch.where(mine[:, None, None], 0.0, keeping)
     return GameParameters(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,12 +16,12 @@ from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.surroundings import nearest_pieces
 from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.windows import AGREE, SPACING, VECTORS, WindowConfig
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.scene import FIELDS, HEADING, SPEED, Scene
 
 
 class RoadScenes:
     """Scenes as :func:`~epo_lightning.data.recorded.windows.extract` and
-    :class:`~epo_lightning.data.recorded.scenes.RecordedScenes` make them, one at a time and without a future.
+    :class:`~epo_lightning.data.recorded.scenes.RecordedScenes` make them, without a future.
 
     Args:
         lanes: the map.
@@ -37,38 +39,47 @@ class RoadScenes:
 
     def __call__(
         self,
-        history: Float[np.ndarray, "N H 4"],
-        history_mask: Bool[np.ndarray, "N H"],
-        agent_mask: Bool[np.ndarray, " N"],
-        size: Float[np.ndarray, "N 2"],
-        kind: Int[np.ndarray, " N"],
+        history: Float[np.ndarray, "B N H 4"],
+        history_mask: Bool[np.ndarray, "B N H"],
+        agent_mask: Bool[np.ndarray, "B N"],
+        size: Float[np.ndarray, "B N 2"],
+        kind: Int[np.ndarray, "B N"],
+        framed: int | None = None,
     ) -> Scene:
-        """The scene of some vehicles, of which those that are there are on lanes.
+        """The scenes of some vehicles, of which those that are there are on lanes.
 
         Args:
             history: states x, y [m], heading [rad], speed [m/s]; the last step is the current one.
             history_mask: steps at which a vehicle was observed.
-            agent_mask: vehicles that are there.
+            agent_mask: vehicles that are there; the first one of every scene is.
             size: length and width [m].
             kind: classes of the vehicles, indices into :data:`~epo_lightning.scene.KINDS`.
+            framed: number of vehicles, the first ones, that decide on a scene's frame and lanes; None for all.
         """
-        there = np.flatnonzero(agent_mask)
-        now = history[there, -1]
+        first = np.arange(agent_mask.shape[1]) < (framed or agent_mask.shape[1])
+        scene, _ = there = np.nonzero(agent_mask)
+        now = history[there][:, -1]
         here = self.lanes.locate(now[:, :2], now[:, HEADING])
         route = self._routes.of(now[:, :2], now[:, SPEED], here, self.windows.horizon * self.windows.dt)
         limit = self.lanes.speed_limit[here.lane]
-        centre = now[:, :2].mean(0)
-        ahead = np.array([np.cos(now[:, HEADING]).mean(), np.sin(now[:, HEADING]).mean()])
-        scattered = np.linalg.norm(ahead) < AGREE
+        counted = (agent_mask & first)[..., None]
+        heading = history[:, :, -1, HEADING]
+        centre, ahead = (
+            np.where(counted, values, 0.0).sum(1) / counted.sum(1)
+            for values in (history[:, :, -1, :2], np.stack((np.cos(heading), np.sin(heading)), -1))
+        )
+        scattered = np.linalg.norm(ahead, axis=1) < AGREE
         origin = np.floor(centre)
         turns = 2 * np.pi * np.round(now[:, HEADING] / (2 * np.pi))
-        past = (
-            history[there]
-            - np.concatenate([np.tile(origin, (len(there), 1)), turns[:, None], 0 * turns[:, None]], 1)[:, None]
-        )
-        place = np.full(len(agent_mask), -1, dtype=np.int32)
-        place[there] = np.arange(len(there))
-        steps = (len(there), self.windows.horizon)
+        past = history[there].copy()
+        past[..., :2] -= origin[scene][:, None]
+        past[..., HEADING] -= turns[:, None]
+        place = np.full(agent_mask.shape, -1, dtype=np.int32)
+        place[there] = np.arange(len(now))
+        steps = (len(now), self.windows.horizon)
+        chosen = nearest_pieces(self._pieces, centre, self.windows.lanes or len(self._pieces))
+        most = chosen.shape[1]
+        rows = np.where(chosen >= 0, np.arange(chosen.size).reshape(chosen.shape), -1)
         tables = SceneTables(
             history=np.where(history_mask[there][..., None], past, 0.0).astype(np.float32),
             history_mask=history_mask[there],
@@ -76,19 +87,28 @@ class RoadScenes:
             future_mask=np.zeros(steps, dtype=bool),
             size=size[there].astype(np.float32),
             kind=kind[there],
-            track=there,
-            candidates=(route.candidates - origin).astype(np.float32),
-            references=(route.references - origin).astype(np.float32),
+            track=place[there],
+            candidates=(route.candidates - origin[scene][:, None]).astype(np.float32),
+            references=(route.references - origin[scene][:, None, None]).astype(np.float32),
             reference_speed=np.where(np.isnan(limit), self.windows.speed_limit, limit).astype(np.float32),
-            polylines=self._pieces - origin,
-            agents=place[None],
-            lanes=nearest_pieces(self._pieces, centre[None], self.windows.lanes or len(self._pieces)),
-            centre=(centre - origin)[None],
-            direction=np.array([now[0, HEADING] if scattered else np.arctan2(ahead[1], ahead[0])]),
-            recording=np.zeros(1, dtype=np.int32),
-            frame=np.zeros(1, dtype=np.int64),
-            origin=origin[None],
+            polylines=self._pieces[chosen.ravel()] - origin.repeat(most, 0)[:, None],
+            agents=place,
+            lanes=rows,
+            centre=centre - origin,
+            direction=np.where(scattered, heading[:, 0], np.arctan2(ahead[:, 1], ahead[:, 0])),
+            recording=np.arange(len(origin), dtype=np.int32),
+            frame=np.zeros(len(origin), dtype=np.int64),
+            origin=origin,
         )
         columns = {name: torch.as_tensor(values) for name, values in tables.columns().items()}
-        scene = RecordedScenes(columns, self.windows.dt, "aligned", ("",))[torch.zeros(1, dtype=torch.long)]
-        return dataclasses.replace(scene, future=None, future_mask=None, id=None)
+        scenes = RecordedScenes(columns, self.windows.dt, "aligned", ("",))[torch.arange(len(origin))]
+        return dataclasses.replace(scenes, future=None, future_mask=None, id=None)
+
+
+def joined(scenes: Sequence[Scene]) -> Scene:
+    """One batch of scenes with the same fields and sizes."""
+    if len(scenes) == 1:
+        return scenes[0]
+    fields = {name: [getattr(scene, name) for scene in scenes] for name in FIELDS}
+    together: dict[str, Any] = {name: torch.cat(tensors) for name, tensors in fields.items() if tensors[0] is not None}
+    return dataclasses.replace(scenes[0], **together)

@@ -87,6 +87,7 @@ class RPIWorld:
         ConfigError: a value out of its range.
     """
 
+    agents = AGENTS
     shape = "disc"
     energy = ENERGY
     arrived = 5.0
@@ -98,7 +99,7 @@ class RPIWorld:
         if pedestrian not in PEDESTRIANS:
             raise ConfigError(f"unknown pedestrian {pedestrian!r}: {nearest(str(pedestrian), PEDESTRIANS)}")
         self.constants, self.pedestrian = GameConstants(), pedestrian
-        self._c = self.constants.array()
+        self._c, self.dt = self.constants.array(), self.constants.dt
         self._games = [main_game(SEEDS + seed, index, 0, 1, self.constants) for index in range(episodes)]
         self._begun = [self._start(game, seed) for game in self._games]
         self.together = episodes
@@ -132,8 +133,8 @@ class RPIWorld:
         return rollout(game.start, u, self._c[0]), u
 
     @property
-    def finished(self) -> bool:
-        return self.now >= self.constants.steps
+    def going(self) -> Tensor:
+        return torch.arange(len(self.games) if self.now < self.constants.steps else 0)
 
     def observe(self) -> Scene:
         history = torch.tensor(by_agent(self._x[:, self.now - HISTORY : self.now + 1]))

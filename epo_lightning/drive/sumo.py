@@ -26,8 +26,9 @@ from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.data.simulate.motion import SLOWEST, strip_at
 from epo_lightning.data.simulate.traffic import CLASSES, STYLES, simulator
+from epo_lightning.drive.ride import Moment, Position
 from epo_lightning.drive.sumo_process import END, OWN, STEP, Branch, Vehicles, serve
-from epo_lightning.drive.traffic import Moment, Position, TrafficWorld
+from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import KINDS
 
@@ -35,14 +36,20 @@ SEEDS = 1_000_000
 """Added to seeds of episodes, so that their traffic is that of no data set."""
 MERGES = tuple(layout.id for layout in LAYOUTS if sum(np.isfinite(strip.join) for strip in layout.lanes) == 1)
 """Layouts with an on-ramp of one lane, which all vehicles on it have to leave."""
-PER_STREAM = 3
+TOGETHER = 25
+"""Number of simulations that run side by side."""
+PER_STREAM = 4
 """Episodes of one simulation."""
+APART = 1000
+"""Distance of the first streams of two consecutive seeds, and so the largest number of streams."""
 BEYOND = 50.0
 """Distance [m] behind the end of the acceleration lane at which a vehicle has arrived."""
 ASIDE = 0.3
 """Distance [m] of the centre from the nearest lane at which a vehicle is off the road."""
 SECONDS = 24.0
 """Longest duration of an episode."""
+ENDED = "the process of SUMO ended: is there enough memory?"
+"""Message of an error."""
 
 
 def sumo_world(episodes: int, seed: int = 0, style: str = "dense") -> TrafficWorld:
@@ -60,94 +67,147 @@ def sumo_world(episodes: int, seed: int = 0, style: str = "dense") -> TrafficWor
 
 
 class SumoSimulator:
-    """SUMO in a process of its own (:mod:`~epo_lightning.drive.sumo_process`), as a simulator of episodes.
+    """SUMO in processes of its own (:mod:`~epo_lightning.drive.sumo_process`), as a simulator of episodes.
 
-    Consecutive episodes go through all layouts with an on-ramp, ``PER_STREAM`` of them in one simulation.
+    ``TOGETHER`` simulations run side by side, on all layouts with an on-ramp. Each has one of as many consecutive episodes,
+    and another one of the next; after ``PER_STREAM`` episodes a new simulation follows.
 
     Args:
         episodes, seed, style: as in :func:`sumo_world`.
     """
 
+    together = TOGETHER
+
     def __init__(self, episodes: int, seed: int, style: str) -> None:
         check_whole("episodes", episodes)
+        if episodes > APART * PER_STREAM:
+            raise ConfigError(
+                f"episodes must be {APART * PER_STREAM} or fewer in world=sumo, not {episodes}: further ones are those of "
+                "the next seed; drive several seeds"
+            )
         if style not in STYLES:
             raise ConfigError(f"unknown traffic {style!r} of SUMO: {nearest(str(style), tuple(STYLES))}")
         simulator()
         if not hasattr(os, "fork"):
             raise ConfigError("world=sumo branches episodes off by os.fork, which Linux and macOS have")
-        self._episodes, self._seed, self._style = episodes, SEEDS + seed, style
+        self._episodes, self._seed, self._style = episodes, (SEEDS + seed) * APART, style
         self.steps = round(SECONDS * 5)
         self._maps: dict[int, LaneGraph] = {}
-        self._pending = False
 
     def __len__(self) -> int:
         return self._episodes
 
     @cached_property
-    def _pipe(self) -> Any:
-        """The connection to the process, which ends when the connection is closed."""
+    def _pipes(self) -> list[Any]:
+        """Connections to the processes, which end when these are closed."""
         context = multiprocessing.get_context("spawn")
-        pipe, other = context.Pipe()
-        self._process = context.Process(target=serve, args=(other,), daemon=True)
+        pipes, others = zip(*(context.Pipe() for _ in range(min(TOGETHER, self._episodes))), strict=True)
+        self._process = context.Process(target=serve, args=(others,), daemon=True)
         self._process.start()
-        other.close()
-        return pipe
+        for other in others:
+            other.close()
+        return list(pipes)
 
-    def _ask(self, message: Any) -> Any:
-        """Send a message to the process, and return its answer.
+    def branch(self, episode: int) -> Branch:
+        """The stream of an episode, and its number in it."""
+        round_, place = divmod(episode, TOGETHER)
+        turn, number = divmod(round_, PER_STREAM)
+        stream = turn * TOGETHER + place
+        layout = MERGES[stream % len(MERGES)]
+        return Branch(layout, self._seed + stream, self._style, number)
+
+    def begin(self, episode: int) -> SumoSimulation:
+        """Begin an episode. Episodes of one process, such as 0 and ``TOGETHER``, cannot be begun together."""
+        branch = self.branch(episode)
+        if branch.layout not in self._maps:
+            self._maps[branch.layout] = lanes_of(LAYOUTS[branch.layout])
+        return SumoSimulation(self._pipes[episode % TOGETHER], branch, self._maps[branch.layout])
+
+    def close(self) -> None:
+        """End the processes."""
+        if "_pipes" in self.__dict__:
+            for pipe in self._pipes:
+                pipe.close()
+            self._process.join(timeout=10.0)
+            del self.__dict__["_pipes"]
+
+
+class SumoSimulation:
+    """An episode in SUMO, in the process at the other end of a connection.
+
+    Args:
+        pipe: the connection.
+        branch: name of the episode.
+        lanes: the map.
+
+    Raises:
+        ConfigError: the process ended, or SUMO failed.
+    """
+
+    def __init__(self, pipe: Any, branch: Branch, lanes: LaneGraph) -> None:
+        self.layout, self.lanes = LAYOUTS[branch.layout], lanes
+        self._pipe, self._going = pipe, True
+        self._to: Float[np.ndarray, " 4"] | None = None
+        self._ask(branch)
+
+    def history(self) -> list[Moment]:
+        self._name, history = self._answer()
+        last: Vehicles = history[-1]
+        ego = last.names.index(self._name)
+        self._half = last.values[ego, 4] / 2
+        self.ramp = self.layout.lanes[last.strip[ego]]
+        self._end_of_ramp = min(self.ramp.end, self.ramp.leave)
+        self._from = last.values[ego, 0] - self._half
+        return [self._moment(vehicles) for vehicles in history]
+
+    def _ask(self, message: Any) -> None:
+        """Send a message to the process.
 
         Raises:
             ConfigError: the process ended.
         """
-        pipe = self._pipe
         try:
-            pipe.send(message)
-            answer = pipe.recv()
+            self._pipe.send(message)
+        except OSError:
+            self._going = False
+            raise ConfigError(ENDED) from None
+
+    def _answer(self) -> Any:
+        """The answer of the process.
+
+        Raises:
+            ConfigError: the process ended, or SUMO failed.
+        """
+        try:
+            answer = self._pipe.recv()
         except (EOFError, OSError):
-            self._pending = False
-            raise ConfigError("the process of SUMO ended: is there enough memory?") from None
+            self._going = False
+            raise ConfigError(ENDED) from None
         if isinstance(answer, Exception):
-            self._pending = False
+            self._going = False
             raise answer
         return answer
 
-    def branch(self, episode: int) -> Branch:
-        """The stream of an episode, and its number in it."""
-        stream, number = divmod(episode, PER_STREAM)
-        layout = MERGES[stream % len(MERGES)]
-        return Branch(layout, self._seed * 1000 + stream, self._style, number)
-
-    def begin(self, episode: int) -> list[Moment]:
-        self._end()
-        branch = self.branch(episode)
-        self.layout = LAYOUTS[branch.layout]
-        if branch.layout not in self._maps:
-            self._maps[branch.layout] = lanes_of(self.layout)
-        self.lanes = self._maps[branch.layout]
-        self._name, history = self._ask(branch)
-        self._pending = True
-        last: Vehicles = history[-1]
-        ego = last.names.index(self._name)
-        self._half = last.values[ego, 4] / 2
-        self._ramp = self.layout.lanes[last.strip[ego]]
-        self._end_of_ramp = min(self._ramp.end, self._ramp.leave)
-        self._from = last.values[ego, 0] - self._half
-        return [self._moment(vehicles) for vehicles in history]
-
-    def _end(self) -> None:
-        if self._pending:
-            self._pending = False
+    def end(self) -> None:
+        if self._going:
+            self._going = False
             with suppress(OSError):  # the process ended, as the next message will tell
                 self._pipe.send(END)
 
-    def step(self, way: tuple[Float[np.ndarray, " 4"], Float[np.ndarray, " 4"]] | None) -> Moment:
+    def step(self, way: tuple[Float[np.ndarray, " 4"], Float[np.ndarray, " 4"]] | None) -> None:
         if way is None:
-            return self._moment(self._ask(OWN))
-        before, after = way
+            self._to = None
+            self._ask(OWN)
+            return
+        before, self._to = way
         share = np.arange(1, STEP + 1)[:, None] / STEP
-        s, d = self.layout.project(before[:2] + share * (after[:2] - before[:2]))
-        moment = self._moment(self._ask(np.stack([s + self._half, d], 1)))
-        moment.states[0] = after
+        s, d = self.layout.project(before[:2] + share * (self._to[:2] - before[:2]))
+        self._ask(np.stack([s + self._half, d], 1))
+
+    def moment(self) -> Moment:
+        moment = self._moment(self._answer())
+        if self._to is not None:
+            moment.states[0] = self._to
         return moment
 
     def _moment(self, vehicles: Vehicles) -> Moment:
@@ -158,10 +218,12 @@ class SumoSimulator:
         order = [first, *(row for row in range(len(vehicles.names)) if row != first)]
         front, aside, speed, slip, length, width, kind = vehicles.values[order].T
         strip = np.array(vehicles.strip)[order]
-        lanes, s = self.layout.lanes, front - length / 2
-        on = [strip == index for index in range(len(lanes))]
-        d = aside + np.select(on, [self.layout.offset(lane, s) for lane in lanes])
-        along = np.select(on, [self.layout.direction(lane, s) for lane in lanes])
+        s = front - length / 2
+        on = [(self.layout.lanes[index], strip == index) for index in np.unique(strip)]
+        d, along = aside.copy(), np.zeros_like(aside)
+        for lane, here in on:
+            d[here] += self.layout.offset(lane, s[here])
+            along[here] = self.layout.direction(lane, s[here])
         ahead = speed * self.layout.stretch(s, d)
         heading = along + np.arctan2(slip, np.maximum(ahead, SLOWEST))
         kinds = np.array([KINDS.index(CLASSES[int(each)]) for each in kind])
@@ -177,21 +239,13 @@ class SumoSimulator:
         at = np.array([s])
         lane = self.layout.lanes[int(strip_at(self.layout, at, np.array([d]))[0])]
         beside = abs(d - float(self.layout.offset(lane, at)[0])) - self.layout.width / 2
-        on_ramp = lane is self._ramp
+        on_ramp = lane is self.ramp
         return Position(
             progress=s - self._from,
             arrived=s >= self._end_of_ramp + BEYOND and not on_ramp,
             off_road=beside > ASIDE,
-            line=0 if on_ramp and self._ramp.join <= s else 1,
+            line=0 if on_ramp and self.ramp.join <= s else 1,
         )
-
-    def close(self) -> None:
-        """End the process."""
-        if "_pipe" in self.__dict__:
-            self._end()
-            self._pipe.close()
-            self._process.join(timeout=10.0)
-            del self.__dict__["_pipe"]
 
 
 def lanes_of(layout: Layout) -> LaneGraph:

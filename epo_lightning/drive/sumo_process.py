@@ -1,9 +1,10 @@
-"""SUMO in a process of its own, from which episodes branch off.
+"""SUMO in processes of its own, from which episodes branch off.
 
-A *stream* is a simulation with all vehicles under their own drivers. Whenever a vehicle on the on-ramp comes near the road,
-and the last episode began a while ago, an episode begins there: the process forks, and the child simulates what follows
-while the parent waits. So an episode starts in exactly the state of the stream, as often as it is asked for, and its other
-drivers meet the vehicle that a planner drives now. SUMO can also save its state to a file, but what it loads from there does
+A *stream* is a simulation with all vehicles under their own drivers, in a process of its own. Whenever a vehicle on the
+on-ramp comes near the road, and the last episode began a while ago, an episode begins there: the process forks, and the
+child simulates what follows while the parent waits. So an episode starts in exactly the state of the stream, as often as it
+is asked for, and its other drivers meet the vehicle that a planner drives now. All planners drive an episode before the
+stream goes on, so that nothing is simulated twice. SUMO can also save its state to a file, but what it loads from there does
 not continue like what was saved, and not always in the same way.
 """
 
@@ -48,6 +49,8 @@ LONGEST = 3600.0
 """Longest duration [s] of a stream after the warm-up."""
 FILLING = 2.0
 """Time [s] after the warm-up before the first episode begins."""
+AROUND = 250.0
+"""Distance [m] along the road from the planned vehicle within which vehicles are told; no farther one is a neighbour."""
 PATIENCE = 120.0
 """Time [s] within which an episode has to begin; without one, the stream is given up."""
 
@@ -82,8 +85,36 @@ class Vehicles:
     strip: list[int]
     values: Float[np.ndarray, "n 7"]
 
+    def around(self, name: str, vehicles: Vehicles) -> Vehicles:
+        """Those of some vehicles that are near a vehicle of this moment."""
+        if name not in self.names:
+            return vehicles
+        near = np.abs(vehicles.values[:, 0] - self.values[self.names.index(name), 0]) <= AROUND
+        rows = np.flatnonzero(near)
+        return Vehicles(
+            [vehicles.names[row] for row in rows], [vehicles.strip[row] for row in rows], vehicles.values[rows]
+        )
 
-def serve(pipe: Connection) -> None:
+
+def serve(pipes: Sequence[Connection]) -> None:
+    """Answer on every connection, each from a process of its own."""
+    processes = []
+    for pipe in pipes:
+        process = os.fork()
+        if not process:
+            for other in pipes:
+                if other is not pipe:
+                    other.close()
+            _serve(pipe)
+            os._exit(0)
+        processes.append(process)
+    for pipe in pipes:
+        pipe.close()
+    for process in processes:
+        os.waitpid(process, 0)
+
+
+def _serve(pipe: Connection) -> None:
     """Answer until the other end is closed: a :class:`Branch` begins an episode.
 
     The answer is the name of the vehicle that is taken over and a list of ``HISTORY`` moments; then each path [STEP, 2] of
@@ -92,7 +123,8 @@ def serve(pipe: Connection) -> None:
     """
     stream: tuple[int, int, str] | None = None
     streaming = _nothing()
-    number = 0
+    road: _Road | None = None
+    number = -1
     while True:
         try:
             branch = pipe.recv()
@@ -101,18 +133,17 @@ def serve(pipe: Connection) -> None:
         try:
             if branch.stream != stream or branch.number < number:
                 streaming.close()
-                streaming, stream, number = _stream(branch), branch.stream, 0
-            while True:
+                streaming, stream, number = _stream(branch), branch.stream, -1
+            while number < branch.number:
                 road = next(streaming)
                 number += 1
-                if number > branch.number:
-                    break
         except Exception as error:  # whatever it is, it is told to the process that waits for an answer
             stream = None
             pipe.send(error)
             continue
         child = os.fork()
         if not child:
+            assert road is not None
             _episode(pipe, road, branch)
         _, status = os.waitpid(child, 0)
         if status:
@@ -125,9 +156,10 @@ def _episode(pipe: Connection, road: _Road, branch: Branch) -> None:
     status = 0
     try:
         road.hesitate = _Hesitation(STYLES[branch.style], (branch.layout, branch.seed, branch.number))
-        pipe.send((road.taken, list(road.history)))
+        pipe.send((road.taken, [road.history[-1].around(road.taken, each) for each in road.history]))
         while not isinstance(path := pipe.recv(), str) or path != END:
-            pipe.send(road.advance(None if isinstance(path, str) else path))
+            now = road.advance(None if isinstance(path, str) else path)
+            pipe.send(now.around(road.taken, now))
     except (EOFError, BrokenPipeError):
         pass
     except Exception as error:  # as above

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.game.feature_energy import FeatureEnergy
@@ -18,16 +18,18 @@ EGO = 0
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of B episodes, from the first planned moment on.
+    """Outcome of B episodes, from the first planned moment on, until the longest one is over.
+
+    Agents of an episode that is over keep their last states, and are masked.
 
     Attributes:
         states: states of all agents, in one frame for the whole episode.
-        agent_mask: agents that exist at each of these times.
+        agent_mask: agents that exist at each of these times, none of them after the end of the episode.
         size: length and width of every agent [m].
         progress: how far the planned agent has come [m].
         measures: further measures of the episodes, by name; those in ``rates`` are 0 or 1.
         rates: names of the further measures that are shares of the episodes.
-        lines: lines of the road, for films.
+        lines: lines of the road, for films of one episode.
     """
 
     states: Float[Tensor, "B N T+1 4"]
@@ -55,20 +57,25 @@ class Search:
 
 
 class World(Protocol):
-    """The interface of worlds: episodes, of which some are begun together and moved by steps of ``scene.dt``.
+    """The interface of worlds: episodes, of which some are begun together and moved by steps of ``dt``.
 
-    The same arguments make the same episodes, and an episode may be begun any number of times. The planned agent has
-    index :data:`EGO`.
+    The same arguments make the same episodes, and an episode may be begun any number of times. Episodes do not influence
+    each other, and those that are over are left out of scenes and games. The planned agent has index :data:`EGO`.
 
     Attributes:
+        dt: length of a step [s].
+        agents: number of agents, the first ones of a scene, of which forecasters know; planners that are told the costs
+            see all agents of a scene.
         energy: the energy of :meth:`game`.
         shape: shape of the agents' bodies in tests of contact, ``disc`` or ``box``.
         arrived: progress [m] from which an agent that stands has arrived.
         patience: time [s] from which standing before that is a deadlock.
-        together: largest number of episodes that can be begun together.
+        together: largest number of consecutive episodes that can be begun together.
         search: how planners search minima of the costs of :meth:`game`.
     """
 
+    dt: float
+    agents: int
     energy: FeatureEnergy
     shape: str
     arrived: float
@@ -85,20 +92,20 @@ class World(Protocol):
         ...
 
     @property
-    def finished(self) -> bool:
-        """Whether the episodes are over."""
+    def going(self) -> Int[Tensor, " b"]:
+        """Indices, among the begun episodes, of those that are not over."""
         ...
 
     def observe(self) -> Scene:
-        """The scenes that a planner may know: histories up to now, goals and sizes, without any future."""
+        """The scenes [b, ...] that a planner may know: histories up to now, goals and sizes, without any future."""
         ...
 
     def game(self, scene: Scene) -> GameParameters:
-        """The games [B, 1, ...] in which the planned agent's own costs are known, over the time that is planned, with
+        """The games [b, 1, ...] in which the planned agent's own costs are known, over the time that is planned, with
         controls of zero as initial strategies. ``reference_controls`` are what agents do who keep going, if not zero."""
         ...
 
-    def advance(self, controls: Float[Tensor, "B 2"] | None) -> None:
+    def advance(self, controls: Float[Tensor, "b 2"] | None) -> None:
         """Apply controls of the planned agent (acceleration [m/s^2], turn rate [rad/s]) for one step; all others act.
 
         None lets the world's own driver drive the planned agent.

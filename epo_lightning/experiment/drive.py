@@ -76,7 +76,7 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
             measured, rates = done.measured(kind, planners), done.rates(kind)
             results["worlds"][kind] = _results(measured, rates)
             tables.append(_table(kind, measured, rates))
-            if settings.timed and (milliseconds := _milliseconds(world, kind, made, done, settings.timed)):
+            if settings.timed and (milliseconds := _milliseconds(world, made, settings.timed)):
                 results["milliseconds"][kind] = milliseconds
                 tables.append(_times_table(milliseconds))
             if settings.film is not None:
@@ -142,8 +142,18 @@ class _Done:
         self._rows.setdefault(row["kind"], {}).setdefault(row["planner"], {})[row["episodes"][0]] = row
 
     def has(self, kind: str, planner: str, chunk: Sequence[int]) -> bool:
-        """Whether a planner has driven some episodes."""
-        return chunk[0] in self._rows.get(kind, {}).get(planner, {})
+        """Whether a planner has driven some episodes.
+
+        Raises:
+            ConfigError: the file holds other episodes together.
+        """
+        row = self._rows.get(kind, {}).get(planner, {}).get(chunk[0])
+        if row is not None and row["episodes"] != list(chunk):
+            raise ConfigError(
+                f"{self.path} was begun by a version that drove other episodes together: choose another out=<folder>, or "
+                "delete it"
+            )
+        return row is not None
 
     def add(
         self,
@@ -160,8 +170,6 @@ class _Done:
             "episodes": list(chunk),
             "measures": {name: values.tolist() for name, values in measures.items()},
             "rates": sorted(played.outcome.rates),
-            "wall": played.wall,
-            "processor": played.processor,
         }
         self._take(row)
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -187,11 +195,6 @@ class _Done:
             }
             for planner, rows in found.items()
         }
-
-    def seconds(self, kind: str, planner: str) -> tuple[list[float], list[float]]:
-        """Seconds of the plans of single scenes, by the clock and of processor time; each episode's first plan warms up."""
-        rows = [row for row in self._rows[kind][planner].values() if len(row["episodes"]) == 1]
-        return [s for row in rows for s in row["wall"][1:]], [s for row in rows for s in row["processor"][1:]]
 
 
 def _parsed(line: str) -> Any:
@@ -242,9 +245,10 @@ def _titles(paths: Sequence[str], folders: Sequence[Path], titles: Sequence[str]
 
 def _of_run(forecaster: Forecaster, way: str, keep: bool) -> Make:
     if way == RESPOND:
-        return lambda world: ResponsePlanner(world.energy, world.game, forecaster, world.search)
-    planner = ForecastPlanner(forecaster, pair_terms=way != ALONE, warm=way == WARM, keep=keep)
-    return lambda world: planner
+        return lambda world: ResponsePlanner(world.energy, world.game, forecaster, world.search, world.agents)
+    options = {"pair_terms": way != ALONE, "warm": way == WARM, "keep": keep}
+    ForecastPlanner(forecaster, **options)  # refused before any world is made
+    return lambda world: ForecastPlanner(forecaster, world.agents, **options)
 
 
 def _baseline(name: str) -> Make:
@@ -287,21 +291,16 @@ def _cell(value: Estimate, rate: bool) -> str:
     return f"{value.mean:.{digits}f} ({value.low:.{digits}f} to {value.high:.{digits}f})"
 
 
-def _milliseconds(
-    world: World, kind: str, planners: Mapping[str, Planner | None], done: _Done, timed: int
-) -> dict[str, dict[str, float]]:
+def _milliseconds(world: World, planners: Mapping[str, Planner | None], timed: int) -> dict[str, dict[str, float]]:
     """Milliseconds of a plan of one scene: median and 99th percentile, by the clock and of processor time.
 
-    Worlds that begin episodes one by one have timed all plans already; in others some episodes are driven once more, alone.
+    Some episodes are driven once more, alone.
     """
     found = {}
     for name, planner in planners.items():
         if planner is None:
             continue
-        if world.together == 1:
-            wall, processor = done.seconds(kind, name)
-        else:
-            wall, processor = times(world, planner, range(min(timed, len(world))))
+        wall, processor = times(world, planner, range(min(timed, len(world))))
         found[name] = {
             f"{title} {label}": 1e3 * float(torch.tensor(values).quantile(share))
             for title, values in (("clock", wall), ("processor", processor))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import torch
@@ -11,9 +13,12 @@ from epo_lightning.drive import highway_env
 from epo_lightning.drive.episodes import play
 from epo_lightning.drive.highway_env import HighwayEnvSimulator, highway_env_world
 from epo_lightning.drive.measures import measure
-from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner
+from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner, first_agents
+from epo_lightning.drive.ride import SEEN, WINDOWS
+from epo_lightning.drive.road_scenes import RoadScenes
 from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.registry import ConfigError
+from epo_lightning.scene import FIELDS
 
 pytest.importorskip("highway_env", reason="the extra `drive` is not installed")
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -27,9 +32,10 @@ def world(request: pytest.FixtureRequest) -> TrafficWorld:
 def test_vehicles_are_on_the_lanes_of_the_map(world: TrafficWorld) -> None:
     world.reset([0])
     scene = world.observe()
-    assert scene.history.shape == (1, 4, 10, 4)
+    assert scene.history.shape == (1, SEEN, 10, 4)
     assert bool(scene.history_mask[:, 0].all())
-    lanes, moment = world.simulator.lanes, world._log[-1]
+    (ride,) = world.rides
+    lanes, moment = ride.simulation.lanes, ride.now
     located = lanes.locate(moment.states[:, :2], moment.states[:, 2])
     assert (located.lane >= 0).all()
     assert np.abs(located.offset).max() < 2.0
@@ -39,8 +45,24 @@ def test_vehicles_are_on_the_lanes_of_the_map(world: TrafficWorld) -> None:
     assert np.cos(turned).min() > 0.8
 
 
+def test_forecasters_are_shown_the_nearest_vehicles_alone(world: TrafficWorld) -> None:
+    """What a forecaster sees does not depend on how many more vehicles a response sees."""
+    world.reset([0])
+    scene, (ride,) = world.observe(), world.rides
+    assert int(scene.agent_mask.sum()) > WINDOWS.agents, "a response sees more"
+    near = first_agents(scene, world.agents)
+    assert near.agent_mask.shape == (1, WINDOWS.agents)
+    history, seen, there, size, kind = (values[None, : WINDOWS.agents] for values in ride.history())
+    alone = RoadScenes(ride.simulation.lanes, WINDOWS)(history, seen, there, size, kind)
+    for name in FIELDS:
+        torch.testing.assert_close(getattr(near, name), getattr(alone, name))
+    distance = ride.now.distance[[ride.now.rows[name] for name in ride._members if name]]
+    assert distance[1 : WINDOWS.agents].max() <= distance[WINDOWS.agents :].max()
+
+
 def test_left_is_left(world: TrafficWorld) -> None:
-    lanes = world.simulator.lanes
+    world.reset([0])
+    lanes = world.rides[0].simulation.lanes
     for lane in np.flatnonzero(lanes.left_of >= 0):
         position = lanes.centre[lanes.left_of[lane]][1][None]
         _, offset = lanes.centrelines.project(np.array([lane]), position)
@@ -56,19 +78,44 @@ def test_episodes_repeat_and_differ(world: TrafficWorld) -> None:
 def test_planners_drive(world: TrafficWorld) -> None:
     forecaster = epo_lightning.load("highway_sim/hivt_m_epo")
     world.simulator.steps = 8
-    for planner in (ForecastPlanner(forecaster), ResponsePlanner(world.energy, world.game, None, world.search)):
+    for planner in (
+        ForecastPlanner(forecaster, world.agents),
+        ResponsePlanner(world.energy, world.game, None, world.search),
+    ):
         episodes = play(world, planner, [2])
         assert bool(episodes.found.all())
         assert float(measure(episodes, world)["progress"][0]) > 3.0
 
 
 def test_a_vehicle_that_merges_has_to_leave_its_lane() -> None:
-    simulator = HighwayEnvSimulator(1, 1, "merge")
+    roads = HighwayEnvSimulator(1, 1, "merge").roads
     ramp, road = np.array([280.0, -8.0, 0.0, 20.0]), np.array([280.0, -4.0, 0.0, 20.0])
-    assert (simulator.position(ramp).line, simulator.position(road).line) == (0, 1)
-    assert simulator.position(np.array([312.0, -8.0, 0.0, 20.0])).off_road
-    assert not simulator.position(np.array([312.0, -4.0, 0.0, 20.0])).off_road
-    assert simulator.position(np.array([400.0, -4.0, 0.0, 20.0])).arrived
+    assert (roads.position(ramp, 0.0).line, roads.position(road, 0.0).line) == (0, 1)
+    assert roads.position(np.array([312.0, -8.0, 0.0, 20.0]), 0.0).off_road
+    assert not roads.position(np.array([312.0, -4.0, 0.0, 20.0]), 0.0).off_road
+    assert roads.position(np.array([400.0, -4.0, 0.0, 20.0]), 0.0).arrived
+
+
+def test_episodes_that_are_over_are_left_out(world: TrafficWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three episodes of different lengths, driven together and alone, by a forecaster and by the simulator's driver."""
+    begin = world.reset
+
+    def reset(episodes: Sequence[int]) -> None:
+        begin(episodes)
+        for ride, episode in zip(world.rides, episodes, strict=True):
+            ride.steps = 4 + 3 * episode
+
+    monkeypatch.setattr(world, "reset", reset)
+    forecaster = epo_lightning.load("highway_sim/hivt_m_epo")
+    for planner in (ForecastPlanner(forecaster, world.agents), None):
+        together = play(world, planner, range(3))
+        scores = measure(together, world)
+        assert together.outcome.agent_mask[:, 0].sum(1).tolist() == [5, 8, 11]
+        assert together.controls[..., 0].isfinite().sum(1).tolist() == [4, 7, 10]
+        for episode in range(3):
+            alone = measure(play(world, planner, [episode]), world)
+            for name, value in alone.items():
+                assert float(scores[name][episode]) == pytest.approx(float(value[0]), abs=1e-3), name
 
 
 def test_mistakes_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,11 +42,11 @@ def test_scenes_are_those_of_recorded_data(recorded: tuple[RecordedScenes, RoadS
         history = scenes.tables["history"][rows].double().numpy()
         history[..., :2] += origin
         made = make(
-            history,
-            wanted.history_mask[0].numpy(),
-            wanted.agent_mask[0].numpy(),
-            scenes.tables["size"][rows].numpy(),
-            scenes.tables["kind"][rows].numpy(),
+            history[None],
+            wanted.history_mask.numpy(),
+            wanted.agent_mask.numpy(),
+            scenes.tables["size"][rows].numpy()[None],
+            scenes.tables["kind"][rows].numpy()[None],
         )
         for name in ("history", "size", "lanes", "goal_candidates", "references", "reference_speed", "frame"):
             torch.testing.assert_close(getattr(made, name), getattr(wanted, name), rtol=1e-5, atol=2e-4)
@@ -94,7 +94,8 @@ def queue(gap: float) -> Scene:
 
 def test_a_planned_vehicle_brakes_for_a_queue_and_changes_lanes_when_it_wants_to() -> None:
     def plan(scene: Scene, line: int) -> torch.Tensor:
-        return ResponsePlanner(ENERGY, lambda scene: road_game(scene, line, 20), None, TrafficWorld.search)(
+        lines = torch.tensor([line])
+        return ResponsePlanner(ENERGY, lambda scene: road_game(scene, lines, 20), None, TrafficWorld.search)(
             scene, None
         ).states[0]
 

@@ -15,13 +15,14 @@ from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.drive.episodes import play
 from epo_lightning.drive.measures import measure
 from epo_lightning.drive.planners import ForecastPlanner, Plan, Planner, ResponsePlanner
+from epo_lightning.drive.ride import SEEN
 from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
 pytest.importorskip("libsumo", reason="the extra `sim` is not installed")
 
-from epo_lightning.drive.sumo import SumoSimulator, sumo_world
+from epo_lightning.drive.sumo import SumoSimulation, SumoSimulator, lanes_of, sumo_world
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +37,10 @@ def keeps(control: float) -> Planner:
     """A planner with constant acceleration."""
 
     def planner(scene: Scene, previous: Plan | None) -> Plan:
-        controls = torch.zeros(1, 20, 2)
+        count = len(scene.history)
+        controls = torch.zeros(count, 20, 2)
         controls[..., 0] = control
-        return Plan(controls, scene.current[:, :, None].expand(-1, -1, 20, -1), torch.ones(1, dtype=torch.bool))
+        return Plan(controls, scene.current[:, :, None].expand(-1, -1, 20, -1), torch.ones(count, dtype=torch.bool))
 
     return planner
 
@@ -66,13 +68,14 @@ def test_episodes_differ_and_begin_on_the_ramp(world: TrafficWorld) -> None:
         world.reset([episode])
         scene = world.observe()
         begun.append(scene.history.clone())
-        assert scene.history.shape == (1, 4, 10, 4)
+        assert scene.history.shape == (1, SEEN, 10, 4)
         assert scene.future is None
         assert bool(scene.history_mask[:, 0].all())
-        simulator = world.simulator
-        assert isinstance(simulator, SumoSimulator)
-        s, _ = simulator.layout.project(world._log[-1].states[0, :2])
-        assert 40.0 < simulator._ramp.join - float(s) <= 60.0
+        (ride,) = world.rides
+        simulation = ride.simulation
+        assert isinstance(simulation, SumoSimulation)
+        s, _ = simulation.layout.project(ride.now.states[0, :2])
+        assert 40.0 < simulation.ramp.join - float(s) <= 60.0
     assert not any(torch.equal(a, b) for a, b in pairwise(begun))
 
 
@@ -96,7 +99,8 @@ def test_drivers_behind_react_to_the_planned_vehicle(world: TrafficWorld) -> Non
 
 def test_a_forecaster_and_a_response_drive(world: TrafficWorld) -> None:
     forecaster = epo_lightning.load("highway_sim/hivt_m_epo")
-    for planner in (ForecastPlanner(forecaster), ResponsePlanner(world.energy, world.game, forecaster)):
+    response = ResponsePlanner(world.energy, world.game, forecaster, agents=world.agents)
+    for planner in (ForecastPlanner(forecaster, world.agents), response):
         episodes = play(world, planner, [2], keep_plans=True)
         found = measure(episodes, world)
         assert bool(episodes.found.all())
@@ -109,12 +113,13 @@ def test_a_forecaster_and_a_response_drive(world: TrafficWorld) -> None:
 
 def test_the_end_of_the_process_is_told() -> None:
     simulator = SumoSimulator(1, 0, "free")
-    simulator.__dict__["_pipe"], other = Pipe()
-    simulator._pending = True
+    pipe, other = Pipe()
+    simulation = SumoSimulation(pipe, simulator.branch(0), lanes_of(LAYOUTS[0]))
     other.close()
-    with pytest.raises(ConfigError, match="the process of SUMO ended: is there enough memory"):
-        simulator.step(None)
-    assert not simulator._pending, "nothing more is sent"
+    for ask in (simulation.moment, lambda: simulation.step(None)):
+        with pytest.raises(ConfigError, match="the process of SUMO ended: is there enough memory"):
+            ask()
+    simulation.end()  # nothing more is sent
 
 
 def test_mistakes_are_named() -> None:
@@ -122,3 +127,24 @@ def test_mistakes_are_named() -> None:
         sumo_world(1, style="dens")
     with pytest.raises(ConfigError, match="episodes must be a whole number, 1 or more, not 0"):
         sumo_world(0)
+    with pytest.raises(ConfigError, match="episodes must be 4000 or fewer in world=sumo, not 4001"):
+        sumo_world(4001)
+
+
+def test_no_episode_is_one_of_another_seed() -> None:
+    first, second = (SumoSimulator(4000, seed, "free") for seed in (0, 1))
+    streams = {first.branch(episode).seed for episode in range(4000)}
+    assert len({first.branch(episode) for episode in range(4000)}) == 4000
+    assert max(streams) < second.branch(0).seed
+    assert not streams & {second.branch(episode).seed for episode in range(4000)}
+
+
+def test_episodes_that_are_driven_together_do_not_depend_on_each_other(world: TrafficWorld) -> None:
+    """On several maps, with one episode that ends before the others."""
+    planner = ResponsePlanner(world.energy, world.game, None, world.search)
+    together = play(world, planner, [2, 0, 3, 1]).outcome
+    for place, episode in enumerate([2, 0, 3, 1]):
+        alone = play(world, planner, [episode]).outcome
+        seen = int(alone.agent_mask[0].any(1).sum())
+        torch.testing.assert_close(together.states[place, :seen, :13], alone.states[0, :seen], rtol=0, atol=1e-5)
+        assert torch.equal(together.agent_mask[place, :seen], alone.agent_mask[0, :seen])

@@ -104,6 +104,21 @@ def test_a_command_that_was_killed_in_the_middle_of_a_line_is_continued(
         assert len(rows) == 3, "no row is lost"
 
 
+def test_a_file_of_other_episodes_together_is_refused(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "driven"
+    words = ["run=rpi/v_lstm_epo", "ways=[own]", "baselines=[]", "film=null", "timed=0", *SMALL[::2], f"out={out}"]
+    assert epo("drive", *words) == 0
+    (out / "results.json").unlink()
+    text = (out / "episodes.jsonl").read_text()
+    (out / "episodes.jsonl").write_text(text.replace('"episodes": [0, 1]', '"episodes": [0]'))
+    assert epo("drive", *words) == 2
+    assert "was begun by a version that drove other episodes together" in capsys.readouterr().err
+
+
 def test_what_was_driven_by_a_killed_command_gives_the_same_table(
     epo: Callable[..., int],  # noqa: F811
     tmp_path: Path,
