@@ -88,6 +88,8 @@ def _check_decoded_margins(energy: FeatureEnergy, scene: Scene, parameters: Game
     Raises:
         ValueError: a missing margin, a wrong shape, or, on a CPU, a negative value.
     """
+    if not energy.decoded_margins:
+        return
     modes, exists = controls.shape[1], pair_mask(scene)
     batch, count = exists.shape
     for name in energy.decoded_margins:

@@ -65,7 +65,7 @@ class Minimiser(ABC):
         return self
 
     def descent(self) -> Minimiser:
-        """A minimiser that, in each mode, descends from that mode's initial strategy; most minimisers do so already."""
+        """A minimiser that, in each mode, descends from that mode's initial strategy to a minimum; most minimisers do so."""
         return self
 
     def near_minimum(self) -> Minimiser:

@@ -7,6 +7,8 @@ import dataclasses
 import pytest
 import torch
 
+from epo_lightning.drive.rpi import ENERGY as RPI
+from epo_lightning.drive.rpi import RPIWorld
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
@@ -51,6 +53,21 @@ def test_calibration_finds_the_weights_of_the_game_that_was_played() -> None:
             found.pair_weights["proximity"], true[:, None, None].expand(3, 2, 1), rtol=1e-2, atol=0
         )
         assert found.own_weights is inferred.own_weights
+
+
+def test_few_steps_of_the_forecast_do_not_make_the_calibration_less_accurate() -> None:
+    """Twenty Gauss-Newton steps do not arrive at the minima of these games; the weights are those of the minima anyway."""
+    world = RPIWorld(3)
+    scene = world.observe()
+    game = world.game(scene)
+    inferred = dataclasses.replace(game, pair_weights={name: 2 * weight for name, weight in game.pair_weights.items()})
+    few = LevenbergMarquardt(steps=20, step_size=1.0, damping=10.0, adaptive=True)
+    found, converged = (
+        Calibration()(solver, RPI, scene, inferred).pair_weights["clearance"]
+        for solver in (few, dataclasses.replace(few, newton_steps=100))
+    )
+    torch.testing.assert_close(found, converged, rtol=1e-5, atol=0)
+    torch.testing.assert_close(found, game.pair_weights["clearance"], rtol=1e-2, atol=0)
 
 
 def test_weights_without_an_effect_on_the_history_stay() -> None:

@@ -38,6 +38,10 @@ DESCENTS = {compiled.solve: compiled.descend, hosted.solve: hosted.descend}
 """For backends that take all adaptive steps in one call: the function that does, which has no derivative."""
 BACKENDS = ("auto", "pytorch", "compiled", "host", "warp")
 LARGEST_DAMPING = 1e30
+_FAR, _NEAR = 5, 15
+"""Numbers of Gauss-Newton and of Newton steps that lead to a minimum: the former bring a far start near it."""
+_LIGHT = 1e-2
+"""Largest first damping near a minimum: with more of it, the first Newton steps are short."""
 
 
 @register("solver", "levenberg_marquardt")
@@ -108,9 +112,19 @@ class LevenbergMarquardt(Stepwise):
         """The solver to use outside training."""
         return self if self.test_steps is None else self.with_steps(self.test_steps)
 
+    def descent(self) -> LevenbergMarquardt:
+        """The solver with Newton steps at the end, because Gauss-Newton steps may need hundreds to arrive at the minimum.
+
+        Solvers that are not adaptive, and those of a backend without Newton steps, stay as they are."""
+        if self.newton_steps or not self.adaptive or self.backend == "warp":
+            return self
+        return dataclasses.replace(self, steps=min(self.steps, _FAR), newton_steps=_NEAR)
+
     def near_minimum(self) -> LevenbergMarquardt:
         """The solver without its Gauss-Newton steps, if it has Newton steps, which converge quadratically near a minimum."""
-        return dataclasses.replace(self, steps=0) if self.newton_steps else self
+        if not self.newton_steps:
+            return self
+        return dataclasses.replace(self, steps=0, damping=min(self.damping, _LIGHT))
 
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """S steps, and then the Newton steps.

@@ -116,6 +116,22 @@ def test_newton_steps_converge_where_gauss_newton_steps_do_not(backend) -> None:
     assert norms[0].max() > 1e-6
 
 
+def test_descents_end_with_newton_steps_where_the_solver_can_take_them() -> None:
+    solver = LevenbergMarquardt(steps=8, **ADAPTIVE)
+    energy, scene, game = make(2, own=("goal", "acc", "turnr"), pair=())
+    game.goals.mul_(5.0)
+    with torch.no_grad():
+        short, found = (descend(energy, scene, game) for descend in (solver, solver.descent()))
+        nearby = dataclasses.replace(game, initial_controls=found.controls + 1e-3)
+        again = dataclasses.replace(solver.descent().near_minimum(), newton_steps=3)(energy, scene, nearby)
+    assert short.gradient_norm.max() > 1e-6
+    assert found.gradient_norm.max() < 1e-7
+    torch.testing.assert_close(again.controls, found.controls, rtol=0, atol=1e-6)
+    for fixed in (LevenbergMarquardt(), LevenbergMarquardt(backend="warp", adaptive=True)):
+        assert fixed.descent() is fixed
+        assert fixed.near_minimum() is fixed
+
+
 def test_newton_steps_never_raise_the_energy_and_keep_the_energy_of_the_start() -> None:
     energy, scene, game = make(3)
     with torch.no_grad():
