@@ -10,6 +10,7 @@ from lightning import LightningModule
 from torch import Tensor
 
 from epo_lightning.metrics import ForecastMetrics
+from epo_lightning.metrics.forecast import COLUMNS, STOPPED, stopped
 from epo_lightning.objectives.base import Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.scene import JointForecast, Scene
@@ -46,7 +47,7 @@ class Forecaster(LightningModule):
         """The forecast in evaluation mode, with the energy of every feature (:meth:`explain`).
 
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
-        other scenes of the batch are the same as without it.
+        other scenes of the batch are the same as without it. A warning says how many joint modes violate hard constraints.
 
         Raises:
             TypeError: the argument is not a :class:`Scene`.
@@ -73,6 +74,9 @@ class Forecaster(LightningModule):
         finally:
             for module in training:
                 module.training = True
+        lost = stopped(forecast)
+        if lost is not None:
+            _warn_of_stopped(float(lost.double().mean()) if lost.numel() else 0.0, len(lost))
         return forecast.map(lambda tensor: _blank(tensor, broken)) if broken else forecast
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
@@ -107,7 +111,10 @@ class Forecaster(LightningModule):
         self._log_metrics("test", self.test_metrics)
 
     def _log_metrics(self, split: str, metrics: ForecastMetrics) -> None:
-        self.log_dict({f"{split}/{name}": value for name, value in metrics.compute().items()})
+        scores = metrics.compute()
+        self.log_dict({f"{split}/{name}": value for name, value in scores.items()})
+        if split == "test" and STOPPED in scores:
+            _warn_of_stopped(float(scores[STOPPED]), int(metrics.count[0, COLUMNS.index(STOPPED)]))
         metrics.reset()
 
     def configure_optimizers(self) -> Any:
@@ -123,6 +130,17 @@ class Forecaster(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["configuration"] = self.configuration
+
+
+def _warn_of_stopped(share: float, scenes: int) -> None:
+    """Warn if a share of the joint modes of some scenes is above zero: their solver stopped."""
+    if share:
+        warnings.warn(
+            f"in {share:.2%} of the joint modes of {scenes} scene(s) the solver stopped before hard constraints were met. "
+            "Their strategies have no meaning, but are scored like all others (forecast.solution.status names them). Use a "
+            "smaller clearance, or more solver.rounds",
+            stacklevel=3,
+        )
 
 
 def _blank(tensor: Tensor, scenes: list[int]) -> Tensor:

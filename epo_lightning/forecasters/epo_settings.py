@@ -124,13 +124,18 @@ def check_calibration(calibration: Mapping[str, float] | None, energy: Energy, s
 
 
 def check_gate(gate: Mapping[str, Any] | None, energy: Energy) -> None:
-    """Refuse a gate for energies without pair features, and for those whose pairs do not vanish with their weight.
+    """Refuse settings without a gate, and a gate for energies without pair features that vanish with their weight.
 
     Raises:
         ConfigError: see above.
     """
     if gate is None:
         return
+    if isinstance(gate, Mapping) and gate and "name" not in gate:
+        raise ConfigError(
+            f"{', '.join(f'forecaster.gate.{key}' for key in gate)} has no effect without a gate: choose one by "
+            "gate=radius, nearest or attention (in Python, by its name), or set forecaster.gate to null"
+        )
     if FEATURES not in energy.offers:
         raise ConfigError(
             "forecaster.gate leaves pairs out of an energy of named features, such as energy=exid, rpi or pedestrians; "

@@ -24,7 +24,7 @@ from epo_lightning.metrics.functional import (
 )
 from epo_lightning.metrics.functional.calibration import BINS
 from epo_lightning.metrics.functional.overlap import Shape, check_choice, overlap_rates
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import JointForecast, Scene, Status
 
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "overlap_authors")
 """Scores of every forecaster; displacements in m, overlaps as rates."""
@@ -48,6 +48,9 @@ COLLAPSE_METRICS = ("missed",)
 """Scores of subsets alone: the share of a subset's scenes in which no mode is near the future."""
 PAIR_METRICS = ("pair_effect",)
 """Mean displacement [m] between the most likely joint mode and the solution of the same game without its pair terms."""
+STOPPED = "stopped"
+CONSTRAINT_METRICS = (STOPPED,)
+"""Share of the joint modes whose hard constraints were not met (status ``STOPPED``), for solutions with hard constraints."""
 COLUMNS = (
     *METRICS,
     *INITIAL_METRICS,
@@ -56,14 +59,14 @@ COLUMNS = (
     *PROBABILITY_METRICS,
     *COLLAPSE_METRICS,
     *PAIR_METRICS,
+    *CONSTRAINT_METRICS,
 )
 """Scores that are means over scenes."""
 SCORES = (*COLUMNS, "ECE")
 """All scores; ``ECE`` is the calibration error of the probabilities of several modes
 (:mod:`~epo_lightning.metrics.functional.calibration`)."""
 _OF_SUBSETS = tuple(
-    name in (*METRICS, *INITIAL_METRICS, MODE_METRICS[0], *PROBABILITY_METRICS, *COLLAPSE_METRICS, *PAIR_METRICS)
-    for name in COLUMNS
+    name not in EQUILIBRIUM_METRICS and (name not in MODE_METRICS or name == MODE_METRICS[0]) for name in COLUMNS
 )
 _OF_ALL = tuple(name not in COLLAPSE_METRICS for name in COLUMNS)
 
@@ -185,6 +188,7 @@ def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> Float[
     columns.append(brier_min_sade(states, forecast.probabilities, future, mask) if modes else none)
     columns.append(missed(states, future, mask))
     columns.append(pair_effect(forecast, scene.agent_mask))
+    columns.append(none if (lost := stopped(forecast)) is None else lost.double().mean(1))
     return torch.stack([column.double() for column in columns], dim=1)
 
 
@@ -217,6 +221,12 @@ def pair_effect(forecast: JointForecast, agent_mask: Bool[Tensor, "B N"]) -> Flo
     change = forecast.states[rows, likely, ..., :2] - forecast.states_without_pairs[rows, likely, ..., :2]
     moved = torch.linalg.vector_norm(change, dim=-1).mean(-1).where(agent_mask, 0.0).sum(-1) / agent_mask.sum(-1)
     return moved.where(moved.isfinite(), torch.nan)
+
+
+def stopped(forecast: JointForecast) -> Bool[Tensor, "B M"] | None:
+    """Mask of the joint modes whose hard constraints were not met; None for forecasts without hard constraints."""
+    solution = forecast.solution
+    return None if solution is None or solution.constraints is None else solution.status == Status.STOPPED
 
 
 def equilibrium_values(forecast: JointForecast) -> list[Float[Tensor, " B"]]:

@@ -83,6 +83,9 @@ EQUILIBRIUM = (
     Column("nash_gap_relative", "Nash gap, relative"),
 )
 
+STOPPED = "stopped"
+"""Metric of the share of joint modes that do not meet their hard constraints."""
+
 TRUE = "true_"
 """Beginning of the names of metrics that compare inferred costs with the true ones."""
 

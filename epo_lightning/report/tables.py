@@ -19,6 +19,7 @@ from epo_lightning.report.columns import (
     OF_MODES,
     PAIR_EFFECT,
     PROBABILITIES,
+    STOPPED,
     TRUTH,
     Column,
 )
@@ -95,6 +96,8 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
         effect = (Column(PAIR_EFFECT, "all scenes"), *subset_columns(rows, (Column(PAIR_EFFECT, ""),)))
         tables += _partly_shown(f"{where}: effect of the other agents", effect, rows)
         tables += _partly_shown(f"{where}: equilibrium", EQUILIBRIUM, [row for row in rows if "nash_gap" in row.cells])
+        lost = (Column(STOPPED, "all scenes"), *subset_columns(rows, (Column(STOPPED, ""),)))
+        tables += _partly_shown(f"{where}: share of modes that violate hard constraints", lost, rows)
         tables += _partly_shown(f"{where}: inferred against true costs", TRUTH, rows)
     return tables
 

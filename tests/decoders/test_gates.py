@@ -151,6 +151,17 @@ def test_settings_of_a_gate_are_those_of_the_forecaster():
         compose("train", ["experiment=ucy/v_lstm_epo", "gate=nearest", "gate.group=8"])
 
 
+def test_settings_of_a_gate_without_a_gate_are_refused():
+    with pytest.raises(
+        ConfigError,
+        match=r"forecaster\.gate\.group is a setting of a gate.*add gate=<one of attention, nearest, radius>",
+    ):
+        compose("train", ["experiment=ucy/v_lstm_epo", "forecaster.gate.group=8"])
+    config = compose("train", ["experiment=ucy/v_lstm_epo", "+forecaster.gate.group=8"])
+    with pytest.raises(ConfigError, match=r"forecaster\.gate\.group has no effect without a gate: choose one"):
+        forecaster({**EPO, "gate": config["forecaster"]["gate"]})
+
+
 def test_energies_without_pairs_that_can_be_left_out_are_refused():
     with pytest.raises(ConfigError, match=r"energy\.pair is empty"):
         forecaster({**EPO, "gate": GATES[1]}, energy={"name": "features", "own": ["vel", "acc"], "pair": []})

@@ -187,6 +187,14 @@ def test_the_effect_of_pair_terms_is_shown_and_not_ranked(tmp_path: Path) -> Non
     assert "lower is better" not in legend([table])
 
 
+def test_modes_that_violate_hard_constraints_are_a_table_of_the_rows_that_have_any(tmp_path: Path) -> None:
+    make_run(tmp_path / "hard", "hard", "epo", scores(0.1) | {"stopped": 0.25, "calm/stopped": 0.0})
+    make_run(tmp_path / "soft", "soft", "epo", scores(0.1))
+    (table,) = [table for table in build_tables(collect(tmp_path)) if "hard constraints" in table.title]
+    assert [column.label for column in table.columns] == ["all scenes", "calm"]
+    assert [[row.cells[column.metric].mean for column in table.columns] for row in table.rows] == [[0.25, 0.0]]
+
+
 def test_splits_are_tables_apart(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM", "marginal", scores(0.3), digest="abc")
     make_run(tmp_path / "b", "V-LSTM", "marginal", scores(0.2), digest="xyz", split="val")

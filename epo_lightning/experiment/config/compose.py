@@ -296,6 +296,9 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
         names = [str(known) for known in config if known != "hydra"] if isinstance(config, DictConfig) else []
         if word == "gate" and not walked and "." in key:  # the group's settings are those of the forecaster
             return f"unknown key {key!r}: with gate=<one of {', '.join(options_of(instance, word))}> it is forecaster.{key}"
+        if walked == ["forecaster"] and word == "gate" and word not in names:
+            choice = f"gate=<one of {', '.join(options_of(instance, word))}>"
+            return f"{key} is a setting of a gate, but no gate is chosen: add {choice}, or leave it out"
         if word not in names and not walked and (options := options_of(instance, word)):
             return f"{key} needs a choice of {word}: add {word}=<one of {', '.join(options)}>"
         if word not in names:
