@@ -147,6 +147,7 @@ OF_RPI = {
         ("Ten epochs", "rpi_hard", 4),
         ("The paper's split", "rpi_paper_split", 3),
         ("The paper's split", "rpi_paper_split_game", 1),
+        ("A search of the settings", "rpi_search_winners", 2),
         ("The paper's loss", "rpi_hard", 3),
     ],
 )
@@ -161,6 +162,27 @@ def test_the_page_of_rpi_has_the_scores_of_its_files(heading: str, file: str, ro
                 assert numbers(line)[:3] == [str(cells[0].n), *shown], row.title
                 found += 1
     assert found == rows
+
+
+def test_the_page_of_rpi_has_the_search() -> None:
+    runs = read_results(ROOT / "results" / "rpi_search.json").evaluated
+    section = RPI.partition("\n## A search of the settings\n")[2].partition("\n## ")[0].splitlines()
+    for name in ("SC", "EPO"):
+        own = [run for run in runs if run.name == f"V-LSTM + {name}, relaxed"]
+        own.sort(key=lambda run: (run.config["optimizer"]["lr"], run.config["backbone"]["dropout"]))
+        line = next(line for line in section if line.startswith(f"| +{name} |"))
+        assert numbers(line) == [short(run.metrics["minSADE"], 4) for run in own]
+
+
+def test_the_page_of_the_family_has_the_scores_of_its_rows() -> None:
+    page = (ROOT / "docs" / "family.md").read_text(encoding="utf-8")
+    lines = page.partition("| RPI, hard split |")[2].splitlines()
+    metrics = ("minSADE", "minSFDE", "minSADE_1", "executed/minSADE", "alternative/minSADE", "overlap_jfp")
+    for row in distinct(build_tables(read_results(ROOT / "results" / "table1_rpi.json").evaluated)):
+        line = next(line for line in lines if line.startswith(f"| {row.title.partition(',')[0]} |"))
+        cells = [row.cells[metric] for metric in metrics]
+        shown = [f"{short(cell.mean, 3)} ± {short(cell.deviation or 0, 3)}" for cell in cells]
+        assert numbers(line)[:7] == [str(cells[0].n), *shown], row.title
 
 
 def test_the_page_of_rpi_has_the_steps() -> None:
