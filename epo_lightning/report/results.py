@@ -32,6 +32,7 @@ from epo_lightning.identity import ELSEWHERE, SECTIONS, canonical
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.curves import METRIC
+from epo_lightning.report.entries import OBJECT, OBJECTS, OBJECTS_BY_NAME, PAIRS, ROWS, TEXT, TEXTS, check_entries
 from epo_lightning.report.records import CONFIG, RECORD, TIME, Records
 from epo_lightning.report.runs import read_run, scored, scored_elsewhere
 from epo_lightning.report.write import Report
@@ -47,6 +48,8 @@ RECORDED = (
 """Entries of run.json that are saved."""
 LOGGED = ("step", METRIC)
 """Columns of the log that are saved."""
+_REPORT = {"title": TEXT, "command": TEXT, "sweep": TEXT, "left_out": PAIRS, "runs": OBJECTS}
+_RUN = {"folder": TEXT, "reported": TEXTS, "config": OBJECT, "record": OBJECT, "scores": OBJECTS_BY_NAME, "log": ROWS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +144,18 @@ def read_results(file: str | Path) -> Report:
             f"{file} is a results file of version {content.get('version')}, this program reads version {VERSION}; {again}"
         )
     digest = content.pop("digest", None)
+    remedy = (
+        f"take the committed file again, or write it again with `{content.get('command', 'epo report')} save={file}`"
+    )
     if digest != _digest(content):
         raise ConfigError(
             f"{file} is damaged: its content does not have the digest {digest}; was it edited, or copied incompletely? "
-            f"Take the committed file again, or write it again with `{content.get('command', 'epo report')} save={file}`"
+            f"{remedy[0].upper()}{remedy[1:]}"
         )
+    check_entries(content, _REPORT, str(file), remedy)
     entries = content["runs"]
+    for number, entry in enumerate(entries):
+        check_entries(entry, _RUN, f"{file}, entry {number} of runs,", remedy)
     runs = [SavedRun(Path(e["folder"]), e["config"], e["record"], e["scores"], e["log"]) for e in entries]
     return Report(
         title=content["title"],

@@ -12,9 +12,12 @@ from epo_lightning.identity import identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
+from epo_lightning.report.entries import NUMBERS_BY_NAME, TEXTS, check_entries
 from epo_lightning.report.records import CONFIG, RECORD, Records
 from epo_lightning.run_folder import OTHER, RunFolder, discover
 
+_ABOUT = {"agents": NUMBERS_BY_NAME, "notes": TEXTS}
+"""Entries on the scenes of other data, which older files lack."""
 TRAIN = "train one first, epo train experiment=rpi/v_lstm_epo"
 COPY = "copy the run folder again from where it was made, or move it away"
 
@@ -159,6 +162,7 @@ def read_other(run: Records) -> list[tuple[EvaluatedRun, Mapping[str, Any]]]:
         content = _sound(lambda name=name: run.content(name), again)  # type: ignore[misc]
         for key in ("data", "split", "test", "checkpoint"):
             _entry(content, file, again, key)
+        check_entries(content, {key: check for key, check in _ABOUT.items() if key in content}, str(file), again)
         found.append((_evaluated(run, config, record, file, content, str(content["split"]), again), content))
     return found
 

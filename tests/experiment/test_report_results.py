@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from experiment.test_sweep_report import begin, finish
@@ -16,6 +17,7 @@ from report.test_transfer import three_runs
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import NOT_DRAWN, report
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.results import _digest
 from epo_lightning.run_folder import RunFolder
 
 FILES = {
@@ -131,6 +133,41 @@ def test_a_damaged_or_foreign_file_is_refused(change: Callable[[str], str], mess
     text = file.read_text()
     file.write_text(change(text))
     assert file.read_text() != text
+    with pytest.raises(ConfigError, match=message):
+        report(ReportSettings(results=str(file), out="two"))
+    assert not Path("two").exists()
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (
+            "title",
+            None,
+            r"all\.json is damaged: its entry title must be a text, not None; take the committed file again",
+        ),
+        ("left_out", [["runs/a"]], r"its entry left_out must be a list of pairs of texts, not \[\['runs/a'\]\]"),
+        ("runs", {"a": 1}, r"its entry runs must be a list of objects"),
+        ("runs.0.folder", 3, r"all\.json, entry 0 of runs, is damaged: its entry folder must be a text, not 3"),
+        ("runs.0.reported", ..., r"entry 0 of runs, is damaged: it lacks the entry reported, a list of texts"),
+        ("runs.0.scores", {"metrics.json": []}, r"its entry scores must be objects by name"),
+        ("runs.0.log", [[1, "0.5"]], r"its entry log must be a list of lists of texts"),
+    ],
+)
+def test_a_damaged_entry_with_a_fitting_digest_is_named(path: str, value: object, message: str) -> None:
+    make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.315))
+    file = saved()
+    content = json.loads(file.read_text())
+    del content["digest"]
+    place: Any = content
+    *way, last = [int(key) if key.isdigit() else key for key in path.split(".")]
+    for key in way:
+        place = place[key]
+    if value is ...:
+        del place[last]
+    else:
+        place[last] = value
+    file.write_text(json.dumps({**content, "digest": _digest(content)}))
     with pytest.raises(ConfigError, match=message):
         report(ReportSettings(results=str(file), out="two"))
     assert not Path("two").exists()

@@ -168,6 +168,17 @@ def test_of_two_versions_the_later_one_counts_and_checkpoints_have_lines_of_thei
             '{"data": "b", "split": "all", "test": "t", "checkpoint": "best", "data_digest": "d", "metrics": {"a": "x"}}',
             "metrics must be numbers",
         ),
+        *(
+            (
+                '{"data": "b", "split": "all", "test": "t", "checkpoint": "best", "data_digest": "d", "metrics": {}, '
+                f"{entry}}}",
+                message,
+            )
+            for entry, message in (
+                ('"agents": {"car": "x"}', "is damaged: its entry agents must be numbers by name, not {'car': 'x'}"),
+                ('"notes": 3', "is damaged: its entry notes must be a list of texts, not 3"),
+            )
+        ),
     ],
 )
 def test_damaged_files_are_named_with_a_remedy(tmp_path: Path, text: str, message: str) -> None:
