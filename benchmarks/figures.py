@@ -1,10 +1,12 @@
-"""Figures of docs/game.md.
+"""Figures of docs/game.md and docs/rpi_results.md.
 
     python -m benchmarks.figures levels docs/figures/pair_features.png
     python -m benchmarks.figures weights docs/figures/inferred_w.png RUN [RUN ...]
+    python -m benchmarks.figures modes docs/figures/rpi_modes.png RUN [RUN ...] --records 3280 3294
 
-`levels` draws the level sets of the pair features. `weights` draws the inferred against the true weights of RPI's games; a
-run is a run folder, or `rpi` for the run that ships with the package.
+`levels` draws the level sets of the pair features. `weights` draws the inferred against the true weights of RPI's games.
+`modes` draws the joint modes of runs on records of RPI's test split, and prints their energies before and after the
+solver's steps. A run is a run folder, or the name of a run that ships with the package.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from matplotlib.figure import Figure
@@ -19,12 +22,13 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter
 from torch import Tensor
 
-from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data
 from epo_lightning.experiment.truth import compare, inferred_costs
 from epo_lightning.game.features import PAIR_FEATURES, PairFeature
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.figures import joint_predictions
 from epo_lightning.report.style import MODES, OTHER, save, style
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import read
@@ -104,13 +108,60 @@ def weights(path: Path, runs: Sequence[str]) -> None:
 
 
 @torch.no_grad()
-def _costs(folder: str) -> tuple[str, dict[str, Tensor]]:
-    """Title of a run, and true and inferred costs of random records of its test split."""
+def modes(path: Path, runs: Sequence[str], records: Sequence[int]) -> None:
+    """One column per run and one row per record with two equilibria; prints energies, true and inferred weights w.
+
+    Raises:
+        ConfigError: a run on other data than RPI, or a record that is not there or has one equilibrium.
+    """
+    forecasts = {}
+    for run in runs:
+        settings, forecaster, data = _open(run)
+        scenes = data.open("test")
+        both = [_futures(scenes, record) for record in records]
+        scene, other = (scenes[torch.tensor(rows)] for rows in zip(*both, strict=True))
+        forecasts[settings.title] = forecast = forecaster.predict(scene)
+        if (solution := forecast.solution) is None or forecast.parameters is None:
+            continue
+        costs = inferred_costs(forecast.parameters, forecast.probabilities.argmax(1))
+        true = data.records("test")["weight"]
+        for row, record in enumerate(records):
+            before, after = (
+                ", ".join(f"{value:.0f}" for value in energy[row])
+                for energy in (solution.initial_energy, solution.energy)
+            )
+            print(f"{settings.title}, record {record}: E of the modes {before} before, {after} after the steps")
+            print(f"  w {costs['pair'][row]:.1f}, true {true[record]:.1f}")
+    joint_predictions(scene, forecasts, path, other.future)
+
+
+def _futures(scenes: RPIDataset, record: int) -> tuple[int, int]:
+    """Rows of a record with the executed and the alternative future."""
+    rows = (scenes.record == record).nonzero().flatten()
+    if len(rows) != 2:
+        raise ConfigError(f"record {record} of the test split is missing or has one equilibrium: choose another one")
+    executed, alternative = sorted(rows.tolist(), key=lambda row: int(scenes.mode[row]))
+    return executed, alternative
+
+
+def _open(folder: str) -> tuple[Settings, Any, RPIData]:
+    """Settings, forecaster and data of a run.
+
+    Raises:
+        ConfigError: a run on other data than RPI.
+    """
     run = RunFolder.open(folder)
     settings = read(Settings, run.config())
     forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings)
     if not isinstance(data, RPIData):
         raise ConfigError(f"{folder} was trained on other data than RPI, whose weights are not known")
+    return settings, forecaster, data
+
+
+@torch.no_grad()
+def _costs(folder: str) -> tuple[str, dict[str, Tensor]]:
+    """Title of a run, and true and inferred costs of random records of its test split."""
+    settings, forecaster, data = _open(folder)
     scenes = data.open("test")
     executed = (scenes.mode == 0).nonzero().flatten()
     chosen = executed[torch.randperm(len(executed), generator=torch.Generator().manual_seed(0))[:RECORDS]]
@@ -127,18 +178,23 @@ def _costs(folder: str) -> tuple[str, dict[str, Tensor]]:
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("figure", choices=("levels", "weights"))
+    parser.add_argument("figure", choices=("levels", "weights", "modes"))
     parser.add_argument("path", type=Path)
     parser.add_argument("runs", nargs="*")
+    parser.add_argument("--records", nargs="+", type=int, default=(), metavar="RECORD")
     arguments = parser.parse_args(argv)
-    if (arguments.figure == "weights") != bool(arguments.runs):
-        parser.error("`weights` takes run folders, and `levels` takes none")
+    if (arguments.figure != "levels") != bool(arguments.runs):
+        parser.error("`weights` and `modes` take run folders, and `levels` takes none")
+    if (arguments.figure == "modes") != bool(arguments.records):
+        parser.error("`modes` takes --records, and the other figures take none")
     torch.set_num_threads(1)
     try:
         if arguments.figure == "levels":
             levels(arguments.path)
-        else:
+        elif arguments.figure == "weights":
             weights(arguments.path, arguments.runs)
+        else:
+            modes(arguments.path, arguments.runs, arguments.records)
     except ConfigError as error:
         raise SystemExit(f"figures: {error}") from None
 

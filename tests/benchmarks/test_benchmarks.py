@@ -162,6 +162,23 @@ def test_true_games_are_measured(capsys, tmp_path):
     assert "data=rpi" in refused(true_game.main, "data=drawn")
 
 
+@pytest.mark.slow
+def test_modes_of_records_are_drawn_with_their_energies(capsys, tmp_path):
+    data = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None)
+    data.generate(workers=1, progress=False)
+    small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "budget=smoke"]
+    run = train.train(compose("train", ["experiment=rpi/v_lstm_epo", *small, f"runs={tmp_path}"])).path
+    modes = data.records("test")["modes"]
+    two, one = ((modes == count).nonzero()[0].item() for count in (2, 1))
+    capsys.readouterr()
+    figures.main(["modes", str(tmp_path / "modes.png"), str(run), "--records", str(two)])
+    assert (tmp_path / "modes.png").stat().st_size > 10_000
+    first, second = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(rf".*, record {two}: E of the modes \d+, \d+ before, \d+, \d+ after the steps", first)
+    assert second.endswith(f"true {data.records('test')['weight'][two]:.1f}")
+    assert f"record {one} " in refused(figures.main, "modes", tmp_path / "modes.png", run, "--records", one)
+
+
 TINY = (
     "data=drawn",
     "data.scenes=32",
@@ -228,8 +245,9 @@ def test_figures_are_drawn_and_wrong_runs_are_one_line(tmp_path):
     figures.main(["levels", str(tmp_path / "levels.png")])
     assert (tmp_path / "levels.png").stat().st_size > 10_000
     assert str(tmp_path) in refused(figures.main, "weights", tmp_path / "weights.png", tmp_path)
-    with pytest.raises(SystemExit):
-        figures.main(["weights", str(tmp_path / "weights.png")])
+    for words in (["weights"], ["modes"], ["modes", "rpi/v_lstm_epo"], ["weights", "rpi/v_lstm_epo", "--records", "1"]):
+        with pytest.raises(SystemExit):
+            figures.main([words[0], str(tmp_path / "figure.png"), *words[1:]])
 
 
 @pytest.mark.parametrize("format_", ["commonroad", "ucy", "exid"])
