@@ -197,16 +197,22 @@ def test_the_page_of_rpi_has_the_steps() -> None:
             assert text == short(value, len(text) - 1)
 
 
-HIGHWAYS = (ROOT / "docs" / "highway_results.md").read_text(encoding="utf-8")
+HIGHWAYS, URBAN = ((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8") for page in ("highway_results", "urban"))
 BACKBONES = ("V-LSTM", "VIBES", "HiVT-M")
 ON_HIGHWAYS = pytest.mark.parametrize(("heading", "file"), [("Simulated highways", "highway_sim"), ("US-101", "us101")])
 
 
-def lines_of_highways(heading: str) -> list[str]:
-    return HIGHWAYS.partition(f"\n## {heading}\n")[2].partition("\n## ")[0].splitlines()
+def lines_of_roads(heading: str) -> list[str]:
+    """The lines of a section on highways, or of the one with results on urban roads."""
+    return (
+        (URBAN if heading == "Results" else HIGHWAYS)
+        .partition(f"\n## {heading}\n")[2]
+        .partition("\n## ")[0]
+        .splitlines()
+    )
 
 
-def on_highways(file: str) -> dict[str, dict[int, EvaluatedRun]]:
+def on_roads(file: str) -> dict[str, dict[int, EvaluatedRun]]:
     """The runs of a file by title and seed, with their scores on the test split or on a part of it."""
     saved = read_results(ROOT / "results" / f"{file}.json")
     found: dict[str, dict[int, EvaluatedRun]] = {}
@@ -217,7 +223,7 @@ def on_highways(file: str) -> dict[str, dict[int, EvaluatedRun]]:
 
 @ON_HIGHWAYS
 def test_the_page_of_highways_has_the_scores_of_its_files(heading: str, file: str) -> None:
-    section, found = lines_of_highways(heading), on_highways(file)
+    section, found = lines_of_roads(heading), on_roads(file)
     for title, runs in found.items():
         assert sorted(runs) == [0, 1, 2]
         line = next(line for line in section if line.startswith(f"| {title} |"))
@@ -227,11 +233,22 @@ def test_the_page_of_highways_has_the_scores_of_its_files(heading: str, file: st
             assert cell == f"{short(fmean(values), 3)}{spread}", (title, metric)
 
 
-@ON_HIGHWAYS
+def test_the_page_of_urban_scenes_has_the_scores_of_its_file() -> None:
+    for title, runs in on_roads("urban").items():
+        assert sorted(runs) == [0, 1, 2]
+        line = next(line for line in lines_of_roads("Results") if line.startswith(f"| {title} |"))
+        metrics = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "minSADE_1")
+        found = [[run.metrics[metric] for run in runs.values()] for metric in metrics]
+        assert numbers(line)[:7] == ["3", *(f"{short(fmean(v), 3)} ± {short(stdev(v), 3)}" for v in found)], title
+
+
+@pytest.mark.parametrize(
+    ("heading", "file"), [("Simulated highways", "highway_sim"), ("US-101", "us101"), ("Results", "urban")]
+)
 @pytest.mark.parametrize("unit", ["all nine pairs", "three seeds, each the mean of its backbones"])
-def test_the_page_of_highways_has_the_differences_of_its_files(heading: str, file: str, unit: str) -> None:
-    found = on_highways(file)
-    line = next(line for line in lines_of_highways(heading) if line.startswith(f"| +EPO - +SC, {unit} |"))
+def test_the_pages_of_roads_have_the_differences_of_their_files(heading: str, file: str, unit: str) -> None:
+    found = on_roads(file)
+    line = next(line for line in lines_of_roads(heading) if line.startswith(f"| +EPO - +SC, {unit} |"))
     for cell, metric in zip(numbers(line), ("minSADE", "minSFDE", "overlap_jfp"), strict=False):
         pairs = [
             [found[f"{b} + EPO"][seed].metrics[metric] - found[f"{b} + SC"][seed].metrics[metric] for b in BACKBONES]
