@@ -31,7 +31,8 @@ suppress_warnings = ["ref.python"]  # a name that two modules offer
 # References to this package's objects are checked. Types of other packages in signatures have no page here.
 nitpick_ignore_regex = [
     ("py:.*", r"(?!epo_lightning\b).*"),
-    ("py:(class|obj)", r"epo_lightning\..*\.(_\w+|Function|Part|Section|Some|Value)"),  # private bases and type variables
+    # Private bases and type variables.
+    ("py:(class|obj)", r"epo_lightning\..*\.(_\w+|Function|Part|Section|Some|Value)"),
 ]
 
 myst_heading_anchors = 3
