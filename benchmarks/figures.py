@@ -109,7 +109,7 @@ def weights(path: Path, runs: Sequence[str]) -> None:
 
 @torch.no_grad()
 def modes(path: Path, runs: Sequence[str], records: Sequence[int]) -> None:
-    """One column per run and one row per record with two equilibria; prints energies, true and inferred weights w.
+    """Joint modes, one column per run and one row per record with two equilibria; prints energies, true and inferred w.
 
     Raises:
         ConfigError: a run on other data than RPI, or a record that is not there or has one equilibrium.

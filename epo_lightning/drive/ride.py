@@ -85,7 +85,7 @@ class Simulation(Protocol):
     lanes: LaneGraph
 
     def history(self) -> list[Moment]:
-        """What happened before, with the present moment last; asked for once, before the first step."""
+        """Moments before the first step, with the present one last; asked for once."""
         ...
 
     def step(self, way: tuple[Float[np.ndarray, " 4"], Float[np.ndarray, " 4"]] | None) -> None:

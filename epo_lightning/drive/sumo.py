@@ -49,7 +49,7 @@ ASIDE = 0.3
 SECONDS = 24.0
 """Longest duration of an episode."""
 ENDED = "the process of SUMO ended: is there enough memory?"
-"""Message of an error."""
+"""Message of the error that is raised when a connection breaks."""
 
 
 def sumo_world(episodes: int, seed: int = 0, style: str = "dense") -> TrafficWorld:

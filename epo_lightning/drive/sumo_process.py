@@ -86,7 +86,7 @@ class Vehicles:
     values: Float[np.ndarray, "n 7"]
 
     def around(self, name: str, vehicles: Vehicles) -> Vehicles:
-        """Those of some vehicles that are near a vehicle of this moment."""
+        """The vehicles of another moment that are near where a vehicle is at this one."""
         if name not in self.names:
             return vehicles
         near = np.abs(vehicles.values[:, 0] - self.values[self.names.index(name), 0]) <= AROUND

@@ -148,9 +148,7 @@ def draw_learning(curves: Sequence[Curve], size: tuple[float, float] = SIZE, leg
             draw_line(
                 axes, curve, f"row{i}", 0.16 if len(curves) < 5 else 0.08, color=color, ls=dashes, lw=1.7, marker=marker
             )
-        everything = [value for curve in curves for value in (*curve.low, *curve.high)]
-        if min(everything) > 0 and max(everything) > 5 * min(everything):
-            logarithmic(axes)
+        logarithmic_if_wide(axes, curves)
         axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
         axes.set_xlabel("training steps")
         axes.set_ylabel("minSADE, validation [m]")
@@ -266,8 +264,11 @@ def draw_line(axes: Axes, curve: Curve, gid: str, shade: float, label: str | Non
     return drawn[0]
 
 
-def logarithmic(axes: Axes) -> None:
-    """Set a logarithmic axis with ticks as plain numbers."""
+def logarithmic_if_wide(axes: Axes, curves: Sequence[Curve]) -> None:
+    """Set a logarithmic axis, with ticks as plain numbers, for positive values that differ by more than a factor of five."""
+    values = [value for curve in curves for value in (*curve.low, *curve.high)]
+    if min(values) <= 0 or max(values) <= 5 * min(values):
+        return
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     low, high = axes.get_ylim()

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from epo_lightning.identity import essence
-from epo_lightning.report.curves import SIZE, Curve, draw_line, logarithmic, look, plain_frame
+from epo_lightning.report.curves import SIZE, Curve, draw_line, logarithmic_if_wide, look, plain_frame
 from epo_lightning.report.rows import Row
 from epo_lightning.report.runs import data_name
 from epo_lightning.report.style import style
@@ -79,9 +79,7 @@ def draw_efficiency(curves: Sequence[Curve], size: tuple[float, float] = SIZE, l
         axes.set_xscale("log")
         axes.set_xticks(shares, [f"{100 * share:.3g} %" for share in shares])
         axes.xaxis.set_minor_locator(NullLocator())
-        everything = [value for curve in curves for value in (*curve.low, *curve.high)]
-        if min(everything) > 0 and max(everything) > 5 * min(everything):
-            logarithmic(axes)
+        logarithmic_if_wide(axes, curves)
         axes.set_xlabel("share of the training games")
         axes.set_ylabel("minSADE [m]")
         axes.margins(x=0.06, y=0.12)

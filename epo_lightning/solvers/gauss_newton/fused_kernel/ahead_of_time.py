@@ -24,7 +24,7 @@ _VALUE, _REGISTERS, _STACK = 0x04, 0x2F, 0x12  # a record with a payload, and th
 
 @dataclass(frozen=True)
 class Resources:
-    """What a kernel takes of a GPU.
+    """Resources of a GPU that a kernel takes.
 
     Attributes:
         registers: 32-bit registers per thread.
@@ -59,7 +59,7 @@ def compile_for(architecture: int, double: bool, agents: int, folder: Path) -> d
 
 
 def resources(cubin: bytes) -> Resources:
-    """What the only kernel of a module takes, from the attributes in its machine code (ELF).
+    """Resources that the only kernel of a module takes, from the attributes in its machine code (ELF).
 
     Raises:
         ValueError: no machine code of one kernel.

@@ -1,4 +1,4 @@
-"""What the threads of one game share: their number, a barrier, and fast memory."""
+"""Threads of one game: their number, a barrier, and the fast memory that they share."""
 
 from types import SimpleNamespace
 from typing import Any, no_type_check
