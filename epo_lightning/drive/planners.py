@@ -35,9 +35,6 @@ from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarq
 BRAKING = 2.0
 """Deceleration [m/s^2] of the plan that is followed where there is no earlier plan to fall back to."""
 
-KEEPING, HOLDING = ("accref", "turnrref"), 1e3
-"""Features of deviations from given controls, and their weight for agents that are held."""
-
 
 @dataclass(frozen=True)
 class Plan(Batch):
@@ -257,22 +254,15 @@ class _OfGame:
         held = torch.zeros(start.shape[2], dtype=torch.bool)
         if agent is not None:
             held = torch.arange(len(held)) != agent
-            usual = torch.zeros_like(start) if game.reference_controls is None else game.reference_controls
-            game = dataclasses.replace(
-                game,
-                own_weights={
-                    name: torch.where(held, HOLDING if name in KEEPING else 0.0, weight)
-                    for name, weight in game.own_weights.items()
-                },
-                reference_controls=torch.where(held[:, None, None], start, usual),
-            )
         starts = [start]
         for acceleration in () if held[EGO] else self.search.accelerations:
             other = start.clone()
             other[:, 0, EGO] = constant(scene.current[:, EGO, SPEED], acceleration, start.shape[-2], scene.dt).to(start)
             starts.append(other)
-        solver = LevenbergMarquardt(steps=steps, step_size=1.0, damping=1.0, adaptive=True)
-        solution = solver(self.energy, scene, dataclasses.replace(game, initial_controls=torch.cat(starts, 1)))
+        game = dataclasses.replace(game, initial_controls=torch.cat(starts, 1))
+        damping = start.new_ones(len(start), len(starts), len(held)).masked_fill(held, torch.inf)
+        solver = LevenbergMarquardt(step_size=1.0, adaptive=True)
+        solution, _ = solver.run(self.energy, scene, game, steps, damping)
         found = solution.energy.isfinite() & (solution.status != Status.STOPPED)
         best, rows = solution.energy.masked_fill(~found, torch.inf).argmin(1), torch.arange(len(start))
         controls = solution.controls[rows, best][:, None]
@@ -311,13 +301,19 @@ class ResponsePlanner(_OfGame):
         scene = scene.to(torch.float64)
         game, controls = self._start(scene, previous)
         others = torch.arange(controls.shape[2]) != EGO
-        controls[:, :, others] = 0.0 if game.reference_controls is None else game.reference_controls[:, :, others]
-        if self.forecast is not None:
-            told = self.forecast.controls_of_all(scene)
-            told = F.pad(told, (0, 0, 0, max(0, controls.shape[-2] - told.shape[-2])))[..., : controls.shape[-2], :]
-            known = torch.arange(1, told.shape[1])
-            controls[:, 0, known] = told[:, known].nan_to_num(0.0).to(controls)
+        controls[:, :, others] = self.expected(scene, game)[:, :, others]
         return self._plan(scene, *self._descend(scene, game, controls, EGO))
+
+    def expected(self, scene: Scene, game: GameParameters) -> Float[Tensor, "B 1 N K 2"]:
+        """Controls that the others are expected to take; those of the planned agent are without meaning."""
+        usual = game.reference_controls
+        controls = (torch.zeros_like(game.initial_controls) if usual is None else usual).clone()
+        if self.forecast is None:
+            return controls
+        told, steps = self.forecast.controls_of_all(scene), controls.shape[-2]
+        told = F.pad(told, (0, 0, 0, max(0, steps - told.shape[-2])))[..., :steps, :]
+        controls[:, 0, : told.shape[1]] = told.nan_to_num(0.0).to(controls)
+        return controls
 
 
 class GamePlanner(_OfGame):

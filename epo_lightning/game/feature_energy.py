@@ -470,6 +470,10 @@ class FeatureEnergy(Energy):
             return exists
         return exists & (torch.arange(steps, device=exists.device) < evaluated[:, None, None, None])
 
+    def of_scenes(self, rows: Tensor | slice) -> FeatureEnergy:
+        """The energy of some scenes of a batch: this one, if it holds no values of single scenes."""
+        return self
+
     def at_pair_steps(self, states: Float[Tensor, "*batch K X"]) -> Float[Tensor, "*batch L X"]:
         """The states at k = stride, 2 stride, ..., the steps at which pair features are evaluated."""
         return states[..., self.pair_stride - 1 :: self.pair_stride, :]

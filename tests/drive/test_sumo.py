@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import epo_lightning
+from benchmarks import forecast_speed
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.drive.episodes import play
 from epo_lightning.drive.measures import measure
@@ -148,3 +149,31 @@ def test_episodes_that_are_driven_together_do_not_depend_on_each_other(world: Tr
         seen = int(alone.agent_mask[0].any(1).sum())
         torch.testing.assert_close(together.states[place, :seen, :13], alone.states[0, :seen], rtol=0, atol=1e-5)
         assert torch.equal(together.agent_mask[place, :seen], alone.agent_mask[0, :seen])
+
+
+def test_forecasts_are_compared_with_what_happens(world: TrafficWorld) -> None:
+    errors = forecast_speed.watch(world, {}, 2)[forecast_speed.KEEPING]
+    along, distance = errors[2].T
+    assert len(along) > 3
+    assert (np.abs(along) <= distance + 1e-9).all()
+    assert distance.max() < 20.0, "vehicles are not mistaken for others"
+    assert not len(errors[4]), "the episodes are shorter"
+
+
+@pytest.mark.parametrize("change", [0.5, -40.0])
+def test_others_are_expected_to_accelerate_by_a_constant_and_never_backwards(
+    change: float, world: TrafficWorld
+) -> None:
+    world.reset([0])
+    scene = world.observe().to(torch.float64)
+    planner = forecast_speed.Accelerated(world.energy, world.game, None, world.search)
+    game = world.game(scene)
+    usual = planner.expected(scene, game)
+    planner.change = change
+    controls = planner.expected(scene, game)
+    states = world.energy.dynamics.rollout(scene.current[:, None], controls, scene.dt)
+    there = scene.agent_mask[0]
+    assert torch.equal(controls[..., 1], usual[..., 1])
+    if change > 0:
+        torch.testing.assert_close(controls[..., 0][:, :, there], usual[..., 0][:, :, there] + change)
+    assert float(states[0, 0, there, :, 3].min()) > -1e-9

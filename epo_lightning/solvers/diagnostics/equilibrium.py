@@ -33,14 +33,12 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.pairs import pairs
 from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scene, Solution, Tables
 from epo_lightning.solvers.diagnostics import quasi_newton
-from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LEAST_DAMPING, MOST_DAMPING, choose_backend
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 _GAUSS_NEWTON, _NEWTON = 20, 60
 """Largest numbers of steps. Gauss-Newton steps are cheap; Newton steps converge where residuals stay large."""
-_START, _SMALL = 1e-2, 1e-4
-"""Initial damping, and the largest damping at which a step without decrease counts as converged."""
-_TOLERANCE = 1e-13
-"""Relative change of the energy that counts as rounding error."""
+_START = 1e-2
+"""Initial damping."""
 _SWEEPS = 100
 """Largest number of sweeps of coordinate descent over candidates; it ends earlier when no choice changes."""
 
@@ -152,32 +150,16 @@ def descend_features(energy: Energy, scene: Scene, game: GameParameters, agent: 
         game, held = dataclasses.replace(game, own_weights=own, pair_weights=pair), ~mine
     if start.numel() == 0:
         return _nowhere(start)
-    energy.validate(scene, game, start)
-    solve = choose_backend("auto", energy, scene, game)
-    damping = start.new_full((len(start), 1), _START)
-    here = solve(energy, scene, game, 0, 1.0, damping, False, False)
-    controls, value = here.controls.clone(), here.energy.clone()
-    left = value[:, 0].isfinite().nonzero()[:, 0]
-    for exact, count in ((False, _GAUSS_NEWTON), (True, _NEWTON)):
-        some, these = scene[left], game[left]
-        for _ in range(count):
-            if not len(left):
-                break
-            now, before = damping[left], value[left]
-            these = dataclasses.replace(these, initial_controls=controls[left])
-            of_agents = now if held is None else torch.where(held[left], torch.inf, now[..., None])
-            there = solve(energy, some, these, 1, 1.0, of_agents, False, exact)
-            trial, after = there.controls, there.energy
-            better, tiny = after < before, (after - before).abs() <= _TOLERANCE * before
-            controls[left] = torch.where(better[..., None, None, None], trial, these.initial_controls)
-            value[left] = torch.where(better, after, before)
-            arrived = torch.where(better | tiny, tiny & (now <= _SMALL), now >= MOST_DAMPING)[:, 0]
-            now = torch.where(better | tiny, now / 10.0, now * 10.0)
-            damping[left] = now.clamp(LEAST_DAMPING, MOST_DAMPING)
-            if arrived.any():
-                on = (~arrived).nonzero()[:, 0]
-                left, some, these = left[on], some[on], these[on]
-    return Descent(here.energy[:, 0], value[:, 0], controls, here.gradient_norm[:, 0], value[:, 0].isfinite())
+    damping = start.new_full(start.shape[:3], _START)
+    if held is not None:
+        damping = damping.masked_fill(held, torch.inf)
+    solver = LevenbergMarquardt(steps=0, step_size=1.0, adaptive=True)
+    here = solver(energy, scene, game)
+    far, damping = solver.run(energy, scene, game, _GAUSS_NEWTON, damping)
+    there = dataclasses.replace(game, initial_controls=far.controls)
+    near, _ = solver.run(energy, scene, there, _NEWTON, damping, exact=True)
+    value = near.energy[:, 0]
+    return Descent(here.energy[:, 0], value, near.controls, here.gradient_norm[:, 0], value.isfinite())
 
 
 def _descend_any(energy: Energy, scene: Scene, game: GameParameters, agent: Int[Tensor, " W"] | None) -> Descent:

@@ -432,6 +432,10 @@ class _Shifted(FeatureEnergy):
     def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
         """Nothing: the game was checked before its limits were moved."""
 
+    def of_scenes(self, rows: Tensor | slice) -> FeatureEnergy:
+        """The energy with the limits of some scenes."""
+        return dataclasses.replace(self, shifts={name: shift[rows] for name, shift in self.shifts.items()})
+
     @property
     def bounded_by_kind(self) -> Sequence[str]:
         return [name.partition("b, ")[0] for name in self.shifts if name.endswith("lower")]

@@ -25,12 +25,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.base import STATIONARY, Minimiser
-from epo_lightning.solvers.gauss_newton.levenberg_marquardt import (
-    LEAST_DAMPING,
-    MOST_DAMPING,
-    LevenbergMarquardt,
-    choose_backend,
-)
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.solvers.general import descent
 
 ORDERS = ("in_turn", "at_once")
@@ -88,7 +83,8 @@ class BestResponse(Minimiser):
         scene, start = descent.begin(energy, scene, parameters)
         if start.numel() == 0:
             return descent.nothing(start)
-        game = _Game(energy, scene, parameters.for_every_mode(start.shape[1]), self.backend)
+        solver = LevenbergMarquardt(step_size=1.0, adaptive=True, backend=self.backend)
+        game = _Game(energy, scene, parameters.for_every_mode(start.shape[1]), solver)
         value = game.at(start).energy
         damping = start.new_full(start.shape[:3], self.damping)
         now = _Plans(start, value, damping)
@@ -128,19 +124,21 @@ class _Plans:
 
 @dataclass(frozen=True)
 class _Game:
-    """The games of a batch, and the backend that computes their steps."""
+    """The games of a batch, and the solver that takes steps in them."""
 
     energy: FeatureEnergy
     scene: Scene
     parameters: GameParameters
-    backend: str
+    solver: LevenbergMarquardt
 
-    def at(self, controls: Tensor, steps: int = 0, damping: Tensor | None = None) -> Solution:
-        """The energy at given controls, or the result of steps from there; agents with infinite damping are held."""
-        damping = torch.ones_like(controls[:, :, :, 0, 0]) if damping is None else damping
+    def descend(self, controls: Tensor, steps: int, damping: Tensor) -> tuple[Solution, Tensor]:
+        """Adaptive steps from given controls, and the damping afterwards; agents with infinite damping are held."""
         parameters = dataclasses.replace(self.parameters, initial_controls=controls)
-        solve = choose_backend(self.backend, self.energy, self.scene, parameters)
-        return solve(self.energy, self.scene, parameters, steps, 1.0, damping, False, False)
+        return self.solver.run(self.energy, self.scene, parameters, steps, damping)
+
+    def at(self, controls: Tensor) -> Solution:
+        """The energy at given controls."""
+        return self.descend(controls, 0, torch.ones_like(controls[:, :, 0, 0, 0]))[0]
 
     def worlds(self, agents: int) -> _Game:
         """A copy of every scene for each of its agents [B * N]."""
@@ -153,15 +151,8 @@ class _Game:
 
 def _response(game: _Game, now: _Plans, mine: Tensor, steps: int) -> _Plans:
     """The plans after steps of one agent of each scene, ``mine`` [B, 1, N], with the others held."""
-    for _ in range(steps):
-        trial = game.at(now.controls, 1, torch.where(mine, now.damping, torch.inf))
-        better = trial.energy < now.value
-        less, more = now.damping / 10.0, now.damping * 10.0
-        changed = torch.where(better[..., None], less, more).clamp(LEAST_DAMPING, MOST_DAMPING)
-        damping = torch.where(mine, changed, now.damping)
-        accepted = _Plans(trial.controls, trial.energy, damping)
-        now = accepted.where(better, dataclasses.replace(now, damping=damping))
-    return now
+    found, damping = game.descend(now.controls, steps, torch.where(mine, now.damping, torch.inf))
+    return _Plans(found.controls, found.energy, torch.where(mine, damping, now.damping))
 
 
 def _in_turn(game: _Game, now: _Plans, steps: int) -> _Plans:

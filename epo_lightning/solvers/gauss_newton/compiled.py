@@ -123,11 +123,13 @@ def descend(
     parameters: GameParameters,
     steps: int,
     step_size: float,
-    damping: Float[Tensor, "B M"],
+    damping: Float[Tensor, "B M *agents"],
     exact: bool = False,
     threads: int | None = None,
-) -> tuple[Solution, Float[Tensor, "B M"]]:
+) -> tuple[Solution, Float[Tensor, "B M *agents"]]:
     """S adaptive steps in one call, without a derivative; see :class:`~.levenberg_marquardt.LevenbergMarquardt`.
+
+    Agents with infinite damping keep their controls.
 
     Returns:
         the solution, and the damping to continue with.

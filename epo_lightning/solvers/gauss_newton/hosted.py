@@ -122,9 +122,9 @@ def descend(
     parameters: GameParameters,
     steps: int,
     step_size: float,
-    damping: Float[Tensor, "B M"],
+    damping: Float[Tensor, "B M *agents"],
     exact: bool = False,
-) -> tuple[Solution, Float[Tensor, "B M"]]:
+) -> tuple[Solution, Float[Tensor, "B M *agents"]]:
     """S adaptive steps of :func:`.compiled.descend` for tensors on a device; the solution, and the damping afterwards."""
     road = _Road(parameters)
     here, game, factor = road.down(_read(energy, scene), _given(energy, parameters), damping)

@@ -25,8 +25,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import GameParameters, Scene, Solution, Status
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
-from epo_lightning.solvers.gauss_newton import compiled, fused, hosted, structured
-from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, MOST_DAMPING
+from epo_lightning.solvers.gauss_newton import adaptive, compiled, fused, hosted, structured
 from epo_lightning.solvers.general import descent
 
 Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool, bool], Solution]
@@ -161,7 +160,8 @@ class LevenbergMarquardt(Stepwise):
         """Take a number of steps, with the Hessian if ``exact``; returns the solution and the damping to continue with.
 
         Args:
-            memory: the damping with which an earlier call ended; None at the start.
+            memory: the damping [B, M] or [B, M, N] with which an earlier call ended; None at the start. Agents with infinite
+                damping keep their controls.
 
         Raises:
             ValueError: scene and parameters do not fit together (the message names the tensor and its expected shape), or
@@ -186,16 +186,13 @@ class LevenbergMarquardt(Stepwise):
             return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates, exact), damping
         if solve in DESCENTS and not torch.is_grad_enabled() and not self.keep_iterates:
             return DESCENTS[solve](energy, scene, parameters, steps, self.step_size, damping, exact)
-        solution = solve(energy, scene, parameters, 0, self.step_size, damping, True, False)
-        for _ in range(steps):
-            here = dataclasses.replace(parameters, initial_controls=solution.controls)
-            trial = solve(energy, scene, here, 1, self.step_size, damping, False, exact)
-            better = trial.energy < solution.energy
-            damping = torch.where(
-                better, (damping / 10.0).clamp_min(LEAST_DAMPING), (damping * 10.0).clamp_max(MOST_DAMPING)
-            )
-            solution = _chosen(better, trial, solution, self.keep_iterates)
-        return solution if self.keep_iterates else dataclasses.replace(solution, iterates=None), damping
+
+        def step(rows: Tensor | slice, controls: Tensor, damping: Tensor) -> Solution:
+            game = dataclasses.replace(parameters[rows], initial_controls=controls)
+            return solve(energy.of_scenes(rows), scene[rows], game, 1, self.step_size, damping, False, exact)
+
+        here = solve(energy, scene, parameters, 0, self.step_size, damping, False, False)
+        return adaptive.descend(step, here, steps, damping, self.keep_iterates)
 
 
 def choose_backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Backend:
@@ -222,22 +219,3 @@ def choose_backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: G
     if not torch.compiler.is_exporting():
         compiled.say_once(obstacle)
     return structured.solve
-
-
-def _chosen(better: Tensor, trial: Solution, before: Solution, keep_iterates: bool) -> Solution:
-    """The trial solution where it is better, and the solution before it elsewhere."""
-    keep = better[..., None, None, None]
-    controls = torch.where(keep, trial.controls, before.controls)
-    accepted = torch.where(better, trial.status, Status.SOLVED)
-    assert before.iterates is not None
-    return Solution(
-        controls=controls,
-        states=torch.where(keep, trial.states, before.states),
-        initial_energy=before.initial_energy,
-        energy=torch.where(better, trial.energy, before.energy),
-        gradient_norm=torch.where(better, trial.gradient_norm, before.gradient_norm),
-        # If the matrix of a step cannot be factorised, the step counts as rejected. A problem whose energy is NaN or
-        # infinite takes no step at all, because no comparison of energies accepts one.
-        status=torch.where(before.energy.isfinite(), before.status.maximum(accepted), Status.STOPPED),
-        iterates=(*before.iterates, controls) if keep_iterates else before.iterates,
-    )

@@ -15,7 +15,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import GameParameters, Scene, Status
 from epo_lightning.solvers.backward import Implicit, Unrolled
-from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton import adaptive, compiled, structured
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 PAIR = ("proximity", "clearance")
@@ -67,19 +67,29 @@ def test_a_newton_step_is_the_same_in_both_backends(seed, agents, own, pair, end
 @pytest.mark.parametrize("steps", [0, 1, 12])
 @pytest.mark.parametrize("exact", [False, True])
 @pytest.mark.parametrize("damping", [1.0, 1e5])
-def test_steps_inside_of_the_compiled_layer_equal_single_calls(dtype, steps, exact, damping) -> None:
+@pytest.mark.parametrize("held", [False, True])
+def test_steps_inside_of_the_compiled_layer_equal_single_calls(dtype, steps, exact, damping, held) -> None:
     """With a gradient enabled, Python decides on every step; without, the compiled layer does.
 
-    They agree to the last bit until the compiled layer stops at a minimum; further steps change rounding errors only.
+    They agree to the last bit until the compiled layer stops at a minimum; further steps change rounding errors only. Agents
+    with infinite damping are held.
     """
     energy, scene, game = make(0, dtype, ends=(7, 4, 2))
     scene.history[1, 0, -1, 0] = torch.nan
     game.initial_controls[2] *= 50.0  # steps that are rejected
     solver = LevenbergMarquardt(backend="compiled", **{**ADAPTIVE, "damping": damping})
+    memory = None
+    if held:
+        memory = torch.full((3, 2, 3), damping, dtype=dtype)
+        memory[0, :, 1] = memory[2, 0, 0] = torch.inf
     with torch.enable_grad():
-        one, damping_one = solver.run(energy, scene, game, steps, exact=exact)
+        one, damping_one = solver.run(energy, scene, game, steps, memory, exact=exact)
     with torch.no_grad():
-        other, damping_other = solver.run(energy, scene, game, steps, exact=exact)
+        other, damping_other = solver.run(energy, scene, game, steps, memory, exact=exact)
+    if memory is not None:
+        still = memory.isinf()
+        assert torch.equal(damping_other.isinf(), still)
+        assert torch.equal(other.controls[still], game.initial_controls[still])
     if steps <= 1:
         for name in ("controls", "states", "initial_energy", "energy", "gradient_norm", "status"):
             assert torch.equal(getattr(one, name).nan_to_num(7.0), getattr(other, name).nan_to_num(7.0)), name
@@ -91,6 +101,32 @@ def test_steps_inside_of_the_compiled_layer_equal_single_calls(dtype, steps, exa
         assert torch.equal(one.status, other.status)
     assert (other.status[1] == Status.STOPPED).all()
     assert (other.status[[0, 2]] != Status.STOPPED).all()
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_without_a_gradient_scenes_at_a_minimum_take_no_further_steps(exact) -> None:
+    energy, scene, game = make(2, own=("goal", "acc", "turnr"), pair=())
+    with torch.no_grad():
+        most, _ = LevenbergMarquardt(backend="compiled", **ADAPTIVE).run(energy, scene, game, 200, exact=exact)
+    game.initial_controls[1] = most.controls[1]
+    solver = LevenbergMarquardt(backend="pytorch", **ADAPTIVE)
+    sizes: list[int] = []
+
+    def step(rows: torch.Tensor | slice, controls: torch.Tensor, damping: torch.Tensor):
+        sizes.append(len(damping))
+        some = dataclasses.replace(game[rows], initial_controls=controls)
+        return structured.solve(energy, scene[rows], some, 1, 1.0, damping, exact=exact)
+
+    with torch.no_grad():
+        start, damping = solver.run(energy, scene, game, 0)
+        found, _ = adaptive.descend(step, start, 200, damping, keep_iterates=True)
+    assert sizes[0] == 3
+    assert sizes[-1] < 3, "the scene that starts at its minimum is left out first"
+    assert len(sizes) < 200
+    assert len(found.iterates) == 201
+    assert torch.equal(found.iterates[-1], found.controls)
+    torch.testing.assert_close(found.energy, most.energy, rtol=1e-12, atol=0)
+    torch.testing.assert_close(found.controls, most.controls, rtol=0, atol=1e-5)
 
 
 def test_a_given_damping_is_not_overwritten() -> None:

@@ -379,9 +379,10 @@ class Range {
     }
 
     /// At most S steps, each accepted or rejected by every problem. An accepted step lowers the energy and divides the damping by 10;
-    /// a rejected one multiplies it by 10. A problem is done once a step cannot lower its energy by more than the rounding of it.
+    /// a rejected one multiplies it by 10; infinite damping stays. A problem is done once a step cannot lower its energy by more than
+    /// the rounding of it.
     void descend() {
-        T *const controls = iterate(0), *const trial = iterate(1), *const damping = static_cast<T*>(run_.damping);
+        T *const controls = iterate(0), *const trial = iterate(1);
         T *const best = static_cast<T*>(run_.energy), *const before = static_cast<T*>(run_.initial_energy);
         const int64_t count = last_ - first_;
         std::vector<int64_t> tried(count);
@@ -397,15 +398,15 @@ class Range {
                 const int64_t problem = first_ + at;
                 if (done_[at]) continue;
                 // The decrease is that with damping: only with little of it is a small decrease a sign of a minimum.
-                done_[at] = predicted[at] <= std::numeric_limits<T>::epsilon() * best[problem] && damping[problem] <= T(kLightDamping);
+                done_[at] = predicted[at] <= std::numeric_limits<T>::epsilon() * best[problem] && damping(problem) <= T(kLightDamping);
                 all &= done_[at] != 0;
                 if (found[at] < best[problem]) {
                     std::copy(trial + problem * size_, trial + (problem + 1) * size_, controls + problem * size_);
                     best[problem] = found[at];
-                    damping[problem] = std::max(damping[problem] / T(10), T(kLeastDamping));
+                    change_damping(problem, [](T value) { return std::max(value / T(10), T(kLeastDamping)); });
                     run_.status[problem] = std::max(run_.status[problem], tried[at]);
                 } else {
-                    damping[problem] = std::min(damping[problem] * T(10), T(kMostDamping));
+                    change_damping(problem, [](T value) { return std::min(value * T(10), T(kMostDamping)); });
                 }
             }
             if (all) break;
@@ -417,6 +418,23 @@ class Range {
     }
 
   private:
+    /// Applies a function to the damping of the agents of a problem that move.
+    template <class Change>
+    void change_damping(int64_t problem, Change change) {
+        T* const values = static_cast<T*>(run_.damping) + problem * run_.damping_problem;
+        for (int64_t i = 0; i < (run_.damping_agent ? game_.N : 1); ++i) {
+            T& value = values[i * run_.damping_agent];
+            if (finite(value)) value = change(value);
+        }
+    }
+
+    /// Largest damping of the agents of a problem that move.
+    T damping(int64_t problem) {
+        T most = 0;
+        change_damping(problem, [&most](T value) { return most = std::max(most, value), value; });
+        return most;
+    }
+
     const EpoGame& game_;
     const EpoRun& run_;
     const int64_t first_, last_, row_, size_;
