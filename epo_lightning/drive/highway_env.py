@@ -36,6 +36,8 @@ SPACING = 2.0
 """Largest distance [m] between two points of a line of the map."""
 ASIDE = 0.3
 """Distance [m] of the centre from the lanes at which a vehicle is off the road."""
+CLOSED = 0.5
+"""Largest distance [m] of a line's end from the next one's begin that is no gap."""
 MIRROR = np.array([1.0, -1.0])
 Lane = tuple[str, str, int]
 
@@ -53,6 +55,7 @@ class Setting:
         speed: speed limit [m/s], what the traffic on the road drives at.
         seconds: longest duration.
         gap: largest gap [m] between the ends of lanes that follow one another.
+        turning: share of a motorway's costs of turning that planners are told.
     """
 
     environment: str
@@ -63,12 +66,13 @@ class Setting:
     speed: float
     seconds: float
     gap: float
+    turning: float = 1.0
 
 
 SETTINGS = {
     "merge": Setting("merge-v1", -1, 0.0, ("j", "k", "b", "c", "d"), -90.0, 30.0, 20.0, 1.0),
     "roundabout": Setting(
-        "roundabout-v1", 0, 15.0, ("ser", "ses", "se", "ex", "ee", "nx", "nxs", "nxr"), -117.5, 12.0, 24.0, 8.0
+        "roundabout-v1", 0, 15.0, ("ser", "ses", "se", "ex", "ee", "nx", "nxs", "nxr"), -117.5, 12.0, 24.0, 8.0, 0.2
     ),
 }
 """The environments by their names in ``others``."""
@@ -85,7 +89,8 @@ def highway_env_world(episodes: int, seed: int = 0, place: str = "merge") -> Tra
     Raises:
         ConfigError: a value out of its range, or highway-env is not installed.
     """
-    return TrafficWorld(HighwayEnvSimulator(episodes, seed, place))
+    simulator = HighwayEnvSimulator(episodes, seed, place)
+    return TrafficWorld(simulator, SETTINGS[place].turning)
 
 
 class HighwayEnvSimulator:
@@ -249,6 +254,13 @@ def _line(lane: Any, aside: float) -> Float[np.ndarray, "n 2"]:
     return np.array([lane.position(s, aside) for s in along], dtype=float) * MIRROR
 
 
+def _joined(line: Float[np.ndarray, "n 2"], onward: Sequence[Float[np.ndarray, "m 2"]]) -> Float[np.ndarray, "n 2"]:
+    """A line that ends where the next one begins, if exactly one follows behind a gap."""
+    if len(onward) != 1 or np.linalg.norm(onward[0][0] - line[-1]) < CLOSED:
+        return line
+    return np.concatenate((line, onward[0][:1]))
+
+
 def keys_of(network: Any) -> list[Lane]:
     """The lanes of a network, in the order of the map."""
     return [(a, b, i) for a, ends in network.graph.items() for b, lanes in ends.items() for i in range(len(lanes))]
@@ -259,7 +271,8 @@ def lanes_of(network: Any, setting: Setting) -> LaneGraph:
     keys = keys_of(network)
     index = {key: place for place, key in enumerate(keys)}
     lanes = [network.get_lane(key) for key in keys]
-    centre = [_line(lane, 0.0) for lane in lanes]
+    sides = [[_line(lane, side * lane.width_at(0.0) / 2) for lane in lanes] for side in (0, -1, 1)]
+    centre = sides[0]
     onward = dict(pairwise(setting.route))
     successors = []
     for place, (_, node, _) in enumerate(keys):
@@ -273,14 +286,18 @@ def lanes_of(network: Any, setting: Setting) -> LaneGraph:
             if min(gaps) < setting.gap:
                 found.append(index[node, end, int(np.argmin(gaps))])
         successors.append(tuple(found))
+    for lines in sides:
+        lines[:] = [
+            _joined(line, [lines[after] for after in found]) for line, found in zip(lines, successors, strict=True)
+        ]
     left = np.array([index.get((a, b, i - 1), -1) for a, b, i in keys])
     right = np.array([index.get((a, b, i + 1), -1) for a, b, i in keys])
     open_right = np.array([other if other >= 0 and not lanes[other].forbidden else -1 for other in right])
     return LaneGraph(
         ids=np.arange(len(keys)),
-        left=[_line(lane, -lane.width_at(0.0) / 2) for lane in lanes],
-        right=[_line(lane, lane.width_at(0.0) / 2) for lane in lanes],
-        centre=centre,
+        left=sides[1],
+        right=sides[2],
+        centre=sides[0],
         successors=successors,
         left_of=left,
         right_of=open_right,

@@ -39,25 +39,29 @@ OWN_LINE = 1
 """Index of the line along an agent's own lane."""
 
 
-def road_game(scene: Scene, line: Int[Tensor, " B"], steps: int) -> GameParameters:
+def road_game(scene: Scene, line: Int[Tensor, " B"], steps: int, turning: float = 1.0) -> GameParameters:
     """The game of a scene, of one mode, in float64.
 
     Args:
         scene: scenes with reference lines.
         line: index of the reference line that the planned vehicle of each scene follows.
         steps: number of steps.
+        turning: share of the costs of turning. Those of a motorway would rather stand than drive around a roundabout.
     """
     batch, agents = scene.agent_mask.shape
     mine = torch.arange(agents) == EGO
     keeping = keep_going(scene, steps)
     assert scene.reference_speed is not None
+    share = dict.fromkeys(("turnrref", "turnacc"), turning)
     scale = {"velref": scene.reference_speed[:, None].clamp_min(1.0)}  # the share of the reference speed counts
     reference = torch.where(mine, line[:, None], OWN_LINE)[:, None]
     # The planned vehicle's controls are costly in themselves, those of others where they differ from keeping going.
     usual = torch.where(mine[:, None, None], 0.0, keeping)
     return GameParameters(
         own_weights={
-            name: (torch.where(mine, weight, _OTHERS[name]) / scale.get(name, 1.0)).double().expand(batch, 1, -1)
+            name: (share.get(name, 1.0) * torch.where(mine, weight, _OTHERS[name]) / scale.get(name, 1.0))
+            .double()
+            .expand(batch, 1, -1)
             for name, weight in _OWN.items()
         },
         pair_weights={

@@ -57,6 +57,7 @@ class TrafficWorld:
 
     Args:
         simulator: the simulator, which the world closes.
+        turning: share of a motorway's costs of turning that planners are told.
     """
 
     dt = WINDOWS.dt
@@ -67,8 +68,8 @@ class TrafficWorld:
     patience = 10.0
     search = Search(steps=25, accelerations=(-3.0,))
 
-    def __init__(self, simulator: Simulator) -> None:
-        self.simulator = simulator
+    def __init__(self, simulator: Simulator, turning: float = 1.0) -> None:
+        self.simulator, self.turning = simulator, turning
         self.together = simulator.together
         self.rides: list[Ride] = []
         self._scenes: dict[int, RoadScenes] = {}
@@ -124,7 +125,7 @@ class TrafficWorld:
 
     def game(self, scene: Scene) -> GameParameters:
         lines = torch.tensor([ride.positions[-1].line for ride in self._left()])
-        return road_game(scene, lines, WINDOWS.horizon)
+        return road_game(scene, lines, WINDOWS.horizon, self.turning)
 
     def advance(self, controls: Float[Tensor, "b 2"] | None) -> None:
         rides = self._left()

@@ -87,6 +87,26 @@ def test_planners_drive(world: TrafficWorld) -> None:
         assert float(measure(episodes, world)["progress"][0]) > 3.0
 
 
+def test_a_response_drives_around_the_roundabout_where_costs_of_a_motorway_would_stand() -> None:
+    progress = []
+    for turning in (1.0, highway_env.SETTINGS["roundabout"].turning):
+        world = TrafficWorld(HighwayEnvSimulator(2, 5, "roundabout"), turning)
+        outcome = play(world, ResponsePlanner(world.energy, world.game, None, world.search), range(2)).outcome
+        progress.append(outcome.progress[:, -1])
+    assert progress[0].max() < 30.0
+    assert progress[1].min() > 100.0
+    assert outcome.measures["arrived"].bool().all()
+
+
+def test_a_lane_of_the_route_ends_where_the_next_one_begins() -> None:
+    simulator = HighwayEnvSimulator(1, 1, "roundabout")
+    keys, lanes = highway_env.keys_of(simulator._environment.road.network), simulator.roads.lanes
+    leaving, onward = keys.index(("ee", "nx", 1)), keys.index(("nx", "nxs", 0))
+    assert lanes.successors[leaving] == (onward,)
+    for lines in (lanes.centre, lanes.left, lanes.right):
+        np.testing.assert_array_equal(lines[leaving][-1], lines[onward][0])
+
+
 def test_a_vehicle_that_merges_has_to_leave_its_lane() -> None:
     roads = HighwayEnvSimulator(1, 1, "merge").roads
     ramp, road = np.array([280.0, -8.0, 0.0, 20.0]), np.array([280.0, -4.0, 0.0, 20.0])
