@@ -50,3 +50,12 @@ def test_functions_within_functions_are_checked_at_every_call() -> None:
             within(None)(two, other=three)
         with pytest.raises(jaxtyping.TypeCheckError, match="return value"):
             within(three)(two, other=two)
+
+
+def test_functions_without_annotations_are_left_as_they_are() -> None:
+    @checked
+    def free(value, other=1):  # type: ignore[no-untyped-def]
+        return value
+
+    assert free("x") == "x"
+    assert free(torch.zeros(2), other=3).shape == (2,)

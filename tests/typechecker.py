@@ -21,7 +21,7 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     annotations = function.__annotations__
     if any(re.fullmatch(r"ret\d+", name) for name in function.__code__.co_varnames) and function.__kwdefaults__ is None:
-        function.__annotations__ = annotations = {"return": annotations["return"]}
+        function.__annotations__ = annotations = {name: hint for name, hint in annotations.items() if name == "return"}
     if "<locals>" not in function.__qualname__ or function.__defaults__ or function.__kwdefaults__:
         return _beartype(function)
     hints = tuple((name, repr(hint)) for name, hint in annotations.items())

@@ -37,6 +37,12 @@ class Column:
         """A value as tables print it: metrics of the game with three significant digits, others with fixed decimals."""
         return significant(value) if self.metric in GAME else number(value, self.digits)
 
+    def deviation(self, value: float, mean: float) -> str:
+        """A deviation from a mean, with the decimals of the mean."""
+        if self.metric in GAME or math.isnan(value) or math.isnan(mean):
+            return self.text(value)
+        return f"{value:.{decimals(mean, self.digits)}f}"
+
     def long_text(self, value: float) -> str:
         """A value with six digits."""
         return f"{value:.6g}" if self.metric in GAME and not math.isnan(value) else number(value, 6)
@@ -49,9 +55,18 @@ GAME = (*OWN_UNITS, "nash_gap_relative")
 """Metrics of the game that a forecaster solves; those of ``OWN_UNITS`` have the units of the row's own energy."""
 
 
+LEAST = 1e-6
+"""Numbers below this one are printed as zero."""
+
+
 def number(value: float, digits: int) -> str:
-    """A number with fixed decimals; a dash for nan."""
-    return MISSING if math.isnan(value) else f"{value:.{digits}f}"
+    """A number with fixed decimals, or more if it would be a zero that it is not; a dash for nan."""
+    return MISSING if math.isnan(value) else f"{value:.{decimals(value, digits)}f}"
+
+
+def decimals(value: float, digits: int) -> int:
+    """Decimals of a number: ``digits``, or those of two significant digits if it would be rounded to zero, down to 1e-6."""
+    return digits if round(value, digits) or abs(value) < LEAST else 1 - math.floor(math.log10(abs(value)))
 
 
 def significant(value: float) -> str:

@@ -131,7 +131,9 @@ def _cell(row: Row, column: Column) -> str:
     if cell is None:
         return MISSING
     form = {1: r"\textbf{%s}", 2: r"\underline{%s}"}.get(cell.rank or 0, "%s")
-    deviation = "" if cell.deviation is None else rf"\,{{\scriptsize$\pm$\,{_minus(column.text(cell.deviation))}}}"
+    deviation = ""
+    if cell.deviation is not None:
+        deviation = rf"\,{{\scriptsize$\pm$\,{_minus(column.deviation(cell.deviation, cell.mean))}}}"
     return form % _minus(column.text(cell.mean)) + deviation
 
 

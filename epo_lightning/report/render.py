@@ -14,10 +14,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from epo_lightning.report.columns import GAME, MISSING, OF_MODES, TRUE, Column, number
+from epo_lightning.report.columns import GAME, MISSING, OF_MODES, TRUE, Column, decimals, number
 from epo_lightning.report.rows import Cell, Row
 from epo_lightning.report.selection import BestSetting
 from epo_lightning.report.statistics import Comparisons, Difference
@@ -59,6 +60,8 @@ EFFECT = (
     "part of the game alone; a large effect is not better than a small one."
 )
 
+NAMES = 16
+"""Least width of the column of names in a terminal."""
 CSV_HEADER = (
     *("data", "split", "method", "backbone", "forecaster", "goal", "budget", "seeds", "n"),
     *("metric", "mean", "std", "paper", "difference"),
@@ -95,6 +98,7 @@ def signed(value: float, digits: int) -> str:
     """A difference as tables print it: with its sign, unless it rounds to zero."""
     if math.isnan(value):
         return number(value, digits)
+    digits = decimals(value, digits)
     rounded = round(value, digits)
     return f"{rounded:+.{digits}f}" if rounded else number(0.0, digits)
 
@@ -102,7 +106,7 @@ def signed(value: float, digits: int) -> str:
 def own_text(cell: Cell, column: Column) -> str:
     """Mean and deviation of a cell as text."""
     mean = column.text(cell.mean)
-    return mean if cell.deviation is None else f"{mean} ± {column.text(cell.deviation)}"
+    return mean if cell.deviation is None else f"{mean} ± {column.deviation(cell.deviation, cell.mean)}"
 
 
 def paper_text(row: Row, column: Column) -> str:
@@ -243,12 +247,20 @@ def to_rich(table: Table | Sheet) -> RichTable:
     return rich
 
 
+def least_width(table: RichTable) -> int:
+    """Width at which every number of a terminal's table is shown, and at least :data:`NAMES` characters of the names."""
+    wide = Console(width=10_000)
+    natural = wide.measure(table, options=wide.options).maximum
+    names = max((len(line) for cell in table.columns[0].cells for line in str(cell).splitlines()), default=0)
+    return natural - max(0, names - NAMES)
+
+
 def _rich_cell(row: Row, column: Column) -> Text:
     cell = row.cells.get(column.metric)
     if cell is None:
         return Text(MISSING)
     style = {1: "bold", 2: "underline"}.get(cell.rank or 0, "")
-    deviation = "" if cell.deviation is None else f"\n±{column.text(cell.deviation)}"
+    deviation = "" if cell.deviation is None else f"\n±{column.deviation(cell.deviation, cell.mean)}"
     return Text.assemble((column.text(cell.mean), style), (deviation, "dim"))
 
 

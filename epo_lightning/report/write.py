@@ -22,6 +22,7 @@ from epo_lightning.report.render import (
     code,
     comparison_sheet,
     comparisons_to_csv,
+    least_width,
     legend,
     settings_sheet,
     to_csv,
@@ -203,8 +204,11 @@ def write_report(
     console = console or Console()
     for note in notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    terminal = console.width
     for rich in (*map(to_rich, tables), *map(to_rich, transfer), *map(to_rich, costs), *map(to_rich, shown)):
+        console.width = max(terminal, least_width(rich))  # a long line is better than a row without its name
         console.print(rich)
+    console.width = terminal
     if report.left_out:
         console.print(_summary(report.left_out), style="yellow", markup=False, highlight=False, soft_wrap=True)
     return markdown

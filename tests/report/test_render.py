@@ -11,11 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
+from rich.table import Table as RichTable
 
+from epo_lightning.report.columns import Column
 from epo_lightning.report.render import (
     Sheet,
     comparison_sheet,
     comparisons_to_csv,
+    least_width,
+    own_text,
     p_text,
     settings_sheet,
     signed,
@@ -23,6 +27,7 @@ from epo_lightning.report.render import (
     to_markdown,
     to_rich,
 )
+from epo_lightning.report.rows import Cell
 from epo_lightning.report.runs import collect
 from epo_lightning.report.selection import best_settings
 from epo_lightning.report.statistics import build_comparisons
@@ -129,10 +134,40 @@ def test_titles_are_escaped_for_the_terminal(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.0, "0.000"), (-0.0004, "0.000"), (0.0004, "0.000"), (-0.25, "-0.250"), (0.25, "+0.250"), (math.nan, "-")],
+    [
+        *((0.0, "0.000"), (-0.0004, "-0.00040"), (0.00042, "+0.00042"), (-9e-7, "0.000")),
+        *((-0.25, "-0.250"), (0.25, "+0.250"), (math.nan, "-")),
+    ],
 )
-def test_differences_have_a_sign_unless_they_round_to_zero(value: float, text: str) -> None:
+def test_differences_have_a_sign_unless_they_are_zero(value: float, text: str) -> None:
     assert signed(value, 3) == text
+
+
+@pytest.mark.parametrize(
+    ("mean", "deviation", "text"),
+    [
+        (0.171, 2.5e-6, "0.171 ± 0.000"),
+        (0.0002, 6.1e-5, "0.00020 ± 0.00006"),
+        (0.0, 0.0, "0.000 ± 0.000"),
+        (math.nan, math.nan, "- ± -"),
+    ],
+)
+def test_small_means_have_two_digits_and_deviations_as_many_decimals(mean: float, deviation: float, text: str) -> None:
+    assert own_text(Cell(mean, deviation), Column("minSADE", "SADE")) == text
+
+
+def test_no_table_of_a_terminal_loses_the_names_of_its_rows() -> None:
+    columns = [Column(f"m{place}", f"metric {place}") for place in range(12)]
+    table = RichTable()
+    for name in ("method", *(column.label for column in columns)):
+        table.add_column(name, no_wrap=name != "method")
+    table.add_row("a very long name of a method", *("0.123" for _ in columns))
+    console = Console(file=io.StringIO(), width=least_width(table))
+    assert console.width > 80
+    console.print(table)
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "a very long name" in printed
+    assert printed.count("0.123") == len(columns)
 
 
 @given(st.floats(-1e6, 1e6))
