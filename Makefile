@@ -61,7 +61,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # $(1): the extras. The layer is compiled on one core while packages are downloaded and unpacked on another.
 # Without a compiler its build fails, and the last line says so.
 define INSTALL
-@echo "installing into $(VENV) (a minute or two and the download) ..."
+@echo "installing into $(VENV): a minute or two and the download, while the layer is compiled in the background ..."
 $(PYTHON) -m venv $(VENV)
 $(BIN)/pip install -q --no-compile uv || true
 $(if $(TORCH_INDEX),$(call INSTALL_PACKAGES,--index-url $(TORCH_INDEX) -c constraints.txt torch))
@@ -93,7 +93,7 @@ run: $(INSTALLED)
 	@echo "V-LSTM forecasts each agent by itself, +SC all agents together, +EPO as solutions of a game that it infers: both joint rows must be"
 	@echo "far below V-LSTM, and +EPO below +SC (minSADE, minSFDE in metres; smaller is better). These three rows are trained with a remedy"
 	@echo "against modes that are never taught. The two rows below them have the paper's plain loss: with so little training it is a coin toss"
-	@echo "whether all modes learn, hence the remedy (docs/rpi_results.md). This was a tenth of the data and eight epochs; the paper's settings take a day:"
+	@echo "whether all modes learn, hence the remedy (docs/rpi_results.md). This was a tenth of the data and eight epochs; the paper's settings take a day for each of nine runs:"
 	@echo "  $(EPO) generate && $(EPO) sweep rpi_main && $(EPO) report rpi_main"
 
 test: $(TESTABLE)

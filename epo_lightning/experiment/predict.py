@@ -144,7 +144,7 @@ def scenes_of(
             raise
         scenes = pretrained.examples(run.path)
         count, name = len(scenes.history), pretrained.name_of(run.path)
-        print(f"{count} example scenes that ship with {name} are forecast instead of its test split: {missing}")
+        print(f"These are the {count} example scenes that ship with {name}. Its test split is not here: {missing}")
         return Chosen(spread(scenes, settings.scenes), None, own)
 
 

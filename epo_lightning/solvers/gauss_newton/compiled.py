@@ -70,8 +70,8 @@ def unsupported(energy: FeatureEnergy, scene: Scene, parameters: GameParameters)
 def say_once(reason: str) -> None:
     """Warn once per reason that plain PyTorch replaces the kernel."""
     warnings.warn(
-        f"{reason}. Plain PyTorch does the same, at a tenth of the speed or less; solver.backend=pytorch silences this "
-        "warning.",
+        f"{reason}. Plain PyTorch does the same, 20 to 60 times as slowly; `solver.backend=pytorch` (in Python "
+        "`LevenbergMarquardt(backend='pytorch')`) says that this is intended.",
         stacklevel=2,
     )
 
