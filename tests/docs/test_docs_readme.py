@@ -35,7 +35,7 @@ NOT_RUN = {
     "epo generate data=highway_sim": "minutes of simulation; tests/data/simulate",
     "epo train experiment=highway/vibes_epo data=highway_sim budget=short": "needs that set; make smoke trains the row",
     "epo train experiment=urban/v_lstm_epo data=interaction data.folder=data/interaction": "needs those recordings",
-    "epo evaluate run=runs/highway_sim/vibes_epo/short-s0 data=us101 data.folder=data/us101": "needs that run and recordings",
+    "epo evaluate run=runs/highway_sim/vibes_epo/short-s0 data=us101 data.folder=data/us101": "needs run and recordings",
 }
 
 
