@@ -32,6 +32,8 @@ from epo_lightning.scene import GameParameters, Scene
 PEDESTRIANS = ("plays", "ignores")
 SEEDS = 1_000_000
 """Added to seeds of episodes, so that their games are none of those of a data set."""
+TOGETHER = 50
+"""Largest number of episodes that are begun together: fewer make a plan dearer, more make progress unseen for long."""
 RECONSIDERED = 5
 """Steps after which a pedestrian who plays looks for a better solution than that near its plan."""
 _SETTINGS = PotentialSettings().array()
@@ -76,7 +78,7 @@ def true_game(weight: Tensor, goals: Tensor, headings: Tensor, steps: int) -> Ga
 
 
 class RPIWorld:
-    """Episodes of the robot-pedestrian game; all of them may be begun together, and are begun at once.
+    """Episodes of the robot-pedestrian game. An episode does not depend on those that are begun together with it.
 
     Args:
         episodes: number of episodes.
@@ -101,9 +103,10 @@ class RPIWorld:
         self.constants, self.pedestrian = GameConstants(), pedestrian
         self._c, self.dt = self.constants.array(), self.constants.dt
         self._games = [main_game(SEEDS + seed, index, 0, 1, self.constants) for index in range(episodes)]
-        self._begun = [self._start(game, seed) for game in self._games]
-        self.together = episodes
-        self.reset(range(episodes))
+        self._seed = seed
+        self._begun: dict[int, tuple[Array, Array]] = {}
+        self.together = min(TOGETHER, episodes)
+        self.reset(range(self.together))
 
     def __len__(self) -> int:
         return len(self._games)
@@ -112,16 +115,22 @@ class RPIWorld:
         self.games = [self._games[episode] for episode in episodes]
         self.weight = torch.tensor([game.weight for game in self.games], dtype=torch.double)
         self._goals = torch.tensor(np.stack([game.goals for game in self.games]))
-        self._x = np.stack([self._begun[episode][0] for episode in episodes])
-        self._u = np.stack([self._begun[episode][1] for episode in episodes])
+        begun = [self._start(episode) for episode in episodes]
+        self._x, self._u = (np.stack(values) for values in zip(*begun, strict=True))
         self.now = HISTORY
 
-    def _start(self, game: MainGame, seed: int) -> tuple[Array, Array]:
+    def _start(self, episode: int) -> tuple[Array, Array]:
         """States [K+1, 8] and controls [K, 4] of the main game's mode that is begun; the pedestrian's future is its plan.
 
-        One of the two modes is drawn. A pedestrian that ignores the robot follows its own solution from the start.
+        One of the two modes is drawn. A pedestrian that ignores the robot follows its own solution from the start. The
+        games are solved when their episodes are begun for the first time.
         """
-        random = generator(SEEDS + seed, game.game, 0, 1)
+        if episode not in self._begun:
+            self._begun[episode] = self._solved(self._games[episode])
+        return self._begun[episode]
+
+    def _solved(self, game: MainGame) -> tuple[Array, Array]:
+        random = generator(SEEDS + self._seed, game.game, 0, 1)
         main = solve(game.start, main_starts(random, self.constants.steps), self._c, game.goals, game.weight)
         modes = cheapest(main, self.constants)
         index = modes[sorted(modes)[random.integers(len(modes))]]

@@ -11,6 +11,7 @@ not continue like what was saved, and not always in the same way.
 from __future__ import annotations
 
 import os
+import select
 import tempfile
 import zlib
 from collections import deque
@@ -133,10 +134,12 @@ def _serve(pipe: Connection) -> None:
         try:
             if branch.stream != stream or branch.number < number:
                 streaming.close()
-                streaming, stream, number = _stream(branch), branch.stream, -1
+                streaming, stream, number = _stream(branch, pipe), branch.stream, -1
             while number < branch.number:
                 road = next(streaming)
                 number += 1
+        except EOFError:
+            return
         except Exception as error:  # whatever it is, it is told to the process that waits for an answer
             stream = None
             pipe.send(error)
@@ -173,8 +176,20 @@ def _nothing() -> Generator[_Road]:
     yield from ()
 
 
-def _stream(branch: Branch) -> Generator[_Road]:
-    """The simulation at the beginning of one episode after the other."""
+def _closed(pipe: Connection) -> bool:
+    """Whether the other end is closed, because its process closed it or was killed; messages are left where they are."""
+    poll = select.poll()
+    poll.register(pipe.fileno(), 0)
+    return bool(poll.poll(0))
+
+
+def _stream(branch: Branch, pipe: Connection) -> Generator[_Road]:
+    """The simulation at the beginning of one episode after the other.
+
+    Raises:
+        ConfigError: no episode begins.
+        EOFError: the other end of the connection is closed: no process waits for the episode.
+    """
     layout, style = LAYOUTS[branch.layout], STYLES[branch.style]
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -183,6 +198,8 @@ def _stream(branch: Branch) -> Generator[_Road]:
         free = WARM_UP + FILLING
         while road.time < WARM_UP + LONGEST:
             road.advance(None)
+            if _closed(pipe):
+                raise EOFError
             if road.time < free:
                 continue
             if road.time > free + PATIENCE:

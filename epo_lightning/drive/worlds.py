@@ -32,14 +32,16 @@ class Place:
     baselines: Mapping[str, str]
 
     def check_kinds(self, world: str, kinds: tuple[str, ...]) -> None:
-        """Refuse unknown kinds of episodes.
+        """Refuse kinds of episodes that are unknown or named twice.
 
         Raises:
-            ConfigError: the message names the nearest known one.
+            ConfigError: the message names the kind, and the nearest known one.
         """
         for kind in kinds:
             if kind not in self.kinds:
                 raise ConfigError(f"unknown others {kind!r} of world={world}: {nearest(kind, self.kinds)}")
+            if kinds.count(kind) > 1:
+                raise ConfigError(f"others names {kind!r} twice: name each kind of others once")
 
 
 def _of_rpi(data: Mapping[str, Any]) -> str | None:

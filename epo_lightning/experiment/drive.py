@@ -5,18 +5,21 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from epo_lightning.drive.episodes import Episodes, play, times
+from epo_lightning.data.cache import file_digest
+from epo_lightning.drive.driven import Driven
+from epo_lightning.drive.episodes import play, times
 from epo_lightning.drive.film import film
-from epo_lightning.drive.measures import RATES, UNITS, Estimate, differences, estimate, estimates, measure
+from epo_lightning.drive.measures import UNITS, Estimate, differences, estimate, estimates, measure
 from epo_lightning.drive.planners import ForecastPlanner, GamePlanner, Planner, ResponsePlanner
+from epo_lightning.drive.progress import Progress
 from epo_lightning.drive.world import World
 from epo_lightning.drive.worlds import BEST_RESPONSE, CONSTANT_VELOCITY, DRIVER, Place, place
 from epo_lightning.experiment import assembly
@@ -31,33 +34,31 @@ ROUNDS = 3
 """Best responses of every agent in turn."""
 OWN, WARM, ALONE, RESPOND = "own", "warm", "alone", "respond"
 WAYS = {OWN: "{}", WARM: "{}, warm start", ALONE: "{}, without pair term", RESPOND: "response to {}"}
-EVERY = 10
-"""Number of chunks of episodes between two lines about progress."""
 Make = Callable[[World], Planner | None]
-Measured = dict[str, dict[str, list[float]]]
 
 
 def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
     """Drive the same episodes with every planner, and write ``results.json``, ``table.md`` and films.
 
-    What was driven is kept in ``episodes.jsonl``; the same command continues there after it was killed.
+    What was driven is kept in ``episodes.jsonl`` (:class:`~epo_lightning.drive.driven.Driven`); the same command continues
+    there after it was killed. The folder is locked meanwhile.
 
     Args:
         settings: runs, world and planners.
-        tell: called with a line from time to time, and per planner.
+        tell: called with a line at first, from time to time, and per planner.
 
     Returns:
         the files that were written.
 
     Raises:
-        ConfigError: a run, checkpoint, world or kind of others that does not exist, a run that is named twice or cannot
-            drive in this world, a world whose extra is not installed, or results in ``out`` that would be overwritten.
+        ConfigError: a run, checkpoint, world or kind of others that does not exist, a run or kind that is named twice, a
+            run that cannot drive in this world, a world whose extra is not installed, an ``out`` that is no folder, holds
+            results or is worked on by another process, or what was driven there with other settings or weights.
     """
     assembly.quiet()
     torch.set_num_threads(1)
     out = Path(settings.out).expanduser()
-    if (out / "results.json").exists():
-        raise ConfigError(f"{out} holds results already: nothing is overwritten; choose another out=<folder>")
+    _check_free(out)
     where = place(settings.world)
     kinds = where.kinds if settings.others is None else tuple(settings.others)
     where.check_kinds(settings.world, kinds)
@@ -66,14 +67,33 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
         if name in planners:
             raise ConfigError(f"two planners are called {name!r}: name each way and baseline once, and rename runs")
         planners[name] = make
-    done = _Done(out / "episodes.jsonl", json.loads(json.dumps(dataclasses.asdict(settings))))
-    results: dict[str, Any] = {"settings": done.settings, "worlds": {}, "milliseconds": {}}
+    with _alone(out):
+        return _compare(settings, where, kinds, planners, out, tell)
+
+
+def _compare(
+    settings: DriveSettings,
+    where: Place,
+    kinds: Sequence[str],
+    planners: Mapping[str, Make],
+    out: Path,
+    tell: Callable[[str], None],
+) -> list[Path]:
+    """Drive with all planners and write the files."""
+    plain = json.loads(json.dumps(dataclasses.asdict(settings)))
+    begun = {name: value for name, value in plain.items() if name != "out"}
+    driven = Driven(out / "episodes.jsonl", begun, _digests(settings), tell)
+    tell(
+        f"drives {settings.episodes} episodes with each of {len(planners)} planners, others: {', '.join(kinds)}; "
+        "the same command continues if it is stopped"
+    )
+    results: dict[str, Any] = {"settings": plain, "worlds": {}, "milliseconds": {}}
     tables, films = [], []
     for kind in kinds:
         with closing(where.make(settings.episodes, settings.seed, kind)) as world:
             made = {name: make(world) for name, make in planners.items()}
-            _drive(world, kind, made, done, tell)
-            measured, rates = done.measured(kind, planners), done.rates(kind)
+            _drive(world, kind, made, driven, tell)
+            measured, rates = driven.measured(kind, planners), driven.rates(kind)
             results["worlds"][kind] = _results(measured, rates)
             tables.append(_table(kind, measured, rates))
             if settings.timed and (milliseconds := _milliseconds(world, made, settings.timed)):
@@ -84,125 +104,68 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
                     name: play(world, planner, [settings.film], keep_plans=True) for name, planner in made.items()
                 }
                 films.append(film(played, world.shape, out / f"film-{kind}.gif"))
+    _check_free(out)
     write_file(out / "table.md", "\n".join(tables))
     write_json(out / "results.json", results)
     return [out / "results.json", out / "table.md", *films]
 
 
 def _drive(
-    world: World, kind: str, planners: Mapping[str, Planner | None], done: _Done, tell: Callable[[str], None]
+    world: World, kind: str, planners: Mapping[str, Planner | None], driven: Driven, tell: Callable[[str], None]
 ) -> None:
     """Drive all episodes of a world with all planners."""
-    seconds = dict.fromkeys(planners, 0.0)
-    chunks = [range(first, min(first + world.together, len(world))) for first in range(0, len(world), world.together)]
-    for count, chunk in enumerate(chunks, 1):
+    progress = Progress(kind, len(world), planners, tell)
+    for first in range(0, len(world), world.together):
+        chunk = range(first, min(first + world.together, len(world)))
         for name, planner in planners.items():
-            if done.has(kind, name, chunk):
+            if driven.has(kind, name, chunk):
+                progress.skip(name, len(chunk))
                 continue
             began = time.perf_counter()
             episodes = play(world, planner, chunk)
-            done.add(kind, name, chunk, measure(episodes, world), episodes)
-            seconds[name] += time.perf_counter() - began
-        if count % EVERY == 0:
-            tell(f"{kind:8} {chunk.stop} of {len(world)} episodes, {sum(seconds.values()):.0f} s")
-    for name, values in done.measured(kind, planners).items():
+            driven.add(kind, name, chunk, measure(episodes, world), episodes.outcome.rates)
+            progress.drove(name, len(chunk), time.perf_counter() - began)
+    for name, values in driven.measured(kind, planners).items():
         collisions = float(values["collision"].mean())
-        tell(f"{kind:8} {name}: {100 * collisions:.1f} % collisions, {seconds[name]:.0f} s")
+        tell(f"{kind:8} {name}: {100 * collisions:.1f} % collisions, {progress.seconds[name]:.0f} s")
 
 
-class _Done:
-    """The file of what was driven: a line of settings, then a line per planner and chunk of episodes.
-
-    A last line without its line break was cut off by a kill, and is dropped.
-
-    Args:
-        path: the file, which is continued.
-        settings: the settings that it belongs to.
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Context in which this process alone works on the results in ``out``; the folder is made.
 
     Raises:
-        ConfigError: the file belongs to other settings.
+        ConfigError: the folder cannot be made, another process works on it, or it holds results.
     """
-
-    def __init__(self, path: Path, settings: dict[str, Any]) -> None:
-        self.path, self.settings = path, settings
-        self._rows: dict[str, dict[str, dict[int, dict[str, Any]]]] = {}
-        text = path.read_text() if path.exists() else ""
-        whole = text[: text.rfind("\n") + 1]
-        lines = whole.splitlines()
-        if lines and _parsed(lines[0]) != settings:
-            raise ConfigError(
-                f"{path} was begun with other settings: nothing is mixed; choose another out=<folder>, or delete it"
-            )
-        if whole != text:
-            write_file(path, whole)
-        for row in filter(None, map(_parsed, lines[1:])):
-            self._take(row)
-
-    def _take(self, row: dict[str, Any]) -> None:
-        self._rows.setdefault(row["kind"], {}).setdefault(row["planner"], {})[row["episodes"][0]] = row
-
-    def has(self, kind: str, planner: str, chunk: Sequence[int]) -> bool:
-        """Whether a planner has driven some episodes.
-
-        Raises:
-            ConfigError: the file holds other episodes together.
-        """
-        row = self._rows.get(kind, {}).get(planner, {}).get(chunk[0])
-        if row is not None and row["episodes"] != list(chunk):
-            raise ConfigError(
-                f"{self.path} was begun by a version that drove other episodes together: choose another out=<folder>, or "
-                "delete it"
-            )
-        return row is not None
-
-    def add(
-        self,
-        kind: str,
-        planner: str,
-        chunk: Sequence[int],
-        measures: Mapping[str, Tensor],
-        played: Episodes,
-    ) -> None:
-        """Append what a planner has driven."""
-        row = {
-            "kind": kind,
-            "planner": planner,
-            "episodes": list(chunk),
-            "measures": {name: values.tolist() for name, values in measures.items()},
-            "rates": sorted(played.outcome.rates),
-        }
-        self._take(row)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("a") as file:
-            if not file.tell():
-                file.write(json.dumps(self.settings) + "\n")
-            file.write(json.dumps(row) + "\n")
-
-    def rates(self, kind: str) -> set[str]:
-        """Names of the measures that are 0 or 1."""
-        rows = (row for rows in self._rows[kind].values() for row in rows.values())
-        return set(RATES).union(*(row.get("rates", ()) for row in rows))
-
-    def measured(self, kind: str, planners: Iterable[str]) -> dict[str, dict[str, Tensor]]:
-        """Measures of all episodes, by planner in the given order."""
-        found = {planner: self._rows[kind][planner] for planner in planners}
-        return {
-            planner: {
-                name: torch.tensor(
-                    [value for _, row in sorted(rows.items()) for value in row["measures"][name]], dtype=torch.double
-                )
-                for name in next(iter(rows.values()))["measures"]
-            }
-            for planner, rows in found.items()
-        }
+    with ExitStack() as held:
+        with _naming(out):
+            held.enter_context(RunFolder(out).lock())
+        _check_free(out)
+        yield
 
 
-def _parsed(line: str) -> Any:
-    """The contents of a line of JSON; None for a broken one."""
+def _check_free(out: Path) -> None:
+    """Refuse a folder that holds results."""
+    with _naming(out):
+        if (out / "results.json").exists():
+            raise ConfigError(f"{out} holds results already: nothing is overwritten; choose another out=<folder>")
+
+
+@contextmanager
+def _naming(out: Path) -> Iterator[None]:
+    """Context in which an error of the operating system names the key ``out``."""
     try:
-        return json.loads(line)
-    except json.JSONDecodeError:
-        return None
+        yield
+    except OSError as error:
+        raise ConfigError(
+            f"out={out} is no folder that can be made and written ({error.strerror or error}): choose another out=<folder>"
+        ) from error
+
+
+def _digests(settings: DriveSettings) -> dict[str, str]:
+    """Digest of the checkpoint of every run that drives, by the run's name in the settings."""
+    paths = settings.runs if settings.ways else []
+    return {path: file_digest(RunFolder.open(path).checkpoint(settings.checkpoint))[:16] for path in paths}
 
 
 def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -203,7 +204,8 @@ def drive_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     settings = check_settings("drive", config)
     from epo_lightning.experiment.drive import drive
 
-    print("\n".join(f"wrote {path}" for path in drive(settings, print)))
+    tell = partial(print, flush=True)  # a file shows the progress at once
+    print("\n".join(f"wrote {path}" for path in drive(settings, tell)))
 
 
 def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:

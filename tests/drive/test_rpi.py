@@ -12,7 +12,7 @@ import epo_lightning
 from epo_lightning.data.rpi.subgames import HISTORY
 from epo_lightning.drive.episodes import play
 from epo_lightning.drive.measures import measure
-from epo_lightning.drive.planners import GamePlanner, Planner, ResponsePlanner
+from epo_lightning.drive.planners import ForecastPlanner, GamePlanner, Planner, ResponsePlanner
 from epo_lightning.drive.rpi import RPIWorld
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import SPEED
@@ -35,6 +35,12 @@ def test_a_seed_names_the_episodes(world: RPIWorld) -> None:
     again, other = (RPIWorld(2, seed, world.pedestrian).observe() for seed in (1, 2))
     torch.testing.assert_close(again.history, world.observe().history[:2], rtol=0, atol=0)
     assert not torch.allclose(again.history, other.history)
+
+
+def test_games_are_solved_when_their_episodes_are_begun() -> None:
+    world = RPIWorld(500, seed=1)
+    assert world.together == 50
+    assert len(world.games) == 50
 
 
 def test_a_scene_shows_the_past_alone(world: RPIWorld) -> None:
@@ -90,6 +96,28 @@ def test_an_episode_is_the_same_alone_and_again(world: RPIWorld) -> None:
         alone = play(own, planner, [1]).outcome
         torch.testing.assert_close(alone.states[0], together.states[1], rtol=0, atol=1e-9)
         torch.testing.assert_close(alone.measures["cost"][0], together.measures["cost"][1])
+
+
+@pytest.mark.parametrize("way", ["forecast", "response"])
+def test_measures_do_not_depend_on_how_many_episodes_are_driven_together(
+    way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forecaster = epo_lightning.load("rpi/v_lstm_epo")
+
+    def measured(together: int) -> dict[str, torch.Tensor]:
+        monkeypatch.setattr("epo_lightning.drive.rpi.TOGETHER", together)
+        world = RPIWorld(3, seed=1)
+        assert world.together == together
+        planner: Planner = ForecastPlanner(forecaster)
+        if way == "response":
+            planner = ResponsePlanner(world.energy, world.game, forecaster, world.search, world.agents)
+        chunks = [range(3)[first : first + together] for first in range(0, 3, together)]
+        parts = [measure(play(world, planner, chunk), world) for chunk in chunks]
+        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+    whole, halves = measured(3), measured(2)
+    for name, values in whole.items():
+        torch.testing.assert_close(halves[name], values, rtol=1e-5, atol=1e-5)
 
 
 # Measured before worlds got their common interface, on 5 episodes of seed 3, with the same machine to the last bit.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from multiprocessing import Pipe
@@ -24,6 +25,7 @@ from epo_lightning.scene import Scene
 pytest.importorskip("libsumo", reason="the extra `sim` is not installed")
 
 from epo_lightning.drive.sumo import SumoSimulation, SumoSimulator, lanes_of, sumo_world
+from epo_lightning.drive.sumo_process import END, _closed, _stream
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +123,20 @@ def test_the_end_of_the_process_is_told() -> None:
         with pytest.raises(ConfigError, match="the process of SUMO ended: is there enough memory"):
             ask()
     simulation.end()  # nothing more is sent
+
+
+def test_a_simulation_ends_when_no_process_waits_for_it() -> None:
+    pipe, other = Pipe()
+    assert not _closed(pipe)
+    other.send(END)
+    assert not _closed(pipe), "a message that waits is no end"
+    streaming = _stream(SumoSimulator(1, 0, "free").branch(0), pipe)
+    other.close()
+    assert _closed(pipe)
+    began = time.perf_counter()
+    with pytest.raises(EOFError):
+        next(streaming)
+    assert time.perf_counter() - began < 20.0, "the first step of the warm-up, which takes longer, is the last one"
 
 
 def test_mistakes_are_named() -> None:

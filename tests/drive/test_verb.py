@@ -8,12 +8,22 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from experiment.conftest import epo  # noqa: F401 - a fixture
 
 from epo_lightning.experiment.drive import _titles
 from epo_lightning.run_folder import RunFolder, read_json
 
 SMALL = ["episodes=2", "timed=1", "others=[ignores]"]
+QUICK = [
+    "run=rpi/v_lstm_epo",
+    "ways=[own]",
+    "baselines=[constant_velocity]",
+    "film=null",
+    "timed=0",
+    "episodes=2",
+    "others=[ignores]",
+]
 
 
 def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -> None:  # noqa: F811
@@ -39,6 +49,7 @@ def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -
     [
         (["run=highway_sim/hivt_m_epo"], "was trained on data=highway_sim, and world=rpi takes runs of data=rpi"),
         (["run=rpi/v_lstm_epo", "others=[play]"], "did you mean 'plays'"),
+        (["run=rpi/v_lstm_epo", "others=[plays,plays]"], "others names 'plays' twice: name each kind of others once"),
         (["run=rpi/v_lstm_epo", "film=2", "episodes=2"], "film must be an episode from 0 to 1, or null, not 2"),
         (["run=rpi/v_lstm_epo", "episodes=0", "film=null"], "episodes must be 1 or more, not 0"),
         (["run=rpi/v_lstm_epo", "ways=[]", "baselines=[]"], "nothing drives"),
@@ -73,18 +84,97 @@ def test_a_command_that_was_killed_is_continued(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "driven"
-    words = ["run=rpi/v_lstm_epo", "ways=[own]", "baselines=[constant_velocity]", "film=null", "timed=0", *SMALL[::2]]
-    assert epo("drive", *words, f"out={out}") == 0
+    assert epo("drive", *QUICK, f"out={out}") == 0
+    told = capsys.readouterr().out
+    assert "drives 2 episodes with each of 2 planners, others: ignores; the same command continues" in told
+    assert "V-LSTM + EPO, relaxed: 2 of 2 episodes" in told
     whole, lines = (out / "results.json").read_text(), (out / "episodes.jsonl").read_text().splitlines(keepends=True)
     assert len(lines) == 3, "settings, and a line per planner"
     (out / "results.json").unlink()
-    half = lines[1].replace('"collision": [0.0', '"collision": [1.0') if '"collision": [0.0' in lines[1] else lines[1]
-    (out / "episodes.jsonl").write_text(lines[0] + half + lines[2][:50])
-    assert epo("drive", *words, f"out={out}") == 0
-    assert ((out / "results.json").read_text() == whole) == (half == lines[1]), "what was driven is not driven again"
+    (out / "episodes.jsonl").write_text(lines[0] + lines[1] + lines[2][:50])
+    assert epo("drive", *QUICK, f"out={out}") == 0
+    assert (out / "results.json").read_text() == whole
+    told = capsys.readouterr().out
+    assert "V-LSTM + EPO, relaxed: 2 of 2 episodes" not in told, "what was driven is not driven again"
+    assert "response to constant velocity: 2 of 2 episodes" in told
     (out / "results.json").unlink()
-    assert epo("drive", *words, "seed=1", f"out={out}") == 2
-    assert "was begun with other settings" in capsys.readouterr().err
+    assert epo("drive", *QUICK, "seed=1", f"out={out}") == 2
+    assert "was begun with other settings (seed)" in capsys.readouterr().err
+
+
+def test_a_damaged_row_is_told_and_driven_again(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "driven"
+    assert epo("drive", *QUICK, f"out={out}") == 0
+    whole, text = (out / "results.json").read_text(), (out / "episodes.jsonl").read_text()
+    (out / "results.json").unlink()
+    (out / "episodes.jsonl").write_text(text.replace('"collision": [', '"collision": [1.0, ', 1))
+    capsys.readouterr()
+    assert epo("drive", *QUICK, f"out={out}") == 0
+    assert f"{out / 'episodes.jsonl'}, line 2 is damaged: its episodes are driven again" in capsys.readouterr().out
+    assert (out / "results.json").read_text() == whole
+
+
+def test_a_run_that_was_trained_on_is_refused(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    shutil.copytree(RunFolder.open("rpi/v_lstm_epo").path, tmp_path / "own")
+    words = ["run=own", *QUICK[1:], "out=driven"]
+    assert epo("drive", *words) == 0
+    (tmp_path / "driven" / "results.json").unlink()
+    best = tmp_path / "own" / "checkpoints" / "best.ckpt"
+    content = torch.load(best, weights_only=False)
+    next(iter(content["state_dict"].values())).add_(1e-3)
+    torch.save(content, best)
+    assert epo("drive", *words) == 2
+    assert "was begun with other settings: the checkpoint of the run own has changed" in capsys.readouterr().err
+
+
+def test_a_folder_has_one_command_at_a_time(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with RunFolder(tmp_path / "driven").lock():
+        assert epo("drive", *QUICK, "out=driven") == 2
+    assert "another process works on driven" in capsys.readouterr().err
+    assert not (tmp_path / "driven" / "episodes.jsonl").exists()
+
+
+def test_results_that_appear_meanwhile_are_not_overwritten(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def meanwhile(*values: object) -> str:
+        (tmp_path / "driven" / "results.json").write_text("{}")
+        return ""
+
+    monkeypatch.setattr("epo_lightning.experiment.drive._table", meanwhile)
+    assert epo("drive", *QUICK, "out=driven") == 2
+    assert "driven holds results already" in capsys.readouterr().err
+    assert (tmp_path / "driven" / "results.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("out", ["file", "file/below", "x" * 300])
+def test_a_folder_that_cannot_be_made_is_refused_before_anything_is_driven(
+    epo: Callable[..., int],  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    out: str,
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    assert epo("drive", *QUICK, f"out={out}") == 2
+    captured = capsys.readouterr()
+    assert f"out={out} is no folder that can be made and written" in captured.err
+    assert "episodes" not in captured.out
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_a_command_that_was_killed_in_the_middle_of_a_line_is_continued(
@@ -92,31 +182,15 @@ def test_a_command_that_was_killed_in_the_middle_of_a_line_is_continued(
     tmp_path: Path,
 ) -> None:
     out = tmp_path / "driven"
-    words = ["run=rpi/v_lstm_epo", "ways=[own]", "baselines=[constant_velocity]", "film=null", "timed=0", *SMALL[::2]]
-    assert epo("drive", *words, f"out={out}") == 0
+    assert epo("drive", *QUICK, f"out={out}") == 0
     whole, lines = (out / "results.json").read_text(), (out / "episodes.jsonl").read_text().splitlines(keepends=True)
     for left in (lines[0] + lines[2] + lines[1][:50], lines[0][:20]):
         (out / "results.json").unlink()
         (out / "episodes.jsonl").write_text(left)
-        assert epo("drive", *words, f"out={out}") == 0
+        assert epo("drive", *QUICK, f"out={out}") == 0
         assert (out / "results.json").read_text() == whole, "the first planner stays the first"
         rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
         assert len(rows) == 3, "no row is lost"
-
-
-def test_a_file_of_other_episodes_together_is_refused(
-    epo: Callable[..., int],  # noqa: F811
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    out = tmp_path / "driven"
-    words = ["run=rpi/v_lstm_epo", "ways=[own]", "baselines=[]", "film=null", "timed=0", *SMALL[::2], f"out={out}"]
-    assert epo("drive", *words) == 0
-    (out / "results.json").unlink()
-    text = (out / "episodes.jsonl").read_text()
-    (out / "episodes.jsonl").write_text(text.replace('"episodes": [0, 1]', '"episodes": [0]'))
-    assert epo("drive", *words) == 2
-    assert "was begun by a version that drove other episodes together" in capsys.readouterr().err
 
 
 def test_what_was_driven_by_a_killed_command_gives_the_same_table(
