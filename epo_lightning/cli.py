@@ -48,31 +48,39 @@ def main(words: Sequence[str] | None = None) -> None:
         print(f"epo: {error.strerror or error}{where}", file=sys.stderr)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
-        print(f"epo: interrupted; {_way_on(words)}", file=sys.stderr)
+        print(_farewell("interrupted", words), file=sys.stderr)
         raise SystemExit(130) from None
     except SystemExit as ending:
         if ending.code == TERMINATED:
-            print(f"epo: terminated; {_way_on(words)}", file=sys.stderr)
+            print(_farewell("terminated", words), file=sys.stderr)
         raise
 
 
-def _way_on(words: Sequence[str]) -> str:
-    """Hint how to continue a command that was interrupted."""
+def _farewell(ended: str, words: Sequence[str]) -> str:
+    """The line that a command prints when a signal ended it: how it ended, and how to continue."""
+    if "explore" in words:  # it is ended by Ctrl-C, and has nothing to continue
+        return "epo: stopped"
     if "train" in words:
-        return "continue the run with `epo train resume=<run folder>`"
-    return "no incomplete file was left; the same command continues"
+        return f"epo: {ended}; continue the run with `epo train resume=<run folder>`"
+    return f"epo: {ended}; no incomplete file was left; the same command continues"
 
 
 @contextmanager
 def _termination() -> Iterator[None]:
     """Context in which SIGTERM ends the program as Ctrl-C does: temporary files are deleted and locks released.
 
+    An exception after the signal is one of its consequences, so it is replaced by the exit status of the signal: PyTorch,
+    for example, fails at an assertion if the signal comes while it traces a program.
+
     During a training, :func:`epo_lightning.experiment.assembly.signals` handles SIGTERM instead.
     """
     program = os.getpid()
+    told = False
 
     def end(number: int, _: object) -> None:
+        nonlocal told
         if os.getpid() == program:
+            told = True
             raise SystemExit(TERMINATED)
         signal.signal(number, signal.SIG_DFL)  # a forked worker process: end it by the default action
         os.kill(os.getpid(), number)
@@ -82,6 +90,10 @@ def _termination() -> Iterator[None]:
         signal.signal(signal.SIGTERM, end)
     try:
         yield
+    except Exception as error:
+        if told:
+            raise SystemExit(TERMINATED) from error
+        raise
     finally:
         if ours:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)

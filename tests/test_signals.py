@@ -9,6 +9,7 @@ import time
 import pytest
 
 from epo_lightning import cli
+from epo_lightning.registry import ConfigError
 
 
 @pytest.mark.parametrize("verb", ["generate", "train", "evaluate", "predict", "report", "sweep", "config"])
@@ -39,6 +40,43 @@ def test_a_stopped_verb_prints_a_message(
     assert message.count("\n") == 1
     assert ("resume=" in message) == (verb == "train")
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.parametrize("error", [AssertionError("Trying to pop empty mode stack"), ConfigError("a"), OSError(5, "b")])
+def test_an_exception_after_sigterm_is_a_termination(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(_: object) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(20.0)
+        finally:
+            raise error
+
+    monkeypatch.setattr(cli, "_run", run)
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["export"])
+    assert ended.value.code == 143
+    assert capsys.readouterr().err == "epo: terminated; no incomplete file was left; the same command continues\n"
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_explore_only_says_that_it_stopped(
+    number: signal.Signals, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(_: object) -> None:
+        os.kill(os.getpid(), number)
+        time.sleep(20.0)
+
+    monkeypatch.setattr(cli, "_run", run)
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["explore", "run=rpi/v_lstm_epo"])
+    finally:
+        signal.signal(signal.SIGINT, ours)
+    assert ended.value.code == status
+    assert capsys.readouterr().err == "epo: stopped\n"
 
 
 def test_a_signal_handler_of_a_caller_stays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -119,22 +119,31 @@ def check_exportable(forecaster: Forecaster, title: str, form: Format) -> None:
         raise ConfigError(
             f"{title} cannot be exported as ONNX, which has no Cholesky factorisation: use format=pt2 or format=aoti"
         )
-    for game in games:
-        if isinstance(game, EPO) and game.calibration is not None:
-            part = "its calibration"
-        elif not isinstance(game.solver, LevenbergMarquardt) or game.solver.adaptive:
-            part = f"its solver ({type(game.solver).__name__})"
-        elif isinstance(game, EPO) and game.gate is not None:
-            raise ConfigError(
-                f"{title} cannot be exported: its gate chooses pairs by their values, and a program has a fixed sequence of "
-                "operations. Rows without forecaster.gate can"
-            )
-        else:
-            continue
+    obstacles = list(dict.fromkeys(obstacle for game in games for obstacle in _obstacles(game)))
+    if obstacles:
         raise ConfigError(
-            f"{title} cannot be exported: {part} takes as many steps as the values need, and a program has a fixed sequence "
-            "of operations. Rows with a fixed number of steps can (solver=levenberg_marquardt, solver.adaptive=false)"
+            f"{title} cannot be exported: a program has a fixed sequence of operations, and {'; '.join(obstacles)}. A run "
+            "keeps its settings: train one with these"
         )
+
+
+def _obstacles(game: EPO | Refined) -> list[str]:
+    """Parts of a game that a program cannot have, each with the setting that does without it."""
+    found = []
+    if isinstance(game, EPO) and game.calibration is not None:
+        found.append("its calibration takes as many steps as the values need (without: forecaster.calibration=null)")
+    if not isinstance(game.solver, LevenbergMarquardt):
+        found.append(
+            f"its solver, {type(game.solver).__name__}, takes as many steps as the values need (a fixed number: "
+            "solver=levenberg_marquardt solver.adaptive=false)"
+        )
+    elif game.solver.adaptive:
+        found.append(
+            "its solver takes adaptive steps, which depend on the values (a fixed number: solver.adaptive=false)"
+        )
+    if isinstance(game, EPO) and game.gate is not None:
+        found.append("its gate chooses pairs by their values (without: forecaster.gate=null)")
+    return found
 
 
 def games_of(forecaster: Forecaster) -> list[EPO | Refined]:

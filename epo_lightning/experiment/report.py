@@ -6,6 +6,7 @@ import math
 import os
 import shlex
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import EvaluatedRun, Report, build_tables, collect, write_report
 from epo_lightning.report.render import code
-from epo_lightning.report.results import read_results, save_results
+from epo_lightning.report.results import read_results, results_name, save_results
 from epo_lightning.report.rows import Row
 from epo_lightning.report.runs import scored, scored_elsewhere
 from epo_lightning.report.tables import distinct
@@ -50,7 +51,9 @@ def report(settings: ReportSettings) -> Path:
         subject = read_results(settings.results)
     else:
         subject = of_sweep(sweep) if sweep else Report.of_folder(settings.runs)
-    out = Path(settings.out or (sweep.folder / "report" if sweep else "report")).expanduser()
+    if settings.save:  # the report that is written from the results file has the same bytes
+        subject = replace(subject, title=results_name(settings.save))
+    out = Path(settings.out or _default_folder(settings, sweep)).expanduser()
     rows = distinct(build_tables(subject.evaluated))  # whatever cannot be reported is said before anything is drawn
     if settings.save:
         save_results(subject, settings.save)
@@ -60,6 +63,13 @@ def report(settings: ReportSettings) -> Path:
         drawn, notes = [], [NOT_DRAWN] if rows else []
     write_report(subject, out, drawn, preface(subject.evaluated), notes)
     return out
+
+
+def _default_folder(settings: ReportSettings, sweep: Sweep | None) -> Path:
+    """Folder of a report without ``out``; every results file has its own."""
+    if settings.results:
+        return Path("report") / results_name(settings.results)
+    return sweep.folder / "report" if sweep else Path("report")
 
 
 def of_sweep(sweep: Sweep) -> Report:

@@ -30,6 +30,8 @@ from epo_lightning.schema import read
 
 NOT_IN_COMMAND = ("sweep=", "existing=", "runs=", "run_dir=", "resume=")
 """Overrides that do not change what is trained, and are left out of the recorded command."""
+CODE = ("epo_lightning", "conf", "sweeps", "pyproject.toml")
+"""Code and settings in a checkout. Changes elsewhere, such as outputs of earlier commands, decide on no result."""
 PACKAGES = ("epo_lightning", "torch", "lightning", "hydra-core", "omegaconf", "torchmetrics", "numpy", "numba")
 
 
@@ -296,14 +298,14 @@ def _versions() -> dict[str, str | None]:
 
 
 def _commit() -> str | None:
-    """The checkout's commit, with a ``+`` if files were changed since; None outside a checkout."""
+    """The checkout's commit, with a ``+`` if code or settings were changed or added since; None outside a checkout."""
     root = PACKAGE.parent
     if not (root / ".git").exists():
         return None
     try:
         commit = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
         changes = subprocess.run(
-            ["git", "-C", root, "status", "--porcelain"], capture_output=True, text=True, check=True
+            ["git", "-C", root, "status", "--porcelain", "--", *CODE], capture_output=True, text=True, check=True
         )
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -62,17 +62,37 @@ def choices_to_yaml(best: Sequence[BestSetting], command: str) -> str:
     return HEADER.format(command=command) + yaml.safe_dump(content, sort_keys=False, width=120) if content else ""
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML's safe loader, which refuses a key that stands twice in a mapping instead of taking its last value."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        counts = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        for key, count in counts.items():
+            if count > 1:
+                raise _TwiceError(key)
+        return super().construct_mapping(node, deep)
+
+
+class _TwiceError(Exception):
+    """A key that stands twice in a mapping."""
+
+
 def read_choices(file: str) -> Choices:
     """The choices in a file.
 
     Raises:
-        ConfigError: the file cannot be read, or an entry is not an experiment with its overrides.
+        ConfigError: the file cannot be read, an entry is not an experiment with its overrides, or an experiment, or a key of
+            its overrides, stands in the file twice.
     """
     what = "experiment names with their overrides, as `epo report <search>` writes it"
     try:
-        content = yaml.safe_load(Path(file).expanduser().read_text(encoding="utf-8"))
+        content = yaml.load(Path(file).expanduser().read_text(encoding="utf-8"), _Loader)  # a SafeLoader
     except OSError as error:
         raise ConfigError(f"cannot read choices={file}: {error.strerror}; it must be a file of {what}") from error
+    except _TwiceError as twice:
+        raise ConfigError(
+            f"choices={file} has the entry {twice} twice, and only one of them can count: leave one of them out"
+        ) from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(
             f"choices={file} is not YAML ({' '.join(str(error).split())}); it must have {what}"
@@ -84,11 +104,18 @@ def read_choices(file: str) -> Choices:
         words = entry.get("overrides") if isinstance(entry, dict) else None
         if not isinstance(words, list) or not words:
             raise ConfigError(f"choices={file}: {experiment} has no list `overrides`; it must have {what}")
+        values: dict[str, str] = {}
         for word in words:
             if not isinstance(word, str) or not OVERRIDE.fullmatch(word):
                 raise ConfigError(
                     f"choices={file}: {experiment} has the override {word!r}, expected a setting of a section, such as "
                     "optimizer.lr=0.0005"
                 )
+            key = word.partition("=")[0]
+            if key in values:
+                raise ConfigError(
+                    f"choices={file}: {experiment} sets {key} twice, by {values[key]} and by {word}: leave one of them out"
+                )
+            values[key] = word
         found[str(experiment)] = tuple(words)
     return Choices(file, content, found)

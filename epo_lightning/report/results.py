@@ -4,7 +4,8 @@
 
     {
      "format": "epo_lightning results", "version": 1,
-     "title", "command", "sweep", "left_out":  as in :class:`~epo_lightning.report.write.Report`
+     "title", "command", "sweep", "left_out":  as in :class:`~epo_lightning.report.write.Report`; the title is
+                                                the name of the file (:func:`results_name`) when it is read
      "runs": [{
        "folder":   the run folder
        "reported": the splits whose scores are in the tables
@@ -83,6 +84,11 @@ class SavedRun:
         return [dict(zip(LOGGED, row, strict=False)) for row in self.validations]
 
 
+def results_name(file: str | Path) -> str:
+    """Title of the reports of a results file: the name of the file without ``.json``."""
+    return Path(file).name.removesuffix(".json")
+
+
 def save_results(report: Report, file: str | Path) -> None:
     """Write the results file of a report. The same runs give the same bytes.
 
@@ -126,7 +132,7 @@ def _saved(run: Records, reported: Sequence[str]) -> dict[str, Any]:
 
 
 def read_results(file: str | Path) -> Report:
-    """The report of a results file, as it was saved.
+    """The report of a results file, as it was saved, with the name of the file as its title.
 
     Raises:
         ConfigError: the file is missing or damaged, is no results file, or was written by another version.
@@ -158,7 +164,7 @@ def read_results(file: str | Path) -> Report:
         check_entries(entry, _RUN, f"{file}, entry {number} of runs,", remedy)
     runs = [SavedRun(Path(e["folder"]), e["config"], e["record"], e["scores"], e["log"]) for e in entries]
     return Report(
-        title=content["title"],
+        title=results_name(file),
         command=content["command"],
         runs=tuple(runs),
         evaluated=tuple(

@@ -24,6 +24,7 @@ from epo_lightning.experiment.program_files import FORMATS
 from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
+from epo_lightning.solvers.general.lbfgs import LBFGS
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cpp"
 ELSEWHERE = """
@@ -139,19 +140,38 @@ def test_what_takes_as_many_steps_as_the_values_need_is_refused() -> None:
     forecaster = epo_lightning.load("rpi/v_lstm_epo")
     check_exportable(forecaster, "two steps", FORMATS["aoti"])
     forecaster.gate = NearestGate()
-    with pytest.raises(ConfigError, match=r"gated cannot be exported: its gate chooses pairs by their values"):
+    with pytest.raises(
+        ConfigError,
+        match=r"gated .* its gate chooses pairs by their values \(.*forecaster\.gate=null\)",
+    ):
         check_exportable(forecaster, "gated", FORMATS["pt2"])
     forecaster.gate = None
     forecaster.solver = replace(forecaster.solver, adaptive=True)
     with pytest.raises(
-        ConfigError, match=r"solved cannot be exported: its solver \(LevenbergMarquardt\) takes as many steps"
+        ConfigError, match=r"solved cannot be .* its solver takes adaptive steps, .*solver\.adaptive=false"
     ):
         check_exportable(forecaster, "solved", FORMATS["pt2"])
     forecaster.calibration = object()
-    with pytest.raises(ConfigError, match=r"calibrated cannot be exported: its calibration takes as many steps"):
+    both = r"calibrated .* its calibration .*forecaster\.calibration=null\); its solver .*solver\.adaptive=false\)"
+    with pytest.raises(ConfigError, match=both):
         check_exportable(forecaster, "calibrated", FORMATS["pt2"])
+    forecaster.solver = LBFGS()
+    with pytest.raises(ConfigError, match=r"its solver, LBFGS, takes as many steps .*solver=levenberg_marquardt"):
+        check_exportable(forecaster, "minimised", FORMATS["pt2"])
     with pytest.raises(ConfigError, match=r"game cannot be exported as ONNX, .*: use format=pt2 or format=aoti"):
         check_exportable(forecaster, "game", FORMATS["onnx"])
+
+
+def test_every_obstacle_of_the_shipped_row_that_is_refused_is_named_with_its_setting(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as refused:
+        export(ExportSettings(run="rpi/v_lstm_epo_game_refined", out=str(tmp_path / "it.pt2")))
+    message = str(refused.value)
+    assert "forecaster.calibration=null" in message
+    assert "solver.adaptive=false" in message
+    assert "solver=levenberg_marquardt" not in message, "it is this solver"
+    forecaster = epo_lightning.load("rpi/v_lstm_epo_game_refined")
+    forecaster.calibration, forecaster.solver = None, replace(forecaster.solver, adaptive=False)
+    check_exportable(forecaster, "with these settings", FORMATS["pt2"])
 
 
 def test_a_file_has_the_suffix_of_its_format_and_packages_that_are_missing_are_named(

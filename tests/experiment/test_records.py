@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import shlex
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,8 +15,9 @@ from experiment import tiny
 from experiment.conftest import TINY, Epo
 from report.run_folders import make_run, scores
 
+from epo_lightning.experiment import train
 from epo_lightning.masking import is_masked, mask
-from epo_lightning.run_folder import RunFolder
+from epo_lightning.run_folder import RunFolder, write_file
 
 ROW = "experiment=rpi/v_lstm_sc"
 
@@ -233,3 +235,30 @@ def test_a_full_disk_fails_only_the_runs_without_space(epo: Epo, capsys: pytest.
     assert {path: text for path, text in content("runs/rpi").items() if path in before} == before
     assert epo(*words) == 0
     assert "4 runs: 4 done" in capsys.readouterr().out
+
+
+# The commit of the code
+
+
+def test_a_commit_is_marked_for_changes_of_code_and_settings_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def git(*words: str) -> str:
+        names = ("-c", "user.name=a", "-c", "user.email=a@b")
+        return subprocess.run(["git", *names, *words], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+
+    for file in ("epo_lightning/losses.py", "conf/train.yaml", "pyproject.toml", "README.md"):
+        write_file(tmp_path / file, "1\n")
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-q", "-m", "one")
+    monkeypatch.setattr(train, "PACKAGE", tmp_path / "epo_lightning")
+    commit = git("rev-parse", "HEAD").strip()
+    write_file(tmp_path / "shipped" / "run.json", "{}")
+    write_file(tmp_path / "README.md", "2\n")
+    assert train._commit() == commit
+    for file in ("epo_lightning/new.py", "epo_lightning/losses.py", "conf/train.yaml", "pyproject.toml"):
+        write_file(tmp_path / file, "2\n")
+        assert train._commit() == f"{commit}+", file
+        git("stash", "-q", "--include-untracked", "--", file)
+        assert train._commit() == commit

@@ -73,6 +73,18 @@ def test_a_report_is_rebuilt_from_its_results_file() -> None:
     assert "logless/logs/metrics.csv is missing or has no row" in two["index.html"].decode()
 
 
+def test_reports_of_two_files_lie_in_folders_with_their_names_and_have_them_as_titles() -> None:
+    make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.315))
+    file = saved()
+    shutil.copy(file, "results/other.json")
+    assert Path("one/results.md").read_text().startswith("# Results: all\n")
+    for name in ("all", "other"):
+        assert report(ReportSettings(results=f"results/{name}.json")) == Path("report") / name
+    for name in ("all", "other"):
+        assert Path(f"report/{name}/results.md").read_text().startswith(f"# Results: {name}\n")
+        assert f"<title>{name}" in Path(f"report/{name}/index.html").read_text()
+
+
 def test_scores_on_other_data_are_rebuilt() -> None:
     three_runs(Path("runs"))
     file = saved()

@@ -13,6 +13,7 @@ from report.run_folders import make_run, scores
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import of_sweep, report
 from epo_lightning.experiment.sweeps.sweep import Sweep
+from epo_lightning.experiment.sweeps.watch import status
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_file, write_json
 
@@ -44,6 +45,19 @@ def finish(run: RunFolder) -> RunFolder:
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path / "runs"
+
+
+def test_the_status_of_a_sweep_says_how_to_continue(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    finish(make_run(runs / "a", "V-LSTM", "marginal", scores(0.3)))
+    hint = "give the same command again to continue"
+    for folder, shown in (("c", True), ("d", True), ("a", False)):  # interrupted, waiting, done
+        if folder == "c":
+            make_run(runs / "c", "V-LSTM", "marginal", None)
+        status(begin(runs, "rpi_main", dict.fromkeys(("a", folder))))
+        assert (hint in capsys.readouterr().out) == shown, folder
+    with RunFolder(runs / "c").lock():
+        status(begin(runs, "rpi_main", dict.fromkeys(("c", "d"))))
+    assert hint not in capsys.readouterr().out, "the sweep runs"
 
 
 def test_a_sweep_reports_its_runs_and_the_states_of_the_others(runs: Path) -> None:

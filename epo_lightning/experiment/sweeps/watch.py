@@ -30,7 +30,7 @@ POLL = 2.0
 
 
 def status(sweep: Sweep) -> Counter[State]:
-    """Print the state of every run; returns the number of runs in each state."""
+    """Print the state of every run, and how to continue; returns the number of runs in each state."""
     jobs = sweep.jobs
     states = [sweep.state(job) for job in jobs]
     names = names_of(jobs)
@@ -44,6 +44,8 @@ def status(sweep: Sweep) -> Counter[State]:
     console.print(table)
     counts = Counter(states)
     console.print(f"{summary(counts)}; they lie below {sweep.root}", highlight=False, markup=False, soft_wrap=True)
+    if (counts["interrupted"] or counts["waiting"]) and not counts["running"]:
+        console.print("give the same command again to continue", highlight=False)
     return counts
 
 

@@ -106,6 +106,15 @@ def test_choices_that_do_not_fit_are_refused(epo: Epo, refused: Callable[..., st
         ("rpi/v_lstm: {overrides: [seed=4]}", "'seed=4', expected a setting of a section"),
         ("rpi/v_lstm: {overrides: [+optimizer.new=4]}", "expected a setting of a section"),
         ("rpi/v_lstm: {lr: 4}", "rpi/v_lstm has no list `overrides`"),
+        (
+            "rpi/v_lstm: {overrides: [optimizer.lr=0.1]}\nrpi/v_lstm: {overrides: [optimizer.lr=0.2]}",
+            r"choices=.*c\.yaml has the entry rpi/v_lstm twice, .*: leave one of them out",
+        ),
+        ("rpi/v_lstm: {overrides: [optimizer.lr=0.1], overrides: [goal=all]}", "has the entry overrides twice"),
+        (
+            "rpi/v_lstm: {overrides: [optimizer.lr=0.1, goal=all, optimizer.lr=0.2]}",
+            r"c\.yaml: rpi/v_lstm sets optimizer\.lr twice, by optimizer\.lr=0\.1 and by optimizer\.lr=0\.2: leave one",
+        ),
         ("[", "is not YAML"),
         ("", "has no choices"),
         (None, "cannot read choices=.*: No such file"),
