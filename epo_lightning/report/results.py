@@ -33,10 +33,21 @@ from epo_lightning.identity import ELSEWHERE, SECTIONS, canonical
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.curves import METRIC
-from epo_lightning.report.entries import OBJECT, OBJECTS, OBJECTS_BY_NAME, PAIRS, ROWS, TEXT, TEXTS, check_entries
+from epo_lightning.report.entries import (
+    OBJECT,
+    OBJECTS,
+    OBJECTS_BY_NAME,
+    PAIRS,
+    ROWS,
+    TEXT,
+    TEXTS,
+    check_configuration,
+    check_entries,
+    check_record,
+)
 from epo_lightning.report.records import CONFIG, RECORD, TIME, Records
-from epo_lightning.report.runs import read_run, scored, scored_elsewhere
-from epo_lightning.report.write import Report
+from epo_lightning.report.runs import EvaluatedRun, read_other, read_run, scored, scored_elsewhere
+from epo_lightning.report.write import Report, is_measured
 from epo_lightning.run_folder import read_json, write_file
 
 FORMAT, VERSION = "epo_lightning results", 1
@@ -93,9 +104,11 @@ def save_results(report: Report, file: str | Path) -> None:
     """Write the results file of a report. The same runs give the same bytes.
 
     Raises:
-        ConfigError: a file of a run folder is damaged.
+        ConfigError: a file of a run folder is damaged, or the report has no run.
         OSError: the file cannot be written.
     """
+    if not report.runs:
+        raise ConfigError(f"{file} is not written: the report {report.title} has no run with the scores that it shows")
     reported: dict[Path, list[str]] = {}
     for run in report.evaluated:
         reported.setdefault(run.path, []).append(run.split)
@@ -147,7 +160,7 @@ def read_results(file: str | Path) -> Report:
         raise ConfigError(f"{file} is no results file: it has no entry format: {FORMAT!r}; {again}")
     if content.get("version") != VERSION:
         raise ConfigError(
-            f"{file} is a results file of version {content.get('version')}, this program reads version {VERSION}; {again}"
+            f"{file} is a results file of version {content.get('version')!r}, this program reads version {VERSION}; {again}"
         )
     digest = content.pop("digest", None)
     remedy = (
@@ -159,23 +172,50 @@ def read_results(file: str | Path) -> Report:
             f"{remedy[0].upper()}{remedy[1:]}"
         )
     check_entries(content, _REPORT, str(file), remedy)
-    entries = content["runs"]
-    for number, entry in enumerate(entries):
-        check_entries(entry, _RUN, f"{file}, entry {number} of runs,", remedy)
-    runs = [SavedRun(Path(e["folder"]), e["config"], e["record"], e["scores"], e["log"]) for e in entries]
+    if not content["runs"]:
+        raise ConfigError(f"{file} is damaged: its entry runs is empty, and a report needs a run; {remedy}")
+    runs, evaluated = [], list[EvaluatedRun]()
+    for number, entry in enumerate(content["runs"]):
+        run, shown = _read_entry(entry, f"{file}, entry {number} of runs,", remedy)
+        runs.append(run)
+        evaluated += shown
     return Report(
         title=results_name(file),
         command=content["command"],
         runs=tuple(runs),
-        evaluated=tuple(
-            one
-            for run, entry in zip(runs, entries, strict=True)
-            for one in read_run(run)
-            if one.split in entry["reported"]
-        ),
+        evaluated=tuple(evaluated),
         left_out=tuple((folder, why) for folder, why in content["left_out"]),
         sweep=content["sweep"],
     )
+
+
+def _read_entry(entry: Mapping[str, Any], where: str, remedy: str) -> tuple[SavedRun, list[EvaluatedRun]]:
+    """The records of one run, and its scores on the splits that the report shows.
+
+    Raises:
+        ConfigError: the entry is damaged; the message begins with ``where`` and ends with ``remedy``.
+    """
+    check_entries(entry, _RUN, where, remedy)
+    check_configuration(entry["config"], f"{where} config", remedy)
+    check_record(entry["record"], f"{where} record", remedy)
+    run = SavedRun(Path(entry["folder"]), entry["config"], entry["record"], entry["scores"], entry["log"])
+    if not is_measured(run):
+        raise ConfigError(
+            f"{where} is damaged: its entry scores has neither scores nor the time of a forecast; {remedy}"
+        )
+    try:
+        found = read_run(run)
+        read_other(run)  # the tables of transfer read it again
+    except ConfigError as error:
+        raise ConfigError(f"{where} is damaged: {error}. {remedy[0].upper()}{remedy[1:]}") from error
+    known = [one.split for one in found]
+    for split in entry["reported"]:
+        if split not in known:
+            raise ConfigError(
+                f"{where} is damaged: its entry reported has the split {split!r}, and the run has scores on "
+                f"{', '.join(known) or 'no split'}; {remedy}"
+            )
+    return run, [one for one in found if one.split in entry["reported"]]
 
 
 def _digest(content: Mapping[str, Any]) -> str:

@@ -12,7 +12,7 @@ from epo_lightning.identity import identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
-from epo_lightning.report.entries import NUMBERS_BY_NAME, TEXTS, check_entries
+from epo_lightning.report.entries import NUMBERS_BY_NAME, TEXTS, check_configuration, check_known, check_record
 from epo_lightning.report.records import CONFIG, RECORD, Records
 from epo_lightning.run_folder import OTHER, RunFolder, discover
 
@@ -99,6 +99,19 @@ def find_runs(folder: str | Path) -> list[RunFolder]:
     return known
 
 
+def checked_records(run: Records) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Configuration and record of a run, whose entries are of the expected kinds, where they are not missing.
+
+    Raises:
+        ConfigError: a file is missing or damaged; the message names the file and the entry, and says what to do.
+    """
+    _require_records(run)
+    config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
+    check_configuration(config, str(run.path / CONFIG), COPY)
+    check_record(record, str(run.path / RECORD), COPY)
+    return config, record
+
+
 def scored(run: Records) -> list[str]:
     """Names of files with a run's scores: ``metrics.json`` of the test split first, then ``metrics-<split>.json``."""
     names = run.names()
@@ -139,8 +152,7 @@ def read_run(run: Records) -> list[EvaluatedRun]:
     names = scored(run)
     if not names:
         return []
-    _require_records(run)
-    config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
+    config, record = checked_records(run)
     return [_read_split(run, config, record, name) for name in names]
 
 
@@ -153,8 +165,7 @@ def read_other(run: Records) -> list[tuple[EvaluatedRun, Mapping[str, Any]]]:
     names = scored_elsewhere(run)
     if not names:
         return []
-    _require_records(run)
-    config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
+    config, record = checked_records(run)
     found: list[tuple[EvaluatedRun, Mapping[str, Any]]] = []
     for name in names:
         file = run.path / name
@@ -162,7 +173,7 @@ def read_other(run: Records) -> list[tuple[EvaluatedRun, Mapping[str, Any]]]:
         content = _sound(lambda name=name: run.content(name), again)  # type: ignore[misc]
         for key in ("data", "split", "test", "checkpoint"):
             _entry(content, file, again, key)
-        check_entries(content, {key: check for key, check in _ABOUT.items() if key in content}, str(file), again)
+        check_known(content, _ABOUT, str(file), again)
         found.append((_evaluated(run, config, record, file, content, str(content["split"]), again), content))
     return found
 
@@ -234,16 +245,14 @@ def _evaluated(
     def recorded(key: str) -> str:
         return str(_entry(record, record_file, COPY, key))
 
-    seed = setting("seed")
-    if not seed.isdigit():
-        raise ConfigError(f"{config_file}: seed must be a whole number, not {seed!r}; {COPY}")
+    seed = int(setting("seed"))
     trained = recorded("data_digest")
     _entry(config, config_file, COPY, "data", "name")
     trained_data = data_name(config["data"])
     return EvaluatedRun(
         path=run.path,
         name=mask(setting("title")),
-        seed=int(seed),
+        seed=seed,
         data=str(result.get("data", trained_data)),
         trained_data=trained_data,
         backbone=setting("backbone", "name"),

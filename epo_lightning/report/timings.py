@@ -14,7 +14,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
 from epo_lightning.report.records import TIME, Records
 from epo_lightning.report.render import Sheet
-from epo_lightning.report.runs import data_name
+from epo_lightning.report.runs import checked_records, data_name
 
 METHOD = ("forecaster", "dynamics", "energy", "solver", "backward", "objective")
 SIZES = ("modes", "steps", "test_steps")
@@ -65,9 +65,9 @@ def _read(run: Records) -> Timing:
     """The timing of a run.
 
     Raises:
-        ConfigError: its runtime.json is damaged.
+        ConfigError: its runtime.json, its configuration or its record is damaged.
     """
-    content, config = run.content(TIME), run.config()
+    content, (config, _) = run.content(TIME), checked_records(run)
     try:
         seconds = {name: float(content["seconds"][name]) for name in ("mean", "median", "p10", "p90")}
         if not all(math.isfinite(value) and value > 0 for value in seconds.values()):

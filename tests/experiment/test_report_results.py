@@ -17,7 +17,8 @@ from report.test_transfer import three_runs
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import NOT_DRAWN, report
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.results import _digest
+from epo_lightning.report import Report
+from epo_lightning.report.results import _digest, save_results
 from epo_lightning.run_folder import RunFolder
 
 FILES = {
@@ -71,6 +72,19 @@ def test_a_report_is_rebuilt_from_its_results_file() -> None:
     assert "- `runs/waiting`: interrupted" in written
     assert "times/damaged/runtime.json is not what" in written
     assert "logless/logs/metrics.csv is missing or has no row" in two["index.html"].decode()
+
+
+def test_a_timed_run_with_a_damaged_record_is_noted() -> None:
+    make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.3))
+    timed(Path("runs/times"), 4, 2, 1, 0.002).update(versions=5)
+    report(ReportSettings(runs="runs", out="one", scenes=False))
+    assert "run.json is damaged: its entry versions must be texts by name" in Path("one/results.md").read_text()
+
+
+def test_a_report_without_runs_is_not_saved() -> None:
+    with pytest.raises(ConfigError, match=r"all\.json is not written: the report empty has no run"):
+        save_results(Report("empty", "epo report empty", (), ()), "all.json")
+    assert not Path("all.json").exists()
 
 
 def test_reports_of_two_files_lie_in_folders_with_their_names_and_have_them_as_titles() -> None:
@@ -164,6 +178,44 @@ def test_a_damaged_or_foreign_file_is_refused(change: Callable[[str], str], mess
         ("runs.0.reported", ..., r"entry 0 of runs, is damaged: it lacks the entry reported, a list of texts"),
         ("runs.0.scores", {"metrics.json": []}, r"its entry scores must be objects by name"),
         ("runs.0.log", [[1, "0.5"]], r"its entry log must be a list of lists of texts"),
+        ("runs", [], r"all\.json is damaged: its entry runs is empty, .*; take the committed file again"),
+        ("runs.0.scores", {}, r"entry 0 of runs, is damaged: its entry scores has neither scores nor the time"),
+        ("runs.0.reported", ["tset"], r"its entry reported has the split 'tset', and the run has scores on test; take"),
+        ("version", "1", r"all\.json is a results file of version '1', this program reads version 1"),
+        *(
+            (
+                f"runs.0.config.{section}",
+                5,
+                rf"0 of runs, config is damaged: its entry {section} must be an object.*, not 5",
+            )
+            for section in ("energy", "solver", "backward", "objective", "data", "forecaster", "trainer", "budget")
+        ),
+        (
+            "runs.0.config.backbone",
+            {"name": 5},
+            r"its entry backbone must be an object with a text `name`, .*not {'name': 5}",
+        ),
+        (
+            "runs.0.config.objective",
+            {"relaxation": "x"},
+            r"its entry objective\.relaxation must be a finite number, not 'x'",
+        ),
+        ("runs.0.config.solver", {"steps": [2]}, r"its entry solver\.steps must be a whole number, or null, not \[2\]"),
+        ("runs.0.config.seed", "one", r"its entry seed must be a whole number, not 'one'; take"),
+        (
+            "runs.0.record.versions",
+            5,
+            r"0 of runs, record is damaged: its entry versions must be texts by name, or null, not 5",
+        ),
+        ("runs.0.record.git_commit", 5, r"its entry git_commit must be a text, or null, not 5"),
+        ("runs.0.record.steps", "many", r"its entry steps must be a whole number, or null, not 'many'"),
+        ("runs.0.record.seconds", "x", r"its entry seconds must be a finite number, or null, not 'x'"),
+        ("runs.0.record.status", [], r"its entry status must be a text, not \[\]"),
+        (
+            "runs.0.config.backbone",
+            ...,
+            r"entry 0 of runs, is damaged: .*has no entry backbone\.name: .* Take the committed",
+        ),
     ],
 )
 def test_a_damaged_entry_with_a_fitting_digest_is_named(path: str, value: object, message: str) -> None:
