@@ -28,12 +28,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.checks import check_number, is_number
-from epo_lightning.game.dynamics import Dynamics, Unicycle
+from epo_lightning.game.dynamics import Dynamics, Unicycle, controls_between
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.flatness import followed_controls
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import HEADING, SPEED, GameParameters, JointForecast, Scene
+from epo_lightning.scene import GameParameters, JointForecast, Scene
 from epo_lightning.solvers.backward import Backward, Implicit
 from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -226,17 +226,10 @@ def track(states: Tensor, scene: Scene, dynamics: Dynamics, noise: float) -> Flo
     states = torch.where(present[..., None], states, current[..., None, : states.shape[-1]])
     controls = followed_controls(states[..., :2], current, scene.dt, noise)
     if states.shape[-1] == 4:
-        told = _changes(states, current, scene.dt)
+        told = controls_between(torch.cat((current[..., None, :], states), -2), scene.dt)
         missed = (dynamics.rollout(current, told, scene.dt) - states)[..., :2].abs().amax((-2, -1))
         controls = torch.where((missed < OBEYS)[..., None, None], told, controls)
     return torch.where(present[..., None], controls, 0.0)
-
-
-def _changes(states: Tensor, current: Tensor, dt: float) -> Tensor:
-    """Changes of speed and heading per second."""
-    motion = torch.cat((current[..., None, :], states), -2)[..., [SPEED, HEADING]].diff(dim=-2)
-    turn = torch.remainder(motion[..., 1] + torch.pi, 2.0 * torch.pi) - torch.pi
-    return torch.stack((motion[..., 0], turn), -1) / dt
 
 
 def check_forecast(states: Tensor, probabilities: Tensor, scene: Scene) -> None:

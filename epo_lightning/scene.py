@@ -34,6 +34,18 @@ KINDS = ("car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "o
 ACCELERATION, TURN_RATE = range(2)
 
 
+def wrapped(turn: Tensor) -> Tensor:
+    """The turn in [-pi, pi) that leads to the same direction as a difference of two headings [rad].
+
+    Example:
+        From just below pi to just above -pi, as recordings write headings:
+
+        >>> wrapped(torch.tensor(-3.0 - 3.0))
+        tensor(0.2832)
+    """
+    return torch.remainder(turn + math.pi, 2.0 * math.pi) - math.pi
+
+
 Some = TypeVar("Some", bound="Batch")
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from epo_lightning.drive.planners import Plan, Planner, turned
 from epo_lightning.drive.world import EGO, Outcome, World
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.game.dynamics import controls_between
+from epo_lightning.scene import Scene
 
 
 @dataclass
@@ -98,7 +99,7 @@ def _spread(values: Tensor, going: Int[Tensor, " b"], count: int, rest: float) -
 
 def _told(outcome: Outcome, dt: float) -> Float[Tensor, "B T 2"]:
     """Changes of the planned agent's speed and heading per second; NaN after the end of an episode."""
-    changes = outcome.states[:, EGO][..., [SPEED, HEADING]].diff(dim=1) / dt
+    changes = controls_between(outcome.states[:, EGO], dt)
     return changes.where(outcome.agent_mask[:, EGO, 1:, None], torch.nan)
 
 

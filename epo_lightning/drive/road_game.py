@@ -14,7 +14,7 @@ from torch import Tensor
 
 from epo_lightning.drive.world import EGO
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import SPEED, TURN_RATE, GameParameters, Scene
+from epo_lightning.scene import SPEED, TURN_RATE, GameParameters, Scene, wrapped
 
 ENERGY = FeatureEnergy(
     own=("lane", "velref", "accref", "turnrref", "jerk", "turnacc", "velb", "accb"),
@@ -81,7 +81,7 @@ def keep_going(scene: Scene, steps: int) -> Float[Tensor, "B N K 2"]:
     piece = line.diff(dim=2)
     length = piece.norm(dim=-1).clamp_min(1e-6)
     heading = torch.atan2(piece[..., 1], piece[..., 0])
-    turn = torch.remainder(heading.diff(dim=2) + torch.pi, 2 * torch.pi) - torch.pi
+    turn = wrapped(heading.diff(dim=2))
     heading = torch.cat((heading[..., :1], heading[..., :1] + turn.cumsum(2)), 2)  # continuous along the line
     ends = torch.cat((torch.zeros_like(length[..., :1]), length.cumsum(2)), 2)
     nearest = (line - scene.current[:, :, None, :2].double()).norm(dim=-1).argmin(2, keepdim=True)

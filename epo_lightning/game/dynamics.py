@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE
+from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE, wrapped
 
 _BETA = {"euler": 1.0, "semi_implicit": 0.0, "heun": 0.5}
 
@@ -30,6 +30,15 @@ def _direction(heading: Float[Tensor, "..."]) -> Float[Tensor, "... 2"]:
 def _turn_left(vector: Float[Tensor, "... 2"]) -> Float[Tensor, "... 2"]:
     """R(90 degrees) times a vector."""
     return torch.stack((-vector[..., 1], vector[..., 0]), -1)
+
+
+def controls_between(states: Float[Tensor, "*batch T 4"], dt: float) -> Float[Tensor, "*batch T-1 2"]:
+    """Controls of a unicycle between its states: changes of speed and heading per second, turns being at most half a turn.
+
+    Headings need not be continuous: a recording that wraps them at pi gives the same controls.
+    """
+    change = states[..., [SPEED, HEADING]].diff(dim=-2)
+    return torch.stack((change[..., 0], wrapped(change[..., 1])), -1) / dt
 
 
 @runtime_checkable

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.scene import HEADING, SPEED
+from epo_lightning.scene import HEADING, SPEED, wrapped
 
 JERK = 5.0
 """J, the jerk [m/s^3] that counts as much as a difference of ``noise``."""
@@ -54,8 +54,7 @@ def followed_controls(
     heading = heading.gather(-1, known)
     speed = velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
     speed = torch.cat((current[..., None, SPEED], speed[..., 1:]), -1)
-    turn = torch.remainder(heading.diff(dim=-1) + torch.pi, 2.0 * torch.pi) - torch.pi
-    rates = torch.stack((speed.diff(dim=-1), turn), -1) / dt
+    rates = torch.stack((speed.diff(dim=-1), wrapped(heading.diff(dim=-1))), -1) / dt
     return torch.cat((rates, torch.zeros_like(rates[..., :1, :])), -2)
 
 

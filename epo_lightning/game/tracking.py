@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.scene import HEADING, SPEED, Scene, wrapped
 
 _SMOOTHNESS = 1e-2
 """mu relative to the mean of a channel's diagonal entries of J^T J, so that it has no unit."""
@@ -120,9 +120,8 @@ def _differences(
         return motion.gather(-2, index.clamp_max(steps)[..., None].expand(*index.shape, 2))
 
     speed, heading = (at(after) - at(before)).unbind(-1)
-    turn = torch.remainder(heading + torch.pi, 2.0 * torch.pi) - torch.pi
     time = dt * (after - before).to(motion.dtype)
-    return torch.where(ends[..., None], torch.stack((speed, turn), -1) / time[..., None], 0.0)
+    return torch.where(ends[..., None], torch.stack((speed, wrapped(heading)), -1) / time[..., None], 0.0)
 
 
 def _reach(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from epo_lightning.drive.rpi import RPIWorld
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import HEADING, GameParameters, Scene, wrapped
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 ENERGY = FeatureEnergy(own=["goal", "vel", "acc", "turnr"], pair=["proximity"])
@@ -53,6 +54,30 @@ def test_calibration_finds_the_weights_of_the_game_that_was_played() -> None:
             found.pair_weights["proximity"], true[:, None, None].expand(3, 2, 1), rtol=1e-2, atol=0
         )
         assert found.own_weights is inferred.own_weights
+
+
+@pytest.mark.parametrize(("guess", "true"), [(0.05, 20.0), (100.0, 2.0)])
+def test_weights_that_are_off_by_a_large_factor_are_found_as_well(guess: float, true: float) -> None:
+    """Six steps of at most a factor of e are too few for the first of these games."""
+    scene, goals = played(torch.tensor([true], dtype=torch.double))
+    inferred = parameters(torch.tensor([guess], dtype=torch.double), 1, AHEAD, goals)
+    found = Calibration()(SOLVER, ENERGY, scene, inferred)
+    assert float(found.pair_weights["proximity"]) == pytest.approx(true, rel=1e-2)
+
+
+def test_headings_that_wrap_give_the_same_weights() -> None:
+    """The same history, turned so that an agent's heading passes pi; recordings write it in [-pi, pi)."""
+    true, angle = torch.tensor([5.0, 10.0], dtype=torch.double), 0.07
+    scene, goals = played(true)
+    cos, sin = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[cos, sin], [-sin, cos]], dtype=torch.double)
+    history = scene.history + torch.tensor([0.0, 0.0, angle, 0.0])
+    history[..., :2] = history[..., :2] @ turn
+    history[..., HEADING] = wrapped(history[..., HEADING])
+    assert history[:, 1, :, HEADING].diff().amax() > 6
+    inferred = parameters(2 * true, 1, AHEAD, goals @ turn)
+    found = Calibration()(SOLVER, ENERGY, dataclasses.replace(scene, history=history), inferred)
+    torch.testing.assert_close(found.pair_weights["proximity"].flatten(), true, rtol=1e-3, atol=0)
 
 
 def test_few_steps_of_the_forecast_do_not_make_the_calibration_less_accurate() -> None:

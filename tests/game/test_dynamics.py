@@ -7,8 +7,9 @@ import math
 import pytest
 import torch
 
-from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.dynamics import Unicycle, controls_between
 from epo_lightning.registry import ConfigError
+from epo_lightning.scene import HEADING, wrapped
 
 INTEGRATORS = ("euler", "semi_implicit", "heun")
 
@@ -63,6 +64,15 @@ def test_tangent_equals_automatic_differentiation(integrator):
     direction = torch.randn(1, 6, 2, dtype=torch.float64)
     expected = torch.einsum("ksju,ju->ks", jacobian, direction[0])
     torch.testing.assert_close(unicycle.tangent(states, direction, 0.1)[0], expected, rtol=0, atol=1e-12)
+
+
+def test_controls_between_states_are_those_that_were_driven_also_where_headings_wrap():
+    start = torch.tensor([0.0, 0.0, 3.0, 5.0], dtype=torch.float64)
+    controls = torch.tensor([[1.0, 0.5], [-2.0, 0.7], [0.0, -1.5], [0.5, 0.2]], dtype=torch.float64)
+    states = torch.cat((start[None], Unicycle().rollout(start, controls, 0.4)))
+    states[:, HEADING] = wrapped(states[:, HEADING])
+    assert states[:, HEADING].diff().abs().amax() > 6
+    torch.testing.assert_close(controls_between(states, 0.4), controls)
 
 
 def test_unknown_integrator_names_the_nearest_one():

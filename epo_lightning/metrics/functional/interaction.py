@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.metrics.functional.overlap import overlapping_pairs
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.scene import HEADING, SPEED, Scene, wrapped
 
 INTERACTIVE = "interactive"
 SUBSETS = ("calm", INTERACTIVE)
@@ -120,8 +120,7 @@ def along(
     share = ((target - low) / (high - low).clamp_min(1e-9)).clamp(0.0, 1.0)[..., None]
     low, high = (way.gather(-2, at[..., None].expand(*at.shape, 4)) for at in (before, after))
     change = high - low
-    turn = torch.remainder(change[..., HEADING] + math.pi, 2 * math.pi) - math.pi
-    heading = low[..., HEADING] + share[..., 0] * turn
+    heading = low[..., HEADING] + share[..., 0] * wrapped(change[..., HEADING])
     beyond = (target - arc[..., -1:]).clamp_min(0.0)
     ahead = torch.stack((heading.cos(), heading.sin()), -1)
     place = low[..., :2] + share * change[..., :2] + beyond[..., None] * ahead
