@@ -137,6 +137,7 @@ class AttentionGate(Gate):
         super().__init__(group, ahead)
         check_whole("gate.neighbours", neighbours, least=1)
         check_whole("gate.size", size, least=1)
+        check_number("gate.scale", scale)
         self.neighbours, self.scale = neighbours, scale
         self.query, self.key = nn.Linear(width, size, bias=False), nn.Linear(width, size, bias=False)
         with torch.no_grad():

@@ -23,6 +23,8 @@ from epo_lightning.scene import HEADING, SPEED, wrapped
 
 JERK = 5.0
 """J, the jerk [m/s^3] that counts as much as a difference of ``noise``."""
+BRAKE = 10.0
+"""Largest change of velocity [m/s^2] of an agent that comes to a stand and moves backwards in the next step."""
 STILL = 1e-3
 """Least displacement [m] that tells a heading, also without noise."""
 
@@ -32,7 +34,8 @@ def followed_controls(
 ) -> Float[Tensor, "*batch K 2"]:
     """Controls of the explicit Euler unicycle whose rollout from ``current`` follows the positions.
 
-    The last control is zero, because it affects no position.
+    The last control is zero, because it affects no position. An agent whose present speed is negative, or that stands and
+    then moves against its heading, drives backwards: it keeps its heading.
 
     Args:
         positions: p_1 .. p_K [m].
@@ -47,11 +50,18 @@ def followed_controls(
     velocity = torch.cat((begin, free), -2).diff(dim=-2) / dt  # at the nodes 0 .. K-1
     heading = torch.atan2(velocity[..., 1], velocity[..., 0])
     # Displacements shorter than the noise tell no heading: there it is that of the last node with a longer one, and
-    # displacements across it are ignored. The first node has the observed heading.
-    heading = torch.cat((current[..., None, HEADING], heading[..., 1:]), -1)
+    # displacements across it are ignored. The first node has the observed direction of motion.
+    backwards = current[..., SPEED, None] < 0
+    observed = current[..., HEADING, None]
+    heading = torch.cat((torch.where(backwards, observed + torch.pi, observed), heading[..., 1:]), -1)
     nodes = torch.arange(heading.shape[-1], device=heading.device)
     known = torch.where(dt * velocity.norm(dim=-1) > max(noise, STILL), nodes, 0).cummax(-1).values
     heading = heading.gather(-1, known)
+    # Where an agent stands and then moves the other way, it keeps its heading and changes the sign of its speed.
+    stands = (known[..., :-1] < nodes[:-1]) | (velocity.diff(dim=-2).norm(dim=-1) <= BRAKE * dt)
+    switches = stands & (heading.diff(dim=-1).cos() < 0)
+    backwards = torch.cat((backwards, backwards ^ (switches.cumsum(-1) % 2 == 1)), -1)
+    heading = torch.where(backwards, heading - torch.pi, heading)
     speed = velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
     speed = torch.cat((current[..., None, SPEED], speed[..., 1:]), -1)
     rates = torch.stack((speed.diff(dim=-1), wrapped(heading.diff(dim=-1))), -1) / dt

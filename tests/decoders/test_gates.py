@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -176,3 +177,9 @@ def test_the_solver_meets_the_same_game_with_either_backend():
     found = epo.predict(scene)
     epo.solver = dataclasses.replace(epo.solver, backend="pytorch")
     torch.testing.assert_close(epo.predict(scene).states, found.states, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [0, -1.0, math.nan, math.inf])
+def test_the_scale_of_attention_must_be_a_positive_number(scale: float):
+    with pytest.raises(ConfigError, match=r"gate\.scale must be a number, positive"):
+        AttentionGate(scale=scale)

@@ -87,7 +87,7 @@ def overlap_rates(
     def valid(rate: Tensor) -> Tensor:
         return rate.to(states.dtype).masked_fill(broken, torch.inf).masked_fill(agents == 0, torch.nan)
 
-    return valid(pairs.any(-1)), valid(pairs.sum(-1) / agents)
+    return valid(pairs.any(-1)), valid(pairs.sum(-1).to(states.dtype) / agents)
 
 
 def overlapping_pairs(

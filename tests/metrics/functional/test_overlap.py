@@ -120,6 +120,15 @@ def test_a_nan_forecast_has_an_infinite_overlap_rate(shape: str) -> None:
     assert values.tolist() == [0.0, math.inf]
 
 
+def test_rates_have_the_precision_of_the_forecast() -> None:
+    """One of the three pairs of three agents overlaps: a third, in float64."""
+    states = torch.zeros(1, 1, 3, 1, 4, dtype=torch.float64)
+    states[0, 0, :, 0, 0] = torch.tensor([0.0, 1.0, 9.0])
+    there = torch.ones(1, 3, dtype=torch.bool)
+    rate = overlap_rate(states, states.new_ones(1, 1), states.new_full((1, 3, 2), 2.0), there, definition="authors")
+    assert rate.item() == 1 / 3
+
+
 def test_unknown_options_are_named() -> None:
     with pytest.raises(ConfigError, match=r"unknown shape 'disk'.*did you mean 'disc'"):
         rate([[0, 0, 0]], shape="disk")
