@@ -52,6 +52,8 @@ NOISE = 0.1
 """Standard deviation [m] of given positions around a smooth motion, unless another one is given."""
 OBEYS = 1e-3
 """Difference [m] of positions up to which futures with headings and speeds obey the dynamics."""
+LARGEST = 1e6
+"""Largest weight, margin and inverse temperature: squares and products of larger ones leave the range of float32."""
 SUM_TOLERANCE = 1e-3
 """Largest difference from one of the sum of a scene's probabilities; files of predictions are often rounded."""
 
@@ -92,7 +94,8 @@ def refine(
         the refined forecast; ``initial_states`` are the rollouts of the tracked strategies.
 
     Raises:
-        TypeError: futures or probabilities that are no tensors of floating-point numbers.
+        TypeError: futures or probabilities that are no tensors in single or double precision, a scene that is none, or
+            weights or margins that are no mappings.
         ValueError: a shape, value, weight or feature that cannot be used; the message names it.
 
     Example:
@@ -107,6 +110,8 @@ def refine(
         >>> bool(apart(given[None, None]) < 0.1), bool(apart(refined.states) > 2.0)
         (True, True)
     """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene is a {type(scene).__name__}; refine() takes an epo_lightning.Scene")
     scene.validate_values()
     check_forecast(states, probabilities, scene)
     check_number("noise", noise, zero=True)
@@ -115,7 +120,20 @@ def refine(
             raise ValueError(f"inverse_temperature must be one finite number, 0 or more, not {inverse_temperature}")
     else:
         check_number("inverse_temperature", inverse_temperature, zero=True)
+    for name, values in (("weights", weights), ("margins", margins)):
+        if values is not None and not isinstance(values, Mapping):
+            raise TypeError(
+                f"{name} is a {type(values).__name__}; it takes a mapping from names of features to numbers"
+            )
+    if _largest(inverse_temperature) > LARGEST:
+        raise ValueError(f"inverse_temperature must be at most {LARGEST:g}, not {_largest(inverse_temperature):g}")
     weights, margins = dict(WEIGHTS if weights is None else weights), dict(margins or {})
+    for what, given in (("weights", weights), ("margins", margins)):
+        for name, value in given.items():
+            if ((isinstance(value, Tensor) and value.numel()) or is_number(value)) and math.inf > _largest(
+                value
+            ) > LARGEST:
+                raise ValueError(f"{what}[{name!r}] must be at most {LARGEST:g} in size, not {_largest(value):g}")
     learned = (*weights.values(), *margins.values(), inverse_temperature)
     with torch.set_grad_enabled(torch.is_grad_enabled() and any(_requires_grad(value) for value in learned)):
         return refined(
@@ -130,6 +148,11 @@ def refine(
             solver,
             Implicit() if backward is None else backward,
         )
+
+
+def _largest(value: float | Tensor) -> float:
+    """The largest absolute value."""
+    return float(value.detach().abs().max()) if isinstance(value, Tensor) else abs(float(value))
 
 
 def _requires_grad(value: float | Tensor) -> bool:
@@ -242,8 +265,8 @@ def check_forecast(states: Tensor, probabilities: Tensor, scene: Scene) -> None:
     for name, value in (("states", states), ("probabilities", probabilities)):
         if not isinstance(value, Tensor):
             raise TypeError(f"{name} is a {type(value).__name__}; convert it with torch.as_tensor")
-        if not value.is_floating_point():
-            raise TypeError(f"{name} is of type {value.dtype}, expected floating-point numbers")
+        if value.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"{name} is of type {value.dtype}, expected floating-point numbers: float32 or float64")
     batch, agents = scene.agent_mask.shape
     if states.dim() != 5 or states.shape[0] != batch or states.shape[2] != agents or states.shape[4] not in (2, 4):
         raise ValueError(
