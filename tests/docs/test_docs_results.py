@@ -174,15 +174,26 @@ def test_the_page_of_rpi_has_the_search() -> None:
         assert numbers(line) == [short(run.metrics["minSADE"], 4) for run in own]
 
 
-def test_the_page_of_the_family_has_the_scores_of_its_rows() -> None:
+SIDES = ("executed/minSADE", "alternative/minSADE")
+
+
+@pytest.mark.parametrize(
+    ("file", "heading", "metrics"),
+    [
+        ("table1_rpi", "RPI, hard split", ("minSADE", "minSFDE", "minSADE_1", *SIDES, "overlap_jfp")),
+        ("table1_highway", "simulated highways", ("minSADE", "minSFDE", "minSADE_1", "overlap_jfp")),
+    ],
+)
+def test_the_page_of_the_family_has_the_scores_of_its_rows(file: str, heading: str, metrics: tuple[str, ...]) -> None:
     page = (ROOT / "docs" / "family.md").read_text(encoding="utf-8")
-    lines = page.partition("| RPI, hard split |")[2].splitlines()
-    metrics = ("minSADE", "minSFDE", "minSADE_1", "executed/minSADE", "alternative/minSADE", "overlap_jfp")
-    for row in distinct(build_tables(read_results(ROOT / "results" / "table1_rpi.json").evaluated)):
+    lines = page.partition(f"| {heading} |")[2].splitlines()
+    saved = read_results(ROOT / "results" / f"{file}.json")
+    runs = [*saved.evaluated, *(part for run in saved.runs for part in read_parts(run))]
+    for row in distinct(build_tables(runs)):
         line = next(line for line in lines if line.startswith(f"| {row.title.partition(',')[0]} |"))
         cells = [row.cells[metric] for metric in metrics]
         shown = [f"{short(cell.mean, 3)} ± {short(cell.deviation or 0, 3)}" for cell in cells]
-        assert numbers(line)[:7] == [str(cells[0].n), *shown], row.title
+        assert numbers(line)[: 1 + len(metrics)] == [str(cells[0].n), *shown], row.title
 
 
 def test_the_page_of_rpi_has_the_steps() -> None:
