@@ -21,9 +21,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.drive.episodes import play
+from epo_lightning.drive.episodes import outside, play
 from epo_lightning.drive.measures import differences, estimate, measure
-from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner, turned
+from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner
 from epo_lightning.drive.ride import Moment
 from epo_lightning.drive.road_game import keep_going
 from epo_lightning.drive.traffic import TrafficWorld
@@ -71,7 +71,7 @@ Forecasts = Mapping[str, Float[np.ndarray, "n K 2"]]
 def watch(
     world: TrafficWorld, forecasters: Mapping[str, ForecastPlanner], episodes: int
 ) -> Mapping[str, Mapping[int, Float[np.ndarray, "n 2"]]]:
-    """Errors along and across the neighbours' headings [m], by forecast and by the time ahead [s]."""
+    """Parts of the errors along the neighbours' headings, and their lengths [m], by forecast and by the time ahead [s]."""
     world.reset(range(episodes))
     every = round(1 / world.dt)
     moments: list[list[Moment]] = [[] for _ in range(episodes)]
@@ -83,7 +83,7 @@ def watch(
         if step % every == 0:
             scene = world.observe()
             forecasts = _positions(world, scene, forecasters)
-            here = _outside(scene, scene.current[:, : world.agents, None].double())[:, :, 0].numpy()
+            here = outside(scene.current[:, : world.agents, None, :2], scene)[:, :, 0].numpy()
             for row, episode in enumerate(going.tolist()):
                 names = _names(moments[episode][-1], here[row], scene.agent_mask[row])
                 told.append((episode, step, names, {name: value[row] for name, value in forecasts.items()}))
@@ -118,15 +118,9 @@ def _positions(world: TrafficWorld, scene: Scene, forecasters: Mapping[str, Fore
     controls[KEEPING] = keep_going(scene, steps)[:, : world.agents]
     start = scene.current[:, : world.agents].double()
     return {
-        name: _outside(scene, Unicycle().rollout(start, value, world.dt)).numpy() for name, value in controls.items()
+        name: outside(Unicycle().rollout(start, value, world.dt)[..., :2], scene).numpy()
+        for name, value in controls.items()
     }
-
-
-def _outside(scene: Scene, states: Float[Tensor, "B N K 4"]) -> Float[Tensor, "B N K 2"]:
-    """Positions of states in the world's frame."""
-    assert scene.frame is not None
-    frame = scene.frame.double()[:, None, None]
-    return turned(states[..., :2], frame[..., 2]) + frame[..., :2]
 
 
 def _names(now: Moment, positions: Float[np.ndarray, "N 2"], mask: Tensor) -> list[str]:

@@ -130,9 +130,8 @@ def refine(
     weights, margins = dict(WEIGHTS if weights is None else weights), dict(margins or {})
     for what, given in (("weights", weights), ("margins", margins)):
         for name, value in given.items():
-            if ((isinstance(value, Tensor) and value.numel()) or is_number(value)) and math.inf > _largest(
-                value
-            ) > LARGEST:
+            known = value.numel() > 0 if isinstance(value, Tensor) else is_number(value)
+            if known and LARGEST < _largest(value) < math.inf:
                 raise ValueError(f"{what}[{name!r}] must be at most {LARGEST:g} in size, not {_largest(value):g}")
     learned = (*weights.values(), *margins.values(), inverse_temperature)
     with torch.set_grad_enabled(torch.is_grad_enabled() and any(_requires_grad(value) for value in learned)):

@@ -71,7 +71,7 @@ def play(world: World, planner: Planner | None, episodes: Sequence[int], keep_pl
         controls.append(_spread(plan.controls[:, 0].double(), going, count, torch.nan))
         found.append(_spread(plan.found, going, count, True))
         if keep_plans:
-            plans.append(_spread(_outside(plan.states[..., :2], scene), going, count, torch.nan))
+            plans.append(_spread(outside(plan.states[..., :2], scene), going, count, torch.nan))
         last = going, scene, plan
     outcome = world.outcome()
     told = _told(outcome, world.dt)
@@ -103,7 +103,7 @@ def _told(outcome: Outcome, dt: float) -> Float[Tensor, "B T 2"]:
     return changes.where(outcome.agent_mask[:, EGO, 1:, None], torch.nan)
 
 
-def _outside(position: Float[Tensor, "B N K 2"], scene: Scene) -> Float[Tensor, "B N K 2"]:
+def outside(position: Float[Tensor, "B N K 2"], scene: Scene) -> Float[Tensor, "B N K 2"]:
     """Positions of a scene in the world's frame; NaN for agents that are not there."""
     position = position.double()
     if scene.frame is not None:

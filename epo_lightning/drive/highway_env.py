@@ -271,8 +271,8 @@ def lanes_of(network: Any, setting: Setting) -> LaneGraph:
     keys = keys_of(network)
     index = {key: place for place, key in enumerate(keys)}
     lanes = [network.get_lane(key) for key in keys]
-    sides = [[_line(lane, side * lane.width_at(0.0) / 2) for lane in lanes] for side in (0, -1, 1)]
-    centre = sides[0]
+    drawn = [[_line(lane, side * lane.width_at(0.0) / 2) for lane in lanes] for side in (0, -1, 1)]
+    centre = drawn[0]
     onward = dict(pairwise(setting.route))
     successors = []
     for place, (_, node, _) in enumerate(keys):
@@ -286,18 +286,18 @@ def lanes_of(network: Any, setting: Setting) -> LaneGraph:
             if min(gaps) < setting.gap:
                 found.append(index[node, end, int(np.argmin(gaps))])
         successors.append(tuple(found))
-    for lines in sides:
-        lines[:] = [
-            _joined(line, [lines[after] for after in found]) for line, found in zip(lines, successors, strict=True)
-        ]
+    centre, left_border, right_border = (
+        [_joined(line, [lines[after] for after in found]) for line, found in zip(lines, successors, strict=True)]
+        for lines in drawn
+    )
     left = np.array([index.get((a, b, i - 1), -1) for a, b, i in keys])
     right = np.array([index.get((a, b, i + 1), -1) for a, b, i in keys])
     open_right = np.array([other if other >= 0 and not lanes[other].forbidden else -1 for other in right])
     return LaneGraph(
         ids=np.arange(len(keys)),
-        left=sides[1],
-        right=sides[2],
-        centre=sides[0],
+        left=left_border,
+        right=right_border,
+        centre=centre,
         successors=successors,
         left_of=left,
         right_of=open_right,

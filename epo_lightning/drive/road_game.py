@@ -46,7 +46,7 @@ def road_game(scene: Scene, line: Int[Tensor, " B"], steps: int, turning: float 
         scene: scenes with reference lines.
         line: index of the reference line that the planned vehicle of each scene follows.
         steps: number of steps.
-        turning: share of the costs of turning. Those of a motorway would rather stand than drive around a roundabout.
+        turning: share of a motorway's costs of turning, with which standing is cheaper than driving around a roundabout.
     """
     batch, agents = scene.agent_mask.shape
     mine = torch.arange(agents) == EGO

@@ -33,7 +33,7 @@ PEDESTRIANS = ("plays", "ignores")
 SEEDS = 1_000_000
 """Added to seeds of episodes, so that their games are none of those of a data set."""
 TOGETHER = 50
-"""Largest number of episodes that are begun together: fewer make a plan dearer, more make progress unseen for long."""
+"""Largest number of episodes begun together: with fewer an episode takes longer, with more progress is rarely told."""
 RECONSIDERED = 5
 """Steps after which a pedestrian who plays looks for a better solution than that near its plan."""
 _SETTINGS = PotentialSettings().array()

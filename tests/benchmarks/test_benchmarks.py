@@ -219,13 +219,13 @@ def test_best_responses_come_close_to_the_central_solution(capsys, tmp_path):
 @pytest.mark.slow
 def test_forecasts_of_traffic_are_made_faster_and_slower(capsys, tmp_path):
     pytest.importorskip("libsumo", reason="the extra `sim` is not installed")
-    run = train.train(compose("train", ["experiment=highway/v_lstm", *TINY, f"runs={tmp_path}"]))
-    forecast_speed.main([str(run.path), "--traffic", "free", "--episodes", "1", "--watched", "1"])
+    forecast_speed.main(["highway_sim/hivt_m_epo", "--traffic", "free", "--episodes", "1", "--watched", "1"])
     rows = [line.split("  ")[0] for line in capsys.readouterr().out.splitlines()]
-    assert [rows.count(name) for name in ("V-LSTM", "keeping their speed")] == [3, 3]
+    assert [rows.count(name) for name in ("HiVT-M + EPO", "keeping their speed")] == [3, 3]
     assert "keeping their speed, +0.85 m/s²" in rows
-    assert "V-LSTM, -0.85 m/s²" in rows
-    assert "epo" in refused(forecast_speed.main, tmp_path / "nothing")
+    assert "HiVT-M + EPO, -0.85 m/s²" in rows
+    other = train.train(compose("train", ["experiment=highway/v_lstm", *TINY, f"runs={tmp_path}"]))
+    assert "takes runs of recorded traffic" in refused(forecast_speed.main, other.path)
 
 
 def test_gates_are_compared_and_missing_data_is_one_line(capsys, tmp_path):
