@@ -103,6 +103,36 @@ def test_steps_inside_of_the_compiled_layer_equal_single_calls(dtype, steps, exa
     assert (other.status[[0, 2]] != Status.STOPPED).all()
 
 
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 10_000),
+    agents=st.integers(2, 6),
+    pair=st.sampled_from([("proximity",), PAIR, *STATE_PAIRS]),
+    ends=st.none() | st.tuples(*[st.integers(2, 7)] * 3),
+    exact=st.booleans(),
+)
+def test_steps_without_held_agents_in_the_factorisation_equal_those_with_infinite_damping(
+    seed, agents, pair, ends, exact
+) -> None:
+    """With a gradient enabled, held agents are in the matrices, with infinite damping; without, only their pairs count."""
+    energy, scene, game = make(seed, agents=agents, pair=pair, ends=ends)
+    held = torch.rand(3, 2, agents) < 0.5
+    memory = torch.full((3, 2, agents), 10.0, dtype=torch.float64).masked_fill(held, torch.inf)
+    solver = LevenbergMarquardt(backend="compiled", **ADAPTIVE)
+    with torch.enable_grad():
+        one, damping_one = solver.run(energy, scene, game, 1, memory, exact=exact)
+    with torch.no_grad():
+        other, damping_other = solver.run(energy, scene, game, 1, memory, exact=exact)
+    # A matrix that is not positive definite is damped more, for all agents that are factorised together. Without the held
+    # agents, these are fewer.
+    same = (one.status == Status.SOLVED) & (other.status == Status.SOLVED)
+    assert same.any() or exact
+    assert torch.equal(other.controls[held], game.initial_controls[held])
+    torch.testing.assert_close(other.controls[same], one.controls[same], rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(other.energy[same], one.energy[same], rtol=1e-10, atol=0)
+    assert torch.equal(damping_one[same], damping_other[same])
+
+
 @pytest.mark.parametrize("exact", [False, True])
 def test_without_a_gradient_scenes_at_a_minimum_take_no_further_steps(exact) -> None:
     energy, scene, game = make(2, own=("goal", "acc", "turnr"), pair=())

@@ -138,28 +138,29 @@ INLINE T of_pair(const void* values, const int64_t* strides, int64_t b, int64_t 
     return static_cast<const T*>(values)[b * strides[0] + m * strides[1] + pair * strides[2]];
 }
 
-/// W independent games of n agents. What it does does not gain from a number of agents that is known at compile time, so that it
-/// is compiled once for all numbers.
+/// W independent games of n agents, of which the first `movers` move; the others are held, and count only by their pairs with
+/// agents that move. What it does does not gain from a number of agents that is known at compile time, so that it is compiled once
+/// for all numbers.
 template <class T>
 struct Games {
     static constexpr int W = Lanes<T>::W;
     const EpoGame& game;
-    const int n, K, pairs;
+    const int movers, n, K, pairs;        // `pairs`: those with an agent that moves
     const bool coupled;                   // whether there is a pair feature
     const bool state_pairs;               // whether there is one of states, and not only of distances
     const bool cut;                       // whether games may end before step K
     const T dt;
     Arena<T>& arena;
     int problem[W], scene[W], mode[W], *agent;  // agent[i * W + lane]
-    Vec<T>*weight;                        // [n, OWN_COUNT]
+    Vec<T>*weight;                        // [movers, OWN_COUNT]
     Vec<T>*pair_weight, *reach, *margin;  // [PAIR_COUNT, pairs]
     Vec<T>*length, *width;                // [n], only for pair features of states
     Vec<T>* given;                        // the weights of agents and pairs, of which `enter` sets some to zero; only where `cut`
     Vec<T> end;                           // numbers of steps of the games; only where `cut`
-    Vec<T>*goal_x, *goal_y, *goal_heading, *reference_speed, *wheelbase;  // [n]
-    Nearest<T> nearest;                   // from `find_nearest`, or kept by an earlier call
+    Vec<T>*goal_x, *goal_y, *goal_heading, *reference_speed, *wheelbase;  // [movers]
+    Nearest<T> nearest;                   // of the movers: from `find_nearest`, or kept by an earlier call
     Vec<T>*turn, *thrust;                 // controls [n, K]
-    Vec<T>*reference_turn, *reference_thrust;  // [n, K], only for features of reference controls
+    Vec<T>*reference_turn, *reference_thrust;  // [movers, K], only for features of reference controls
     std::vector<Path<T>> path;
 
     Vec<T> own(int feature, int i) const { return weight[i * OWN_COUNT + feature]; }
@@ -181,12 +182,12 @@ struct Games {
     INLINE void enter(int k) const {
         if (!cut || (k + 1 < K && !any<T>(end == splat<T>(T(k + 1))))) return;
         const Mask<T> live = has_step(k);
-        for (int e = 0; e < OWN_COUNT * n + PAIR_COUNT * pairs; ++e) weight[e] = live ? given[e] : Vec<T>{};
+        for (int e = 0; e < OWN_COUNT * movers + PAIR_COUNT * pairs; ++e) weight[e] = live ? given[e] : Vec<T>{};
     }
 
     /// Lane `lane` holds the row items[lane * (n + 1)]: the problem, then its agents. Unused lanes repeat the last row.
-    NOINLINE Games(const EpoGame& game, Arena<T>& arena, int n, const int32_t* items, int filled, const T* controls)
-        : game(game), n(n), K(int(game.K)), pairs(n * (n - 1) / 2),
+    NOINLINE Games(const EpoGame& game, Arena<T>& arena, int movers, int n, const int32_t* items, int filled, const T* controls)
+        : game(game), movers(movers), n(n), K(int(game.K)), pairs(movers * n - movers * (movers + 1) / 2),
           coupled(interacts(game)), state_pairs(has_state_pairs(game)), cut(game.ends != nullptr), dt(T(game.dt)), arena(arena) {
         owners_.resize(n * W);
         agent = owners_.data();
@@ -199,23 +200,23 @@ struct Games {
         }
         turn = arena.take(n * K);
         thrust = arena.take(n * K);
-        load(controls, turn, thrust);
+        load(n, controls, turn, thrust);
         for (int i = 0; i < n; ++i) path.push_back(new_path());
         roll();
     }
 
-    /// Read [B, M, N, K, 2] into [n, K] vectors.
-    NOINLINE void load(const T* from, Vec<T>* turns, Vec<T>* thrusts) const {
-        for (int i = 0; i < n; ++i) {
+    /// Read the first agents of [B, M, N, K, 2] into [agents, K] vectors.
+    NOINLINE void load(int agents, const T* from, Vec<T>* turns, Vec<T>* thrusts) const {
+        for (int i = 0; i < agents; ++i) {
             const T* rows[W];
             for (int lane = 0; lane < W; ++lane) rows[lane] = from + row_of(i, lane) * K * 2;
             gather<T>(rows, 2 * K, [&](int e, Vec<T> value) { (e % 2 ? turns : thrusts)[i * K + e / 2] = value; });
         }
     }
 
-    /// Write [n, K] vectors of the lanes whose bit is set in `lanes` to [B, M, N, K, 2].
+    /// Write [movers, K] vectors of the lanes whose bit is set in `lanes` to [B, M, N, K, 2].
     NOINLINE void store(const Vec<T>* turns, const Vec<T>* thrusts, uint32_t lanes, T* to) const {
-        for (int i = 0; i < n; ++i) {
+        for (int i = 0; i < movers; ++i) {
             T* rows[W];
             for (int lane = 0; lane < W; ++lane)
                 rows[lane] = lanes >> lane & 1 ? to + row_of(i, lane) * K * 2 : nullptr;
@@ -286,22 +287,23 @@ struct Games {
         }
     }
 
-    /// The matrix Z of step k for every agent.
+    /// The matrix Z of step k for every agent that moves.
     void motions(int k, Motion<T>* Z) const {
-        for (int i = 0; i < n; ++i) {
+        for (int i = 0; i < movers; ++i) {
             const Path<T>& p = path[i];
             const Vec<T> along = dt * p.speed[k];
             Z[i] = {-along * p.sine[k], along * p.cosine[k], dt * p.cosine[k], dt * p.sine[k]};
         }
     }
 
-    /// Computes the nearest points of the reference lines, with TANGENTS also the unit tangents there, and writes them to `found`.
+    /// Computes the nearest points of the movers' reference lines, with TANGENTS also the unit tangents there, and writes them to
+    /// `found`.
     template <bool TANGENTS>
     NOINLINE void find_nearest(const Nearest<T>& found) {
         nearest = found;
         Vec<T>* segments = arena.take((game.points - 1) * 5);
         // Four states at a time: each segment is loaded once for all four, and the processor can overlap their comparisons.
-        for (int i = 0; i < n; ++i) {
+        for (int i = 0; i < movers; ++i) {
             load_line(i, segments);
             int k = 1;
             for (; k + 4 <= K + 1; k += 4) find_nearest_at<TANGENTS, 4>(i, k, segments);
@@ -385,27 +387,27 @@ struct Games {
 
     /// Loads weights, goals and radii, which the features need and a bare rollout does not.
     NOINLINE void load_parameters() {
-        const int weights = OWN_COUNT * n + PAIR_COUNT * pairs;
+        const int weights = OWN_COUNT * movers + PAIR_COUNT * pairs;
         weight = arena.take(weights);
-        pair_weight = weight + OWN_COUNT * n;
+        pair_weight = weight + OWN_COUNT * movers;
         for (int f = 0; f < OWN_COUNT; ++f) {
             if (!game.own[f]) continue;
             for (int lane = 0; lane < W; ++lane) {
                 const int64_t* strides = game.own_strides[f];
                 const T* from = static_cast<const T*>(game.own[f]) + scene[lane] * strides[0] + mode[lane] * strides[1];
-                for (int i = 0; i < n; ++i) weight[i * OWN_COUNT + f][lane] = from[agent[i * W + lane] * strides[2]];
+                for (int i = 0; i < movers; ++i) weight[i * OWN_COUNT + f][lane] = from[agent[i * W + lane] * strides[2]];
             }
         }
         if (game.reference_controls) {
-            reference_turn = arena.take(n * K);
-            reference_thrust = arena.take(n * K);
-            load(static_cast<const T*>(game.reference_controls), reference_turn, reference_thrust);
+            reference_turn = arena.take(movers * K);
+            reference_thrust = arena.take(movers * K);
+            load(movers, static_cast<const T*>(game.reference_controls), reference_turn, reference_thrust);
         }
-        goal_x = arena.take(n);
-        goal_y = arena.take(n);
-        goal_heading = arena.take(n);
-        reference_speed = arena.take(n);
-        wheelbase = arena.take(n);
+        goal_x = arena.take(movers);
+        goal_y = arena.take(movers);
+        goal_heading = arena.take(movers);
+        reference_speed = arena.take(movers);
+        wheelbase = arena.take(movers);
         reach = arena.take(PAIR_COUNT * pairs);
         margin = arena.take(PAIR_COUNT * pairs);
         length = arena.take(n);
@@ -413,7 +415,12 @@ struct Games {
         for (int lane = 0; lane < W; ++lane) {
             const int64_t b = scene[lane], m = mode[lane];
             const T* size = static_cast<const T*>(game.size);
-            for (int i = 0; i < n; ++i) {
+            for (int i = 0; state_pairs && i < n; ++i) {
+                const int64_t row = b * game.N + agent[i * W + lane];
+                length[i][lane] = size[2 * row];
+                width[i][lane] = size[2 * row + 1];
+            }
+            for (int i = 0; i < movers; ++i) {
                 const int64_t a = agent[i * W + lane], row = b * game.N + a;
                 if (has(GOAL)) {
                     const T* goal = static_cast<const T*>(game.goals) + b * game.goals_b + m * game.goals_m + a * game.goals_n;
@@ -426,17 +433,14 @@ struct Games {
                         static_cast<const T*>(game.goal_headings)[b * strides[0] + m * strides[1] + a * strides[2]];
                 }
                 if (has(VELREF)) reference_speed[i][lane] = static_cast<const T*>(game.reference_speed)[row];
-                if (state_pairs) {
-                    length[i][lane] = size[2 * row];
-                    width[i][lane] = size[2 * row + 1];
-                }
                 if (has(STEER)) wheelbase[i][lane] = T(kWheelbase) * size[2 * row];
             }
             int p = 0;
-            for (int i = 0; coupled && i < n; ++i)
+            for (int i = 0; coupled && i < movers; ++i)
                 for (int j = i + 1; j < n; ++j, ++p) {
-                    const int64_t a = agent[i * W + lane], c = agent[j * W + lane];
-                    const int64_t pair = a * game.N - a * (a + 1) / 2 + c - a - 1;  // a < c, as in the item
+                    const int64_t one = agent[i * W + lane], other = agent[j * W + lane];
+                    const int64_t a = std::min(one, other), c = std::max(one, other);
+                    const int64_t pair = a * game.N - a * (a + 1) / 2 + c - a - 1;
                     const T *first = size + 2 * (b * game.N + a), *second = size + 2 * (b * game.N + c);
                     for (int f = 0; f < PAIR_COUNT; ++f) {
                         if (!has_pair(f)) continue;
@@ -519,13 +523,13 @@ struct Games {
     }
 };
 
-/// Games whose number of agents the compiler knows (N = 0: it does not).
+/// Games whose number of agents that move the compiler knows (N = 0: it does not).
 template <class T, int N>
 struct Group : Games<T> {
     const Count<N> count;
 
-    Group(const EpoGame& game, Arena<T>& arena, Count<N> count, const int32_t* items, int filled, const T* controls)
-        : Games<T>(game, arena, count.agents(), items, filled, controls), count(count) {}
+    Group(const EpoGame& game, Arena<T>& arena, Count<N> count, int n, const int32_t* items, int filled, const T* controls)
+        : Games<T>(game, arena, count.agents(), n, items, filled, controls), count(count) {}
 };
 
 }  // namespace EPO_LEVEL

@@ -2,7 +2,7 @@
 //
 // In each step, every problem is split into groups of agents that overlap at the current iterate: the connected components of the
 // graph of active pairs. Each group has a factorisation of its own. Groups of the same size are solved together, one per lane of
-// the vector registers.
+// the vector registers. Adaptive steps leave held agents out of the factorisations: these agents connect no others.
 
 #include <algorithm>
 #include <cstring>
@@ -16,10 +16,26 @@ namespace {
 
 static_assert(kMostAgents == 8 * sizeof(uint64_t), "contacts are a mask of one bit per agent");
 
-/// Groups of agents in contact by size: items[n] holds rows of a problem and its n agents, in ascending order.
-struct Plan {
-    std::vector<std::vector<int32_t>> items;
-    int64_t groups(int n, int lanes) const { return (int64_t(items[n].size()) / (n + 1) + lanes - 1) / lanes; }
+/// Numbers of the agents of a group that move, and of the held agents in contact with them.
+struct Size {
+    int movers, held;
+    int agents() const { return movers + held; }
+};
+
+/// Groups of agents in contact by size: rows of a problem, the agents that move, and the held ones, each in ascending order.
+class Plan {
+  public:
+    Plan(int64_t N, bool holds) : stride_(int(N) + 1), rows_((holds ? N : 1) * stride_) {}
+
+    int kinds() const { return int(rows_.size()); }
+    Size size(int kind) const { return {kind % stride_, kind / stride_}; }
+    const std::vector<int32_t>& rows(int kind) const { return rows_[kind]; }
+    std::vector<int32_t>& rows(Size size) { return rows_[size.held * stride_ + size.movers]; }
+    int64_t count(int kind) const { return int64_t(rows_[kind].size()) / (size(kind).agents() + 1); }
+
+  private:
+    int stride_;
+    std::vector<std::vector<int32_t>> rows_;  // by kind
 };
 
 /// Contacts between the agents of W problems: bit j of touching[i * W + lane] is set where i and j overlap.
@@ -118,13 +134,15 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
         }
 }
 
-/// The plan for the problems first .. last, without those that are marked in `done`.
+/// The plan for the problems first .. last, without those that are marked in `done`. `held` is a mask of agents for each problem, or
+/// empty if no agent is held.
 template <class T>
-Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last, const std::vector<char>& done, const T* controls) {
+Plan make_plan(
+    const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last, const std::vector<char>& done,
+    const std::vector<uint64_t>& held, const T* controls) {
     constexpr int W = Lanes<T>::W;
     const int N = int(game.N);
-    Plan plan;
-    plan.items.resize(N + 1);
+    Plan plan(game.N, !held.empty());
     std::vector<uint64_t> touching(std::size_t(N) * W, 0);
     for (int64_t start = first; start < last; start += W) {
         const int filled = int(std::min<int64_t>(W, last - start));
@@ -136,21 +154,25 @@ Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last
         }
         for (int lane = 0; lane < filled; ++lane) {
             if (done[start + lane - first]) continue;
+            const uint64_t still = held.empty() ? 0 : held[start + lane - first];
             uint64_t left = 0;
             for (int i = 0; i < N; ++i) left |= uint64_t(game.present[(start + lane) / game.M * N + i] != 0) << i;
+            left &= ~still;
             while (left) {
-                uint64_t group = left & -left, border = group;
+                uint64_t group = left & -left, border = group, beside = 0;
                 while (border) {
                     const int i = __builtin_ctzll(border);
                     border &= border - 1;
-                    const uint64_t fresh = touching[std::size_t(i) * W + lane] & ~group;
+                    const uint64_t reached = touching[std::size_t(i) * W + lane], fresh = reached & ~(group | still);
+                    beside |= reached & still;
                     group |= fresh;
                     border |= fresh;
                 }
                 left &= ~group;
-                auto& items = plan.items[__builtin_popcountll(group)];
-                items.push_back(int32_t(start + lane));
-                for (uint64_t rest = group; rest; rest &= rest - 1) items.push_back(__builtin_ctzll(rest));
+                auto& rows = plan.rows({__builtin_popcountll(group), __builtin_popcountll(beside)});
+                rows.push_back(int32_t(start + lane));
+                for (const uint64_t agents : {group, beside})
+                    for (uint64_t rest = agents; rest; rest &= rest - 1) rows.push_back(__builtin_ctzll(rest));
             }
         }
     }
@@ -161,7 +183,7 @@ Plan make_plan(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t last
 template <class T>
 struct StepTape {
     Plan plan;
-    std::vector<Buffer<T>> factors, nearest;  // by group size, group after group
+    std::vector<Buffer<T>> factors, nearest;  // by number of agents, group after group
     std::vector<char> taken;               // by problem of the range: whether it took the step
 };
 
@@ -172,23 +194,23 @@ struct Tape {
 };
 
 /// Calls body(group, index, lanes in use) for every W groups of the same size; `index` counts these calls, from 0 for each size. For up
-/// to 4 agents, the number of agents is known at compile time.
+/// to 4 agents that move, their number is known at compile time.
 template <class T, class Body>
 void for_each_group(const EpoGame& game, Arena<T>& arena, const Plan& plan, const T* controls, const Body& body) {
     constexpr int W = Lanes<T>::W;
-    for (int n = 1; n < int(plan.items.size()); ++n) {
-        const auto& items = plan.items[n];
-        const int64_t count = int64_t(items.size()) / (n + 1);
+    for (int kind = 0; kind < plan.kinds(); ++kind) {
+        const Size size = plan.size(kind);
+        const int64_t count = plan.count(kind);
         for (int64_t start = 0; start < count; start += W) {
-            const int32_t* rows = items.data() + start * (n + 1);
+            const int32_t* rows = plan.rows(kind).data() + start * (size.agents() + 1);
             const int filled = int(std::min<int64_t>(W, count - start));
             arena.clear();
-            const auto call = [&](auto size) {
-                using Size = decltype(size);
-                auto group = Group<T, Size::value>(game, arena, Count<Size::value>{n}, rows, filled, controls);
+            const auto call = [&](auto known) {
+                constexpr int N = decltype(known)::value;
+                auto group = Group<T, N>(game, arena, Count<N>{size.movers}, size.agents(), rows, filled, controls);
                 body(group, start / W, filled);
             };
-            switch (n) {
+            switch (size.movers) {
                 case 1: call(std::integral_constant<int, 1>{}); break;
                 case 2: call(std::integral_constant<int, 2>{}); break;
                 case 3: call(std::integral_constant<int, 3>{}); break;
@@ -272,13 +294,12 @@ class Range {
     StepTape<T> step(const T* controls, T* next, T* directions, T* energy, T* predicted, int64_t* status) {
         constexpr int W = Lanes<T>::W;
         const bool record = run_.record != 0, has_lines = game_.own[LANE] != nullptr, exact = run_.exact != 0;
-        StepTape<T> step;
-        step.plan = make_plan<T>(game_, arena_, first_, last_, done_, controls);
+        StepTape<T> step{make_plan<T>(game_, arena_, first_, last_, done_, held_, controls), {}, {}, valid_};
         step.factors.resize(game_.N + 1);
         step.nearest.resize(game_.N + 1);
-        step.taken = valid_;
-        for (int n = 1; n <= game_.N; ++n) {
-            const std::size_t groups = step.plan.groups(n, W);
+        for (int kind = 0; kind < step.plan.kinds(); ++kind) {
+            const int n = step.plan.size(kind).movers;
+            const std::size_t groups = (step.plan.count(kind) + W - 1) / W;
             if (groups && (record || !reused_[n]))
                 (record ? step.factors : reused_)[n] = Buffer<T>((record ? groups : 1) * Factors<T>::size(n, game_.K));
             if (groups && record && has_lines) step.nearest[n] = Buffer<T>(groups * Nearest<T>::size(n, game_.K));
@@ -286,7 +307,7 @@ class Range {
         if (energy) std::fill(energy + first_, energy + last_, T(0));
         if (predicted) std::fill(predicted + first_, predicted + last_, T(0));
         for_each_group<T>(game_, arena_, step.plan, controls, [&](auto& group, int64_t index, int filled) {
-            const int n = group.count.agents();
+            const int n = group.movers;
             group.load_parameters();
             if (has_lines && record)
                 group.template find_nearest<true>(Nearest<T>::at(step.nearest[n].data() + index * Nearest<T>::size(n, game_.K), n, game_.K));
@@ -327,10 +348,11 @@ class Range {
         for (int64_t problem = first_; problem < last_; ++problem) {
             T *d = directions + problem * size_, *to = next + problem * size_;
             const T *from = controls + problem * size_, alpha = T(run_.step_size);
-            // Absent agents are in no group, so no direction was stored for them.
+            // Absent and held agents are in no group that moves them, so no direction was stored for them.
             const uint8_t* present = game_.present + problem / game_.M * game_.N;
+            const uint64_t still = held_.empty() ? 0 : held_[problem - first_];
             for (int64_t i = 0; i < game_.N; ++i)
-                if (!present[i]) std::fill(d + i * row_, d + (i + 1) * row_, T(0));
+                if (!present[i] || still >> i & 1) std::fill(d + i * row_, d + (i + 1) * row_, T(0));
             bool taken = step.taken[problem - first_];
             for (int64_t e = 0; e < size_; ++e) taken &= finite(from[e] + alpha * d[e]);
             step.taken[problem - first_] = taken;
@@ -348,9 +370,9 @@ class Range {
             std::fill(norm + first_, norm + last_, T(0));
             std::memset(states + first_ * size_ * 2, 0, sizeof(T) * (last_ - first_) * size_ * 2);
         }
-        const Plan plan = make_plan<T>(game_, arena_, first_, last_, done_, controls);
+        const Plan plan = make_plan<T>(game_, arena_, first_, last_, done_, {}, controls);
         for_each_group<T>(game_, arena_, plan, controls, [&](auto& group, int64_t, int filled) {
-            const int n = group.n;
+            const int n = group.movers;
             group.load_parameters();
             if (game_.own[LANE])
                 group.template find_nearest<false>(Nearest<T>::at(arena_.take(Nearest<T>::size(n, game_.K)), n, game_.K));
@@ -387,6 +409,7 @@ class Range {
         const int64_t count = last_ - first_;
         std::vector<int64_t> tried(count);
         std::vector<T> found(count), predicted(count);
+        find_held();
         measure(controls, best, nullptr);
         std::copy(best + first_, best + last_, before + first_);
         for (int64_t s = 0; s < run_.steps; ++s) {
@@ -418,6 +441,17 @@ class Range {
     }
 
   private:
+    /// Finds the agents with infinite damping, which keep their controls.
+    void find_held() {
+        if (!run_.damping_agent) return;
+        held_.assign(last_ - first_, 0);
+        for (int64_t problem = first_; problem < last_; ++problem)
+            for (int64_t i = 0; i < game_.N; ++i) {
+                const T given = static_cast<const T*>(run_.damping)[problem * run_.damping_problem + i * run_.damping_agent];
+                held_[problem - first_] |= uint64_t(!finite(given)) << i;
+            }
+    }
+
     /// Applies a function to the damping of the agents of a problem that move.
     template <class Change>
     void change_damping(int64_t problem, Change change) {
@@ -441,6 +475,7 @@ class Range {
     Arena<T> arena_;
     std::vector<Buffer<T>> reused_;
     std::vector<char> valid_, done_;  // by problem
+    std::vector<uint64_t> held_;      // by problem: mask of the held agents; empty if steps move all agents
 };
 
 template <class T>
@@ -463,11 +498,11 @@ void pull_states(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t la
     for (int start = 0; start < count; start += W) {
         const int filled = std::min(W, count - start);
         arena.clear();
-        const Games<T> games(game, arena, 1, items.data() + 2 * start, filled, controls);
+        const Games<T> games(game, arena, 1, 1, items.data() + 2 * start, filled, controls);
         const int K = games.K;
         const auto& path = games.path[0];
         Vec<T>*turn = arena.take(K), *thrust = arena.take(K), *given = arena.take(4 * K), x{}, y{}, heading{}, speed{};
-        games.load(bar, turn, thrust);
+        games.load(1, bar, turn, thrust);
         const T* rows[W];
         for (int lane = 0; lane < W; ++lane) rows[lane] = states + games.row_of(0, lane) * K * 4;
         gather<T>(rows, 4 * K, [&](int e, Vec<T> value) { given[e] = value; });
@@ -551,8 +586,8 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
             Vec<T>*bar_turn = arena.take(n * K), *bar_thrust = arena.take(n * K);
             Vec<T>*mu_turn = arena.take(n * K), *mu_thrust = arena.take(n * K);
             Vec<T>*d_turn = arena.take(n * K), *d_thrust = arena.take(n * K);
-            group.load(bar, bar_turn, bar_thrust);
-            group.load(static_cast<const T*>(run.directions) + s * all, d_turn, d_thrust);
+            group.load(n, bar, bar_turn, bar_thrust);
+            group.load(n, static_cast<const T*>(run.directions) + s * all, d_turn, d_thrust);
             for (int e = 0; e < n * K; ++e) {
                 mu_turn[e] = T(run.step_size) * bar_turn[e];
                 mu_thrust[e] = T(run.step_size) * bar_thrust[e];

@@ -19,23 +19,27 @@ INLINE void add_disc_costs(const Group<T, N>& g, int feature, int state, bool ex
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
     int pair = feature * g.pairs;
     for (int i = 0; i < n; ++i)
-        for (int j = i + 1; j < n; ++j, ++pair) {
+        for (int j = i + 1; j < g.n; ++j, ++pair) {
             const Vec<T> dx = g.path[i].x[state] - g.path[j].x[state], dy = g.path[i].y[state] - g.path[j].y[state];
             const Vec<T> reach = g.reach[pair];
             if (!any<T>(dx * dx + dy * dy < reach * reach)) continue;
             const Contact<T> contact(dx, dy, reach);
+            const bool both = j < n;
             const Vec<T> weight = g.pair_weight[pair], pushed = weight * weight * contact.depth;
             energy += T(0.5) * pushed * contact.depth;
             const Vec<T> push_x = pushed * contact.x, push_y = pushed * contact.y;
             y[2 * i] -= push_x;
             y[2 * i + 1] -= push_y;
-            y[2 * j] += push_x;
-            y[2 * j + 1] += push_y;
+            if (both) {
+                y[2 * j] += push_x;
+                y[2 * j + 1] += push_y;
+            }
             if (!P) continue;
             const Vec<T> nx = weight * contact.x, ny = weight * contact.y;
             // Each product goes straight into its sum, so that the compiler can fuse them whether or not `exact` adds more.
             const auto add = [&](Vec<T> xx, Vec<T> xy, Vec<T> yy) INLINE_LAMBDA {
                 for (const int a : {i, j}) {
+                    if (a >= n) return;
                     P[2 * a * ld + 2 * a] += xx;
                     P[(2 * a + 1) * ld + 2 * a] += xy;
                     P[(2 * a + 1) * ld + 2 * a + 1] += yy;
@@ -62,27 +66,28 @@ INLINE void entries_of(int i, int j, int m, int* at) {
 /// Adds the costs of the pair features of states at one state; arguments as for `add_state_costs`.
 template <class T>
 NOINLINE void add_state_pair_costs(const Games<T>& g, int state, bool exact, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
-    const int n = g.n, m = 2 * n, ld = 3 * m;
+    const int n = g.movers, m = 2 * n, ld = 3 * m;
     for (int feature = 0; feature < PAIR_COUNT; ++feature) {
         if (of_discs(feature) || !g.has_pair(feature)) continue;
         int pair = 0;
         for (int i = 0; i < n; ++i)
-            for (int j = i + 1; j < n; ++j, ++pair) {
+            for (int j = i + 1; j < g.n; ++j, ++pair) {
                 if (!g.in_range(feature, pair, i, j, state)) continue;
                 PairValue<Vec<T>> d;
+                const int unknowns = j < n ? 8 : 4;  // a held agent has none
                 const int entry = feature * g.pairs + pair;
                 evaluate_pair<T, Vec<T>>(feature, g.body(i, state), g.body(j, state), g.margin[entry], d);
                 const Vec<T> weight = g.pair_weight[entry], pushed = weight * weight * d.value;
                 energy += T(0.5) * pushed * d.value;
                 int at[8];
                 entries_of(i, j, m, at);
-                for (int e = 0; e < 8; ++e) y[at[e]] += pushed * d.by[e];
+                for (int e = 0; e < unknowns; ++e) y[at[e]] += pushed * d.by[e];
                 if (!P) continue;
                 Vec<T> row[8];
-                for (int e = 0; e < 8; ++e) row[e] = weight * d.by[e];
-                for (int e = 0; e < 8; ++e)
+                for (int e = 0; e < unknowns; ++e) row[e] = weight * d.by[e];
+                for (int e = 0; e < unknowns; ++e)
                     for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += row[e] * row[f];
-                for (int e = 0; exact && e < 8; e += 2) {  // two columns of the feature's Hessian
+                for (int e = 0; exact && e < unknowns; e += 2) {  // two columns of the feature's Hessian
                     PairValue<Dual<T>> h;
                     const Dual<T> margin{g.margin[entry], Vec<T>{}, Vec<T>{}};
                     evaluate_pair<T, Dual<T>>(feature, g.shifted_body(i, state, e), g.shifted_body(j, state, e - 4), margin, h);
@@ -206,7 +211,8 @@ INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* 
 
 /// Computes the damped Gauss-Newton direction (or, if `exact`, the damped Newton direction) of every lane: the changes [n, K] of turn
 /// rates (`turn`) and accelerations (`thrust`). Also writes the factors, the energy, its decrease that the damped quadratic model
-/// predicts, and a mask of the lanes in which the damped matrix is positive definite.
+/// predicts, and a mask of the lanes in which the damped matrix is positive definite. Where agents are held, it is the energy of
+/// those that move, given the held ones.
 ///
 /// Every agent has its own damping [n]. Infinite damping makes the reciprocal pivots zero, and therefore the direction as well.
 template <class T, int N>
