@@ -32,6 +32,7 @@ from epo_lightning.game.dynamics import Dynamics, Unicycle, controls_between
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.flatness import followed_controls
+from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import GameParameters, JointForecast, Scene
 from epo_lightning.solvers.backward import Backward, Implicit
@@ -79,7 +80,8 @@ def refine(
         states: futures [B, M, N, K, 4] with x, y [m], heading [rad], speed [m/s], or [B, M, N, K, 2] with x, y only; the
             first step is one time step ``scene.dt`` after t0. Futures of absent agents are ignored.
         probabilities: probabilities [B, M] of the joint modes.
-        scene: the scenes of the forecasts: present states, and sizes if the energy has features of bodies.
+        scene: the scenes of the forecasts: present states, and sizes if the energy has features of bodies. Pair
+            features need no sizes where no scene has two agents.
         energy: the energy; it may need nothing but sizes, reference speeds and reference controls.
         weights: weight of each of the energy's features, a number, or a tensor that can be expanded to [B, M, N] for
             features of agents and to [B, M, P] for those of pairs. None for :data:`WEIGHTS`, which are those of the
@@ -176,7 +178,7 @@ def refined(
         ValueError: an energy, a solver, weights or margins that cannot be used.
     """
     check_energy(energy, solver)
-    scene = _of_game(scene, states.dtype)
+    scene = _of_game(scene, states.dtype, energy)
     controls = track(states, scene, energy.dynamics, noise)
     batch, modes, agents = controls.shape[:3]
     own, pair = energy.weighted
@@ -214,17 +216,20 @@ def refined(
     )
 
 
-def _of_game(scene: Scene, dtype: torch.dtype) -> Scene:
+def _of_game(scene: Scene, dtype: torch.dtype, energy: Energy) -> Scene:
     """The scene of the game, which ends with the forecast: histories, maps and ``game_steps`` are left out."""
 
     def floats(value: Tensor | None) -> Tensor | None:
         return None if value is None else value.to(dtype)
 
+    size = scene.size
+    if size is None and "size" not in energy.needs and not pair_mask(scene).any():
+        size = scene.current.new_zeros(*scene.agent_mask.shape, 2)  # only pair features read it, and there is no pair
     return Scene(
         history=scene.history[:, :, -1:].to(dtype),
         dt=scene.dt,
         agent_mask=scene.agent_mask,
-        size=floats(scene.size),
+        size=floats(size),
         kind=scene.kind,
         reference_speed=floats(scene.reference_speed),
     )

@@ -241,3 +241,36 @@ def test_what_cannot_be_refined_is_refused_by_name(changes, error, message):
 def test_sizes_are_needed_where_bodies_interact():
     scene, states = crossing()
     refused(ValueError, "size", scene=dataclasses.replace(scene, size=None), states=states)
+
+
+def alone(scene: Scene, absent: int = 0, sized: bool = False) -> Scene:
+    """The first agent of a scene, with absent ones, and without sizes."""
+    agents = 1 + absent
+    return Scene(
+        scene.history[:, :agents],
+        dt=scene.dt,
+        agent_mask=torch.arange(agents)[None] < 1,
+        size=scene.size[:, :agents] if sized else None,
+    )
+
+
+@pytest.mark.parametrize("absent", [0, 1])
+def test_agents_without_others_need_no_sizes(absent: int):
+    scene, states = crossing()
+    given = states[:, :, : 1 + absent]
+    refined = refine(given, torch.ones(1, 1), alone(scene, absent))
+    assert_close(refined.states[:, :, 0], states[:, :, 0], rtol=0, atol=1e-3)
+    assert (refined.states == refine(given, torch.ones(1, 1), alone(scene, absent, sized=True)).states).all()
+
+
+def test_agents_without_others_need_sizes_where_their_own_features_do():
+    scene, states = crossing()
+    steers = FeatureEnergy(own=("accref", "turnrref", "steer"), pair=("circles",))
+    refused(
+        ValueError,
+        r"scene\.size.*None",
+        states=states[:, :, :1],
+        scene=alone(scene),
+        energy=steers,
+        weights={**WEIGHTS, "steer": 1.0},
+    )
