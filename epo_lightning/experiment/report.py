@@ -66,10 +66,13 @@ def report(settings: ReportSettings) -> Path:
 
 
 def _default_folder(settings: ReportSettings, sweep: Sweep | None) -> Path:
-    """Folder of a report without ``out``; every results file has its own."""
+    """Folder of a report without ``out``: reports of different runs do not replace each other."""
     if settings.results:
         return Path("report") / results_name(settings.results)
-    return sweep.folder / "report" if sweep else Path("report")
+    if sweep:
+        return sweep.folder / "report"
+    runs, usual = Path(settings.runs).expanduser().resolve(), Path(ReportSettings.runs).resolve()
+    return Path("report") / (runs.relative_to(usual) if runs.is_relative_to(usual) else runs.name)
 
 
 def of_sweep(sweep: Sweep) -> Report:

@@ -161,7 +161,7 @@ def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
         elif not own and file.is_file():
             print(f"  in {file}")
     if settings.run not in pretrained.names():
-        print(f"next: epo report runs={settings.runs or settings.run} out=report")
+        print(f"next: epo report runs={settings.runs or settings.run}")
 
 
 def _tested_on(file: Path) -> str:

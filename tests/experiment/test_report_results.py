@@ -99,6 +99,24 @@ def test_reports_of_two_files_lie_in_folders_with_their_names_and_have_them_as_t
         assert f"<title>{name}" in Path(f"report/{name}/index.html").read_text()
 
 
+def test_reports_of_two_folders_do_not_replace_each_other(tmp_path: Path) -> None:
+    for folder, title in (("runs/rpi", "V-LSTM"), ("mine/one", "first"), ("mine/two", "second")):
+        make_run(Path(folder) / "a", title, "marginal", scores(0.3))
+    made = {
+        "runs": "report",
+        "./runs/": "report",
+        "runs/rpi/a": "report/rpi/a",
+        "mine/one": "report/one",
+        "mine/two/": "report/two",
+        str(tmp_path / "mine"): "report/mine",
+    }
+    for runs, folder in made.items():
+        assert report(ReportSettings(runs=runs, scenes=False)) == Path(folder)
+    assert "first" in Path("report/one/results.md").read_text()
+    assert "second" in Path("report/two/results.md").read_text()
+    assert report(ReportSettings(runs="mine/one", out="chosen", scenes=False)) == Path("chosen")
+
+
 def test_scores_on_other_data_are_rebuilt() -> None:
     three_runs(Path("runs"))
     file = saved()
