@@ -39,7 +39,7 @@ def short_keys(keys: Sequence[str], config: Mapping[str, Any]) -> dict[str, str]
 def labels(
     title: str, settings: Sequence[Mapping[str, Any]], config: Mapping[str, Any], rows: Sequence[str]
 ) -> list[str]:
-    """Labels of rows that share a title.
+    """Labels of rows that share a title: all settings in which they differ, or of many only the names of parts.
 
     Args:
         title: the shared title.
@@ -56,7 +56,8 @@ def labels(
     if len({*names}) < len(names):
         names = named(_shown)
     if len(keys) > MOST:
-        names = [title] * len(settings)
+        settings = [{key: value for key, value in own.items() if key.endswith(".name")} for own in settings]
+        names = named(_shown) if len(settings[0]) <= MOST else [title] * len(settings)
     return [name if names.count(name) == 1 else f"{name}, row {row[:8]}" for name, row in zip(names, rows, strict=True)]
 
 

@@ -77,10 +77,12 @@ def test_labels_round_numbers_unless_that_makes_them_equal() -> None:
     assert of(0.0003453, 0.0003454) == ["V, rate=0.0003453, steps=1234", "V, rate=0.0003454, steps=1234"]
 
 
-def test_rows_with_too_long_labels_are_named_by_their_identity() -> None:
+def test_rows_with_too_long_labels_are_named_by_their_parts_or_their_identity() -> None:
     rows = ["0123456789abcdef", "fedcba9876543210"]
     many = [{f"solver.k{number}": number + row for number in range(5)} for row in range(2)]
     assert labels("V", many, CONFIG, rows) == ["V, row 01234567", "V, row fedcba98"]
+    parts = [{**entry, "backbone.name": name} for entry, name in zip(many, ("v_lstm", "vibes"), strict=True)]
+    assert labels("V", parts, CONFIG, rows) == ["V, backbone.name=v_lstm", "V, backbone.name=vibes"]
     long = [{"solver.name": "x" * 50 + end} for end in "ab"]
     first, second = labels("V", long, CONFIG, rows)
     assert first != second

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -32,6 +32,8 @@ PLUGINS = {
     "hydra/sweeper/optuna": "search",
 }
 """Options that come with another package, and the extra that installs it."""
+TITLED = ("backbone", "forecaster")
+"""Parts that titles of experiments name: "V-LSTM + EPO"."""
 
 
 def tree() -> Path:
@@ -94,7 +96,7 @@ def resolve(config: DictConfig) -> dict[str, Any]:
 
     Adds ``experiment`` and, for `epo train`, ``variant``. ``variant`` is empty if all settings that decide on the result
     have the values of the experiment's file and the budget's file. Otherwise it is six digits of a hash of those settings,
-    without the seed.
+    without the seed. A title from the experiment's file gets the names of backbone and forecaster where they differ from it.
 
     Raises:
         ConfigError: an interpolation of a key that does not exist, or a value that is still missing.
@@ -110,24 +112,38 @@ def resolve(config: DictConfig) -> dict[str, Any]:
         own = canonical(essence(of_row(values)))
         words = tuple(f"{group}={choices[group]}" for group in ("experiment", "budget") if choices.get(group))
         search_path = GlobalHydra.instance().config_loader().get_search_path().get_path()
-        same = own == _as_written(words, tuple(entry.path for entry in search_path))
+        written = _as_written(words, tuple(entry.path for entry in search_path))
+        same = written is not None and own == canonical(essence(of_row(written)))
         values["variant"] = "" if same else hashlib.sha256(own.encode()).hexdigest()[:6]
+        if written is not None and choices.get("experiment"):
+            values["title"] = _true_title(values, written)
     return values
 
 
-@cache
-def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> str | None:
-    """The essence (:func:`~epo_lightning.identity.essence`) of a configuration with the overrides ``words`` only, as JSON.
+def _true_title(values: Mapping[str, Any], written: Mapping[str, Any]) -> Any:
+    """The title of a run; where it is that of the experiment's file, with the names of parts that differ from this file."""
+    if values["title"] != written["title"]:
+        return values["title"]
+    names = {part: _name(values, part) for part in TITLED if _name(values, part) != _name(written, part)}
+    return ", ".join([str(values["title"]), *(f"{part}={name}" for part, name in names.items())])
 
-    The seed is left out. None if the configuration cannot be composed with these overrides alone.
-    """
+
+def _name(values: Mapping[str, Any], part: str) -> Any:
+    """The name of a part; None where its section is missing, which the schema refuses later."""
+    section = values.get(part)
+    return section.get("name") if isinstance(section, Mapping) else None
+
+
+@cache
+def _as_written(words: tuple[str, ...], search_path: tuple[str, ...]) -> dict[str, Any] | None:
+    """The configuration with the overrides ``words`` only; None if it cannot be composed with these alone."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.types import RunMode
 
     loader = GlobalHydra.instance().config_loader()
     try:
         config = loader.load_configuration("train", list(words), run_mode=RunMode.RUN)
-        return canonical(essence(of_row(_plain_values(config))))
+        return _plain_values(config)
     except Exception:  # a mandatory value is missing: only the other overrides of the run give it
         return None
 

@@ -287,6 +287,17 @@ def test_run_folders_are_named_by_their_settings() -> None:
     assert variant("optimizer.clip=1") == variant("optimizer.clip=1.0") != ""
 
 
+def test_titles_name_the_backbone_and_the_forecaster_that_differ_from_those_of_the_row() -> None:
+    def title(*words: str) -> str:
+        return compose("train", ["experiment=highway/v_lstm_epo", *words])["title"]
+
+    assert title() == title("backbone=v_lstm", "solver=converging", "seed=7") == "V-LSTM + EPO"
+    assert title("backbone=vibes") == "V-LSTM + EPO, backbone=vibes"
+    assert title("backbone=vibes", "data=highway_sim", "budget=short") == "V-LSTM + EPO, backbone=vibes"
+    assert title("forecaster=marginal", "backbone=hivt_m") == "V-LSTM + EPO, backbone=hivt_m, forecaster=marginal"
+    assert title("backbone=vibes", "title=mine") == "mine"
+
+
 def test_globs_find_experiments_in_folders() -> None:
     listed = jobs("train", ["experiment=glob('rpi/*')", "seed=1,2,3"])
     assert ["experiment=rpi/v_lstm_epo", "seed=2"] in listed
