@@ -200,10 +200,16 @@ def _config(arguments: Arguments) -> None:
 
     settings = read(Settings, config)
     data, model = assembly.check_buildable(settings)
+    try:
+        digest = data.digest
+    except ConfigError as error:
+        raise ConfigError(
+            f"{settings.title}: the settings fit together, but the data cannot be used: {error}"
+        ) from error
     run = train.folder_for(settings)
     print(f"{settings.title}: the configuration is valid")
     print(f"  parameters  {assembly.parameters(model)}")
-    print(f"  data        {settings.data['name']}, digest {data.digest}")
+    print(f"  data        {settings.data['name']}, digest {digest}")
     print(f"  run folder  {run.path}" + (" (exists)" if run.exists else ""))
 
 

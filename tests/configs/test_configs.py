@@ -276,6 +276,20 @@ def test_help_and_configurations_are_printed(epo: Epo, capsys: pytest.CaptureFix
     assert not list(Path.cwd().iterdir())
 
 
+def test_a_check_without_the_data_says_in_one_line_what_is_missing(
+    epo: Epo,  # noqa: F811
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert epo("config", "check", "experiment=exid/v_lstm_epo", "data.folder=nowhere", "data.root=empty") == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith(
+        "epo: V-LSTM + EPO: the settings fit together, but the data cannot be used: no folder"
+    )
+    assert "nowhere with exid recordings" in printed.err
+    assert printed.err.endswith("point data.folder at the recordings, or unpack them there\n")
+
+
 def test_user_configuration_folders_take_precedence() -> None:
     assert compose("train", ["data=tiny"], [str(tiny.CONF)])["data"]["name"] == "tiny"
 
