@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 
 import numpy as np
@@ -27,13 +27,14 @@ from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner
 from epo_lightning.drive.ride import Moment
 from epo_lightning.drive.road_game import keep_going
 from epo_lightning.drive.traffic import TrafficWorld
-from epo_lightning.drive.world import EGO
+from epo_lightning.drive.world import EGO, Search
 from epo_lightning.drive.worlds import place
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import ACCELERATION, HEADING, SPEED, GameParameters, Scene
@@ -49,11 +50,21 @@ SAME = 0.01
 class Accelerated(ResponsePlanner):
     """A response to a forecast in which all others accelerate more, or less, by a constant; they never drive backwards.
 
-    Attributes:
-        change: the acceleration [m/s^2] that is added.
+    Args:
+        change: the acceleration [m/s^2] that is added; the other arguments are those of the response.
     """
 
-    change = 0.0
+    def __init__(
+        self,
+        change: float,
+        energy: FeatureEnergy,
+        game: Callable[[Scene], GameParameters],
+        forecaster: Forecaster | None = None,
+        search: Search | None = None,
+        agents: int | None = None,
+    ) -> None:
+        super().__init__(energy, game, forecaster, search, agents)
+        self.change = change
 
     def expected(self, scene: Scene, game: GameParameters) -> Float[Tensor, "B 1 N K 2"]:
         """Controls that the others are expected to take, changed."""
@@ -174,11 +185,11 @@ def report(runs: Sequence[str], traffic: str, episodes: int, watched: int, seed:
         planners: dict[str, ResponsePlanner] = {}
         pairs: list[tuple[str, str]] = []
         for name, forecaster in forecasters.items():
-            changed = Accelerated(world.energy, world.game, forecaster, world.search, world.agents)
-            changed.change = change if forecaster is None else -change
-            pairs.append((f"{name}, {changed.change:+.2f} m/s²", name))
-            planners[name] = ResponsePlanner(world.energy, world.game, forecaster, world.search, world.agents)
-            planners[pairs[-1][0]] = changed
+            planner = world.energy, world.game, forecaster, world.search, world.agents
+            added = change if forecaster is None else -change
+            pairs.append((f"{name}, {added:+.2f} m/s²", name))
+            planners[name] = ResponsePlanner(*planner)
+            planners[pairs[-1][0]] = Accelerated(added, *planner)
         measured = drive(world, planners)
     print(f"{'response to':<40}{'collisions [%]':>26}{'progress [m]':>14}")
     for name, measures in measured.items():

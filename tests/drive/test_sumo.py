@@ -182,11 +182,9 @@ def test_others_are_expected_to_accelerate_by_a_constant_and_never_backwards(
 ) -> None:
     world.reset([0])
     scene = world.observe().to(torch.float64)
-    planner = forecast_speed.Accelerated(world.energy, world.game, None, world.search)
     game = world.game(scene)
-    usual = planner.expected(scene, game)
-    planner.change = change
-    controls = planner.expected(scene, game)
+    usual = ResponsePlanner(world.energy, world.game, None, world.search).expected(scene, game)
+    controls = forecast_speed.Accelerated(change, world.energy, world.game, None, world.search).expected(scene, game)
     states = world.energy.dynamics.rollout(scene.current[:, None], controls, scene.dt)
     there = scene.agent_mask[0]
     assert torch.equal(controls[..., 1], usual[..., 1])
