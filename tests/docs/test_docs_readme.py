@@ -14,7 +14,7 @@ README = ROOT / "README.md"
 DATA = ["data.games=6", "data.placements=1"]
 CHEAPER = {
     "epo generate": [*DATA, "workers=1", "progress=false"],
-    "epo drive run=rpi/v_lstm_epo": ["episodes=1", "timed=1", "ways=[own]", "baselines=[]"],
+    "epo drive run=rpi/v_lstm_epo_game_refined": ["episodes=1", "timed=1", "ways=[own]", "baselines=[]"],
     "epo train experiment=rpi/v_lstm_epo budget=long": [
         *DATA,
         "budget=smoke",

@@ -148,6 +148,7 @@ OF_RPI = {
         ("The paper's split", "rpi_paper_split", 3),
         ("The paper's split", "rpi_paper_split_game", 1),
         ("A search of the settings", "rpi_search_winners", 2),
+        ("Searched settings on the paper's split", "rpi_paper_split_winners", 3),
         ("The paper's loss", "rpi_hard", 3),
     ],
 )
@@ -164,13 +165,24 @@ def test_the_page_of_rpi_has_the_scores_of_its_files(heading: str, file: str, ro
     assert found == rows
 
 
-def test_the_page_of_rpi_has_the_search() -> None:
-    runs = read_results(ROOT / "results" / "rpi_search.json").evaluated
-    section = RPI.partition("\n## A search of the settings\n")[2].partition("\n## ")[0].splitlines()
-    for name in ("SC", "EPO"):
-        own = [run for run in runs if run.name == f"V-LSTM + {name}, relaxed"]
+@pytest.mark.parametrize(
+    ("heading", "file", "rows"),
+    [
+        ("A search of the settings", "rpi_search", {"+SC": " + SC", "+EPO": " + EPO"}),
+        (
+            "Searched settings on the paper's split",
+            "rpi_paper_split_search",
+            {"marginal": "", "+SC": " + SC", "+EPO": " + EPO"},
+        ),
+    ],
+)
+def test_the_page_of_rpi_has_the_searches(heading: str, file: str, rows: dict[str, str]) -> None:
+    runs = read_results(ROOT / "results" / f"{file}.json").evaluated
+    section = RPI.partition(f"\n## {heading}\n")[2].partition("\n## ")[0].splitlines()
+    for shown, name in rows.items():
+        own = [run for run in runs if run.name == f"V-LSTM{name}, relaxed"]
         own.sort(key=lambda run: (run.config["optimizer"]["lr"], run.config["backbone"]["dropout"]))
-        line = next(line for line in section if line.startswith(f"| +{name} |"))
+        line = next(line for line in section if line.startswith(f"| {shown} |"))
         assert numbers(line) == [short(run.metrics["minSADE"], 4) for run in own]
 
 
@@ -285,7 +297,7 @@ def test_the_page_of_rpi_has_the_scores_on_shares_of_the_games() -> None:
         ("V-LSTM + EPO, game: inferred", "v_lstm_epo_game", 5),
     ):
         line = numbers(next(line for line in section if line.startswith(f"| {start}")))
-        for cell, share in zip(line, (0.01, 0.1, 1.0), strict=True):
+        for cell, share in zip(line, (0.01, 0.03, 0.1, 0.3, 1.0), strict=True):
             values = found.get((row, share), [])
             assert len(values) in (0, 3)
             shown = f"{short(fmean(values), digits)} ± {short(stdev(values), digits)}" if values else "-"
