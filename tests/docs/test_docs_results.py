@@ -165,6 +165,14 @@ def test_the_page_of_rpi_has_the_scores_of_its_files(heading: str, file: str, ro
     assert found == rows
 
 
+def test_the_page_of_feedback_players_has_the_scores_of_its_file() -> None:
+    page = (ROOT / "docs" / "rpi.md").read_text(encoding="utf-8")
+    for row in distinct(build_tables(read_results(ROOT / "results" / "rpi_feedback.json").evaluated)):
+        line = next(line for line in page.splitlines() if line.startswith(f"| {row.title} |"))
+        cells = [row.cells[metric] for metric in ("minSADE", "minSFDE")]
+        assert numbers(line)[:2] == [f"{short(c.mean, 4)} ± {short(c.deviation or 0, 4)}" for c in cells], row.title
+
+
 @pytest.mark.parametrize(
     ("heading", "file", "rows"),
     [
