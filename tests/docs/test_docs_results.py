@@ -316,9 +316,10 @@ def test_the_pages_of_roads_have_the_differences_of_their_files(heading: str, fi
 
 def test_the_page_of_rpi_has_the_scores_on_shares_of_the_games() -> None:
     found: dict[tuple[str, float], list[float]] = {}
-    for run in read_results(ROOT / "results" / "rpi_games_share.json").evaluated:
+    for run in sorted(read_results(ROOT / "results" / "rpi_games_share.json").evaluated, key=lambda run: run.seed):
         share = run.config["data"].get("games_share", 1.0)
         found.setdefault((run.experiment.removeprefix("rpi/"), share), []).append(run.metrics["minSADE"])
+    shares = (0.01, 0.03, 0.1, 0.3, 1.0)
     section = RPI.partition("\n## Fewer games\n")[2].partition("\n## ")[0].splitlines()
     for start, row, digits in (
         ("V-LSTM + SC, relaxed", "v_lstm_sc_relaxed", 4),
@@ -327,8 +328,12 @@ def test_the_page_of_rpi_has_the_scores_on_shares_of_the_games() -> None:
         ("V-LSTM + EPO, game: inferred", "v_lstm_epo_game", 5),
     ):
         line = numbers(next(line for line in section if line.startswith(f"| {start}")))
-        for cell, share in zip(line, (0.01, 0.03, 0.1, 0.3, 1.0), strict=True):
-            values = found.get((row, share), [])
-            assert len(values) in (0, 3)
-            shown = f"{short(fmean(values), digits)} ± {short(stdev(values), digits)}" if values else "-"
-            assert cell == shown, (row, share)
+        for cell, share in zip(line, shares, strict=True):
+            values = found[row, share]
+            assert len(values) == 3
+            assert cell == f"{short(fmean(values), digits)} ± {short(stdev(values), digits)}", (row, share)
+    for start, row in (("the paper's energy", "v_lstm_epo_relaxed"), ("game, refined", "v_lstm_epo_game_refined")):
+        line = numbers(next(line for line in section if line.startswith(f"| {start}")))
+        for cell, share in zip(line, shares, strict=True):
+            pairs = zip(found[row, share], found["v_lstm_sc_relaxed", share], strict=True)
+            assert cell == interval([ours - theirs for ours, theirs in pairs], 4), (row, share)
