@@ -13,8 +13,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,14 +28,13 @@ from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner
 from epo_lightning.drive.ride import Moment
 from epo_lightning.drive.road_game import keep_going
 from epo_lightning.drive.traffic import TrafficWorld
-from epo_lightning.drive.world import EGO, Search
+from epo_lightning.drive.world import EGO
 from epo_lightning.drive.worlds import place
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import ACCELERATION, HEADING, SPEED, GameParameters, Scene
@@ -51,19 +51,12 @@ class Accelerated(ResponsePlanner):
     """A response to a forecast in which all others accelerate more, or less, by a constant; they never drive backwards.
 
     Args:
-        change: the acceleration [m/s^2] that is added; the other arguments are those of the response.
+        change: the acceleration [m/s^2] that is added.
+        response: arguments of :class:`~epo_lightning.drive.planners.ResponsePlanner`.
     """
 
-    def __init__(
-        self,
-        change: float,
-        energy: FeatureEnergy,
-        game: Callable[[Scene], GameParameters],
-        forecaster: Forecaster | None = None,
-        search: Search | None = None,
-        agents: int | None = None,
-    ) -> None:
-        super().__init__(energy, game, forecaster, search, agents)
+    def __init__(self, change: float, *response: Any) -> None:
+        super().__init__(*response)
         self.change = change
 
     def expected(self, scene: Scene, game: GameParameters) -> Float[Tensor, "B 1 N K 2"]:

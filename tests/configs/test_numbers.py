@@ -64,7 +64,8 @@ def changed(key: str, value: Any) -> dict[str, Any]:
 
 
 def test_the_default_configuration_is_accepted() -> None:
-    assembly.check_buildable(read(Settings, CONFIG))
+    _, model = assembly.check_buildable(read(Settings, CONFIG))
+    assert assembly.parameters(model) > 0
 
 
 @pytest.mark.parametrize(("key", "value"), CASES, ids=lambda case: str(case))
