@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 VECTOR = 4
@@ -48,6 +51,27 @@ class LanePolylines(nn.Module):
             assert isinstance(linear, nn.Linear)
             # The linear map of the concatenation, without a copy of the maximum for every vector.
             of_vector, of_polyline = linear.weight.split(self.width, 1)
-            of_maximum = F.linear(features.amax(-2), of_polyline, linear.bias)
+            of_maximum = F.linear(_Largest.apply(features), of_polyline, linear.bias)
             features = norm(F.linear(features, of_vector).add_(of_maximum[..., None, :])).relu_()
-        return features.amax(-2)
+        return _Largest.apply(features)
+
+
+class _Largest(torch.autograd.Function):
+    """Maximum over the last dimension but one, with the gradient of ``Tensor.amax``: equal entries share it.
+
+    The backward pass of ``amax`` is a quarter of the encoder's, because it makes a tensor of booleans and converts it.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Float[Tensor, "*batch V F"]) -> Float[Tensor, "*batch F"]:
+        largest = values.amax(-2)
+        ctx.save_for_backward(values, largest)
+        return largest
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Float[Tensor, "*batch F"]) -> Float[Tensor, "*batch V F"]:
+        values, largest = ctx.saved_tensors
+        # The sign of the difference is -1, and 0 for the largest.
+        is_largest = values.sub(largest[..., None, :]).sign_().add_(1)
+        return is_largest.mul_((gradient / is_largest.sum(-2))[..., None, :])
