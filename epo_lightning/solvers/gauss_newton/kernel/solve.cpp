@@ -326,24 +326,33 @@ class Range {
                 damping[i] = given[i];
                 raised[i] = most<T>(given[i], splat<T>(T(kLeastRaisedDamping)));
             }
-            Mask<T> positive, failed{};
+            Mask<T> open = ~Mask<T>{}, failed{};  // lanes without a direction, and lanes that needed more damping
             for (int attempt = 0;; ++attempt) {
-                solve_step(group, exact, damping, factors, turn, thrust, found, decrease, positive);
-                if (attempt == kRetries || !any<T>(~positive)) break;
-                failed |= ~positive;
+                // The adjoint needs the factors of all lanes, so that those with a direction are computed again.
+                Mask<T> positive = record ? ~Mask<T>{} : open;
+                solve_step(group, exact, damping, factors, turn, thrust, energy ? &found : nullptr, decrease, positive);
+                const bool last = attempt == kRetries;
+                uint32_t fresh = 0;
+                for (int lane = 0; lane < filled; ++lane) {
+                    if (!open[lane] || !(positive[lane] || last)) continue;
+                    fresh |= uint32_t(1) << lane;
+                    if (predicted) predicted[group.problem[lane]] += positive[lane] ? decrease[lane] : T(INFINITY);
+                }
+                group.store(turn, thrust, fresh, directions);
+                open &= ~positive;
+                if (last || !any<T>(open)) break;
+                failed |= open;
                 for (int i = 0; i < n; ++i) {
                     raised[i] *= T(10);
-                    damping[i] = positive ? damping[i] : given[i] + raised[i];
+                    damping[i] = open ? given[i] + raised[i] : damping[i];
                 }
             }
             for (int lane = 0; lane < filled; ++lane) {
                 const int problem = group.problem[lane];
                 if (failed[lane]) status[problem] = std::max<int64_t>(status[problem], DAMPED);
-                if (!positive[lane]) step.taken[problem - first_] = 0;
+                if (open[lane]) step.taken[problem - first_] = 0;
                 if (energy) energy[problem] += found[lane];
-                if (predicted) predicted[problem] += positive[lane] ? decrease[lane] : T(INFINITY);
             }
-            group.store(turn, thrust, first_lanes(filled), directions);
         });
         for (int64_t problem = first_; problem < last_; ++problem) {
             T *d = directions + problem * size_, *to = next + problem * size_;

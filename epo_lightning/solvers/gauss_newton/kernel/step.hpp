@@ -78,6 +78,7 @@ NOINLINE void add_state_pair_costs(const Games<T>& g, int state, bool exact, Vec
                 const int entry = feature * g.pairs + pair;
                 evaluate_pair<T, Vec<T>>(feature, g.body(i, state), g.body(j, state), g.margin[entry], d);
                 const Vec<T> weight = g.pair_weight[entry], pushed = weight * weight * d.value;
+                if (!any<T>(pushed != 0)) continue;  // a feature that is not active has no derivatives either
                 energy += T(0.5) * pushed * d.value;
                 int at[8];
                 entries_of(i, j, m, at);
@@ -87,13 +88,18 @@ NOINLINE void add_state_pair_costs(const Games<T>& g, int state, bool exact, Vec
                 for (int e = 0; e < unknowns; ++e) row[e] = weight * d.by[e];
                 for (int e = 0; e < unknowns; ++e)
                     for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += row[e] * row[f];
-                for (int e = 0; exact && e < unknowns; e += 2) {  // two columns of the feature's Hessian
-                    PairValue<Dual<T>> h;
+                // Two columns of the feature's Hessian at a time. Features depend on the difference of the two positions, so the
+                // columns of the second one are those of the first with the other sign.
+                PairValue<Dual<T>> of_position, of_motion;
+                for (int e = 0; exact && e < unknowns; e += 2) {
+                    PairValue<Dual<T>>& h = e == X1 || e == X2 ? of_position : of_motion;
                     const Dual<T> margin{g.margin[entry], Vec<T>{}, Vec<T>{}};
-                    evaluate_pair<T, Dual<T>>(feature, g.shifted_body(i, state, e), g.shifted_body(j, state, e - 4), margin, h);
-                    for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += pushed * h.by[f].a;
+                    if (e != X2)
+                        evaluate_pair<T, Dual<T>>(feature, g.shifted_body(i, state, e), g.shifted_body(j, state, e - 4), margin, h);
+                    const Vec<T> factor = e == X2 ? -pushed : pushed;
+                    for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += factor * h.by[f].a;
                     for (int f = 0; f <= e + 1; ++f)
-                        P[std::max(at[e + 1], at[f]) * ld + std::min(at[e + 1], at[f])] += pushed * h.by[f].b;
+                        P[std::max(at[e + 1], at[f]) * ld + std::min(at[e + 1], at[f])] += factor * h.by[f].b;
                 }
             }
     }
@@ -210,15 +216,17 @@ INLINE void push(const Group<T, N>& g, const Factors<T>& factors, const Vec<T>* 
 }
 
 /// Computes the damped Gauss-Newton direction (or, if `exact`, the damped Newton direction) of every lane: the changes [n, K] of turn
-/// rates (`turn`) and accelerations (`thrust`). Also writes the factors, the energy, its decrease that the damped quadratic model
-/// predicts, and a mask of the lanes in which the damped matrix is positive definite. Where agents are held, it is the energy of
-/// those that move, given the held ones.
+/// rates (`turn`) and accelerations (`thrust`). Also writes the factors, the decrease of the energy that the damped quadratic model
+/// predicts and, unless it is null, the energy. Where agents are held, it is the energy of those that move, given the held ones.
+///
+/// `positive` is the mask of the lanes that are wanted; it becomes the mask of those of them in which the damped matrix is positive
+/// definite. If there is none, directions are zero, and what is left of the recursion is left out unless the energy is wanted.
 ///
 /// Every agent has its own damping [n]. Infinite damping makes the reciprocal pivots zero, and therefore the direction as well.
 template <class T, int N>
 void solve_step(
     const Group<T, N>& g, bool exact, const Vec<T>* damping, const Factors<T>& factors, Vec<T>* turn, Vec<T>* thrust,
-    Vec<T>& energy, Vec<T>& predicted, Mask<T>& positive) {
+    Vec<T>* energy, Vec<T>& predicted, Mask<T>& positive) {
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
     Vec<T>*P = g.arena.take(ld * ld), *y = g.arena.take(ld), *h = g.arena.take(g.K * m), *damped = g.arena.take(m);
     Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
@@ -228,16 +236,16 @@ void solve_step(
     // Only if `exact`: the gradient of the energy by a common shift of all later positions of an agent, and y before a state.
     Vec<T>*shift = g.arena.take(m), *before = g.arena.take(m);
     for (int e = 0; e < m; ++e) shift[e] = Vec<T>{};
-    energy = predicted = Vec<T>{};
-    positive = ~Mask<T>{};
+    Vec<T> found = predicted = Vec<T>{};
     for (int k = g.K - 1; k >= 0; --k) {
+        if (!energy && !any<T>(positive)) break;
         Vec<T>*L = factors.L + std::size_t(k) * m * m, *G = factors.G + std::size_t(k) * m * ld, *linear = h + k * m;
         g.enter(k);
         for (int e = 0; exact && e < m; ++e) before[e] = y[e];
-        energy += add_state_costs(g, k + 1, exact, P, y);
+        found += add_state_costs(g, k + 1, exact, P, y);
         for (int e = 0; exact && e < m; ++e) shift[e] += y[e] - before[e];
         costs.set(g, k, exact);
-        energy += costs.energy;
+        found += costs.energy;
         g.motions(k, Z);
         for (int r = 0; r < m; ++r) damped[r] = costs.stiffness[r] + damping[r / 2];
         if (g.cut)  // steps after the end of a game have no costs: a unit matrix keeps them regular without damping
@@ -263,7 +271,9 @@ void solve_step(
             P[v * ld + v - 1] += y_ * Z[i].x_speed - x * Z[i].y_speed;
         }
     }
-    push(g, factors, h, turn, thrust);
+    if (energy) *energy = found;
+    if (any<T>(positive)) return push(g, factors, h, turn, thrust);
+    for (int e = 0; e < n * g.K; ++e) turn[e] = thrust[e] = Vec<T>{};
 }
 
 /// Overwrites a cotangent v [n, K] of turn rates and accelerations with mu = H^-1 v, zero after the end of a game.
