@@ -23,6 +23,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +40,8 @@ REQUIRED = ("states", "probabilities", "history", "dt")
 OPTIONAL = ("agent_mask", "history_mask", "size", "kind", "id")
 FORECASTS = "forecasts.safetensors"
 """Name of the file of tensors that ``epo predict`` writes, beside ``index.json``."""
+_DAMAGED = (OSError, ValueError, EOFError, AttributeError, TypeError, NotImplementedError, RuntimeError)
+"""Errors of NumPy and zipfile for damaged archives, beside those of their own."""
 
 
 class Predictions(NamedTuple):
@@ -86,21 +89,34 @@ def read_predictions(path: str | Path) -> Predictions:
         if name not in arrays:
             raise ConfigError(f"{path} lacks the array {name!r}; it has {', '.join(sorted(arrays)) or 'none'}")
     try:
-        tensors = {
-            name: torch.from_numpy(np.asarray(arrays[name])) for name in (*REQUIRED, *OPTIONAL) if name in arrays
-        }
+        dt = np.asarray(arrays["dt"])
+        if dt.size != 1 or dt.dtype.kind not in "fiu":
+            raise ValueError(f"dt has shape {list(dt.shape)} and type {dt.dtype}; it is one number of seconds")
+        names = [name for name in (*REQUIRED, *OPTIONAL) if name in arrays and name != "dt"]
+        tensors = {name: _tensor(name, arrays[name]) for name in names}
         number = torch.float64 if tensors["states"].dtype == torch.float64 else torch.float32
         tensors = {name: t.to(number) if t.is_floating_point() else t for name, t in tensors.items()}
-        if tensors["dt"].numel() != 1:
-            raise ValueError(f"dt has shape {list(tensors['dt'].shape)}; it is one number of seconds")
         scene = Scene(
-            dt=float(arrays["dt"]), **{name: t for name, t in tensors.items() if name not in ("dt", *REQUIRED[:2])}
+            dt=float(dt.item()), **{name: t for name, t in tensors.items() if name not in ("states", "probabilities")}
         )
         check_forecast(tensors["states"], tensors["probabilities"], scene)
         scene.validate_values()
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{path}: {error}") from error
     return Predictions(tensors["states"], tensors["probabilities"], scene)
+
+
+def _tensor(name: str, array: Any) -> Tensor:
+    """An array as a tensor, in the byte order of this machine.
+
+    Raises:
+        TypeError: no array of numbers; the message names it.
+    """
+    array = np.asarray(array)
+    try:
+        return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
+    except TypeError:
+        raise TypeError(f"{name} is of type {array.dtype}, expected numbers that PyTorch has, such as float32") from None
 
 
 def _archive(path: Path) -> dict[str, Any]:
@@ -114,7 +130,7 @@ def _archive(path: Path) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = dict(archive)
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+    except (*_DAMAGED, zipfile.BadZipFile, zlib.error) as error:
         raise ConfigError(f"{path} is not a NumPy archive of plain arrays, or is damaged ({error})") from error
     known = (*REQUIRED, *OPTIONAL)
     for name in arrays:
@@ -137,10 +153,9 @@ def _folder(path: Path) -> dict[str, Any]:
         if not file.is_file():
             raise ConfigError(f"{path} lacks {file.name}: give an .npz file, or the folder that `epo predict` wrote")
     try:
-        found = load_file(tensors)
-        return {
-            **{name: found[name] for name in (*REQUIRED, *OPTIONAL) if name in found},
-            "dt": json.loads(index.read_text())["dt"],
-        }
+        found, about = load_file(tensors), json.loads(index.read_text(encoding="utf-8"))
+        if not isinstance(about, dict) or "dt" not in about:
+            raise ValueError(f"{index.name} has no entry dt")
+        return {**{name: found[name] for name in (*REQUIRED, *OPTIONAL) if name in found}, "dt": about["dt"]}
     except (OSError, ValueError, KeyError, SafetensorError) as error:
         raise ConfigError(f"{path} was not written by `epo predict`, or is damaged ({error})") from error

@@ -200,7 +200,8 @@ class Scene(Batch):
         """Refuse values that no forecaster can use. On a GPU, this check makes the host wait for the tensors.
 
         Raises:
-            ValueError: a length or width that is not positive, or the index of a reference line that does not exist.
+            ValueError: a length or width that is not positive, a kind that does not exist, or the index of a reference
+                line that does not exist.
         """
         if self.size is not None:
             bad = ~(self.size > 0).all(-1) & self.agent_mask
@@ -209,6 +210,14 @@ class Scene(Batch):
                 raise ValueError(
                     f"scene.size[{scene}, {agent}] is {self.size[scene, agent].tolist()}; length and width must be "
                     "positive [m]"
+                )
+        if self.kind is not None:
+            bad = ((self.kind < 0) | (self.kind >= len(KINDS))) & self.agent_mask
+            if bad.any():
+                scene, agent = bad.nonzero()[0].tolist()
+                raise ValueError(
+                    f"scene.kind[{scene}, {agent}] is {int(self.kind[scene, agent])}; kinds are 0 to {len(KINDS) - 1}: "
+                    f"{', '.join(KINDS)}"
                 )
         if self.goal_reference is not None and self.references is not None:
             lines = self.references.shape[2]

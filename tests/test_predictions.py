@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from games import highway_scene, pad
+from safetensors.numpy import save_file
 
 from epo_lightning import refine
 from epo_lightning.experiment import train
@@ -92,6 +93,11 @@ def good() -> dict[str, Any]:
         ({"agent_mask": np.ones((3, 4))}, "agent_mask"),
         ({"size": np.zeros((3, 4, 2))}, "length and width must be positive"),
         ({"states": np.array([object()])}, "not a NumPy archive of plain arrays"),
+        ({"dt": np.True_}, "dt has .* type bool; it is one number"),
+        ({"dt": np.array("a")}, "dt has .* it is one number"),
+        ({"id": np.array(["a", "b", "c"])}, "id is of type <U1, expected numbers"),
+        ({"kind": np.full((3, 4), 9)}, r"scene\.kind\[0, 0\] is 9; kinds are 0 to 7"),
+        ({"kind": np.full((3, 4), -2)}, r"scene\.kind\[0, 0\] is -2"),
     ],
 )
 def test_mistakes_are_named(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -99,6 +105,38 @@ def test_mistakes_are_named(changes: dict[str, Any], message: str, tmp_path: Pat
     with pytest.raises(ConfigError, match=message) as error:
         read_predictions(tmp_path / "bad.npz")
     assert "bad.npz" in str(error.value)
+
+
+def test_dt_in_a_list_and_other_byte_orders_are_read(tmp_path: Path) -> None:
+    plain = good()
+    np.savez(tmp_path / "plain.npz", **plain)
+    np.savez(tmp_path / "other.npz", **{**plain, "dt": np.array([0.2]), "states": plain["states"].astype(">f4")})
+    one, other = (read_predictions(tmp_path / f"{name}.npz") for name in ("plain", "other"))
+    assert torch.equal(one.states, other.states)
+    assert one.scene.dt == other.scene.dt == 0.2
+
+
+def test_archives_and_folders_with_wrong_bytes_are_named(tmp_path: Path) -> None:
+    """Damaged archives raise errors of zlib and zipfile, and not only those of NumPy."""
+    file = write_predictions(tmp_path / "mine.npz", *forecasts(), highway_scene(3))
+    content, random = file.read_bytes(), np.random.default_rng(0)
+    refused = 0
+    for _ in range(200):
+        damaged = bytearray(content)
+        for at in random.integers(len(content), size=4):
+            damaged[at] = random.integers(256)
+        file.write_bytes(damaged)
+        try:
+            read_predictions(file)
+        except ConfigError as error:
+            assert "mine.npz" in str(error)
+            refused += 1
+    assert refused > 100
+    save_file({"states": np.ones((1, 1, 1, 2, 2), "f4")}, tmp_path / "forecasts.safetensors")
+    for index in ("[1]", "null", '"dt"', "{}"):
+        (tmp_path / "index.json").write_text(index)
+        with pytest.raises(ConfigError, match=r"index\.json has no entry dt"):
+            read_predictions(tmp_path)
 
 
 def test_missing_damaged_and_misnamed_files_are_named(tmp_path: Path) -> None:
