@@ -116,7 +116,9 @@ def _tensor(name: str, array: Any) -> Tensor:
     try:
         return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
     except TypeError:
-        raise TypeError(f"{name} is of type {array.dtype}, expected numbers that PyTorch has, such as float32") from None
+        raise TypeError(
+            f"{name} is of type {array.dtype}, expected numbers that PyTorch has, such as float32"
+        ) from None
 
 
 def _archive(path: Path) -> dict[str, Any]:

@@ -48,6 +48,10 @@ def _or_null(check: Check) -> Check:
 TEXT: Check = "a text", _text
 TEXTS: Check = "a list of texts", lambda value: _all(value, _text)
 ROWS: Check = "a list of lists of texts", lambda value: _all(value, TEXTS[1])
+LOG: Check = (
+    "a list of lists of a step and perhaps a score, as texts",
+    lambda value: ROWS[1](value) and all(row and row[0].isdecimal() and len(row) < 3 for row in value),
+)
 PAIRS: Check = "a list of pairs of texts", lambda value: ROWS[1](value) and all(len(row) == 2 for row in value)
 OBJECT: Check = "an object", _object
 OBJECTS: Check = "a list of objects", lambda value: _all(value, _object)

@@ -34,11 +34,11 @@ from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.curves import METRIC
 from epo_lightning.report.entries import (
+    LOG,
     OBJECT,
     OBJECTS,
     OBJECTS_BY_NAME,
     PAIRS,
-    ROWS,
     TEXT,
     TEXTS,
     check_configuration,
@@ -61,7 +61,7 @@ RECORDED = (
 LOGGED = ("step", METRIC)
 """Columns of the log that are saved."""
 _REPORT = {"title": TEXT, "command": TEXT, "sweep": TEXT, "left_out": PAIRS, "runs": OBJECTS}
-_RUN = {"folder": TEXT, "reported": TEXTS, "config": OBJECT, "record": OBJECT, "scores": OBJECTS_BY_NAME, "log": ROWS}
+_RUN = {"folder": TEXT, "reported": TEXTS, "config": OBJECT, "record": OBJECT, "scores": OBJECTS_BY_NAME, "log": LOG}
 
 
 @dataclass(frozen=True, eq=False)

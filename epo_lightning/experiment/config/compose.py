@@ -7,8 +7,9 @@ composed and checked before anything else happens, so that a misspelt word is re
 from __future__ import annotations
 
 import hashlib
+import inspect
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from epo_lightning.experiment.config.sources import recorded_name
 from epo_lightning.identity import canonical, essence, of_row
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError, nearest, parts
 
 if TYPE_CHECKING:
     from hydra._internal.hydra import Hydra
@@ -317,12 +318,20 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             return f"{key} is a setting of a gate, but no gate is chosen: add {choice}, or leave it out"
         if word not in names and not walked and (options := options_of(instance, word)):
             return f"{key} needs a choice of {word}: add {word}=<one of {', '.join(options)}>"
+        if word not in names and len(walked) == 1 and names and word in _arguments(walked[0], config):
+            return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
         if word not in names:
             level = f" in {'.'.join(walked)}" if walked else ""
             return f"unknown key {key!r}{level}: {nearest(word, names)}"
         walked.append(word)
         config = config[word]
     return f"unknown key {key!r}"
+
+
+def _arguments(group: str, section: DictConfig) -> Collection[str]:
+    """Names of the arguments of the part that a section chooses, which its file need not list; empty for other sections."""
+    chosen = parts(group).get(str(section.get("name")))
+    return inspect.signature(chosen).parameters if chosen else ()
 
 
 def _groups(instance: Hydra, overrides: Iterable[str]) -> list[str]:

@@ -35,6 +35,7 @@ from epo_lightning.experiment.sweeps.orphans import end_with
 from epo_lightning.identity import identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.entries import OBJECT, OBJECTS, TEXT, TEXTS, WHOLE, Check, check_entries, check_known
 from epo_lightning.report.runs import data_name
 from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_file, write_json
 from epo_lightning.schema import read
@@ -48,6 +49,15 @@ BESIDE = (
     *("trainer.accelerator", "trainer.devices", "trainer.share", "trainer.threads"),
 )
 """Overrides that do not change a sweep's label: they only say where it runs and what is logged or shown."""
+AGAIN = "delete the file and give the command of the sweep again, which trains no finished run again"
+_RECORD = {
+    **dict.fromkeys(("name", "began", "command", "host"), TEXT),
+    "process": WHOLE,
+    "jobs": OBJECTS,
+    "choices": OBJECT,
+}
+_JOB = {"overrides": TEXTS, "folder": TEXT, "identity": TEXT, "title": TEXT, "seed": WHOLE}
+_SCORE: Check = ("a list of texts", lambda value: value is None or TEXT[1](value) or TEXTS[1](value))
 
 
 class RunFailed(RuntimeError):
@@ -146,18 +156,26 @@ class Sweep:
 
     @property
     def record(self) -> dict[str, Any]:
-        """The contents of sweep.json."""
-        return read_json(self.folder / "sweep.json")
+        """The contents of sweep.json.
+
+        Raises:
+            ConfigError: it is damaged; the message names the entry, and says what to do.
+        """
+        return _content(self.folder / "sweep.json")
 
     @property
     def jobs(self) -> list[Job]:
         """All runs of the sweep; for a searching sweep, the runs that it has chosen so far."""
-        found = [read_json(path) for path in sorted((self.folder / "found").glob("*.json"))]
-        return [self._job(entry) for entry in [*self.record.get("jobs", []), *found]]
+        file = self.folder / "sweep.json"
+        found = [(path, _content(path)) for path in sorted((self.folder / "found").glob("*.json"))]
+        return [self._job(where, entry) for where, entry in [*((file, e) for e in self.record.get("jobs", [])), *found]]
 
-    def _job(self, entry: Mapping[str, Any]) -> Job:
+    def _job(self, file: Path, entry: Mapping[str, Any]) -> Job:
+        where = f"{file}, a run of the sweep,"
+        check_entries(entry, _JOB, where, AGAIN)
+        check_known(entry, {"score": _SCORE, "data": TEXT}, where, AGAIN)
         run = RunFolder(Path(os.path.relpath(self.root / entry["folder"])))
-        measured = measures(entry["score"])  # null or a word in records of older versions
+        measured = measures(entry.get("score"))  # null or a word in records of older versions
         return Job(
             tuple(entry["overrides"]),
             run,
@@ -295,6 +313,20 @@ class Sweep:
             write_file(self._failure(run), f"{message}\n\n{mask(traceback.format_exc())}")
             raise RunFailed(f"{settings.title}, seed {settings.seed}: {message}") from None
         return next(iter(run.record.get("best", {}).values()), None)
+
+
+def _content(file: Path) -> dict[str, Any]:
+    """The contents of a file of a sweep's folder.
+
+    Raises:
+        ConfigError: the file is damaged.
+    """
+    try:
+        content = read_json(file)
+    except ConfigError as error:
+        raise ConfigError(f"{error}; {AGAIN}") from error
+    check_known(content, _RECORD, str(file), AGAIN)
+    return content
 
 
 def label(name: str, overrides: Sequence[str]) -> str:

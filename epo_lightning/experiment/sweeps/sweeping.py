@@ -19,6 +19,7 @@ from epo_lightning.experiment.sweeps.watch import news, status, summary
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.choices import Choices, read_choices
+from epo_lightning.report.entries import TEXT, WHOLE, check_entries
 from epo_lightning.report.labels import value_text, word
 from epo_lightning.run_folder import RunFolder, read_json
 from epo_lightning.schema import read
@@ -166,6 +167,8 @@ def _set_aside(run: RunFolder, settings: TrainerSettings) -> None:
     if not file.is_file():
         return
     found = read_json(file)
+    again = "delete it, and the same command measures the time again"
+    check_entries(found, {"device": TEXT, "threads": WHOLE}, str(file), again)
     on_gpu = found["device"] != "cpu"
     if found["threads"] != settings.threads or (
         settings.accelerator != "auto" and on_gpu == (settings.accelerator == "cpu")
@@ -242,7 +245,7 @@ def show(name: str | None, overrides: Sequence[str]) -> None:
         return
     for sweep in Sweep.begun(runs):
         counts = Counter(sweep.state(job) for job in sweep.jobs)
-        print(f"{sweep.label}: {summary(counts)}\n    {sweep.record['command']}")
+        print(f"{sweep.label}: {summary(counts)}\n    {sweep.record.get('command', '')}")
 
 
 def _runs(overrides: Sequence[str]) -> str:

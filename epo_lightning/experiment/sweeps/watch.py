@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
@@ -15,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
+from epo_lightning.registry import ConfigError
 from epo_lightning.report.timings import duration
 from epo_lightning.run_folder import read_json
 
@@ -40,7 +42,7 @@ def status(sweep: Sweep) -> Counter[State]:
     for job, state in zip(jobs, states, strict=True):
         table.add_row(escape(names[job.run.path]), Text(state, STYLES[state]), escape(_details(sweep, job, state)))
     console = Console()
-    console.print(sweep.record["command"], style="bold", highlight=False, markup=False)
+    console.print(sweep.record.get("command", ""), style="bold", highlight=False, markup=False)
     console.print(table)
     counts = Counter(states)
     console.print(f"{summary(counts)}; they lie below {sweep.root}", highlight=False, markup=False, soft_wrap=True)
@@ -83,6 +85,20 @@ def _details(sweep: Sweep, job: Job, state: State) -> str:
     return result(job) if state == "done" else ""
 
 
+def _or_damaged(describe: Callable[[Job], str]) -> Callable[[Job], str]:
+    """``describe``, which says so where a record of the run is damaged: one run must not hide the others."""
+
+    @wraps(describe)
+    def described(job: Job) -> str:
+        try:
+            return describe(job)
+        except (ConfigError, KeyError, TypeError, ValueError, AttributeError, ZeroDivisionError) as error:
+            return f"records in {job.run.path} are damaged ({type(error).__name__}: {error})"
+
+    return described
+
+
+@_or_damaged
 def how_far(job: Job) -> str:
     """Steps, and minutes that are left at the present pace."""
     progress = job.run.progress
@@ -96,6 +112,7 @@ def how_far(job: Job) -> str:
     return f"step {step} of {steps}{left}"
 
 
+@_or_damaged
 def result(job: Job) -> str:
     """Summary of a finished run: its best validation score and how long it took, and how long a forecast takes."""
     told = []

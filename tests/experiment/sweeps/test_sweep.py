@@ -186,6 +186,36 @@ def test_records_of_older_versions_are_read(tmp_path: Path) -> None:
     assert [job.measures for job in sweep.jobs] == [("test",), (), ("time",)]
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "is not JSON"),
+        ("[1]", "holds no JSON object"),
+        ('{"began": 5}', "its entry began must be a text, not 5"),
+        ('{"jobs": 5}', "its entry jobs must be a list of objects, not 5"),
+        ('{"jobs": [{}]}', "a run of the sweep, is damaged: it lacks the entry overrides"),
+        ('{"jobs": [{"overrides": [], "folder": 5}]}', "its entry folder must be a text, not 5"),
+    ],
+)
+def test_damaged_records_of_a_sweep_are_named(tmp_path: Path, content: str, message: str) -> None:
+    file = tmp_path / "sweeps" / "rpi_main" / "sweep.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(content)
+    with pytest.raises(
+        ConfigError, match=f"sweep.json.*{message}.*; delete the file and give the command of the sweep"
+    ):
+        _ = Sweep.find("rpi_main", [], tmp_path).jobs
+
+
+@pytest.mark.parametrize("best", ['"x"', '{"val/minSADE": "x"}', "5"])
+def test_a_damaged_record_of_a_run_is_said_in_its_line(tmp_path: Path, best: str) -> None:
+    (tmp_path / "run.json").write_text(f'{{"status": "finished", "best": {best}}}')
+    (tmp_path / "runtime.json").write_text("{}")
+    for measures in ((), ("time",)):
+        job = Job((), RunFolder(tmp_path), "0", "EPO", 0, measures)
+        assert result(job).startswith(f"records in {tmp_path} are damaged (")
+
+
 def test_runs_of_one_title_and_seed_have_distinct_names(tmp_path: Path) -> None:
     places = ("rpi/a/paper-s0", "rpi/b/paper-s0", "rpi/c/short-s0")
     jobs = [Job((), RunFolder(tmp_path / place), "0", "EPO", 0, ()) for place in places]
@@ -215,6 +245,7 @@ def test_invalid_sweeps_are_refused(refused: Callable[..., str]) -> None:
     assert "'rpi_main'" in refused("sweep", "rpi_mian")
     assert "rpi_main" in refused("sweep", "seed=1")
     assert "'seed'" in refused("sweep", "rpi_main", "sede=1")
+    assert "set it by +data.games_share=<value>" in refused("sweep", "rpi_main", "data.games_share=0.1")
     assert "none has" in refused("sweep", "status", "rpi_main")
     assert "run_dir" in refused("sweep", "rpi_main", "run_dir=x")
     assert "epo generate" in refused("sweep", "rpi_main", "data.root=nowhere"), "said once, before any run begins"
