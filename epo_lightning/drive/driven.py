@@ -14,7 +14,7 @@ from torch import Tensor
 
 from epo_lightning.drive.measures import RATES
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import write_file
+from epo_lightning.run_folder import errors_naming, write_file
 
 REMEDY = "nothing is mixed; choose another out=<folder>, or delete it"
 
@@ -102,7 +102,11 @@ class Driven:
         measures: Mapping[str, Float[Tensor, " B"]],
         rates: Iterable[str] = (),
     ) -> None:
-        """Append what a planner has driven, with the names of the further measures that are 0 or 1."""
+        """Append what a planner has driven, with the names of the further measures that are 0 or 1.
+
+        Raises:
+            OSError: the disk is full, for example; it names the file.
+        """
         row = {
             "kind": kind,
             "planner": planner,
@@ -111,7 +115,7 @@ class Driven:
             "rates": sorted(rates),
         }
         self._take(row)
-        with self.path.open("a", encoding="utf-8") as file:
+        with errors_naming(self.path), self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({**row, "checksum": _checksum(row)}) + "\n")
 
     def rates(self, kind: str) -> set[str]:

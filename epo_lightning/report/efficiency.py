@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from epo_lightning.identity import essence
+from epo_lightning.identity import essence, of_row
 from epo_lightning.report.curves import SIZE, Curve, draw_line, logarithmic_if_wide, look, plain_frame
 from epo_lightning.report.rows import Row
 from epo_lightning.report.runs import data_name
@@ -42,8 +42,8 @@ def efficiencies(rows: Iterable[Row]) -> list[Efficiency]:
         share = run.config["data"].get("games_share", 1.0)
         if SCORE not in row.cells or not run.learned or not isinstance(share, int | float):
             continue
-        same = essence(run.config)
-        same = {**same, "seed": None, "data": {**same["data"], "games_share": None}}
+        same = essence(of_row(run.config))  # without the runs that refined rows refine: each share has its own
+        same = {**same, "data": {**same["data"], "games_share": None}}
         whole = data_name({**run.config["data"], "games_share": 1})
         members = series.setdefault(f"{whole}, {run.split} split", {})
         members.setdefault(json.dumps(same, sort_keys=True), {})[float(share)] = row

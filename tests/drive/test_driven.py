@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -123,3 +124,15 @@ def test_bytes_that_are_not_text_are_an_error_that_names_the_file(path: Path) ->
 def test_other_episodes_together_are_refused(path: Path) -> None:
     with pytest.raises(ConfigError, match="was begun by a version that drove other episodes together"):
         opened(path, []).has("plays", "a", range(3))
+
+
+def test_a_row_that_cannot_be_written_names_the_file(path: Path) -> None:
+    driven = opened(path, [])
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 5, hard))
+    try:
+        with pytest.raises(OSError, match=r"episodes\.jsonl"):
+            driven.add("plays", "c", range(2), {"distance": torch.ones(2)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert opened(path, []).has("plays", "b", range(2))

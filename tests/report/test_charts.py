@@ -118,7 +118,8 @@ def test_data_efficiency_joins_rows_that_differ_only_in_the_share_of_the_games(t
         settings = {} if share is None else {"data.games_share": share}
         for seed in range(2 if share != 0.1 else 1):
             folder = tmp_path / title / f"{share}-s{seed}"
-            make_run(folder, title, "scene_consistent", scores(value + 0.01 * seed), seed=seed, settings=settings)
+            refines = {**settings, "forecaster.frozen": f"runs/{share}-s{seed}"}
+            make_run(folder, title, "scene_consistent", scores(value + 0.01 * seed), seed=seed, settings=refines)
     wider = {"data.games_share": 0.1, "backbone.width": 256}
     make_run(tmp_path / "wide", "V-LSTM + SC", "scene_consistent", scores(0.7), settings=wider)
     tables = build_tables(collect(tmp_path))
