@@ -60,6 +60,8 @@ def _farewell(ended: str, words: Sequence[str]) -> str:
     """The line that a command prints when a signal ended it: how it ended, and how to continue."""
     if "explore" in words:  # it is ended by Ctrl-C, and has nothing to continue
         return "epo: stopped"
+    if "train" in words and {"-m", "--multirun"}.intersection(words):
+        return f"epo: {ended}; the same command with existing=continue continues, and skips finished runs"
     if "train" in words:
         return f"epo: {ended}; continue the run with `epo train resume=<run folder>`"
     return f"epo: {ended}; no incomplete file was left; the same command continues"
@@ -220,6 +222,11 @@ def _single(arguments: Arguments) -> None:
         _resume(resumed[-1].partition("=")[2], [word for word in arguments.overrides if word not in resumed])
         return
     words = list(arguments.overrides)
+    if arguments.verb == "train" and not words:  # the defaults would train a nameless row, for a day
+        raise ConfigError(
+            "choose what to train: experiment=<row>, for example `epo train experiment=rpi/v_lstm_epo budget=short`; "
+            "`epo train --help` lists rows and budgets"
+        )
     if arguments.verb == "report" and words and "=" not in words[0]:
         words[0] = f"sweep={words[0]}"
     from epo_lightning.experiment.config.compose import compose

@@ -42,6 +42,10 @@ def test_a_stopped_verb_prints_a_message(
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+def test_a_stopped_multirun_is_continued_by_itself() -> None:
+    assert "existing=continue" in cli._farewell("terminated", ["train", "-m", "seed=0,1"])
+
+
 @pytest.mark.parametrize("error", [AssertionError("Trying to pop empty mode stack"), ConfigError("a"), OSError(5, "b")])
 def test_an_exception_after_sigterm_is_a_termination(
     error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -144,6 +144,21 @@ class EpochLines(Callback):
         )
 
 
+class FirstLine(Callback):
+    """Callback that prints the length and the folder of a training when it begins, long before its first epoch ends."""
+
+    def __init__(self, title: str, folder: Path) -> None:
+        self._title, self._folder = title, folder
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        steps = trainer.estimated_stepping_batches
+        length = f"at most {steps:.0f} steps" if math.isfinite(steps) else "no limit of steps"
+        begun = f"from step {trainer.global_step}, " if trainer.global_step else ""
+        print(f"{self._title}: {begun}{length}, in {self._folder}", flush=True)
+
+
 class Progress(Callback):
     """Callback that writes the current step to ``progress.json`` in the run folder every few seconds."""
 
@@ -212,6 +227,8 @@ def run_callbacks(settings: CallbackSettings, run: RunFolder, title: str) -> lis
     style = settings.progress
     if style == "auto":
         style = "bar" if sys.stdout.isatty() else "lines"
+    if style in ("bar", "lines"):
+        found.append(FirstLine(title, run.path))
     if style == "bar":
         found.append(TQDMProgressBar(refresh_rate=settings.refresh))
     elif style == "lines":

@@ -260,11 +260,11 @@ def _occupied(run: RunFolder) -> str:
     if run.finished:
         return (
             f"{run.path} holds a finished run: nothing is overwritten; score it with `epo evaluate run={run.path}`, "
-            "or choose another seed=<number> or run_dir=<folder>"
+            "choose another seed=<number> or run_dir=<folder>, or skip finished runs with existing=continue"
         )
     return (
         f"{run.path} holds an unfinished run: continue it with `epo train resume={run.path}`, "
-        "or choose another run_dir=<folder>"
+        "or by the same command with existing=continue, or choose another run_dir=<folder>"
     )
 
 

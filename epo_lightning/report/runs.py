@@ -14,7 +14,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
 from epo_lightning.report.entries import NUMBERS_BY_NAME, TEXTS, check_configuration, check_known, check_record
 from epo_lightning.report.records import CONFIG, RECORD, Records
-from epo_lightning.run_folder import OTHER, RunFolder, discover
+from epo_lightning.run_folder import FINISHED, OTHER, RunFolder, discover
 
 _ABOUT = {"agents": NUMBERS_BY_NAME, "notes": TEXTS}
 """Entries on the scenes of other data, which older files lack."""
@@ -134,9 +134,15 @@ def collect(runs: str | Path | Iterable[Records]) -> list[EvaluatedRun]:
     found = [evaluated for run in known for evaluated in read_run(run)]
     if not found:
         begun = next((run for run in known if RECORD in run.names()), known[0])
+        open_ones = [run for run in known if RECORD in run.names() and _status(run) != FINISHED]
         remedy = f"epo evaluate runs={runs}" if isinstance(runs, str | Path) else f"epo evaluate run={begun.path}"
-        raise ConfigError(f"none of the {len(known)} runs {where} is evaluated: {remedy} does it")
+        first = f"; before it, epo train resume={open_ones[0].path} continues an unfinished run" if open_ones else ""
+        raise ConfigError(f"none of the {len(known)} runs {where} is evaluated: {remedy} does it{first}")
     return found
+
+
+def _status(run: Records) -> Any:
+    return _sound(lambda: run.record, COPY).get("status")
 
 
 def _listed(runs: str | Path | Iterable[Records]) -> list[Records]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -152,12 +153,26 @@ def test_representatives_hold_every_pair() -> None:
     assert len(few) < len(grid) / 2
 
 
+@cache
+def counted_in_docs() -> dict[str, int]:
+    """The numbers of runs in the table of docs/sweeps.md, by sweep."""
+    rows = re.findall(
+        r"^\| (`.+?`) \| .* \| ([\d, ]+?)(?: each)? \|$", (tree() / "docs/sweeps.md").read_text(), flags=re.MULTILINE
+    )
+    found: dict[str, int] = {}
+    for cell, numbers in rows:
+        sweeps, counts = re.findall(r"`(\w+)`", cell), [int(number) for number in numbers.split(",")]
+        found.update(zip(sweeps, counts * len(sweeps) if len(counts) == 1 else counts, strict=True))
+    return found
+
+
 @pytest.mark.parametrize("sweep", names(tree() / "sweeps"))
 @pytest.mark.parametrize("every_pair", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["ends", "pairs"])
 def test_sweeps_list_their_runs(sweep: str, every_pair: bool) -> None:
     listed = jobs("train", [f"sweeps={sweep}"])
     # A search chooses its runs while it runs.
     assert len(listed) > 1 or sweep.endswith("_search")
+    assert counted_in_docs()[sweep] == len(listed) or sweep.endswith("_search")
     with hydra() as instance:
         known = options_of(instance, "experiment")
     named = {word.partition("=")[2] for job in listed for word in job if word.startswith("experiment=")}
@@ -233,7 +248,7 @@ MISTAKES = {
     "evaluate runs=.": "no finished run",
     "evaluate run=a split=tset": "split must be one of test, val, train, all or null",
     "evaluate run=a split=train": "split=train needs data=<data set>",
-    "predict": "run=<value>",
+    "predict": "run=<run folder>",
     "report runs=nowhere": "nowhere",
     "report -m runs=a,b": "has no option -m",
     "generate worker=3": "'workers'",
@@ -245,6 +260,24 @@ def test_invalid_configurations_are_refused_in_one_message(words: str, refused: 
     verb, *rest = words.split()
     data = ["data=tiny"] if verb == "train" and "resume" not in words else []
     assert MISTAKES[words] in refused(verb, *data, *rest)
+
+
+def test_a_training_of_nothing_in_particular_is_refused(refused: Callable[..., str]) -> None:  # noqa: F811
+    assert "choose what to train: experiment=<row>" in refused("train")
+
+
+@pytest.mark.parametrize(
+    ("row", "hint"),
+    [
+        ("us101/v_lstm_ep", "did you mean 'us101/v_lstm_epo'? known: us101/const_vel, us101/hivt_m, "),
+        ("v_lstm_epo", "known: argoverse2/..., dut/..., exid/..., "),
+    ],
+)
+def test_a_mistyped_row_is_answered_by_the_rows_beside_it(row: str, hint: str, refused: Callable[..., str]) -> None:  # noqa: F811
+    message = refused("train", f"experiment={row}")
+    assert hint in message
+    assert "did you mean" in message
+    assert len(message) < 800
 
 
 def test_missing_data_is_reported_before_a_folder_is_made(refused: Callable[..., str]) -> None:  # noqa: F811

@@ -126,11 +126,16 @@ def test_a_killed_run_continues_to_the_same_metrics(tmp_path: Path) -> None:
     assert (tmp_path / "whole/metrics.json").read_bytes() == (tmp_path / "parts/metrics.json").read_bytes()
 
 
-def test_a_finished_run_is_never_overwritten(epo: Epo, refused: Callable[..., str]) -> None:
-    words = ("train", ROW, *TINY, "run_dir=run")
+def test_a_finished_run_is_never_overwritten(
+    epo: Epo, refused: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("train", ROW, *TINY[:-1], "callbacks.progress=lines", "run_dir=run")
     assert epo(*words) == 0
+    assert "V-LSTM + SC, seed 0: at most 8 steps, in run\n" in capsys.readouterr().out
     before = weights("run")
-    assert "nothing is overwritten" in refused(*words)
+    message = refused(*words)
+    assert "nothing is overwritten" in message
+    assert "existing=continue" in message
     assert "is finished" in refused("train", "resume=run")
     assert epo(*words, "existing=continue") == 0
     assert all(torch.equal(before[key], value) for key, value in weights("run").items())

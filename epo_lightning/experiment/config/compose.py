@@ -157,7 +157,11 @@ def _plain_values(config: DictConfig) -> dict[str, Any]:
     try:
         values = OmegaConf.to_container(plain, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
-        raise ConfigError(f"{error.full_key}=<value> is needed: it has no default") from error
+        key = error.full_key
+        value = (
+            "<run folder>, or a run that ships with the package (run=rpi/v_lstm_epo)," if key == "run" else "<value>"
+        )
+        raise ConfigError(f"{key}={value} is needed: it has no default") from error
     except OmegaConfBaseException as error:
         raise ConfigError(_sentence(error)) from error
     assert isinstance(values, dict)
@@ -284,7 +288,20 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
     options = options_of(instance, group) if option else []
     if not options:
         return f"unknown configuration {missing!r}: " + " ".join(message.split())
-    return f"unknown option {group}={option}: {nearest(option, options)}"
+    return f"unknown option {group}={option}: {_known(option, options)}"
+
+
+def _known(option: str, options: Sequence[str]) -> str:
+    """A hint for an option that does not exist: the nearest one, then the options of its folder or, failing that, all.
+
+    Where options lie in folders, as the rows of all data sets do, the folders stand for them.
+    """
+    folder = option.rpartition("/")[0] + "/"
+    if beside := [name for name in options if name.startswith(folder)]:
+        return nearest(option, beside)
+    shown = {name.partition("/")[0] + "/..." if "/" in name else name for name in options}
+    hint, known, _ = nearest(option, options).partition("known: ")
+    return hint + known + ", ".join(sorted(shown))
 
 
 def options_of(instance: Hydra, group: str) -> list[str]:
