@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -150,7 +150,7 @@ def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     own = settings.data is None
     for run, file, metrics in evaluate(config, overrides):
         shown = ", ".join(f"{name} {metrics[name]:.4f}" for name in HEADLINE if name in metrics)
-        print(f"{run.path} ({settings.own_split if own else _tested_on(file)}): {shown}")
+        print(f"{run.path} ({settings.own_split if own else _tested_on(file, settings.data)}): {shown}")
         if costs := ", ".join(
             f"{column.label} {metrics[column.metric]:.3f}" for column in TRUTH if column.metric in metrics
         ):
@@ -164,10 +164,10 @@ def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
         print(f"next: epo report runs={settings.runs or settings.run}")
 
 
-def _tested_on(file: Path) -> str:
-    """The data, split and number of scenes of a file with scores on other data."""
-    if not file.is_file():  # a shipped run, beside which nothing is written
-        return "other data"
+def _tested_on(file: Path, data: Mapping[str, Any] | None) -> str:
+    """The data, split and number of scenes of a file with scores on other data; the name of the data without a file."""
+    if data is not None and not file.is_file():
+        return f"{data.get('dataset', data['name'])}, not stored: nothing is written beside a forecaster of the package"
     content = read_json(file)
     return f"{content['data']}, {content['split']}, {content['scenes']} scenes"
 

@@ -134,6 +134,17 @@ def test_a_run_folder_takes_precedence_and_unknown_names_are_refused(
         RunFolder.open(ROW)
 
 
+def test_scores_of_a_shipped_forecaster_on_other_data_name_the_data(
+    epo: Epo, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted((pretrained.HOME / "rpi/v_lstm_sc").iterdir())
+    assert epo("evaluate", "run=rpi/v_lstm_sc", "data=drawn", "data.like=rpi", "data.scenes=8") == 0
+    assert "v_lstm_sc (drawn, not stored: nothing is written beside a forecaster of the package): minADE" in (
+        capsys.readouterr().out
+    )
+    assert sorted((pretrained.HOME / "rpi/v_lstm_sc").iterdir()) == before
+
+
 def test_a_packed_run_forecasts_like_the_run(
     epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
