@@ -149,7 +149,9 @@ def estimate(values: Float[Tensor, " B"], rate: bool = False) -> Estimate:
         return Estimate(mean, float(interval.low), float(interval.high))
     draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
     means = values.numpy()[draws].mean(1)
-    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    # Nothing can be interpolated between infinite means; the distance is infinite in episodes without other agents.
+    method = "linear" if np.isfinite(means).all() else "nearest"
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method=method)
     return Estimate(mean, float(low), float(high))
 
 
@@ -161,5 +163,7 @@ def estimates(measures: Mapping[str, Float[Tensor, " B"]], rates: Container[str]
 def differences(
     one: Mapping[str, Float[Tensor, " B"]], other: Mapping[str, Float[Tensor, " B"]]
 ) -> dict[str, Estimate]:
-    """The mean of one minus other over the same episodes, for every measure."""
-    return {name: estimate(values - other[name]) for name, values in one.items()}
+    """The mean of one minus other over the same episodes, for every measure; equal infinite values differ by zero."""
+    return {
+        name: estimate(torch.where(values == other[name], 0.0, values - other[name])) for name, values in one.items()
+    }

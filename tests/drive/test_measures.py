@@ -107,3 +107,15 @@ def test_differences_are_those_of_the_same_episodes() -> None:
     base = 10 * torch.randn(200, generator=torch.Generator().manual_seed(0), dtype=torch.double)
     found = differences({"progress": base + 1.0}, {"progress": base})["progress"]
     assert (found.mean, found.low, found.high) == pytest.approx((1.0, 1.0, 1.0))
+
+
+def test_infinite_distances_have_intervals_and_differences() -> None:
+    """In an episode without other agents, the distance is infinite."""
+    values = torch.tensor([torch.inf, *[1.0, 2.0] * 10], dtype=torch.double)
+    found = estimate(values)
+    assert found.mean == found.high == torch.inf
+    assert 1.0 < found.low < 2.0
+    assert estimate(torch.full((3,), torch.inf, dtype=torch.double)).low == torch.inf
+    (difference,) = differences({"distance": values}, {"distance": values - 0.5}).values()
+    assert difference.mean == pytest.approx(0.5 * 20 / 21)
+    assert difference.low <= difference.mean <= difference.high
