@@ -10,6 +10,7 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from epo_lightning.report.columns import MISSING, Column
@@ -72,18 +73,26 @@ class Line:
 def transfers(runs: Iterable[Records]) -> list[Line]:
     """The scores of all rows with a run that was scored on other data, with those on the test split of their own data.
 
+    Scores on a part of a run's own data are shown where rows that were trained on other data were scored on the same part.
+
     Raises:
         ConfigError: a damaged file, as :func:`~epo_lightning.report.runs.read_run`; or the same run twice.
     """
     found: list[tuple[TestSet, EvaluatedRun]] = []
+    parts: list[tuple[TestSet, EvaluatedRun]] = []
     for run in runs:
-        others = [(one, about) for one, about in read_other(run) if not is_part(one, about)]
-        found += [
-            (TestSet(one.data, one.split, one.data_digest, str(about["test"])[:6], about), one) for one, about in others
+        scored = [
+            (TestSet(one.data, one.split, one.data_digest, str(about["test"])[:6], about), one)
+            for one, about in read_other(run)
         ]
+        others = [(test, one) for test, one in scored if not is_part(one, test.about)]
+        found += others
+        parts += [(test, one) for test, one in scored if is_part(one, test.about)]
         if others:
             own = [one for one in read_run(run) if one.split == "test"]
             found += [(TestSet(one.data, one.split, one.data_digest), one) for one in own]
+    elsewhere = {test for test, _ in found}
+    found += [(test, one) for test, one in parts if test in elsewhere]
     variants: dict[tuple[str, str, str], set[str]] = {}
     for test, _ in found:
         variants.setdefault((test.name, test.split, test.digest), set()).update({test.variant} - {""})
@@ -99,8 +108,11 @@ def transfers(runs: Iterable[Records]) -> list[Line]:
 
 
 def _names(runs: Iterable[EvaluatedRun]) -> dict[str, str]:
-    """Labels of rows by their identity."""
-    return {row.identity: row.name for row in plain_rows({run.path: run for run in runs}.values())}
+    """Labels of rows by their identity; only rows that were trained on the same data have to differ."""
+    by_data: dict[str, dict[Path, EvaluatedRun]] = {}
+    for run in runs:
+        by_data.setdefault(run.trained_data, {})[run.path] = run
+    return {row.identity: row.name for members in by_data.values() for row in plain_rows(members.values())}
 
 
 def _line(checkpoint: str, scores: Mapping[TestSet, Mapping[int, EvaluatedRun]], names: Mapping[str, str]) -> Line:

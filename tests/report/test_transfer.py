@@ -136,6 +136,27 @@ def test_rows_of_several_data_sets_share_the_columns_of_the_same_scenes(tmp_path
     assert [line[3:] for line in sheet.lines] == [("1.000", "3.000"), ("4.000", "2.000")]
 
 
+def test_rows_of_different_data_keep_their_titles(tmp_path: Path) -> None:
+    """The first column tells them apart; rows of the same data are told apart by the settings in which they differ."""
+    rows = [("one", "a", 0.1), ("two", "b", 0.2), ("three", "b", 0.3)]
+    for name, data, rate in rows:
+        run = make_run(tmp_path / name, "SC", "scene_consistent", None, data=data, settings={"optimizer.lr": rate})
+        on(run, "c", 1.0)
+    lines = transfers(RunFolder.open(tmp_path / name) for name, _, _ in rows)
+    assert [(line.trained, line.method) for line in lines] == [("a", "SC"), ("b", "SC, lr=0.2"), ("b", "SC, lr=0.3")]
+
+
+def test_a_part_of_the_own_data_is_shown_if_others_were_scored_on_it(tmp_path: Path) -> None:
+    one = make_run(tmp_path / "one", "SC", "scene_consistent", None, data="a", digest="A")
+    other = make_run(tmp_path / "other", "SC", "scene_consistent", None, data="b", digest="B")
+    for run, value in ((one, 1.0), (other, 2.0)):
+        on(run, "a", value, split="test", data_digest="A", settings={"share": 0.5})
+    on(one, "a", 3.0, name="-0", split="test", data_digest="A", settings={"share": 0.25}, test="another")
+    sheet = transfer_sheets(transfers([one, other]))[0]
+    assert sheet.header[3:] == ("a, test",)
+    assert [(line[0], line[3]) for line in sheet.lines] == [("a", "1.000"), ("b", "2.000")]
+
+
 def test_other_scenes_have_columns_of_their_own(tmp_path: Path) -> None:
     one = make_run(tmp_path / "one", "SC", "scene_consistent", None, data="a")
     on(one, "b", 3.0, data_digest="first1", name="-x")
