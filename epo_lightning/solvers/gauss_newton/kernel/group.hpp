@@ -185,14 +185,15 @@ struct Games {
         for (int e = 0; e < OWN_COUNT * movers + PAIR_COUNT * pairs; ++e) weight[e] = live ? given[e] : Vec<T>{};
     }
 
-    /// Lane `lane` holds the row items[lane * (n + 1)]: the problem, then its agents. Unused lanes repeat the last row.
+    /// Lane `lane` holds the row items[lane * (n + 1)]: the problem, then its agents. Lanes that are not in use repeat the rows
+    /// in their order.
     NOINLINE Games(const EpoGame& game, Arena<T>& arena, int movers, int n, const int32_t* items, int filled, const T* controls)
         : game(game), movers(movers), n(n), K(int(game.K)), pairs(movers * n - movers * (movers + 1) / 2),
           coupled(interacts(game)), state_pairs(has_state_pairs(game)), cut(game.ends != nullptr), dt(T(game.dt)), arena(arena) {
         owners_.resize(n * W);
         agent = owners_.data();
         for (int lane = 0; lane < W; ++lane) {
-            const int32_t* item = items + (lane < filled ? lane : filled - 1) * (n + 1);
+            const int32_t* item = items + lane % filled * (n + 1);
             problem[lane] = item[0];
             scene[lane] = int(item[0] / game.M);
             mode[lane] = int(item[0] % game.M);

@@ -318,39 +318,43 @@ class Range {
             Vec<T>* memory = record ? step.factors[n].data() + index * Factors<T>::size(n, game_.K) : reused_[n].data();
             const auto factors = Factors<T>::at(memory, n, game_.K);
             Vec<T>*turn = arena_.take(n * game_.K), *thrust = arena_.take(n * game_.K), found, decrease;
-            Vec<T>*given = arena_.take(n), *damping = arena_.take(n), *raised = arena_.take(n);
-            for (int i = 0; i < n; ++i) {
-                for (int lane = 0; lane < W; ++lane)
-                    given[i][lane] = static_cast<const T*>(
-                        run_.damping)[group.problem[lane] * run_.damping_problem + group.agent[i * W + lane] * run_.damping_agent];
-                damping[i] = given[i];
-                raised[i] = most<T>(given[i], splat<T>(T(kLeastRaisedDamping)));
-            }
-            Mask<T> open = ~Mask<T>{}, failed{};  // lanes without a direction, and lanes that needed more damping
-            for (int attempt = 0;; ++attempt) {
-                // The adjoint needs the factors of all lanes, so that those with a direction are computed again.
-                Mask<T> positive = record ? ~Mask<T>{} : open;
+            Vec<T>* damping = arena_.take(n);
+            // Lanes that are not in use repeat the groups with the dampings of the next attempts. The adjoint needs the factors of a group in
+            // one place, so that there are no copies if they are recorded, and lanes with a direction are computed again.
+            const int copies = record ? 1 : int(std::min<int64_t>(kRetries + 1, W / filled));
+            uint32_t open = first_lanes(filled), failed = 0;  // groups without a direction, and groups that needed more damping
+            for (int64_t first = 0; open && first <= kRetries; first += copies) {
+                Mask<T> positive{};
+                for (int lane = 0; lane < W; ++lane) {
+                    const int64_t attempt = first + lane / filled;
+                    const bool tries = (open >> lane % filled & 1) && lane < filled * copies && attempt <= kRetries;
+                    positive[lane] = record || tries ? -1 : 0;
+                    if (!tries && first) continue;
+                    for (int i = 0; i < n; ++i) damping[i][lane] = raised_damping(group, i, lane, tries ? attempt : 0);
+                }
                 solve_step(group, exact, damping, factors, turn, thrust, energy ? &found : nullptr, decrease, positive);
-                const bool last = attempt == kRetries;
                 uint32_t fresh = 0;
-                for (int lane = 0; lane < filled; ++lane) {
-                    if (!open[lane] || !(positive[lane] || last)) continue;
+                for (int lane = 0; lane < filled * copies; ++lane) {
+                    const uint32_t one = uint32_t(1) << lane % filled;
+                    if (!(open & one)) continue;
+                    if (!positive[lane]) {
+                        failed |= one;
+                        continue;
+                    }
+                    open &= ~one;
                     fresh |= uint32_t(1) << lane;
-                    if (predicted) predicted[group.problem[lane]] += positive[lane] ? decrease[lane] : T(INFINITY);
+                    if (predicted) predicted[group.problem[lane]] += decrease[lane];
                 }
                 group.store(turn, thrust, fresh, directions);
-                open &= ~positive;
-                if (last || !any<T>(open)) break;
-                failed |= open;
-                for (int i = 0; i < n; ++i) {
-                    raised[i] *= T(10);
-                    damping[i] = open ? given[i] + raised[i] : damping[i];
-                }
             }
+            group.store(turn, thrust, open, directions);
             for (int lane = 0; lane < filled; ++lane) {
                 const int problem = group.problem[lane];
-                if (failed[lane]) status[problem] = std::max<int64_t>(status[problem], DAMPED);
-                if (open[lane]) step.taken[problem - first_] = 0;
+                if (failed >> lane & 1) status[problem] = std::max<int64_t>(status[problem], DAMPED);
+                if (open >> lane & 1) {
+                    step.taken[problem - first_] = 0;
+                    if (predicted) predicted[problem] = T(INFINITY);
+                }
                 if (energy) energy[problem] += found[lane];
             }
         });
@@ -459,6 +463,17 @@ class Range {
                 const T given = static_cast<const T*>(run_.damping)[problem * run_.damping_problem + i * run_.damping_agent];
                 held_[problem - first_] |= uint64_t(!finite(given)) << i;
             }
+    }
+
+    /// The damping of an agent of a group in an attempt to take a step; the first attempt has the number 0.
+    T raised_damping(const Games<T>& group, int agent, int lane, int64_t attempt) const {
+        constexpr int W = Lanes<T>::W;
+        const T given = static_cast<const T*>(
+            run_.damping)[group.problem[lane] * run_.damping_problem + group.agent[agent * W + lane] * run_.damping_agent];
+        if (attempt == 0) return given;
+        T added = std::max(given, T(kLeastRaisedDamping));
+        for (int64_t repetition = 0; repetition < attempt; ++repetition) added *= T(10);
+        return given + added;
     }
 
     /// Applies a function to the damping of the agents of a problem that move.
