@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -150,7 +151,7 @@ def estimate(values: Float[Tensor, " B"], rate: bool = False) -> Estimate:
     draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
     means = values.numpy()[draws].mean(1)
     # Nothing can be interpolated between infinite means; the distance is infinite in episodes without other agents.
-    method = "linear" if np.isfinite(means).all() else "nearest"
+    method: Literal["linear", "nearest"] = "linear" if np.isfinite(means).all() else "nearest"
     low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method=method)
     return Estimate(mean, float(low), float(high))
 
