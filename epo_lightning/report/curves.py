@@ -229,8 +229,11 @@ def draw_steps(curve: StepsCurve, size: tuple[float, float] = SIZE, legend: bool
                     label=label,
                     gid=f"row{2 + which}-line",
                 )
-        axes.set_xscale("log", base=2)
         ticks = sorted({*curve.optimised.x, *(STEPS if curve.paper else ())})
+        if ticks[0] > 0:
+            axes.set_xscale("log", base=2)
+        else:  # zero has no logarithm
+            axes.set_xscale("symlog", base=2, linthresh=1)
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_xlabel("optimisation steps S")

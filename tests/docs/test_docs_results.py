@@ -239,6 +239,7 @@ ON_HIGHWAYS = pytest.mark.parametrize(
     ("heading", "file"),
     [
         ("Simulated highways", "highway_sim"),
+        ("Simulated highways, without the layer", "highway_sim_parts"),
         ("Simulated highways, twice the budget", "highway_sim_long"),
         ("US-101", "us101"),
     ],
@@ -296,6 +297,22 @@ def test_the_page_of_highways_has_the_differences_of_every_backbone(backbone: st
     assert cells.pop(0) == str(len(ours))
     for cell, metric in zip(cells, ("minSADE", "minSFDE", "overlap_jfp", "minSADE_1"), strict=False):
         assert cell == interval([ours[seed].metrics[metric] - theirs[seed].metrics[metric] for seed in ours])
+
+
+@pytest.mark.parametrize(
+    ("line", "first", "second"),
+    [
+        ("+EPO - S = 0", " + EPO", " + EPO, S = 0"),
+        ("S = 0 - +SC", " + EPO, S = 0", " + SC"),
+        ("+EPO - +SC", " + EPO", " + SC"),
+    ],
+)
+def test_the_page_of_highways_has_the_differences_without_the_layer(line: str, first: str, second: str) -> None:
+    found, section = on_roads("highway_sim_parts"), lines_of_roads("Simulated highways, without the layer")
+    cells = numbers(next(text for text in section if text.startswith(f"| {line} |")))
+    one, other = found[f"V-LSTM{first}"], found[f"V-LSTM{second}"]
+    for cell, metric in zip(cells, ("minSADE", "minSFDE", "overlap_jfp", "interactive/minSADE"), strict=True):
+        assert cell == interval([one[seed].metrics[metric] - other[seed].metrics[metric] for seed in one])
 
 
 @pytest.mark.parametrize(

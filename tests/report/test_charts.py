@@ -105,6 +105,18 @@ def test_the_s_curve_joins_rows_that_differ_only_in_steps(tmp_path: Path) -> Non
     assert drawn["row3-line"] == [(steps, values["initial/minSADE"]) for steps, values in STEPS.items()]
 
 
+def test_the_s_curve_shows_the_row_without_steps(tmp_path: Path) -> None:
+    for steps in (0, 2):
+        make_run(tmp_path / str(steps), "V-LSTM + EPO", "epo", scores(0.1 + steps), settings={"solver.steps": steps})
+    (curve,) = steps_curves(distinct(build_tables(collect(tmp_path))))
+    assert curve.optimised.x == (0, 2)
+    (axes,) = draw_steps(curve).axes
+    places = axes.transData.transform([(0, 0.1), (2, 0.1)])[:, 0]
+    assert np.isfinite(places).all()
+    assert places[0] < places[1]
+    assert axes.get_xlim()[0] < 0
+
+
 def test_rows_that_differ_in_more_than_steps_are_not_joined(tmp_path: Path) -> None:
     for steps, width in ((1, 32), (2, 64)):
         settings = {"solver.steps": steps, "backbone.width": width}
