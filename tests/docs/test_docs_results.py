@@ -332,6 +332,28 @@ def test_the_pages_of_roads_have_the_differences_of_their_files(heading: str, fi
         assert cell == interval(values)
 
 
+def test_the_page_of_rpi_has_what_the_layer_adds() -> None:
+    found = on_roads("rpi_parts")
+    section = RPI.partition("\n## What the layer adds\n")[2].partition("\n## ")[0].splitlines()
+    for title, runs in found.items():
+        cells = numbers(next(line for line in section if line.startswith(f"| {title} |")))
+        for cell, metric in zip(cells[1:3], ("minSADE", "minSFDE"), strict=True):
+            values = [run.metrics[metric] for run in runs.values()]
+            assert cell == f"{short(fmean(values), 4)} ± {short(stdev(values), 4)}", (title, metric)
+    rows = {"+EPO": "", "+EPO without goal": ", no goal", "S = 0": ", S = 0"}
+    for line, first, second in (
+        ("+EPO without goal - +SC", "+EPO without goal", "+SC"),
+        ("+EPO - S = 0", "+EPO", "S = 0"),
+    ):
+        one, other = (
+            found["V-LSTM + SC, relaxed" if row == "+SC" else f"V-LSTM + EPO, relaxed{rows[row]}"]
+            for row in (first, second)
+        )
+        cells = numbers(next(text for text in section if text.startswith(f"| {line} |")))
+        for cell, metric in zip(cells[1:], ("minSADE", "minSFDE"), strict=True):
+            assert cell == interval([one[seed].metrics[metric] - other[seed].metrics[metric] for seed in one], 4)
+
+
 def test_the_page_of_rpi_has_the_scores_on_shares_of_the_games() -> None:
     found: dict[tuple[str, float], list[float]] = {}
     for run in sorted(read_results(ROOT / "results" / "rpi_games_share.json").evaluated, key=lambda run: run.seed):
