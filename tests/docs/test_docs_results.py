@@ -155,6 +155,7 @@ OF_RPI = {
         ("A search of the settings", "rpi_search_winners", 2),
         ("Searched settings on the paper's split", "rpi_paper_split_winners", 3),
         ("The paper's loss", "rpi_hard", 3),
+        ("The paper's loss on the paper's split", "rpi_paper_split_loss", 3),
     ],
 )
 def test_the_page_of_rpi_has_the_scores_of_its_files(heading: str, file: str, rows: int) -> None:
