@@ -106,7 +106,8 @@ def test_an_unknown_score_cannot_be_monitored(monitor: str) -> None:
 
 
 def test_scores_of_subsets_can_be_monitored() -> None:
-    assembly.check_buildable(read(Settings, changed("callbacks.monitor", "val/executed/minADE")))
+    data, _ = assembly.check_buildable(read(Settings, changed("callbacks.monitor", "val/executed/minADE")))
+    assert "executed" in data.task.subsets
 
 
 @pytest.mark.parametrize("words", ["seed=1 seed=2", "seed=1 +seed=1", "data=rpi data=exid", "a.b=1 c=2 ++a.b=3"])

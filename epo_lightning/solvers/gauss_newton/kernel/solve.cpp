@@ -347,7 +347,7 @@ class Range {
                 }
                 group.store(turn, thrust, fresh, directions);
             }
-            group.store(turn, thrust, open, directions);
+            if (open) group.store(turn, thrust, open, directions);
             for (int lane = 0; lane < filled; ++lane) {
                 const int problem = group.problem[lane];
                 if (failed >> lane & 1) status[problem] = std::max<int64_t>(status[problem], DAMPED);
