@@ -38,9 +38,11 @@ class Plan {
     std::vector<std::vector<int32_t>> rows_;  // by kind
 };
 
-/// Contacts between the agents of W problems: bit j of touching[i * W + lane] is set where i and j overlap.
+/// Contacts between the agents of W problems: bit j of touching[i * W + lane] is set where i and j overlap. Contacts between two
+/// agents of the mask `held` are not looked for.
 template <class T>
-void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, const T* controls, uint64_t* touching) {
+void find_contacts(
+    const EpoGame& game, Arena<T>& arena, const int* problems, uint64_t held, const T* controls, uint64_t* touching) {
     constexpr int W = Lanes<T>::W;
     const int N = int(game.N), K = int(game.K);
     const bool state_pairs = has_state_pairs(game);
@@ -96,6 +98,7 @@ void find_contacts(const EpoGame& game, Arena<T>& arena, const int* problems, co
     int pair = 0;
     for (int i = 0; i < N; ++i)
         for (int j = i + 1; j < N; ++j, ++pair) {
+            if (held >> i & held >> j & 1) continue;
             Vec<T> reach = radius[i] + radius[j];
             for (int f = CLEARANCE; f < PAIR_COUNT; ++f) {
                 if (!game.pair[f]) continue;
@@ -148,9 +151,13 @@ Plan make_plan(
         const int filled = int(std::min<int64_t>(W, last - start));
         if (interacts(game)) {
             int problems[W];
-            for (int lane = 0; lane < W; ++lane) problems[lane] = int(start + std::min(lane, filled - 1));
+            uint64_t held_in_all = held.empty() ? 0 : ~uint64_t(0);
+            for (int lane = 0; lane < W; ++lane) {
+                problems[lane] = int(start + std::min(lane, filled - 1));
+                if (!held.empty()) held_in_all &= held[problems[lane] - first];
+            }
             arena.clear();
-            find_contacts<T>(game, arena, problems, controls, touching.data());
+            find_contacts<T>(game, arena, problems, held_in_all, controls, touching.data());
         }
         for (int lane = 0; lane < filled; ++lane) {
             if (done[start + lane - first]) continue;
@@ -376,14 +383,15 @@ class Range {
     }
 
     /// Writes the energy of `controls` and, unless `states` is null, the norm of its gradient and the states to the results of the call.
-    void measure(const T* controls, T* energy, T* states) {
+    /// With masks of held agents, it is the energy of those that move, given the held ones.
+    void measure(const T* controls, T* energy, T* states, const std::vector<uint64_t>& held = {}) {
         T* const norm = static_cast<T*>(run_.gradient_norm);
         std::fill(energy + first_, energy + last_, T(0));
         if (states) {
             std::fill(norm + first_, norm + last_, T(0));
             std::memset(states + first_ * size_ * 2, 0, sizeof(T) * (last_ - first_) * size_ * 2);
         }
-        const Plan plan = make_plan<T>(game_, arena_, first_, last_, done_, {}, controls);
+        const Plan plan = make_plan<T>(game_, arena_, first_, last_, done_, held, controls);
         for_each_group<T>(game_, arena_, plan, controls, [&](auto& group, int64_t, int filled) {
             const int n = group.movers;
             group.load_parameters();
@@ -418,27 +426,30 @@ class Range {
     /// the rounding of it.
     void descend() {
         T *const controls = iterate(0), *const trial = iterate(1);
-        T *const best = static_cast<T*>(run_.energy), *const before = static_cast<T*>(run_.initial_energy);
+        T *const before = static_cast<T*>(run_.initial_energy), *const after = static_cast<T*>(run_.energy);
         const int64_t count = last_ - first_;
         std::vector<int64_t> tried(count);
-        std::vector<T> found(count), predicted(count);
+        std::vector<T> best(count), found(count), predicted(count);  // energies of the agents that move
         find_held();
-        measure(controls, best, nullptr);
-        std::copy(best + first_, best + last_, before + first_);
+        measure(controls, before, nullptr);
+        if (held_.empty())
+            std::copy(before + first_, before + last_, best.begin());
+        else
+            measure(controls, best.data() - first_, nullptr, held_);
         for (int64_t s = 0; s < run_.steps; ++s) {
             for (int64_t at = 0; at < count; ++at) tried[at] = valid_[at] ? SOLVED : STOPPED;
             step(controls, trial, static_cast<T*>(run_.directions), nullptr, predicted.data() - first_, tried.data() - first_);
-            measure(trial, found.data() - first_, nullptr);
+            measure(trial, found.data() - first_, nullptr, held_);
             bool all = true;
             for (int64_t at = 0; at < count; ++at) {
                 const int64_t problem = first_ + at;
                 if (done_[at]) continue;
                 // The decrease is that with damping: only with little of it is a small decrease a sign of a minimum.
-                done_[at] = predicted[at] <= std::numeric_limits<T>::epsilon() * best[problem] && damping(problem) <= T(kLightDamping);
+                done_[at] = predicted[at] <= std::numeric_limits<T>::epsilon() * best[at] && damping(problem) <= T(kLightDamping);
                 all &= done_[at] != 0;
-                if (found[at] < best[problem]) {
+                if (found[at] < best[at]) {
                     std::copy(trial + problem * size_, trial + (problem + 1) * size_, controls + problem * size_);
-                    best[problem] = found[at];
+                    best[at] = found[at];
                     change_damping(problem, [](T value) { return std::max(value / T(10), T(kLeastDamping)); });
                     run_.status[problem] = std::max(run_.status[problem], tried[at]);
                 } else {
@@ -448,9 +459,9 @@ class Range {
             if (all) break;
         }
         std::fill(done_.begin(), done_.end(), 0);
-        measure(controls, best, static_cast<T*>(run_.states));
+        measure(controls, after, static_cast<T*>(run_.states));
         for (int64_t problem = first_; problem < last_; ++problem)
-            if (!finite(best[problem])) run_.status[problem] = STOPPED;
+            if (!finite(after[problem])) run_.status[problem] = STOPPED;
     }
 
   private:
