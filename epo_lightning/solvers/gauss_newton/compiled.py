@@ -255,8 +255,8 @@ class _Call:
                 game.pair[slot], game.pair_strides[slot][:] = weight.data_ptr(), weight.stride()
             margins = dict(zip(self.margin_slots, self.margins, strict=True))
             for name in energy.margins.keys() & set(energy.pair):
-                fixed = hold(_as(like, energy.margin(scene, parameters, name)))
-                margins[PAIR.index(name)] = fixed.expand(-1, modes, -1)
+                fixed = hold(self.controls.new_tensor(energy.margins[name]))
+                margins[PAIR.index(name)] = fixed.expand(batch, modes, agents * (agents - 1) // 2)
             for slot, margin in margins.items():
                 game.margins[slot], game.margin_strides[slot][:] = margin.data_ptr(), margin.stride()
         if self.goals:
