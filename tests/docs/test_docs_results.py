@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from math import sqrt
 from collections import Counter
+from math import sqrt
 from pathlib import Path
 from statistics import fmean, stdev
 
