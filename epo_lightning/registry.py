@@ -64,6 +64,9 @@ _HOMES = {
 }
 """Module or folder of this package that holds the parts of each group. New files in a folder are found automatically."""
 
+_OF_AN_EXTRA = "epo_lightning.solvers.gauss_newton.fused_kernel."
+"""Modules that import the package of an extra at once. They register no part, and are not imported by a look-up."""
+
 
 @cache
 def _load(group: str) -> None:
@@ -71,7 +74,8 @@ def _load(group: str) -> None:
     if group in _HOMES:
         home = import_module(f"epo_lightning.{_HOMES[group]}")
         for module in pkgutil.walk_packages(getattr(home, "__path__", []), f"{home.__name__}."):
-            import_module(module.name)
+            if not module.name.startswith(_OF_AN_EXTRA):
+                import_module(module.name)
     for entry in entry_points(group="epo_lightning.parts"):
         entry.load()
 

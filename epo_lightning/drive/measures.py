@@ -38,8 +38,9 @@ UNITS: Mapping[str, str] = {
     "progress": "m",
     "jerk": "m/s³",
     "lateral": "m/s²",
+    "speed": "m/s",
 }
-"""Unit of every measure; those of a world have none."""
+"""Units of measures. Costs have none."""
 
 
 def measure(episodes: Episodes, world: World) -> dict[str, Float[Tensor, " B"]]:

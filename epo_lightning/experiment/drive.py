@@ -81,10 +81,10 @@ def _compare(
 ) -> list[Path]:
     """Drive with all planners and write the files."""
     plain = json.loads(json.dumps(dataclasses.asdict(settings)))
-    begun = {name: value for name, value in plain.items() if name != "out"}
+    begun = {name: value for name, value in plain.items() if name not in ("out", "timed", "film")}
     driven = Driven(out / "episodes.jsonl", begun, _digests(settings), tell)
     tell(
-        f"drives {settings.episodes} episodes with each of {len(planners)} planners, others: {', '.join(kinds)}; "
+        f"drives {settings.episodes} episodes per planner, {len(planners)} in all, others: {', '.join(kinds)}; "
         "the same command continues if it is stopped"
     )
     results: dict[str, Any] = {"settings": plain, "worlds": {}, "milliseconds": {}}
@@ -96,10 +96,11 @@ def _compare(
             measured, rates = driven.measured(kind, planners), driven.rates(kind)
             results["worlds"][kind] = _results(measured, rates)
             tables.append(_table(kind, measured, rates))
-            if settings.timed and (milliseconds := _milliseconds(world, made, settings.timed)):
+            if settings.timed and (milliseconds := _milliseconds(world, kind, made, settings.timed, tell)):
                 results["milliseconds"][kind] = milliseconds
                 tables.append(_times_table(milliseconds))
             if settings.film is not None:
+                tell(f"{kind:8} draws a film of episode {settings.film}")
                 played = {
                     name: play(world, planner, [settings.film], keep_plans=True) for name, planner in made.items()
                 }
@@ -254,16 +255,19 @@ def _cell(value: Estimate, rate: bool) -> str:
     return f"{value.mean:.{digits}f} ({value.low:.{digits}f} to {value.high:.{digits}f})"
 
 
-def _milliseconds(world: World, planners: Mapping[str, Planner | None], timed: int) -> dict[str, dict[str, float]]:
+def _milliseconds(
+    world: World, kind: str, planners: Mapping[str, Planner | None], timed: int, tell: Callable[[str], None]
+) -> dict[str, dict[str, float]]:
     """Milliseconds of a plan of one scene: median and 99th percentile, by the clock and of processor time.
 
     Some episodes are driven once more, alone.
     """
-    found = {}
+    found, count = {}, min(timed, len(world))
     for name, planner in planners.items():
         if planner is None:
             continue
-        wall, processor = times(world, planner, range(min(timed, len(world))))
+        tell(f"{kind:8} times every plan of {name}; episodes driven once more, one by one: {count}")
+        wall, processor = times(world, planner, range(count))
         found[name] = {
             f"{title} {label}": 1e3 * float(torch.tensor(values).quantile(share))
             for title, values in (("clock", wall), ("processor", processor))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 import epo_lightning
+from epo_lightning import registry
 
 PACKAGE = Path(epo_lightning.__file__).parent
 PROJECT = PACKAGE.parent / "pyproject.toml"
@@ -50,3 +54,40 @@ def test_modules_import_without_optional_dependencies() -> None:
             if on_demand != (on_demand and of_extra) or (package not in known and package != ON_DEMAND.get(of_extra)):
                 foreign.add(f"{module}: {name}")
     assert not foreign
+
+
+WITHOUT_EXTRAS = """
+import sys
+
+sys.modules.update(dict.fromkeys({packages}))  # an import of them raises ModuleNotFoundError
+{work}
+"""
+OF_EXTRAS = [
+    "gymnasium",
+    "highway_env",
+    "libsumo",
+    "mlflow",
+    "onnx",
+    "onnxruntime",
+    "onnxscript",
+    "optuna",
+    "ray",
+    "starlette",
+    "sumo",
+    "uvicorn",
+    "warp",
+]
+LOOK_UPS = [f"from epo_lightning.registry import parts; assert parts({group!r})" for group in registry._HOMES]
+
+
+@pytest.mark.parametrize(
+    "work", [*LOOK_UPS, "import epo_lightning; assert epo_lightning.load('rpi/v_lstm_epo')", "import warp"]
+)
+def test_parts_are_found_and_loaded_without_extras(work: str) -> None:
+    """Look-ups import whole folders, so no module in them may need a package of an extra at once."""
+    program = WITHOUT_EXTRAS.format(packages=OF_EXTRAS, work=work)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    if work == "import warp":
+        assert "ModuleNotFoundError: import of warp halted" in done.stderr, "the packages are really missing"
+    else:
+        assert done.returncode == 0, done.stderr

@@ -86,7 +86,7 @@ def test_a_command_that_was_killed_is_continued(
     out = tmp_path / "driven"
     assert epo("drive", *QUICK, f"out={out}") == 0
     told = capsys.readouterr().out
-    assert "drives 2 episodes with each of 2 planners, others: ignores; the same command continues" in told
+    assert "drives 2 episodes per planner, 2 in all, others: ignores; the same command continues" in told
     assert "V-LSTM + EPO, relaxed: 2 of 2 episodes" in told
     whole, lines = (out / "results.json").read_text(), (out / "episodes.jsonl").read_text().splitlines(keepends=True)
     assert len(lines) == 3, "settings, and a line per planner"
@@ -97,6 +97,13 @@ def test_a_command_that_was_killed_is_continued(
     told = capsys.readouterr().out
     assert "V-LSTM + EPO, relaxed: 2 of 2 episodes" not in told, "what was driven is not driven again"
     assert "response to constant velocity: 2 of 2 episodes" in told
+    (out / "results.json").unlink()
+    words = [word for word in QUICK if not word.startswith(("timed=", "film="))]
+    assert epo("drive", *words, "timed=1", "film=1", f"out={out}") == 0, "episodes do not depend on times and films"
+    told = capsys.readouterr().out
+    assert "2 of 2 episodes" not in told
+    assert "times every plan of V-LSTM + EPO, relaxed; episodes driven once more, one by one: 1" in told
+    assert "draws a film of episode 1" in told
     (out / "results.json").unlink()
     assert epo("drive", *QUICK, "seed=1", f"out={out}") == 2
     assert "was begun with other settings (seed)" in capsys.readouterr().err
