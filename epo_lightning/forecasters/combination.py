@@ -6,6 +6,7 @@ anything runs, with the reason and the single changes that would make it work.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -103,6 +104,10 @@ class Combination:
                 if both.obstacle is None
             }
             working = list(two)[:6]
+        alternatives = Counter(word.partition("=")[0] for word in working)
+        working.sort(
+            key=lambda word: alternatives[word.partition("=")[0]]
+        )  # the one that is left of its kind comes first
         raise ConfigError(f"{obstacle}. With this instead it works: {', or '.join(working)}")
 
 

@@ -26,6 +26,8 @@ def varying(configs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     first, *others = configs
     found = [{key: (mine, theirs) for key, mine, theirs in differences(first, other)} for other in others]
     keys = sorted({key for entry in found for key in entry} - {"seed"})
+    # Of a mapping that is empty in some configurations, the settings in it say enough.
+    keys = [key for key in keys if not any(other.startswith(f"{key}.") for other in keys)]
     own = {key: next(entry[key][0] for entry in found if key in entry) for key in keys}
     return [own, *({key: entry[key][1] if key in entry else own[key] for key in keys} for entry in found)]
 
@@ -48,9 +50,17 @@ def labels(
         rows: identities of the rows, used if there are too many settings or they do not distinguish rows.
     """
     keys = short_keys(list(settings[0]), config)
+    complete = {key: _long_union([own[key] for own in settings]) for key in keys}
+
+    def parts(own: Mapping[str, Any], shown: Callable[[Any], str]) -> Iterator[str]:
+        for key, value in own.items():
+            if not complete[key]:
+                yield f"{keys[key]}={shown(value)}"
+            elif lacking := [entry for entry in complete[key] if entry not in value]:
+                yield f"{keys[key]} without {', '.join(lacking)}"
 
     def named(shown: Callable[[Any], str]) -> list[str]:
-        return [", ".join([title, *(f"{keys[key]}={shown(value)}" for key, value in own.items())]) for own in settings]
+        return [", ".join([title, *parts(own, shown)]) for own in settings]
 
     names = named(lambda value: _shown(_rounded(value)))
     if len({*names}) < len(names):
@@ -96,6 +106,15 @@ def _rounded(value: Any) -> Any:
 def _shown(value: Any) -> str:
     text = value_text(value)
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+
+
+def _long_union(values: Sequence[Any]) -> list[str]:
+    """The longest of several lists of names, if it is long and contains all the others; otherwise none."""
+    if not all(isinstance(value, list) and all(isinstance(name, str) for name in value) for value in values):
+        return []
+    longest: list[str] = max(values, key=len)
+    contained = all(set(value) <= set(longest) for value in values)
+    return longest if contained and len(value_text(longest)) > LONGEST else []
 
 
 def _keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -385,3 +385,19 @@ def test_the_page_of_rpi_has_the_scores_on_shares_of_the_games() -> None:
         for cell, share in zip(line, shares, strict=True):
             pairs = zip(found[row, share], found["v_lstm_sc_relaxed", share], strict=True)
             assert cell == interval([ours - theirs for ours, theirs in pairs], 4), (row, share)
+
+
+def test_the_page_of_games_has_the_scores_of_games_of_another_class() -> None:
+    rows = distinct(build_tables(read_results(ROOT / "results" / "rpi_wrong_game.json").evaluated))
+    for start, label in (
+        ("a margin that is not told", "clearance=null, game_horizon=82"),
+        ("no final heading", "clearance=0.5, own without heading, game_horizon=82"),
+        ("a margin of 0.6 m", "clearance=0.6, game_horizon=82"),
+        ("a margin of 0.25 m", "clearance=0.25, game_horizon=82"),
+        ("a game that ends with the forecast", "clearance=0.5, game_horizon=40"),
+    ):
+        row = next(row for row in rows if row.name == f"V-LSTM + EPO, game, {label}")
+        cells = [row.cells[metric] for metric in ("minSADE", *SIDES)]
+        assert [cell.n for cell in cells] == [3] * 3
+        shown = [f"{short(cell.mean, 4)} ± {short(cell.deviation or 0, 4)}" for cell in cells]
+        assert line_of(f"| {start}")[:3] == shown, start

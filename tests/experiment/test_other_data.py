@@ -216,6 +216,8 @@ def test_what_does_not_fit_is_refused_with_a_reason(
     run, game = f"run={home / 'runs' / 'v_lstm_epo'}", f"run={home / 'rpi' / 'v_lstm_epo'}"
     folder = f"data.folder={square(home / 'data')}"
     assert "data.folder needs a choice of data: add data=<one of" in refused("evaluate", run, "data.folder=x")
+    told = refused("evaluate", run, "solver=best_response")
+    assert "unknown key 'solver' of epo evaluate: solver is a choice of epo train, and a run keeps it" in told
     assert "split=all needs data=" in refused("evaluate", run, "split=all")
     assert "split=train needs data=" in refused("predict", run, "split=train", "out=o")
     message = refused("evaluate", run, "data=ucy", folder, "data.windows.dt=0.4")

@@ -69,6 +69,23 @@ def test_labels_equal_those_written_by_hand() -> None:
     assert labels("V", [{}], CONFIG, ["aaaa"]) == ["V"]
 
 
+def test_long_lists_of_names_are_told_by_what_they_lack() -> None:
+    def of(*lists: list[Any]) -> list[str]:
+        settings = [{"energy.own": own} for own in lists]
+        return labels("V", settings, CONFIG, ["aaaa", "bbbb", "cccc"][: len(lists)])
+
+    own = ["goal", "vel", "acc", "turnr", "jerk"]
+    assert of(own, own[1:], own[:3]) == ["V", "V, own without goal", "V, own without turnr, jerk"]
+    assert of(own[:2], []) == ["V, own=[goal,vel]", "V, own=[]"], "short lists are shown"
+    assert of(own, ["turnacc"]) == ["V, own=[goal,vel,acc,turnr,jer…", "V, own=[turnacc]"], "none contains the other"
+    assert of([10**12, 10**13], [10**12]) == ["V, own=[1000000000000,10000000…", "V, own=[1000000000000]"], "no names"
+
+
+def test_an_empty_mapping_is_told_by_the_settings_that_it_lacks() -> None:
+    fixed, free = {**CONFIG, "energy": {"margins": {"clearance": 0.5}}}, {**CONFIG, "energy": {"margins": {}}}
+    assert varying([fixed, free]) == [{"energy.margins.clearance": 0.5}, {"energy.margins.clearance": None}]
+
+
 def test_labels_round_numbers_unless_that_makes_them_equal() -> None:
     def of(*rates: float) -> list[str]:
         return labels("V", [{"solver.rate": rate, "solver.steps": 1234} for rate in rates], CONFIG, ["a", "b"])

@@ -334,6 +334,9 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             choice = f"gate=<one of {', '.join(options_of(instance, word))}>"
             return f"{key} is a setting of a gate, but no gate is chosen: add {choice}, or leave it out"
         if word not in names and not walked and (options := options_of(instance, word)):
+            defaults = instance.config_loader.compute_defaults_list(name, overrides=[], run_mode=RunMode.RUN)
+            if word not in defaults.overrides.known_choices:
+                return f"unknown key {key!r} of epo {name}: {word} is a choice of epo train, and a run keeps it"
             return f"{key} needs a choice of {word}: add {word}=<one of {', '.join(options)}>"
         if word not in names and len(walked) == 1 and names and word in _arguments(walked[0], config):
             return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
