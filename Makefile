@@ -4,7 +4,7 @@
 # make lint        check style and types
 # make smoke       train every experiment for a few steps on drawn scenes (a minute)
 # make docs        build the documentation as a site, with references of API and configuration, in build/docs
-# make tables      write docs/tables anew from the results files in results/
+# make tables      write docs/tables and docs/results.md anew from the results files in results/
 # make checkpoint  train the checkpoints that ship with the package anew (half an hour; one: NAME=rpi/v_lstm_epo)
 # make asan        test the kernel with the sanitizers of addresses and undefined behaviour (Clang, Linux)
 # make wheel       build a package for this platform, with the compiled layer, in dist/
@@ -123,7 +123,10 @@ lint: $(TESTABLE)
 docs: $(DOCUMENTABLE)
 	$(BIN)/python -m sphinx -q -W --keep-going -j auto -b $(BUILDER) docs build/docs
 
-tables: $(patsubst results/%.json,docs/tables/%/results.md,$(wildcard results/*.json))
+tables: $(patsubst results/%.json,docs/tables/%/results.md,$(wildcard results/*.json)) docs/results.md
+
+docs/results.md: docs/results.md.j2 $(wildcard results/*.json) $(INSTALLED)
+	$(EPO) report template=$<
 
 docs/tables/%/results.md: results/%.json $(INSTALLED)
 	$(EPO) report results=$< out=build/tables/$* > /dev/null

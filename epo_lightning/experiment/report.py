@@ -29,6 +29,8 @@ from epo_lightning.schema import read
 
 SCENES, GAMES = 4, 512
 """How many scenes are drawn, and over how many the distribution of learned weights is taken."""
+RESULTS = "results"
+"""Folder of the results files of a template, unless another one is named."""
 NOT_DRAWN = "Scenes and learned weights are not drawn: they need checkpoints and data."
 
 
@@ -63,6 +65,24 @@ def report(settings: ReportSettings) -> Path:
         drawn, notes = [], [NOT_DRAWN] if rows else []
     write_report(subject, out, drawn, preface(subject.evaluated), notes)
     return out
+
+
+def report_page(settings: ReportSettings) -> Path:
+    """Write the page of ``template``, whose numbers come from the results files in the folder ``results``.
+
+    Returns:
+        the file that was written.
+
+    Raises:
+        ConfigError: settings of another kind of report, or as :func:`~epo_lightning.report.template.write_page`.
+    """
+    from epo_lightning.report.template import write_page
+
+    if settings.sweep or settings.save:
+        raise ConfigError(
+            "template= writes a page with numbers of results files: leave out the name of a sweep and save="
+        )
+    return write_page(settings.template or "", settings.results or RESULTS, settings.out)
 
 
 def _default_folder(settings: ReportSettings, sweep: Sweep | None) -> Path:

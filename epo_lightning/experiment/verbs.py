@@ -211,9 +211,9 @@ def drive_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
 def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Write tables and figures of all evaluated runs below a folder, and print the path of the page."""
     settings = check_settings("report", config)
-    from epo_lightning.experiment.report import report
+    from epo_lightning.experiment.report import report, report_page
 
-    print(f"wrote {report(settings) / 'index.html'}")
+    print(f"wrote {report_page(settings) if settings.template else report(settings) / 'index.html'}")
 
 
 def _print_report(report: dict[str, Any], indent: str = "  ") -> None:

@@ -1,4 +1,4 @@
-"""Games that a forecaster has learned on highways: their solutions against SciPy, which knows the energy as a function alone."""
+"""Games that a forecaster has learned on highways: solutions against SciPy, which knows only the function."""
 
 from __future__ import annotations
 

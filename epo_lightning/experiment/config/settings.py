@@ -382,4 +382,5 @@ class ReportSettings:
     results: str | None = None
     out: str | None = None
     save: str | None = None
+    template: str | None = None
     scenes: bool = True

@@ -1,0 +1,130 @@
+"""Pages whose numbers come from results files: every number against a plain computation, and errors that name the line."""
+
+from __future__ import annotations
+
+from math import sqrt
+from pathlib import Path
+from statistics import fmean, stdev
+
+import pytest
+from scipy.stats import t as student
+
+from epo_lightning.experiment.config.settings import ReportSettings
+from epo_lightning.experiment.report import report_page
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.results import read_results
+from epo_lightning.report.template import Differences, Scores, average, lower, table, write_page
+
+RESULTS = Path(__file__).parents[2] / "results"
+
+
+def write(folder: Path, text: str) -> str:
+    """The page of a template with this text."""
+    template = folder / "page.md.j2"
+    template.write_text(text, encoding="utf-8")
+    return write_page(template, RESULTS).read_text(encoding="utf-8")
+
+
+def scores(metric: str, title: str) -> dict[int, float]:
+    """Scores by seed of a row of ``rpi_hard_settled.json``, read without the module under test."""
+    runs = read_results(RESULTS / "rpi_hard_settled.json").evaluated
+    return {run.seed: run.metrics[metric] for run in runs if run.name == title}
+
+
+def test_numbers_are_those_of_a_plain_computation(tmp_path: Path) -> None:
+    epo, sc = scores("minSFDE", "V-LSTM + EPO, relaxed"), scores("minSFDE", "V-LSTM + SC, relaxed")
+    found = [epo[seed] - sc[seed] for seed in range(5)]
+    half = student.ppf(0.975, 4) * stdev(found) / sqrt(5)
+    expected = [
+        f"{fmean(epo.values()):.4f} ± {stdev(epo.values()):.4f}",
+        f"{fmean(found):+.4f} ({fmean(found) - half:+.4f} to {fmean(found) + half:+.4f})",
+        f"{fmean(epo.values()) / fmean(sc.values()):.2f}",
+        f"{sum(value < 0 for value in found)} of 5",
+        ", ".join(f"{epo[seed]:.5f}" for seed in range(5)),
+    ]
+    page = write(
+        tmp_path,
+        '{% set rows = results("rpi_hard_settled", digits=4) %}\n'
+        '{% set sc, epo = rows["V-LSTM + SC, relaxed"], rows["V-LSTM + EPO, relaxed"] %}\n'
+        '{{ epo.text("SFDE") }}|{{ (epo - sc).text("SFDE") }}|{{ epo.over(sc, "SFDE") }}|'
+        '{{ lower([epo - sc], "SFDE") }}|{{ epo.seeds("SFDE", 5) }}',
+    )
+    assert page.split("|") == [text.replace("0.", ".") for text in expected]
+
+
+def test_differences_are_of_the_seeds_that_both_rows_have() -> None:
+    one = Scores("one", {0: {"minSADE": 1.0}, 1: {"minSADE": 2.0}, 2: {"minSADE": 9.0}})
+    other = Scores("other", {1: {"minSADE": 0.5}, 0: {"minSADE": 0.75}})
+    assert (one - other).by_seed == {0: {"minSADE": 0.25}, 1: {"minSADE": 1.5}}
+    with pytest.raises(ConfigError, match="no seed in common"):
+        one - Scores("none", {7: {"minSADE": 1.0}})
+
+
+def test_an_average_takes_the_seed_as_the_unit() -> None:
+    pairs = [Differences("a", {0: {"x": 1.0}, 1: {"x": 2.0}}), Differences("b", {0: {"x": 3.0}, 1: {"x": -6.0}})]
+    both = average(pairs)
+    assert isinstance(both, Differences)
+    assert both.values("x") == [2.0, -2.0]
+    assert lower(pairs, "x") == "1 of 4"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.5, ".5000"), (-0.5, "-.5000"), (10.5, "10.5000"), (0.0, ".0000"), (-10.25, "-10.2500")]
+)
+def test_only_a_zero_before_the_point_is_left_out(value: float, text: str) -> None:
+    assert Scores("row", {0: {"x": value}}, 4).text("x") == text
+
+
+def test_a_single_difference_has_no_interval() -> None:
+    assert Differences("row", {0: {"x": 0.5}}).text("x") == "+.500"
+    assert Differences("row", {0: {"x": 0.5}, 1: {"x": 0.5}}).text("x") == "+.500"
+
+
+def test_a_table_has_the_papers_values_beside_its_rows() -> None:
+    rows = {
+        "ours": Scores("a", {0: {"minSADE": 1.0}, 1: {"minSADE": 2.0}}),
+        "other": Scores("b", {0: {"minSADE": 3.0}}),
+    }
+    assert table("method", rows, "SADE", paper={"ours": [".99"]}).splitlines() == [
+        "| method | n | SADE | paper: SADE |",
+        "|:--|--:|--:|--:|",
+        "| ours | 2 | 1.500 ± .707 | .99 |",
+        "| other | 1 | 3.000 |  |",
+    ]
+
+
+def test_the_sources_are_the_files_that_were_used(tmp_path: Path) -> None:
+    page = write(tmp_path, '{% set rows = results("game") %}{{ sources() }}')
+    lines = page.splitlines()
+    assert len(lines) == 3
+    assert lines[2].startswith("| [game](tables/game/results.md) | rpi_hard (")
+    assert "| ba411c2 | 0 to 2 | 12 |" in lines[2]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('a\n{{ results("gmae") }}', r"line 2: no results file .*gmae\.json; did you mean 'game'"),
+        ('a\n\n{{ results("game")["V-LSTM + SC"] }}', "line 3: .*has no row 'V-LSTM \\+ SC'; did you mean"),
+        ('{{ results("game")["V-LSTM + SC, relaxed"].text("SAED") }}', "line 1: .*no metric 'SAED'"),
+        ('{{ results("rpi_games_share") }}', "line 1: .*data must name one of its data sets, found None"),
+        ('{{ results("game", data="rpi") }}', "line 1: .*found rpi; did you mean 'rpi_hard'"),
+        ("a\n{{ nothing.text() }}", "line 2: 'nothing' is undefined"),
+        ("a\n{% if %}", "line 2: "),
+    ],
+)
+def test_an_error_names_the_template_and_the_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=rf"page\.md\.j2, {message}"):
+        write(tmp_path, text)
+    assert not (tmp_path / "page.md").exists()
+
+
+def test_settings_of_another_kind_of_report_are_refused(tmp_path: Path) -> None:
+    template = tmp_path / "page.md.j2"
+    template.write_text("text", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"name ends with \.j2"):
+        write_page(tmp_path / "page.md", RESULTS)
+    with pytest.raises(ConfigError, match="leave out the name of a sweep"):
+        report_page(ReportSettings(template=str(template), sweep="rpi_main"))
+    out = report_page(ReportSettings(template=str(template), results=str(RESULTS), out=str(tmp_path / "out")))
+    assert out.read_text(encoding="utf-8") == "text"
