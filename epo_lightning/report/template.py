@@ -12,7 +12,8 @@ A template gets rows by :meth:`Results.rows`, under the name ``results``, and as
     {{ table("paired difference", {"+EPO - +SC": epo - sc}, "SADE", "SFDE") }}
 
 Metrics are named as in the tables of reports (``SADE``, ``OR``, ``SADE, k=1``) or as in ``metrics.json``. The name of a
-subset or of a stage stands before them: ``interactive SADE``, ``initial SADE``.
+subset or of a stage stands before them: ``interactive SADE``, ``initial SADE``; ``validation SADE`` is the lowest one of the
+training's log.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.report.columns import EQUILIBRIUM, MAIN, PROBABILITIES, TRUTH
+from epo_lightning.report.columns import EQUILIBRIUM, MAIN, MISSING, PROBABILITIES, TRUTH
+from epo_lightning.report.costs import last_fifth
+from epo_lightning.report.curves import METRIC, validation_log
 from epo_lightning.report.results import read_results
 from epo_lightning.report.rows import Row, plain_rows
 from epo_lightning.report.runs import EvaluatedRun, read_parts
@@ -170,12 +173,17 @@ class Results:
         return Rows(file, plain_rows(run for run in runs if data in (None, run.data)), digits)
 
     def sources(self) -> str:
-        """Table of the results files that were used: their data, commits, seeds and numbers of runs."""
+        """Table of the results files that were used, with what their runs saw, and how far they had settled.
+
+        The last column is the change of the lowest validation SADE in the last fifth of the training, in the mean of a row:
+        the rows that changed most and least.
+        """
         lines = []
         for name, runs in sorted(self.used.items()):
             data = dict.fromkeys(f"{run.data} ({run.data_digest})" for run in runs)
             commits = sorted({run.git_commit[:7] for run in runs})
             seeds = sorted({run.seed for run in runs})
+            steps = sorted({int(run.records.record["steps"]) for run in runs if run.learned})
             lines.append(
                 (
                     f"[{name}](tables/{name}/results.md)",
@@ -183,9 +191,12 @@ class Results:
                     ", ".join(commits),
                     f"{seeds[0]} to {seeds[-1]}",
                     str(len(runs)),
+                    " to ".join(str(number) for number in dict.fromkeys((steps[0], steps[-1]))),
+                    _settled(runs),
                 )
             )
-        return _lines(("results file, commands", "scored on (digest)", "commits", "seeds", "runs"), lines, left=4)
+        header = ("results file", "scored on (digest)", "commits", "seeds", "runs", "steps", "change in the last fifth")
+        return _lines(header, lines, left=4)
 
 
 class Rows(Mapping[str, Scores]):
@@ -193,7 +204,7 @@ class Rows(Mapping[str, Scores]):
 
     def __init__(self, file: Path, rows: Iterable[Row], digits: int) -> None:
         self._file = file
-        self._rows = {row.name: Scores(row.name, {run.seed: run.metrics for run in row.runs}, digits) for row in rows}
+        self._rows = {row.name: Scores(row.name, {run.seed: _scores(run) for run in row.runs}, digits) for row in rows}
 
     def __getitem__(self, name: str) -> Scores:
         if name not in self._rows:
@@ -288,6 +299,34 @@ def write_page(template: str | Path, results: str | Path, out: str | Path | None
     file = Path(template.parent if out is None else out).expanduser() / template.stem
     write_file(file, page)
     return file
+
+
+def _scores(run: EvaluatedRun) -> Mapping[str, float]:
+    """The scores of a run, with the lowest validation score of its training."""
+    log = _validations(run)
+    return {**run.metrics, f"validation/{METRIC.partition('/')[2]}": min(log.values())} if log else run.metrics
+
+
+def _validations(run: EvaluatedRun) -> Mapping[int, float]:
+    """Validation scores of a run by training step; empty if it was not trained or its log cannot be read."""
+    try:
+        return validation_log(run.records, METRIC) if run.learned else {}
+    except ConfigError:  # the learning curves of the report say what is wrong with this log
+        return {}
+
+
+def _settled(runs: Iterable[EvaluatedRun]) -> str:
+    """Range over rows of the mean change of their validation scores in the last fifth of the training, in percent."""
+    changes: dict[str, list[float]] = {}
+    for run in runs:
+        log = _validations(run)
+        if log and (change := last_fifth(log)) is not None:
+            changes.setdefault(run.row, []).append(100 * change)
+    means = [statistics.fmean(values) for values in changes.values()]
+    ends = (
+        dict.fromkeys(f"{round(value, 1) + 0.0:.1f}" for value in (min(means), max(means))) if means else {}
+    )  # no -0.0
+    return f"{' to '.join(ends)} %" if ends else MISSING
 
 
 def _line(error: Exception) -> int:

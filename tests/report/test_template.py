@@ -98,7 +98,18 @@ def test_the_sources_are_the_files_that_were_used(tmp_path: Path) -> None:
     lines = page.splitlines()
     assert len(lines) == 3
     assert lines[2].startswith("| [game](tables/game/results.md) | rpi_hard (")
-    assert "| ba411c2 | 0 to 2 | 12 |" in lines[2]
+    assert lines[2].endswith("| ba411c2 | 0 to 2 | 12 | 3670 | -3.4 to 0.0 % |")
+
+
+def test_the_validation_score_is_the_lowest_of_the_log(tmp_path: Path) -> None:
+    run = next(
+        run
+        for run in read_results(RESULTS / "game.json").evaluated
+        if run.name == "V-LSTM + EPO, game" and not run.seed
+    )
+    lowest = min(float(entry["val/minSADE"]) for entry in run.records.log())
+    text = '{{ results("game")["V-LSTM + EPO, game"].seeds("validation SADE", 7) }}'
+    assert write(tmp_path, text).split(", ")[0] == f"{lowest:.7f}".replace("0.", ".", 1)
 
 
 @pytest.mark.parametrize(
