@@ -68,7 +68,7 @@ def write_predictions(path: str | Path, states: Tensor, probabilities: Tensor, s
     arrays: dict[str, Any] = {"states": states, "probabilities": probabilities, "dt": np.float64(scene.dt)}
     arrays |= {name: value for name in ("history", *OPTIONAL) if (value := getattr(scene, name)) is not None}
     content = io.BytesIO()
-    plain: Any = {name: a.detach().cpu().numpy() if isinstance(a, Tensor) else a for name, a in arrays.items()}
+    plain: Any = {name: _array(a) if isinstance(a, Tensor) else a for name, a in arrays.items()}
     np.savez_compressed(content, **plain)
     write_file(path, content.getbuffer())
     return path
@@ -106,13 +106,21 @@ def read_predictions(path: str | Path) -> Predictions:
     return Predictions(tensors["states"], tensors["probabilities"], scene)
 
 
+def _array(tensor: Tensor) -> np.ndarray:
+    """A tensor as an array; NumPy has no bfloat16, whose numbers are also of float32."""
+    tensor = tensor.detach().cpu()
+    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
+
+
 def _tensor(name: str, array: Any) -> Tensor:
-    """An array as a tensor, in the byte order of this machine.
+    """An array as a tensor, in the byte order of this machine; whole numbers have 64 bits.
 
     Raises:
         TypeError: no array of numbers; the message names it.
     """
     array = np.asarray(array)
+    if array.dtype.kind in "iu":
+        array = array.astype(np.int64)
     try:
         return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
     except TypeError:

@@ -21,6 +21,7 @@ Where agents do not interact, the refined futures are the tracked ones.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -114,11 +115,19 @@ def refine(
     """
     if not isinstance(scene, Scene):
         raise TypeError(f"scene is a {type(scene).__name__}; refine() takes an epo_lightning.Scene")
+    for what, part, kind in (
+        ("energy", energy, Energy),
+        ("solver", solver, Minimiser),
+        ("backward", backward if backward is not None else Implicit(), Backward),
+    ):
+        if not isinstance(part, kind):
+            raise TypeError(f"{what} is a {type(part).__name__}; it takes an epo_lightning.{kind.__name__}")
     scene.validate_values()
     check_forecast(states, probabilities, scene)
     check_number("noise", noise, zero=True)
     if isinstance(inverse_temperature, Tensor):
-        if inverse_temperature.dim() or not inverse_temperature.isfinite() or inverse_temperature < 0:
+        real = inverse_temperature.is_floating_point() and not inverse_temperature.dim()
+        if not real or not inverse_temperature.isfinite() or inverse_temperature < 0:
             raise ValueError(f"inverse_temperature must be one finite number, 0 or more, not {inverse_temperature}")
     else:
         check_number("inverse_temperature", inverse_temperature, zero=True)
@@ -153,7 +162,12 @@ def refine(
 
 def _largest(value: float | Tensor) -> float:
     """The largest absolute value."""
-    return float(value.detach().abs().max()) if isinstance(value, Tensor) else abs(float(value))
+    if isinstance(value, Tensor):
+        return float(value.detach().abs().max())
+    try:
+        return abs(float(value))
+    except OverflowError:  # a whole number that no float holds
+        return sys.float_info.max
 
 
 def _requires_grad(value: float | Tensor) -> bool:
@@ -348,6 +362,8 @@ def _expanded(what: str, value: float | Tensor, shape: tuple[int, int, int], lik
         if not is_number(value) or not math.isfinite(value):
             raise ValueError(f"{what} must be a finite number or a tensor, not {value!r}")
         return like.new_full((), float(value)).expand(shape)
+    if value.is_complex() or value.dtype == torch.bool:
+        raise ValueError(f"{what} is of type {value.dtype}, expected real numbers")
     if not value.isfinite().all():
         raise ValueError(f"{what} has entries that are not finite")
     try:

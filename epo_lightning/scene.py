@@ -32,6 +32,8 @@ X, Y, HEADING, SPEED = range(4)
 KINDS = ("car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "other")
 """Classes of agents; ``Scene.kind`` is an index into this tuple."""
 ACCELERATION, TURN_RATE = range(2)
+LARGEST_HEADING = 1e4
+"""Largest size of a heading [rad]: beyond it, single precision has no digits left for a direction."""
 
 
 def wrapped(turn: Tensor) -> Tensor:
@@ -200,16 +202,31 @@ class Scene(Batch):
         """Refuse values that no forecaster can use. On a GPU, this check makes the host wait for the tensors.
 
         Raises:
-            ValueError: a length or width that is not positive, a kind that does not exist, or the index of a reference
-                line that does not exist.
+            ValueError: a present agent that is not observed at t0, a heading without digits for a direction, a length or
+                width that is not positive and finite, a kind that does not exist, or the index of a reference line that does
+                not exist.
         """
+        assert self.history_mask is not None
+        bad = self.agent_mask & ~self.history_mask[..., -1]
+        if bad.any():
+            scene, agent = bad.nonzero()[0].tolist()
+            raise ValueError(
+                f"scene.history_mask[{scene}, {agent}, -1] is False; an agent that is there (agent_mask) is observed at t0"
+            )
+        bad = (self.history[..., HEADING].abs() > LARGEST_HEADING) & self.history_mask & self.agent_mask[..., None]
+        if bad.any():
+            scene, agent, step = bad.nonzero()[0].tolist()
+            raise ValueError(
+                f"scene.history[{scene}, {agent}, {step}] has the heading {float(self.history[scene, agent, step, HEADING]):g} "
+                f"rad; headings are at most {LARGEST_HEADING:g} in size"
+            )
         if self.size is not None:
-            bad = ~(self.size > 0).all(-1) & self.agent_mask
+            bad = ~((self.size > 0) & self.size.isfinite()).all(-1) & self.agent_mask
             if bad.any():
                 scene, agent = bad.nonzero()[0].tolist()
                 raise ValueError(
                     f"scene.size[{scene}, {agent}] is {self.size[scene, agent].tolist()}; length and width must be "
-                    "positive [m]"
+                    "positive and finite [m]"
                 )
         if self.kind is not None:
             bad = ((self.kind < 0) | (self.kind >= len(KINDS))) & self.agent_mask

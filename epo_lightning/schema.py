@@ -79,7 +79,7 @@ def describe(hint: Any) -> str:
         return names[hint]
     base = origin or hint
     if isinstance(base, type) and issubclass(base, Mapping):
-        return "a mapping"
+        return "a mapping" + (f" with {describe(arguments[1])} for every name" if len(arguments) == 2 else "")
     if isinstance(base, type) and issubclass(base, Sequence):
         return "a list" + (f" of {describe(arguments[0])}" if arguments else "")
     return str(getattr(base, "__name__", base))

@@ -18,6 +18,7 @@ from epo_lightning.experiment.config.settings import PredictSettings
 from epo_lightning.experiment.predict import predict
 from epo_lightning.predictions import OPTIONAL, read_predictions, write_predictions
 from epo_lightning.registry import ConfigError
+from epo_lightning.scene import Scene
 
 
 def forecasts(channels: int = 4) -> tuple[torch.Tensor, torch.Tensor]:
@@ -105,6 +106,15 @@ def test_mistakes_are_named(changes: dict[str, Any], message: str, tmp_path: Pat
     with pytest.raises(ConfigError, match=message) as error:
         read_predictions(tmp_path / "bad.npz")
     assert "bad.npz" in str(error.value)
+
+
+def test_numbers_that_one_of_the_libraries_lacks_are_converted(tmp_path: Path) -> None:
+    np.savez(tmp_path / "unsigned.npz", **good(), kind=np.full((3, 4), 6, np.uint64))
+    assert (read_predictions(tmp_path / "unsigned.npz").scene.kind == 6).all()
+    states, probabilities = forecasts()
+    scene = Scene(torch.ones(3, 4, 1, 4, dtype=torch.bfloat16), 0.2)
+    write_predictions(tmp_path / "short.npz", states, probabilities, scene)
+    assert (read_predictions(tmp_path / "short.npz").scene.history == 1).all()
 
 
 def test_dt_in_a_list_and_other_byte_orders_are_read(tmp_path: Path) -> None:

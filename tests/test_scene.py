@@ -112,7 +112,7 @@ def test_masks_default_to_true():
 def test_invalid_values_of_present_agents_are_refused():
     scene = random_scene(3, 2)
     scene.validate_values()
-    for bad in (0.0, -1.0):
+    for bad in (0.0, -1.0, float("inf"), float("nan")):
         scene.size[1, 1, 0] = bad
         with pytest.raises(ValueError, match=r"scene\.size\[1, 1\] is .*length and width must be positive"):
             scene.validate_values()
@@ -128,6 +128,13 @@ def test_invalid_values_of_present_agents_are_refused():
             named.validate_values()
     named.goal_mask[2, 0, 0] = False
     named.validate_values()
+    scene.history_mask[2, 1, -1] = False
+    with pytest.raises(ValueError, match=r"scene\.history_mask\[2, 1, -1\] is False; .* is observed at t0"):
+        scene.validate_values()
+    scene.history_mask[2, 1, -1] = True
+    scene.history[2, 1, 0, 2] = 1e5
+    with pytest.raises(ValueError, match=r"scene\.history\[2, 1, 0\] has the heading 100000 rad"):
+        scene.validate_values()
 
 
 def test_indexing_and_conversion_apply_to_all_tensors_of_a_scene():

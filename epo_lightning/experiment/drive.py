@@ -175,6 +175,8 @@ def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make
     runs = [RunFolder.open(path) for path in paths]
     configs = [read(Settings, run.config()) for run in runs]
     titles = _titles(paths, [run.path.resolve() for run in runs], [of_run.title for of_run in configs])
+    baselines = where.baselines if settings.baselines is None else settings.baselines
+    lacking: list[str] = []
     for path, run, of_run, title in zip(paths, runs, configs, titles, strict=True):
         forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
         if reason := where.refuse(of_run.data):
@@ -182,10 +184,13 @@ def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make
         for way in settings.ways:
             try:
                 make = _of_run(forecaster, way, settings.mode == "nearest")
-            except ConfigError:
-                continue  # a forecaster without a game has no warm start and no pair terms
+            except ConfigError as error:  # a forecaster without a game has no warm start and no pair terms
+                lacking.append(f"{path}, {way}: {error}")
+                continue
             yield WAYS[way].format(title), make
-    for name in where.baselines if settings.baselines is None else settings.baselines:
+    if len(lacking) == len(paths) * len(settings.ways) and not baselines:
+        raise ConfigError(f"no planner is left to drive ({'; '.join(lacking)}): add to ways= or baselines=")
+    for name in baselines:
         if name not in where.baselines:
             known = tuple(where.baselines)
             raise ConfigError(f"unknown baseline {name!r} of world={settings.world}: {nearest(name, known)}")

@@ -80,7 +80,6 @@ def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Pat
     wanted = {name: getattr(forecast, name) for name in OUTPUTS}
     tensors = inputs_of(forecaster, scenes)
     program = program_of(forecaster, tensors, scenes.dt)
-    file.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=file.parent, prefix=".export-") as folder:
         unchecked = Path(folder) / file.name
         form.write(program, {"title": of_run.title, "dt": scenes.dt, **describe(program)}, unchecked)
@@ -94,7 +93,9 @@ def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Pat
 
 
 def check_file(file: Path, form: Format) -> None:
-    """Refuse a file that exists or has another format's suffix, and a format whose packages are missing.
+    """Refuse a file that exists, cannot be written or has another format's suffix, and a format whose packages are missing.
+
+    The folder of the file is made.
 
     Raises:
         ConfigError: see above; the message names the file or the package.
@@ -106,6 +107,11 @@ def check_file(file: Path, form: Format) -> None:
     missing = [name for name in form.packages if find_spec(name) is None]
     if missing:
         raise ConfigError(f"format=onnx needs {', '.join(missing)}: pip install 'epo_lightning[onnx]'")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        TemporaryDirectory(dir=file.parent, prefix=".export-").cleanup()
+    except OSError as error:
+        raise ConfigError(f"out={file} cannot be written ({error.strerror}): choose another out=<file>") from error
 
 
 def check_exportable(forecaster: Forecaster, title: str, form: Format) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import torch
 
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import GameParameters, Scene, wrapped
 
 FARTHEST = 1e4
 """Largest size of a coordinate, angle or speed: farther away, single precision has no digits left for the game."""
@@ -73,10 +73,14 @@ class Edit:
                 raise ConfigError(f"factors: the game has no feature {name!r}: {nearest(name, names)}")
 
     def moved(self, scene: Scene) -> Scene:
-        """The scene in which agents with a new state have driven there at constant velocity."""
+        """The scene in which agents with a new state have driven there at constant velocity.
+
+        The heading of a new state is an angle; those that the agent wants at its goals are the nearest ones to it.
+        """
         if not self.states:
             return scene
-        history = scene.history.clone()
+        history, wanted = scene.history.clone(), scene.goal_headings
+        wanted = None if wanted is None else wanted.clone()
         past = torch.arange(1 - history.shape[2], 1) * scene.dt
         for agent, values in self.states.items():
             x, y, heading, speed = values
@@ -84,9 +88,11 @@ class Edit:
             history[:, int(agent), :, 1] = y + past * speed * math.sin(heading)
             history[:, int(agent), :, 2] = heading
             history[:, int(agent), :, 3] = speed
+            if wanted is not None:
+                wanted[:, int(agent)] = heading + wrapped(wanted[:, int(agent)] - heading)
         mask = scene.history_mask.clone()
         mask[:, [int(agent) for agent in self.states]] = True
-        return dataclasses.replace(scene, history=history, history_mask=mask)
+        return dataclasses.replace(scene, history=history, history_mask=mask, goal_headings=wanted)
 
     def without_absent(self, scene: Scene) -> Scene:
         """The scene without the agents that are not there."""

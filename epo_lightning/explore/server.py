@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import reprlib
 import threading
 from importlib import resources
 from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
@@ -39,16 +40,21 @@ def application(session: Session) -> Starlette:
         return Response(resources.files("epo_lightning.explore").joinpath(name).read_bytes(), media_type=kind)
 
     def scene(request: Request) -> Response:
+        index = request.path_params["index"]
+        if not index.isdecimal() or len(index) > 9:
+            return _refusal(f"/scenes/{reprlib.repr(index)}: a scene is a whole number, counted from zero")
         with working:
-            return _answer(session.describe, request.path_params["index"])
+            return _answer(session.describe, int(index))
 
     async def solve(request: Request) -> Response:
         try:
             values = json.loads(await request.body())
+        except ClientDisconnect:
+            return Response()
         except (ValueError, RecursionError) as error:
             return _refusal(f"the request is no JSON: {error}")
         if not isinstance(values, dict):
-            return _refusal(f"the request must be an object with the changes of a game, not {values!r}")
+            return _refusal(f"the request must be an object with the changes of a game, not {reprlib.repr(values)}")
 
         def solved() -> Response:
             with working:
@@ -59,7 +65,7 @@ def application(session: Session) -> Starlette:
     return Starlette(
         routes=[
             *(Route(address, file) for address in FILES),
-            Route("/scenes/{index:int}", scene),
+            Route("/scenes/{index}", scene),
             Route("/solve", solve, methods=["POST"]),
         ]
     )

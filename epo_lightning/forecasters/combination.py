@@ -90,10 +90,12 @@ class Combination:
         """Refuse a combination that cannot work.
 
         Raises:
-            ConfigError: the reason, and the changes with which it would work.
+            ConfigError: the reason, and the changes with which it would work; or a setting of the solver that does not fit the
+                energy.
         """
         obstacle = self.obstacle
         if obstacle is None:
+            self.solver.check(self.energy)
             return
         working = [word for word, other in self.neighbours if other.obstacle is None]
         if not working:

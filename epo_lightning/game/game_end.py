@@ -35,6 +35,14 @@ def check_game_steps(scene: Scene, steps: int) -> None:
         )
 
 
+def free_controls(scene: Scene, steps: int) -> Bool[Tensor, "B N K"]:
+    """Mask of the controls on which a game depends: those of present agents, before the end of the game."""
+    present = scene.agent_mask[..., None].expand(-1, -1, steps)
+    if scene.game_steps is None:
+        return present
+    return present & (torch.arange(steps, device=present.device) < scene.game_steps[:, None, None])
+
+
 def residual_mask(source: Source, ends: Int[Tensor, " B"], steps: int) -> Bool[Tensor, "B 1 1 R"] | None:
     """Mask of the residuals of an own feature that belong to the game; None for features of the last state.
 

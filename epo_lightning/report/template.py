@@ -7,7 +7,7 @@ A template gets rows by :meth:`Results.rows`, under the name ``results``, and as
     {{ epo.text("SADE") }}                                            .0128 ± .0007
     {{ (epo - sc).text("SADE") }}                                     -.0044 (-.0060 to -.0029)
     {{ epo.over(sc, "SFDE") }}                                        .68
-    {{ lower([epo - sc], "SADE") }}                                   5 of 5
+    {{ below([epo - sc], "SADE") }}                                   5 of 5
     {{ table("hard split", {"+SC": sc, "+EPO": epo}, "SADE", "SFDE") }}
     {{ table("paired difference", {"+EPO - +SC": epo - sc}, "SADE", "SFDE") }}
 
@@ -235,10 +235,10 @@ def average(rows: Iterable[Scores]) -> Scores:
     return type(rows[0])(f"mean of {', '.join(row.name for row in rows)}", found, rows[0].digits)
 
 
-def lower(differences: Iterable[Differences], metric: str) -> str:
-    """Number of pairs of runs in which the first one has the lower score: ``8 of 9``."""
-    values = [value for one in differences for value in one.values(metric)]
-    return f"{sum(value < 0 for value in values)} of {len(values)}"
+def below(rows: Iterable[Scores], metric: str, limit: float = 0.0) -> str:
+    """Number of runs whose score is below a limit, or of pairs whose first run has the lower score: ``8 of 9``."""
+    values = [value for row in rows for value in row.values(metric)]
+    return f"{sum(value < limit for value in values)} of {len(values)}"
 
 
 def table(
@@ -289,7 +289,7 @@ def write_page(template: str | Path, results: str | Path, out: str | Path | None
     environment = Environment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
-    environment.globals.update(results=source.rows, average=average, lower=lower, table=table, sources=source.sources)
+    environment.globals.update(results=source.rows, average=average, below=below, table=table, sources=source.sources)
     try:
         page = environment.from_string(text).render()
     except TemplateSyntaxError as error:

@@ -45,6 +45,13 @@ class Minimiser(ABC):
             ValueError: scene and parameters do not fit together.
         """
 
+    def check(self, energy: Energy) -> None:
+        """Refuse an energy that offers what is needed, but not with these settings of both.
+
+        Raises:
+            ConfigError: the setting, and what it may be.
+        """
+
     def attach(
         self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
     ) -> tuple[Tensor, Tensor] | None:

@@ -184,6 +184,14 @@ def test_a_file_has_the_suffix_of_its_format_and_packages_that_are_missing_are_n
         check_file(Path("it.onnx"), FORMATS["onnx"])
 
 
+def test_a_file_that_cannot_be_written_is_named_before_the_program_is_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"out=.*file/it\.pt2 cannot be written .*choose another out="):
+        check_file(tmp_path / "file" / "it.pt2", FORMATS["pt2"])
+    check_file(tmp_path / "new" / "it.pt2", FORMATS["pt2"])
+    assert not list((tmp_path / "new").iterdir())
+
+
 def test_differences_are_relative_for_large_values_and_nan_is_one() -> None:
     given = {"x": torch.tensor([[0.5], [100.0]])}
     assert largest_difference(lambda given: given, given, given) == 0.0

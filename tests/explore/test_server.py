@@ -69,11 +69,15 @@ def test_questions_are_answered_and_mistakes_named(address: str) -> None:
         ({"scnee": 1}, "unknown key scnee: did you mean 'scene'"),
         ({"scene": "first"}, "scene must be"),
         ({"scene": 99}, "scene must be a number from 0 to 15"),
-        ({"goals": {"0": ["a", "b"]}}, "goals"),
+        ({"goals": {"0": ["a", "b"]}}, "goals must be a mapping with a list of a number for every name"),
+        ({"factors": {"goal": None}}, "factors must be a mapping with a number for every name"),
+        (["x" * 10**6], "must be an object"),
     ):
         status, answer = ask(f"{address}/solve", body)
         assert (status, message in answer["error"]) == (422, True), answer
-    assert ask(f"{address}/scenes/99")[0] == 422
+        assert len(answer["error"]) < 1000
+    for index in ("99", "-1", "first", "9" * 5000):
+        assert ask(f"{address}/scenes/{index}")[0] == 422, index[:9]
 
 
 @pytest.fixture(scope="module")

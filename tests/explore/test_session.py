@@ -149,3 +149,16 @@ def test_edits_that_do_not_fit_are_refused(session: Session, words: dict[str, An
 def test_a_forecaster_without_a_game_is_refused() -> None:
     with pytest.raises(ConfigError, match="infers no game"):
         Session(torch.nn.Linear(1, 1), pretrained.examples(RUN))
+
+
+def test_an_angle_and_a_turn_more_are_the_same_heading() -> None:
+    run = "rpi/v_lstm_epo_game_refined"  # its agents want a heading at their goals
+    session = Session(epo_lightning.load(run), pretrained.examples(run))
+    x, y, heading, speed = session.scenes[SCENE].history[0, 1, -1].tolist()
+    answers = [
+        session.solve(Edit(scene=SCENE, states={"1": [x, y, heading + turn, speed]}))
+        for turn in (0.0, math.tau, -math.tau)
+    ]
+    for answer in answers[1:]:
+        close(states(answer)[..., :2], states(answers[0])[..., :2])
+        assert answer["energy"] == pytest.approx(answers[0]["energy"], rel=1e-3)

@@ -13,7 +13,7 @@ from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import report_page
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.results import read_results
-from epo_lightning.report.template import Differences, Scores, average, lower, table, write_page
+from epo_lightning.report.template import Differences, Scores, average, below, table, write_page
 
 RESULTS = Path(__file__).parents[2] / "results"
 
@@ -47,7 +47,7 @@ def test_numbers_are_those_of_a_plain_computation(tmp_path: Path) -> None:
         '{% set rows = results("rpi_hard_settled", digits=4) %}\n'
         '{% set sc, epo = rows["V-LSTM + SC, relaxed"], rows["V-LSTM + EPO, relaxed"] %}\n'
         '{{ epo.text("SFDE") }}|{{ (epo - sc).text("SFDE") }}|{{ epo.over(sc, "SFDE") }}|'
-        '{{ lower([epo - sc], "SFDE") }}|{{ epo.seeds("SFDE", 5) }}',
+        '{{ below([epo - sc], "SFDE") }}|{{ epo.seeds("SFDE", 5) }}',
     )
     assert page.split("|") == [text.replace("0.", ".") for text in expected]
 
@@ -65,7 +65,7 @@ def test_an_average_takes_the_seed_as_the_unit() -> None:
     both = average(pairs)
     assert isinstance(both, Differences)
     assert both.values("x") == [2.0, -2.0]
-    assert lower(pairs, "x") == "1 of 4"
+    assert below(pairs, "x") == "1 of 4"
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ from epo_lightning.game.circles import separation
 from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.feature_derivatives import Bounds, signal_and_change
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.game_end import free_controls
 from epo_lightning.game.pairs import pairs
 from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError, nearest, register
@@ -123,7 +124,7 @@ class AugmentedLagrangian(Minimiser):
         """Names of the energy's features that are constraints.
 
         Raises:
-            ValueError: a name that the energy does not have or that cannot be a constraint, none at all, or no other
+            ConfigError: a name that the energy does not have or that cannot be a constraint, none at all, or no other
                 feature.
         """
         bounded = [name for name, feature in energy.own_features.items() if feature.bounded]
@@ -131,25 +132,35 @@ class AugmentedLagrangian(Minimiser):
         chosen = can if self.constraints is None else tuple(self.constraints)
         for name in chosen:
             if name not in can:
-                raise ValueError(
+                raise ConfigError(
                     f"solver.constraints: {name!r} is no feature of this energy that can be a constraint, which are "
                     f"proximity, clearance and bounds such as velb; {nearest(name, can)}"
                 )
         if not chosen:
-            raise ValueError(
+            raise ConfigError(
                 "solver=augmented_lagrangian needs an energy with constraints: proximity or clearance in energy.pair, or "
                 "bounds such as velb in energy.own"
             )
         if not (set(energy.own) | set(energy.pair)) - set(chosen):
-            raise ValueError("solver=augmented_lagrangian needs a feature besides the constraints, which is minimised")
+            raise ConfigError("solver=augmented_lagrangian needs a feature besides the constraints, which is minimised")
         return chosen
+
+    def check(self, energy: Energy) -> None:
+        """Refuse an energy without the features that are to be constraints.
+
+        Raises:
+            ConfigError: as :meth:`hard`.
+        """
+        if isinstance(energy, FeatureEnergy):
+            self.hard(energy)
 
     @torch.no_grad()
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """Rounds until the constraints of all games are met.
 
         Raises:
-            ValueError: as :meth:`hard`, or scene and parameters do not fit together.
+            ConfigError: as :meth:`hard`.
+            ValueError: scene and parameters do not fit together.
         """
         if not isinstance(energy, FeatureEnergy):
             raise ValueError(f"solver=augmented_lagrangian takes energy=features, not {type(energy).__name__}")
@@ -300,7 +311,7 @@ class _Game:
             return torch.autograd.grad(value, leaf, create_graph=True)[0]
 
     def hessian(self, multipliers: Tensor, controls: Tensor) -> Float[Tensor, "B M n n"]:
-        """The Hessian of E + sum of lambda h, with ones on the diagonal for absent agents."""
+        """The Hessian of E + sum of lambda h, with ones on the diagonal for controls on which nothing depends."""
         leaf, count = controls.detach().requires_grad_(), controls.shape[2:].numel()
         slope = self.slope(multipliers, leaf)
         units = (
@@ -309,8 +320,8 @@ class _Game:
             .expand(count, *controls.shape)
         )
         rows = torch.autograd.grad(slope, leaf, units, is_grads_batched=True, materialize_grads=True)[0]
-        absent = ~self.scene.agent_mask.repeat_interleave(2 * controls.shape[3], 1)[:, None]
-        return rows.flatten(3).movedim(0, 2) + torch.diag_embed(absent.to(controls.dtype))
+        idle = ~free_controls(self.scene, controls.shape[3]).repeat_interleave(2, -1).flatten(1)[:, None]
+        return rows.flatten(3).movedim(0, 2) + torch.diag_embed(idle.to(controls.dtype))
 
     def augmented(
         self, multipliers: Mapping[str, Tensor], penalty: Tensor, controls: Tensor

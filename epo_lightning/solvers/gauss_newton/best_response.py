@@ -85,10 +85,11 @@ class BestResponse(Minimiser):
             return descent.nothing(start)
         solver = LevenbergMarquardt(step_size=1.0, adaptive=True, backend=self.backend)
         game = _Game(energy, scene, parameters.for_every_mode(start.shape[1]), solver)
-        value = game.at(start).energy
+        begun = game.at(start)
+        value, usable = begun.energy, (begun.status != Status.STOPPED) & begun.energy.isfinite()
         damping = start.new_full(start.shape[:3], self.damping)
         now = _Plans(start, value, damping)
-        quiet = torch.where(value.isfinite(), 0, _QUIET)
+        quiet = torch.where(usable, 0, _QUIET)
         for _ in range(self.rounds):
             going = quiet < _QUIET
             if descent.ended(~going):
@@ -101,7 +102,7 @@ class BestResponse(Minimiser):
         return dataclasses.replace(
             last,
             initial_energy=value,
-            status=torch.where(value.isfinite(), int(Status.SOLVED), int(Status.STOPPED)),
+            status=torch.where(usable, int(Status.SOLVED), int(Status.STOPPED)),
         )
 
 

@@ -27,6 +27,7 @@ from epo_lightning.game.feature_derivatives import (
 )
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OwnFeature, Source
+from epo_lightning.game.game_end import free_controls
 from epo_lightning.game.pairs import pairs
 from epo_lightning.scene import ACCELERATION, GameParameters, Scene
 
@@ -56,12 +57,7 @@ def normal_equations(
     """
     energy.validate(scene, parameters, controls)
     steps = controls.shape[3]
-    present = scene.agent_mask[:, None, :, None, None].expand(-1, 1, *controls.shape[2:])
-    if scene.game_steps is not None:
-        present = present & (
-            torch.arange(steps, device=present.device)[:, None] < scene.game_steps.view(-1, 1, 1, 1, 1)
-        )
-    present = by_channel(present)
+    present = by_channel(free_controls(scene, steps)[:, None, ..., None].expand(-1, -1, -1, -1, 2))
     controls = torch.where(scene.agent_mask[:, None, :, None, None], controls, 0.0)
     states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
     # The 2 K unit directions of every agent, all of acceleration before all of turn rate.

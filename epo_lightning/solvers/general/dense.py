@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.game.energy import RESIDUALS, Energy
+from epo_lightning.game.game_end import free_controls
 from epo_lightning.host import readable
 from epo_lightning.scene import GameParameters, Scene, Status
 from epo_lightning.solvers.general import descent
@@ -74,7 +75,7 @@ def hessian(
                 )[0]
                 for units in _units(controls).split(_PRODUCTS)
             ]
-        return _of_present(scene, torch.cat(parts).flatten(3).movedim(0, 2))
+        return _of_free(scene, controls.shape[3], torch.cat(parts).flatten(3).movedim(0, 2))
 
 
 def gauss_newton(
@@ -105,7 +106,7 @@ def gauss_newton(
         along = torch.func.vmap(lambda unit: torch.func.jvp(residuals, (controls,), (unit,))[1], chunk_size=_PRODUCTS)
         changes = along(_units(controls))
     jacobian = changes.movedim(0, -1)
-    return _of_present(scene, jacobian.mT @ jacobian)
+    return _of_free(scene, controls.shape[3], jacobian.mT @ jacobian)
 
 
 def attach(
@@ -175,11 +176,10 @@ def _closed_form(
     return matrix
 
 
-def _of_present(scene: Scene, matrix: Float[Tensor, "B M n n"]) -> Float[Tensor, "B M n n"]:
-    """The matrix with rows and columns of the identity for absent agents."""
-    agents = scene.agent_mask.shape[1]
-    present = scene.agent_mask[:, None].repeat_interleave(matrix.shape[-1] // max(1, agents), -1)
-    both = present[..., :, None] & present[..., None, :]
+def _of_free(scene: Scene, steps: int, matrix: Float[Tensor, "B M n n"]) -> Float[Tensor, "B M n n"]:
+    """The matrix with rows and columns of the identity for controls on which nothing depends."""
+    free = free_controls(scene, steps).repeat_interleave(2, -1).flatten(1)[:, None]
+    both = free[..., :, None] & free[..., None, :]
     return torch.where(both, matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device))
 
 

@@ -262,3 +262,28 @@ def test_settings_and_games_that_cannot_be_used_are_refused():
     with pytest.raises(ValueError, match="a feature besides the constraints"):
         AugmentedLagrangian()(FeatureEnergy(own=[], pair=["proximity"]), scene, parameters)
     assert isinstance(build("solver", {"name": "augmented_lagrangian"}), AugmentedLagrangian)
+
+
+def test_games_that_end_early_have_the_derivative_of_finite_differences():
+    scene, parameters = meeting(3, steps=8)
+    scene = dataclasses.replace(
+        scene.map(lambda value: value.expand(2, *value.shape[1:])), game_steps=torch.tensor([6, 8])
+    )
+    parameters = parameters.map(lambda value: value.expand(2, *value.shape[1:]).clone())
+    goals = parameters.goals.clone().requires_grad_()
+    found = Implicit()(EXACT, ENERGY, scene, dataclasses.replace(parameters, goals=goals))
+    assert (found.status == Status.SOLVED).all()
+    generator = torch.Generator().manual_seed(0)
+    cotangent = torch.randn(found.controls.shape, dtype=torch.double, generator=generator)
+    (slope,) = torch.autograd.grad((found.controls * cotangent).sum(), goals)
+    along, step = torch.randn(goals.shape, dtype=torch.double, generator=generator), 1e-5
+
+    def total(sign):
+        near = dataclasses.replace(
+            parameters, goals=goals.detach() + sign * step * along, initial_controls=found.controls.detach()
+        )
+        return (EXACT(ENERGY, scene, near).controls * cotangent).sum((1, 2, 3, 4))
+
+    expected = (total(1) - total(-1)) / (2 * step)
+    assert (expected.abs() > 1e-3).all()
+    torch.testing.assert_close((slope * along).sum((1, 2, 3)), expected, rtol=1e-4, atol=0)

@@ -126,3 +126,17 @@ def test_both_backends_agree_also_for_absent_agents_and_shorter_games(order: str
 def test_invalid_settings_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):
         BestResponse(**changes)  # type: ignore[arg-type]
+
+
+@ORDERS
+def test_a_game_with_a_margin_that_is_no_number_is_stopped_and_disturbs_no_other(order: str) -> None:
+    scene, game = crossing(agents=2, modes=2)
+    margins = torch.full((1, 2, 1), 0.5, dtype=torch.double)
+    margins[0, 0, 0] = math.nan
+    energy = dataclasses.replace(ENERGY, margins={})
+    broken = dataclasses.replace(game, margins={"clearance": margins})
+    sound = dataclasses.replace(game, margins={"clearance": torch.full_like(margins, 0.5)})
+    solve = BestResponse(rounds=5, order=order)
+    found, expected = solve(energy, scene, broken), solve(energy, scene, sound)
+    assert found.status.tolist() == [[int(Status.STOPPED), int(Status.SOLVED)]]
+    torch.testing.assert_close(found.controls[:, 1], expected.controls[:, 1], rtol=0, atol=0)
