@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -35,7 +36,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.flatness import followed_controls
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import GameParameters, JointForecast, Scene
+from epo_lightning.scene import SPEED, GameParameters, JointForecast, Scene
 from epo_lightning.solvers.backward import Backward, Implicit
 from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -56,6 +57,8 @@ OBEYS = 1e-3
 """Difference [m] of positions up to which futures with headings and speeds obey the dynamics."""
 LARGEST = 1e6
 """Largest weight, margin and inverse temperature: squares and products of larger ones leave the range of float32."""
+JUMP = 5.0
+"""Distance [m] from the present position up to which a future may begin, besides three times what the speed explains."""
 SUM_TOLERANCE = 1e-3
 """Largest difference from one of the sum of a scene's probabilities; files of predictions are often rounded."""
 
@@ -85,8 +88,8 @@ def refine(
             features need no sizes where no scene has two agents.
         energy: the energy; it may need nothing but sizes, reference speeds and reference controls.
         weights: weight of each of the energy's features, a number, or a tensor that can be expanded to [B, M, N] for
-            features of agents and to [B, M, P] for those of pairs. None for :data:`WEIGHTS`, which are those of the
-            default energy.
+            features of agents and to [B, M, P] for those of pairs. Features of the default energy that are left out have
+            :data:`WEIGHTS`; another energy needs all of its weights.
         margins: the same for margins [m] of pair features that the energy does not fix.
         inverse_temperature: beta >= 0, by which energies reweight the probabilities; 0 keeps them.
         noise: standard deviation [m] of the positions around a smooth motion, which tracking removes; 0 for none.
@@ -138,7 +141,12 @@ def refine(
             )
     if _largest(inverse_temperature) > LARGEST:
         raise ValueError(f"inverse_temperature must be at most {LARGEST:g}, not {_largest(inverse_temperature):g}")
-    weights, margins = dict(WEIGHTS if weights is None else weights), dict(margins or {})
+    if energy is not ENERGY and weights is None:
+        names = [name for part in energy.weighted for name in part]
+        raise ValueError(
+            f"an energy of your own needs weights=, a number for each of {', '.join(names) or 'its features'}"
+        )
+    weights, margins = {**(WEIGHTS if energy is ENERGY else {}), **(weights or {})}, dict(margins or {})
     for what, given in (("weights", weights), ("margins", margins)):
         for name, value in given.items():
             known = value.numel() > 0 if isinstance(value, Tensor) else is_number(value)
@@ -279,6 +287,9 @@ def check_forecast(states: Tensor, probabilities: Tensor, scene: Scene) -> None:
     Raises:
         TypeError: no tensors of floating-point numbers.
         ValueError: a shape that does not fit, futures that are not finite, or probabilities that are none.
+
+    Warns:
+        UserWarning: futures that begin far from the agents.
     """
     for name, value in (("states", states), ("probabilities", probabilities)):
         if not isinstance(value, Tensor):
@@ -308,6 +319,17 @@ def check_forecast(states: Tensor, probabilities: Tensor, scene: Scene) -> None:
         at = lost.nonzero()[0].tolist()
         raise ValueError(
             f"the present state scene.history[{at[0]}, {at[1]}, -1] is not finite: mark the agent as absent"
+        )
+    gap = (states[..., 0, :2] - scene.current[:, None, :, :2]).norm(dim=-1)
+    reach = JUMP + 3.0 * scene.dt * scene.current[:, None, :, SPEED].abs()
+    torn = (gap > reach) & scene.agent_mask[:, None]
+    if torn.any():
+        at = torn.nonzero()[0].tolist()
+        warnings.warn(
+            f"states{at} begins {float(gap[tuple(at)]):.1f} m from the agent's present position, of which its speed "
+            f"explains {scene.dt * float(scene.current[at[0], at[2], SPEED].abs()):.1f} m: are futures and histories in the "
+            "same coordinates? The first step is one dt after the present",
+            stacklevel=3,
         )
     bad = ~(probabilities >= 0).all(1) | ((probabilities.sum(1) - 1).abs() > SUM_TOLERANCE)
     if bad.any():

@@ -216,9 +216,10 @@ class Scene(Batch):
         bad = (self.history[..., HEADING].abs() > LARGEST_HEADING) & self.history_mask & self.agent_mask[..., None]
         if bad.any():
             scene, agent, step = bad.nonzero()[0].tolist()
+            heading = float(self.history[scene, agent, step, HEADING])
             raise ValueError(
-                f"scene.history[{scene}, {agent}, {step}] has the heading {float(self.history[scene, agent, step, HEADING]):g} "
-                f"rad; headings are at most {LARGEST_HEADING:g} in size"
+                f"scene.history[{scene}, {agent}, {step}] has the heading {heading:g} rad; headings are at most "
+                f"{LARGEST_HEADING:g} in size"
             )
         if self.size is not None:
             bad = ~((self.size > 0) & self.size.isfinite()).all(-1) & self.agent_mask

@@ -81,6 +81,8 @@ def describe(hint: Any) -> str:
     if isinstance(base, type) and issubclass(base, Mapping):
         return "a mapping" + (f" with {describe(arguments[1])} for every name" if len(arguments) == 2 else "")
     if isinstance(base, type) and issubclass(base, Sequence):
+        if arguments and typing.get_origin(arguments[0]) is Literal:
+            return "a list with any of " + ", ".join(map(str, typing.get_args(arguments[0])))
         return "a list" + (f" of {describe(arguments[0])}" if arguments else "")
     return str(getattr(base, "__name__", base))
 

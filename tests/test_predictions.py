@@ -21,17 +21,21 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
 
+def traffic() -> Scene:
+    """The same three scenes in every call."""
+    torch.manual_seed(0)
+    return highway_scene(3)
+
+
 def forecasts(channels: int = 4) -> tuple[torch.Tensor, torch.Tensor]:
-    scene = highway_scene(3)
+    scene = traffic()
     return scene.future[:, None, ..., :channels].repeat(1, 2, 1, 1, 1), torch.tensor([[0.3, 0.7]] * 3)
 
 
 @pytest.mark.parametrize("channels", [2, 4])
 def test_what_is_written_is_read_again(channels: int, tmp_path: Path) -> None:
-    torch.manual_seed(0)
     states, probabilities = forecasts(channels)
-    torch.manual_seed(0)
-    scene = highway_scene(3)
+    scene = traffic()
     file = write_predictions(tmp_path / "mine.npz", states, probabilities, scene)
     read = read_predictions(file)
     assert torch.equal(read.states, states)
@@ -47,7 +51,7 @@ def test_what_is_written_is_read_again(channels: int, tmp_path: Path) -> None:
 def test_absent_agents_may_hold_anything(tmp_path: Path) -> None:
     states, probabilities = forecasts()
     wide = torch.cat((states, torch.full_like(states[:, :, :2], torch.nan)), 2)
-    file = write_predictions(tmp_path / "mine.npz", wide, probabilities, pad(highway_scene(3)))
+    file = write_predictions(tmp_path / "mine.npz", wide, probabilities, pad(traffic()))
     assert read_predictions(file).states.shape[2] == 6
 
 
@@ -73,7 +77,7 @@ def good() -> dict[str, Any]:
     return {
         "states": states.numpy(),
         "probabilities": probabilities.numpy(),
-        "history": np.ones((3, 4, 1, 4), "f4"),
+        "history": traffic().history.numpy(),
         "dt": 0.2,
     }
 
@@ -112,9 +116,9 @@ def test_numbers_that_one_of_the_libraries_lacks_are_converted(tmp_path: Path) -
     np.savez(tmp_path / "unsigned.npz", **good(), kind=np.full((3, 4), 6, np.uint64))
     assert (read_predictions(tmp_path / "unsigned.npz").scene.kind == 6).all()
     states, probabilities = forecasts()
-    scene = Scene(torch.ones(3, 4, 1, 4, dtype=torch.bfloat16), 0.2)
+    scene = Scene(traffic().history.bfloat16(), 0.2)
     write_predictions(tmp_path / "short.npz", states, probabilities, scene)
-    assert (read_predictions(tmp_path / "short.npz").scene.history == 1).all()
+    assert torch.equal(read_predictions(tmp_path / "short.npz").scene.history, scene.history.float())
 
 
 def test_dt_in_a_list_and_other_byte_orders_are_read(tmp_path: Path) -> None:
@@ -128,7 +132,7 @@ def test_dt_in_a_list_and_other_byte_orders_are_read(tmp_path: Path) -> None:
 
 def test_archives_and_folders_with_wrong_bytes_are_named(tmp_path: Path) -> None:
     """Damaged archives raise errors of zlib and zipfile, and not only those of NumPy."""
-    file = write_predictions(tmp_path / "mine.npz", *forecasts(), highway_scene(3))
+    file = write_predictions(tmp_path / "mine.npz", *forecasts(), traffic())
     content, random = file.read_bytes(), np.random.default_rng(0)
     messages = []
     for _ in range(200):
@@ -160,4 +164,4 @@ def test_missing_damaged_and_misnamed_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="damaged"):
         read_predictions(tmp_path / "cut.npz")
     with pytest.raises(ConfigError, match=r"mine\.npz"):
-        write_predictions(tmp_path / "mine.csv", *forecasts(), highway_scene(3))
+        write_predictions(tmp_path / "mine.csv", *forecasts(), traffic())

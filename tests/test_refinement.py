@@ -186,6 +186,7 @@ def refused(error: type[Exception], message: str, **changes) -> None:
 GOALS = FeatureEnergy(own=("accref", "turnrref", "goal"), pair=())
 FORGETS = FeatureEnergy(own=("acc", "turnr"), pair=("circles",))
 MARGIN = FeatureEnergy(own=("accref",), pair=("lateral",))
+HEUN = dataclasses.replace(ENERGY, dynamics=Unicycle("heun"))
 BROKEN = torch.zeros(1, 1, 2, K, 4)
 BROKEN[0, 0, 1, 3, 0] = math.nan
 
@@ -208,7 +209,16 @@ BROKEN[0, 0, 1, 3, 0] = math.nan
         ),
         ({"probabilities": torch.full((1, 1), 0.7)}, ValueError, r"probabilities\[0\] is \[0\.6.*sum to 1"),
         ({"probabilities": torch.full((1, 1), math.nan)}, ValueError, r"probabilities\[0\] is \[nan\]"),
-        ({"weights": {"accref": 1.0}}, ValueError, "weights lacks the feature 'turnrref'"),
+        (
+            {"energy": dataclasses.replace(ENERGY), "weights": {"accref": 1.0}},
+            ValueError,
+            "lacks the feature 'turnrref'",
+        ),
+        (
+            {"energy": dataclasses.replace(ENERGY)},
+            ValueError,
+            "needs weights=, a number for each of accref, turnrref, circ",
+        ),
         ({"weights": {**WEIGHTS, "circle": 1.0}}, ValueError, r"unknown feature weights\['circle'\].*'circles'"),
         ({"weights": {**WEIGHTS, "circles": math.inf}}, ValueError, r"weights\['circles'\] must be a finite number"),
         ({"weights": {**WEIGHTS, "circles": torch.ones(3)}}, ValueError, r"shape \[3\].*\[1, 1, 1\]"),
@@ -243,7 +253,7 @@ BROKEN[0, 0, 1, 3, 0] = math.nan
         ({"solver": None}, TypeError, "solver is a NoneType"),
         ({"backward": "implicit"}, TypeError, "backward is a str"),
         ({"noise": -0.1}, ValueError, "noise must be a number, 0 or more"),
-        ({"energy": dataclasses.replace(ENERGY, dynamics=Unicycle("heun"))}, ConfigError, "integrator=euler"),
+        ({"energy": HEUN, "weights": WEIGHTS}, ConfigError, "integrator=euler"),
     ],
 )
 def test_what_cannot_be_refined_is_refused_by_name(changes, error, message):
@@ -286,3 +296,18 @@ def test_agents_without_others_need_sizes_where_their_own_features_do():
         energy=steers,
         weights={**WEIGHTS, "steer": 1.0},
     )
+
+
+def test_futures_in_other_coordinates_lead_to_a_warning():
+    scene, states = crossing()
+    with pytest.warns(UserWarning, match=r"states\[0, 0, 0\] begins 14\d\.\d m from .* in the same coordinates"):
+        refine(states[..., :2] + 100.0, torch.ones(1, 1), scene)
+
+
+def test_one_weight_of_the_default_energy_can_be_changed():
+    scene, states = crossing()
+    whole = refine(states, torch.ones(1, 1), scene, weights={**WEIGHTS, "circles": 20.0})
+    torch.testing.assert_close(
+        refine(states, torch.ones(1, 1), scene, weights={"circles": 20.0}).states, whole.states, rtol=0, atol=0
+    )
+    assert not torch.equal(whole.states, refine(states, torch.ones(1, 1), scene).states)

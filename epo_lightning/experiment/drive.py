@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from epo_lightning.data.cache import file_digest
+from epo_lightning.data.cache import digest, file_digest
 from epo_lightning.drive.driven import Driven
 from epo_lightning.drive.episodes import play, times
 from epo_lightning.drive.film import film
@@ -57,7 +57,7 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
     """
     assembly.quiet()
     torch.set_num_threads(1)
-    out = Path(settings.out).expanduser()
+    out = folder_of(settings)
     _check_free(out)
     where = place(settings.world)
     kinds = where.kinds if settings.others is None else tuple(settings.others)
@@ -71,6 +71,19 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
         return _compare(settings, where, kinds, planners, out, tell)
 
 
+def folder_of(settings: DriveSettings) -> Path:
+    """Folder of the results: ``out``, or one of its own for all settings that decide on the episodes."""
+    if settings.out:
+        return Path(settings.out).expanduser()
+    return Path("drive") / f"{settings.world}-{digest(_deciding(settings))[:6]}"
+
+
+def _deciding(settings: DriveSettings) -> dict[str, Any]:
+    """The settings that decide on the episodes, as plain values."""
+    plain = json.loads(json.dumps(dataclasses.asdict(settings)))
+    return {name: value for name, value in plain.items() if name not in ("out", "timed", "film")}
+
+
 def _compare(
     settings: DriveSettings,
     where: Place,
@@ -81,10 +94,9 @@ def _compare(
 ) -> list[Path]:
     """Drive with all planners and write the files."""
     plain = json.loads(json.dumps(dataclasses.asdict(settings)))
-    begun = {name: value for name, value in plain.items() if name not in ("out", "timed", "film")}
-    driven = Driven(out / "episodes.jsonl", begun, _digests(settings), tell)
+    driven = Driven(out / "episodes.jsonl", _deciding(settings), _digests(settings), tell)
     tell(
-        f"drives {settings.episodes} episodes per planner, {len(planners)} in all, others: {', '.join(kinds)}; "
+        f"drives {settings.episodes} episodes with each of {len(planners)} planners, others: {', '.join(kinds)}; "
         "the same command continues if it is stopped"
     )
     results: dict[str, Any] = {"settings": plain, "worlds": {}, "milliseconds": {}}
@@ -165,13 +177,13 @@ def _naming(out: Path) -> Iterator[None]:
 
 def _digests(settings: DriveSettings) -> dict[str, str]:
     """Digest of the checkpoint of every run that drives, by the run's name in the settings."""
-    paths = settings.runs if settings.ways else []
+    paths = settings.run if settings.ways else []
     return {path: file_digest(RunFolder.open(path).checkpoint(settings.checkpoint))[:16] for path in paths}
 
 
 def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make]]:
     """Planners by name, made for a world."""
-    paths = settings.runs if settings.ways else []
+    paths = settings.run if settings.ways else []
     runs = [RunFolder.open(path) for path in paths]
     configs = [read(Settings, run.config()) for run in runs]
     titles = _titles(paths, [run.path.resolve() for run in runs], [of_run.title for of_run in configs])

@@ -90,8 +90,8 @@ class Combination:
         """Refuse a combination that cannot work.
 
         Raises:
-            ConfigError: the reason, and the changes with which it would work; or a setting of the solver that does not fit the
-                energy.
+            ConfigError: the reason, and the changes with which it would work; or a setting of the solver that does not
+                fit the energy.
         """
         obstacle = self.obstacle
         if obstacle is None:

@@ -45,7 +45,7 @@ class Minimiser(ABC):
             ValueError: scene and parameters do not fit together.
         """
 
-    def check(self, energy: Energy) -> None:
+    def check(self, energy: Energy) -> None:  # noqa: B027 - most minimisers take every energy that offers what they need
         """Refuse an energy that offers what is needed, but not with these settings of both.
 
         Raises:

@@ -86,7 +86,7 @@ def test_a_command_that_was_killed_is_continued(
     out = tmp_path / "driven"
     assert epo("drive", *QUICK, f"out={out}") == 0
     told = capsys.readouterr().out
-    assert "drives 2 episodes per planner, 2 in all, others: ignores; the same command continues" in told
+    assert "drives 2 episodes with each of 2 planners, others: ignores; the same command continues" in told
     assert "V-LSTM + EPO, relaxed: 2 of 2 episodes" in told
     whole, lines = (out / "results.json").read_text(), (out / "episodes.jsonl").read_text().splitlines(keepends=True)
     assert len(lines) == 3, "settings, and a line per planner"

@@ -7,10 +7,11 @@ differ between vehicle types, and the mixture of types differs between recording
 
 from __future__ import annotations
 
+import io
 import subprocess
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -103,8 +104,9 @@ def simulator() -> tuple[ModuleType, Path]:
         ConfigError: SUMO is not installed.
     """
     try:
-        import libsumo
-        import sumo
+        with redirect_stdout(io.StringIO()):  # it prints a warning about pyarrow, which is not used with it
+            import libsumo
+            import sumo
     except ImportError as error:
         raise ConfigError(
             f"simulated traffic needs the simulator SUMO ({error}): install it with `pip install 'epo_lightning[sim]'`"

@@ -343,18 +343,21 @@ class DriveSettings:
 
     run: str | Sequence[str]
     world: str = "rpi"
-    others: Sequence[str] | None = None
-    ways: Sequence[Literal["own", "warm", "alone", "respond"]] = ("own", "warm", "alone", "respond")
-    baselines: Sequence[str] | None = None
+    others: str | Sequence[str] | None = None
+    ways: str | Sequence[Literal["own", "warm", "alone", "respond"]] = ("own", "warm", "alone", "respond")
+    baselines: str | Sequence[str] | None = None
     mode: Literal["likely", "nearest"] = "likely"
     episodes: int = 500
     seed: int = 0
     timed: int = 5
     film: int | None = 0
     checkpoint: str = "best"
-    out: str = "drive"
+    out: str | None = None
 
     def __post_init__(self) -> None:
+        for name in ("run", "others", "ways", "baselines"):
+            if isinstance(value := getattr(self, name), str):
+                object.__setattr__(self, name, [value])  # a list of one
         if self.episodes < 1:
             raise ConfigError(f"episodes must be 1 or more, not {self.episodes}")
         for name in ("seed", "timed"):
@@ -366,11 +369,6 @@ class DriveSettings:
             raise ConfigError("nothing drives: name a run and one of ways, or one of baselines")
         if self.others is not None and not self.others:
             raise ConfigError("nothing drives: name one of others, or leave others out for all of them")
-
-    @property
-    def runs(self) -> list[str]:
-        """The runs, also if there is only one."""
-        return [self.run] if isinstance(self.run, str) else list(self.run)
 
 
 @dataclass(frozen=True)
