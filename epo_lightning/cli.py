@@ -211,7 +211,7 @@ def _config(arguments: Arguments) -> None:
     run = train.folder_for(settings)
     print(f"{settings.title}: the configuration is valid")
     print(f"  parameters  {assembly.parameters(model)}")
-    print(f"  data        {settings.data['name']}, digest {digest}")
+    print(f"  data        {settings.data.get('dataset') or settings.data['name']}, digest {digest}")
     print(f"  run folder  {run.path}" + (" (exists)" if run.exists else ""))
 
 

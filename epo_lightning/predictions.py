@@ -113,14 +113,15 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _tensor(name: str, array: Any) -> Tensor:
-    """An array as a tensor, in the byte order of this machine; whole numbers have 64 bits.
+    """An array as a tensor, in the byte order of this machine; whole numbers have 64 bits, and masks of 0 and 1 are boolean.
 
     Raises:
         TypeError: no array of numbers; the message names it.
     """
     array = np.asarray(array)
     if array.dtype.kind in "iu":
-        array = array.astype(np.int64)
+        is_mask = name.endswith("_mask") and np.isin(array, (0, 1)).all()
+        array = array.astype(bool if is_mask else np.int64)
     try:
         return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
     except TypeError:

@@ -96,6 +96,7 @@ def good() -> dict[str, Any]:
         ({"probabilities": np.ones((3, 2))}, "sum to 1"),
         ({"history": np.ones((3, 4, 4))}, "history"),
         ({"agent_mask": np.ones((3, 4))}, "agent_mask"),
+        ({"agent_mask": np.full((3, 4), 2)}, "agent_mask"),
         ({"size": np.zeros((3, 4, 2))}, "length and width must be positive"),
         ({"states": np.array([object()])}, "not a NumPy archive of plain arrays"),
         ({"dt": np.True_}, "dt has .* type bool; it is one number"),
@@ -113,8 +114,11 @@ def test_mistakes_are_named(changes: dict[str, Any], message: str, tmp_path: Pat
 
 
 def test_numbers_that_one_of_the_libraries_lacks_are_converted(tmp_path: Path) -> None:
-    np.savez(tmp_path / "unsigned.npz", **good(), kind=np.full((3, 4), 6, np.uint64))
-    assert (read_predictions(tmp_path / "unsigned.npz").scene.kind == 6).all()
+    there = np.array([[1, 1, 0, 1]] * 3)
+    np.savez(tmp_path / "unsigned.npz", **good(), kind=np.full((3, 4), 6, np.uint64), agent_mask=there)
+    scene = read_predictions(tmp_path / "unsigned.npz").scene
+    assert (scene.kind == 6).all()
+    assert scene.agent_mask.tolist() == there.astype(bool).tolist()
     states, probabilities = forecasts()
     scene = Scene(traffic().history.bfloat16(), 0.2)
     write_predictions(tmp_path / "short.npz", states, probabilities, scene)

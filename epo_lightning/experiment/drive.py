@@ -25,6 +25,7 @@ from epo_lightning.drive.worlds import BEST_RESPONSE, CONSTANT_VELOCITY, DRIVER,
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import DriveSettings, Settings
 from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.experiment.provenance import commit
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder, write_file, write_json
@@ -99,8 +100,8 @@ def _compare(
         f"drives {settings.episodes} episodes with each of {len(planners)} planners, others: {', '.join(kinds)}; "
         "the same command continues if it is stopped"
     )
-    results: dict[str, Any] = {"settings": plain, "worlds": {}, "milliseconds": {}}
-    tables, films = [], []
+    results: dict[str, Any] = {"settings": plain, "commit": commit(), "worlds": {}, "milliseconds": {}}
+    tables, films = [_heading(settings, results["commit"])], []
     for kind in kinds:
         with closing(where.make(settings.episodes, settings.seed, kind)) as world:
             made = {name: make(world) for name, make in planners.items()}
@@ -252,6 +253,12 @@ def _results(measured: Mapping[str, Mapping[str, Tensor]], rates: Collection[str
 
 def _plain(values: Mapping[str, Estimate]) -> dict[str, dict[str, float]]:
     return {name: dataclasses.asdict(value) for name, value in values.items()}
+
+
+def _heading(settings: DriveSettings, code: str | None) -> str:
+    """What the tables are of: the world, the runs, the number of episodes and their seed, and the code."""
+    of = f"{settings.episodes} episodes of seed {settings.seed}, runs {', '.join(settings.run)}"
+    return f"world={settings.world}, {of}, checkpoint {settings.checkpoint}, commit {code or 'unknown'}\n"
 
 
 def _table(kind: str, measured: Mapping[str, Mapping[str, Tensor]], rates: Collection[str]) -> str:

@@ -6,6 +6,7 @@ Every file also has a description of the program, ``about``: its title, time ste
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,6 +70,9 @@ def _load_package(path: Path) -> Run:
 
 def _write_onnx(program: ExportedProgram, about: dict[str, Any], path: Path) -> None:
     inputs, outputs = list(about["inputs"]), list(about["outputs"])
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(
+        logging.ERROR
+    )  # it misses torchvision, which nothing needs
     written = torch.onnx.export(program, input_names=inputs, output_names=outputs, dynamo=True, verbose=False)
     assert written is not None
     written.model.metadata_props["about"] = json.dumps(about)

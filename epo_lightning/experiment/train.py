@@ -7,10 +7,8 @@ import math
 import platform
 import shlex
 import shutil
-import subprocess
 import time
 from collections.abc import Iterator, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +16,10 @@ from lightning.pytorch import LightningModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import Timer
 
 from epo_lightning.experiment import assembly, callbacks, debugging, distributed, follower, gpus, logs
-from epo_lightning.experiment.config.compose import PACKAGE
 from epo_lightning.experiment.config.settings import EvaluateSettings, Measured, Settings
 from epo_lightning.experiment.evaluate import score
 from epo_lightning.experiment.opening import refuse_changed
+from epo_lightning.experiment.provenance import commit, versions
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import differences, identity, row_identity
 from epo_lightning.registry import ConfigError
@@ -30,9 +28,6 @@ from epo_lightning.schema import read
 
 NOT_IN_COMMAND = ("sweep=", "existing=", "runs=", "run_dir=", "resume=")
 """Overrides that do not change what is trained, and are left out of the recorded command."""
-CODE = ("epo_lightning", "conf", "sweeps", "pyproject.toml")
-"""Code and settings in a checkout. Changes elsewhere, such as outputs of earlier commands, decide on no result."""
-PACKAGES = ("epo_lightning", "torch", "lightning", "hydra-core", "omegaconf", "torchmetrics", "numpy", "numba")
 
 
 class Diverged(ConfigError):
@@ -283,30 +278,6 @@ def _record(settings: Settings, config: dict[str, Any], data_digest: str, overri
         "data_digest": data_digest,
         "command": shlex.join(["epo", "train", *words]),
         "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "versions": {"python": platform.python_version(), **_versions()},
-        "git_commit": _commit(),
+        "versions": {"python": platform.python_version(), **versions()},
+        "git_commit": commit(),
     }
-
-
-def _versions() -> dict[str, str | None]:
-    """Versions of the packages on which results depend; None for those that are not installed."""
-    versions: dict[str, str | None] = dict.fromkeys(PACKAGES)
-    for name in PACKAGES:
-        with contextlib.suppress(PackageNotFoundError):
-            versions[name] = version(name)
-    return versions
-
-
-def _commit() -> str | None:
-    """The checkout's commit, with a ``+`` if code or settings were changed or added since; None outside a checkout."""
-    root = PACKAGE.parent
-    if not (root / ".git").exists():
-        return None
-    try:
-        commit = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-        changes = subprocess.run(
-            ["git", "-C", root, "status", "--porcelain", "--", *CODE], capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return commit.stdout.strip() + ("+" if changes.stdout.strip() else "")

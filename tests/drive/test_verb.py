@@ -40,6 +40,9 @@ def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -
     assert results["milliseconds"]["ignores"][row]["plans"] == 81
     assert (tmp_path / "driven" / "film-ignores.gif").read_bytes()[:3] == b"GIF"
     table = (tmp_path / "driven" / "table.md").read_text()
+    assert table.startswith(
+        "world=rpi, 2 episodes of seed 0, runs rpi/v_lstm_epo, rpi/v_lstm_sc, checkpoint best, commit "
+    )
     assert table.count(f"| {baseline} |") == 2
     assert json.dumps(results)
 

@@ -15,7 +15,7 @@ from experiment import tiny
 from experiment.conftest import TINY, Epo
 from report.run_folders import make_run, scores
 
-from epo_lightning.experiment import train
+from epo_lightning.experiment import provenance
 from epo_lightning.masking import is_masked, mask
 from epo_lightning.run_folder import RunFolder, write_file
 
@@ -252,13 +252,13 @@ def test_a_commit_is_marked_for_changes_of_code_and_settings_alone(
     git("init", "-q")
     git("add", ".")
     git("commit", "-q", "-m", "one")
-    monkeypatch.setattr(train, "PACKAGE", tmp_path / "epo_lightning")
+    monkeypatch.setattr(provenance, "PACKAGE", tmp_path / "epo_lightning")
     commit = git("rev-parse", "HEAD").strip()
     write_file(tmp_path / "shipped" / "run.json", "{}")
     write_file(tmp_path / "README.md", "2\n")
-    assert train._commit() == commit
+    assert provenance.commit() == commit
     for file in ("epo_lightning/new.py", "epo_lightning/losses.py", "conf/train.yaml", "pyproject.toml"):
         write_file(tmp_path / file, "2\n")
-        assert train._commit() == f"{commit}+", file
+        assert provenance.commit() == f"{commit}+", file
         git("stash", "-q", "--include-untracked", "--", file)
-        assert train._commit() == commit
+        assert provenance.commit() == commit
