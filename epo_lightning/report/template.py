@@ -147,7 +147,7 @@ class Results:
         self.used: dict[str, list[EvaluatedRun]] = {}
 
     def rows(self, name: str, data: str | None = None, digits: int = 3) -> Rows:
-        """The rows of a results file by name.
+        """The rows of a results file by name: scores on the test split, or on the one split that the file has.
 
         Args:
             name: name of the file without ``.json``.
@@ -164,6 +164,7 @@ class Results:
             )
         report = read_results(file)
         runs = [*report.evaluated, *(part for run in report.runs for part in read_parts(run))]
+        runs = [run for run in runs if run.split == "test"] or runs
         self.used[name] = runs
         found = dict.fromkeys(run.data for run in runs)
         if (data is None and len(found) > 1) or (data is not None and data not in found):
@@ -183,7 +184,7 @@ class Results:
             data = dict.fromkeys(f"{run.data} ({run.data_digest})" for run in runs)
             commits = sorted({run.git_commit[:7] for run in runs})
             seeds = sorted({run.seed for run in runs})
-            steps = sorted({int(run.records.record["steps"]) for run in runs if run.learned})
+            steps = sorted({int(run.records.record["steps"]) for run in runs if run.learned}) or [0]
             lines.append(
                 (
                     f"[{name}](tables/{name}/results.md)",
@@ -214,10 +215,6 @@ class Rows(Mapping[str, Scores]):
     def __iter__(self) -> Iterator[str]:
         return iter(self._rows)
 
-    def each(self, starts: Iterable[str], ending: str) -> list[Scores]:
-        """The rows whose names are one of the ``starts`` and the ``ending``."""
-        return [self[start + ending] for start in starts]
-
     def minus(self, starts: Iterable[str], first: str, second: str) -> dict[str, Differences]:
         """Differences of the rows ``start + first`` and ``start + second``, by start."""
         return {start: self[start + first] - self[start + second] for start in starts}
@@ -227,9 +224,15 @@ class Rows(Mapping[str, Scores]):
 
 
 def average(rows: Iterable[Scores]) -> Scores:
-    """Mean of several rows, or of several differences, seed by seed, over the seeds and metrics that all of them have."""
+    """Mean of several rows, or of several differences, seed by seed, over the seeds and metrics that all of them have.
+
+    Raises:
+        ConfigError: the rows have no seed in common.
+    """
     rows = list(rows)
     seeds = sorted(set.intersection(*({*row.by_seed} for row in rows)))
+    if not seeds:
+        raise ConfigError(f"rows {', '.join(repr(row.name) for row in rows)} have no seed in common")
     metrics = set.intersection(*({*row.by_seed[seed]} for row in rows for seed in seeds))
     found = {seed: {key: statistics.fmean(row.by_seed[seed][key] for row in rows) for key in metrics} for seed in seeds}
     return type(rows[0])(f"mean of {', '.join(row.name for row in rows)}", found, rows[0].digits)
@@ -294,7 +297,7 @@ def write_page(template: str | Path, results: str | Path, out: str | Path | None
         page = environment.from_string(text).render()
     except TemplateSyntaxError as error:
         raise ConfigError(f"{template}, line {error.lineno}: {error.message}") from error
-    except (TemplateError, TypeError, ConfigError) as error:
+    except (TemplateError, TypeError, ArithmeticError, ConfigError) as error:
         raise ConfigError(f"{template}, line {_line(error)}: {error}") from error
     file = Path(template.parent if out is None else out).expanduser() / template.stem
     write_file(file, page)

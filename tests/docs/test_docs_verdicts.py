@@ -22,16 +22,29 @@ def test_the_page_is_rebuilt_from_the_results_files_byte_for_byte(tmp_path: Path
 
 @pytest.mark.parametrize(("number", "title", "text"), SECTIONS, ids=[number for number, _, _ in SECTIONS])
 def test_a_claim_has_all_its_parts_and_one_verdict(number: str, title: str, text: str) -> None:
-    assert re.findall(r"^\*\*(\w+)\*\*", text, re.MULTILINE) == ["Claim", "Verdict", "Cause", "Tables"], title
+    parts = re.findall(r"^\*\*(\w+)\*\*", text, re.MULTILINE)
+    assert parts[0] in ("Claim", "Question"), title
+    assert parts[1:] == ["Verdict", "Cause", "Tables"], title
     claim, _, rest = text.partition("**Verdict**")
     assert "\n|:--|" in claim, f"{title}: its numbers stand in a table"
     verdict = re.match(r": (.*)\.\n", rest)
     assert verdict is not None
     assert verdict[1] in VERDICTS
-    assert re.search(rf"^\| \[{number} .*\]\(#{number}-.*\) \| {verdict[1]} \|$", PAGE, re.MULTILINE), title
+    assert re.search(rf"^\| \[{number} .*\]\(#{number}-.*\) \| {verdict[1]} \| .*\|$", PAGE, re.MULTILINE), title
 
 
 def test_the_summary_has_every_claim_once() -> None:
     assert [int(number) for number in re.findall(r"^\| \[(\d+) ", PAGE, re.MULTILINE)] == list(
         range(1, len(SECTIONS) + 1)
+    )
+
+
+def test_every_verdict_has_a_rule() -> None:
+    assert (
+        tuple(
+            re.findall(
+                r"^\| ([a-z ]+) \| ", PAGE.partition("| verdict | rule |")[2].partition("**Words")[0], re.MULTILINE
+            )
+        )
+        == VERDICTS
     )

@@ -65,6 +65,8 @@ def test_an_average_takes_the_seed_as_the_unit() -> None:
     both = average(pairs)
     assert isinstance(both, Differences)
     assert both.values("x") == [2.0, -2.0]
+    with pytest.raises(ConfigError, match="rows 'a', 'b' have no seed in common"):
+        average([Scores("a", {0: {"x": 1.0}}), Scores("b", {1: {"x": 1.0}})])
     assert below(pairs, "x") == "1 of 4"
 
 
@@ -120,6 +122,10 @@ def test_the_validation_score_is_the_lowest_of_the_log(tmp_path: Path) -> None:
         ('{{ results("game")["V-LSTM + SC, relaxed"].text("SAED") }}', "line 1: .*no metric 'SAED'"),
         ('{{ results("rpi_games_share") }}', "line 1: .*data must name one of its data sets, found None"),
         ('{{ results("game", data="rpi") }}', "line 1: .*found rpi; did you mean 'rpi_hard'"),
+        (
+            '\n{% set rows = results("rpi_hard") %}{{ rows["V-LSTM"].over(rows["V-LSTM"] - rows["V-LSTM"], "SADE") }}',
+            "line 2: float division by zero",
+        ),
         ("a\n{{ nothing.text() }}", "line 2: 'nothing' is undefined"),
         ("a\n{% if %}", "line 2: "),
     ],
