@@ -256,7 +256,7 @@ def _plain(values: Mapping[str, Estimate]) -> dict[str, dict[str, float]]:
 
 
 def _heading(settings: DriveSettings, code: str | None) -> str:
-    """What the tables are of: the world, the runs, the number of episodes and their seed, and the code."""
+    """Heading of the tables: the world, the runs, the number of episodes and their seed, and the code."""
     of = f"{settings.episodes} episodes of seed {settings.seed}, runs {', '.join(settings.run)}"
     return f"world={settings.world}, {of}, checkpoint {settings.checkpoint}, commit {code or 'unknown'}\n"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -11,7 +12,8 @@ import pytest
 import torch
 from experiment.conftest import epo  # noqa: F401 - a fixture
 
-from epo_lightning.experiment.drive import _titles
+from epo_lightning.experiment.config.settings import DriveSettings
+from epo_lightning.experiment.drive import _titles, folder_of
 from epo_lightning.run_folder import RunFolder, read_json
 
 SMALL = ["episodes=2", "timed=1", "others=[ignores]"]
@@ -57,6 +59,7 @@ def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -
         (["run=rpi/v_lstm_epo", "episodes=0", "film=null"], "episodes must be 1 or more, not 0"),
         (["run=rpi/v_lstm_epo", "ways=[]", "baselines=[]"], "nothing drives"),
         (["run=rpi/v_lstm_epo", "others=[]"], "nothing drives: name one of others"),
+        (["run=rpi/v_lstm_sc", "ways=warm", "baselines=[]"], "no planner is left to drive (rpi/v_lstm_sc, warm: "),
         (["run=[rpi/v_lstm_epo,rpi/v_lstm_epo]"], "the run rpi/v_lstm_epo is named twice"),
         (["run=rpi/v_lstm_epo", "ways=[own,own]"], "two planners are called 'V-LSTM + EPO, relaxed'"),
         (["run=rpi/v_lstm_epo", "world=sum"], "unknown world 'sum': did you mean 'sumo'"),
@@ -239,3 +242,14 @@ def test_results_are_not_overwritten(
     (tmp_path / "results.json").write_text("{}")
     assert epo("drive", "run=rpi/v_lstm_epo", f"out={tmp_path}") == 2
     assert "holds results already" in capsys.readouterr().err
+
+
+def test_every_setting_that_decides_on_episodes_has_a_folder_of_its_own() -> None:
+    one = DriveSettings(run="rpi/v_lstm_epo", ways="own", others="plays")
+    assert (one.run, one.ways, one.others) == (["rpi/v_lstm_epo"], ["own"], ["plays"])
+    assert folder_of(dataclasses.replace(one, timed=0, film=None)) == folder_of(one)
+    assert folder_of(one).parent == Path("drive")
+    assert folder_of(one).name.startswith("rpi-")
+    for change in ({"seed": 1}, {"episodes": 7}, {"others": ["ignores"]}, {"run": ["rpi/v_lstm_sc"]}):
+        assert folder_of(dataclasses.replace(one, **change)) != folder_of(one)
+    assert folder_of(dataclasses.replace(one, out="mine")) == Path("mine")
