@@ -124,7 +124,7 @@ def refine(
         ("backward", backward if backward is not None else Implicit(), Backward),
     ):
         if not isinstance(part, kind):
-            raise TypeError(f"{what} is a {type(part).__name__}; it takes an epo_lightning.{kind.__name__}")
+            raise TypeError(f"{what} is a {type(part).__name__}; it takes a {kind.__module__}.{kind.__name__}")
     scene.validate_values()
     check_forecast(states, probabilities, scene)
     check_number("noise", noise, zero=True)

@@ -249,7 +249,7 @@ BROKEN[0, 0, 1, 3, 0] = math.nan
             ValueError,
             r"weights\['accref'\] is of type .*complex64",
         ),
-        ({"energy": None}, TypeError, "energy is a NoneType; it takes an epo_lightning.Energy"),
+        ({"energy": None}, TypeError, "energy is a NoneType; it takes a epo_lightning.game.energy.Energy"),
         ({"solver": None}, TypeError, "solver is a NoneType"),
         ({"backward": "implicit"}, TypeError, "backward is a str"),
         ({"noise": -0.1}, ValueError, "noise must be a number, 0 or more"),

@@ -10,7 +10,9 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
+from epo_lightning.forecasters.combination import Combination
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.objectives.imitation import Imitation
 from epo_lightning.registry import ConfigError, build
 from epo_lightning.scene import GameParameters, Scene, Status
 from epo_lightning.solvers.backward import Implicit
@@ -262,6 +264,13 @@ def test_settings_and_games_that_cannot_be_used_are_refused():
     with pytest.raises(ValueError, match="a feature besides the constraints"):
         AugmentedLagrangian()(FeatureEnergy(own=[], pair=["proximity"]), scene, parameters)
     assert isinstance(build("solver", {"name": "augmented_lagrangian"}), AugmentedLagrangian)
+
+
+def test_constraints_that_the_energy_lacks_are_refused_before_anything_is_solved():
+    parts = {"energy": ENERGY, "backward": Implicit(), "objective": Imitation}
+    Combination.of(solver=AugmentedLagrangian(constraints=["accb"]), **parts).check()
+    with pytest.raises(ConfigError, match=r"solver\.constraints: 'clearance' is no feature of this energy"):
+        Combination.of(solver=AugmentedLagrangian(constraints=["clearance"]), **parts).check()
 
 
 def test_games_that_end_early_have_the_derivative_of_finite_differences():
