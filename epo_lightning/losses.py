@@ -98,6 +98,17 @@ def _rounded(distance: Tensor, temperature: float) -> Tensor:
     return torch.where(known, square / ((square + temperature**2).sqrt() + temperature), distance)
 
 
+def checked_power(power: float) -> float:
+    """The exponent of :func:`distances`.
+
+    Raises:
+        ValueError: a power below 1, whose gradient has no bound near a distance of zero.
+    """
+    if not power >= 1:
+        raise ValueError(f"power must be 1 or more, not {power}")
+    return power
+
+
 def distances(
     positions: Float[Tensor, "B M N K 2"],
     future: Float[Tensor, "B N K 4"],
@@ -107,7 +118,11 @@ def distances(
     """Mean Euclidean distance [m] of each agent's futures from the observed one, over observed steps; 0 without any.
 
     With a ``power`` above 1, a step's distance is the mean over both coordinates of their absolute errors to that power, as
-    in TGL, which uses 1.05.
+    in TGL, which uses 1.05. The squared norm of the trajectory that Appendix E.4 prints is 2 K times the distance of power 2.
+
+    The power decides whether modes can stay untaught. If one mode is the closest to two observed futures of the same
+    history, the sum of its Euclidean distances from both is the same all along the way between them, so it may stay at one
+    of them. With a power above 1, the sum is smallest half way, where another mode is soon closer to one of both.
 
     Raises:
         ValueError: forecast and observation differ in the number of scenes, agents or steps.

@@ -31,6 +31,7 @@ class Marginal(Forecaster):
         loss_weights: lambda of ``imitation`` and ``probability``.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
+        power: exponent of the distances (:func:`~epo_lightning.losses.distances`).
     """
 
     def __init__(
@@ -44,12 +45,14 @@ class Marginal(Forecaster):
         relaxation_steps: int = 1000,
         annealing: float = 0.0,
         annealing_steps: int = 2000,
+        power: float = 1.0,
     ) -> None:
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.annealing = losses.Annealing(annealing, annealing_steps)
+        self.power = losses.checked_power(power)
         self.decoder = Trajectories(backbone.width, modes, task.horizon, task.scale)
 
     def forward(self, scene: Scene) -> JointForecast:
@@ -70,7 +73,7 @@ class Marginal(Forecaster):
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         future, mask = observed_future(scene)
-        distance = losses.distances(forecast.states[..., :2], future, mask)
+        distance = losses.distances(forecast.states[..., :2], future, mask, self.power)
         step = self.global_step
         imitation, mode = losses.marginal_imitation(distance, mask, self.relaxation.at(step), self.annealing.at(step))
         assert forecast.agent_log_probabilities is not None

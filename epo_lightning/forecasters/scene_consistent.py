@@ -30,6 +30,7 @@ class SceneConsistent(Forecaster):
         control_scale: control at a network output of one.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
+        power: exponent of the distances (:func:`~epo_lightning.losses.distances`).
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
             (:mod:`~epo_lightning.decoders.probabilities`).
     """
@@ -47,6 +48,7 @@ class SceneConsistent(Forecaster):
         relaxation_steps: int = 1000,
         annealing: float = 0.0,
         annealing_steps: int = 2000,
+        power: float = 1.0,
         probabilities: str = "linear",
     ) -> None:
         check_probabilities(probabilities)
@@ -56,6 +58,7 @@ class SceneConsistent(Forecaster):
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.annealing = losses.Annealing(annealing, annealing_steps)
+        self.power = losses.checked_power(power)
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
         self.probabilities = PROBABILITIES[probabilities](backbone.width, modes, task.horizon, task.scale)
 
@@ -68,5 +71,5 @@ class SceneConsistent(Forecaster):
         return JointForecast(states, logits.softmax(1), controls=controls, logits=logits)
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
-        relaxation, temperature = self.relaxation.at(self.global_step), self.annealing.at(self.global_step)
-        return imitation_terms(scene, forecast, self.loss_weights, relaxation, temperature=temperature)
+        how = self.relaxation.at(self.global_step), self.power, self.annealing.at(self.global_step)
+        return imitation_terms(scene, forecast, self.loss_weights, *how)

@@ -27,7 +27,7 @@ class Imitation(Objective):
             solution (``truncated``, ``implicit``). If games go on after the forecast, it also compares the initial controls
             after the forecast with those of the solution, because there are no data for them. If orders of agents are
             decoded, ``probability`` is their cross entropy.
-        power: 1 for the paper's Euclidean distances; above 1 the exponent of both coordinates' absolute errors, 1.05 in TGL.
+        power: exponent of the distances (:func:`~epo_lightning.losses.distances`).
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
     """
@@ -45,10 +45,8 @@ class Imitation(Objective):
         annealing: float = 0.0,
         annealing_steps: int = 2000,
     ) -> None:
-        if power < 1:
-            raise ValueError(f"power must be 1 or more, not {power}")
         self.weights = checked_weights(weights, self.term_names)
-        self.power = power
+        self.power = losses.checked_power(power)
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.annealing = losses.Annealing(annealing, annealing_steps)
 

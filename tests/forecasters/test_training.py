@@ -13,9 +13,13 @@ from suites import IMITATION, LOSS_WEIGHTS, model
 from torch.utils.data import DataLoader
 
 from epo_lightning import losses
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.compose import compose
+from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import Forecaster, build_forecaster
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.scene import Scene
+from epo_lightning.schema import read
 
 BATCHES, EPOCHS = 2, 2
 RELAXED = {"relaxation": 0.5, "relaxation_steps": 3}
@@ -148,3 +152,35 @@ def test_validation_scores_are_those_of_their_own_epoch() -> None:
     first, last = recorder.scores
     assert first["val/minSADE"] != pytest.approx(last["val/minSADE"], rel=1e-3)
     assert last == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("row", ["v_lstm", "v_lstm_sc", "v_lstm_epo"])
+def test_squared_rows_have_the_loss_that_the_appendix_prints(row: str) -> None:
+    """Appendix E.4: the squared norm of an agent's trajectory, averaged over agents; the closest joint mode counts.
+
+    The marginal baseline takes the closest mode of every agent.
+    """
+    settings = read(Settings, compose("train", [f"experiment=rpi/{row}_squared"]))
+    torch.manual_seed(1)
+    _, forecaster = assembly.build(settings)
+    scene = random_scene(4, 2, horizon=forecaster.task.horizon)
+    scene = dataclasses.replace(scene, future_mask=torch.ones_like(scene.future_mask))
+    forecast = forecaster(scene)
+    error = forecast.states[..., :2] - scene.future[:, None, ..., :2]
+    printed = [
+        [[sum(x.item() ** 2 for x in agent.flatten()) for agent in mode] for mode in of_scene] for of_scene in error
+    ]
+    if row == "v_lstm":
+        expected = sum(min(mode[agent] for mode in modes) for modes in printed for agent in range(2)) / 8
+    else:
+        expected = sum(min(sum(mode) / 2 for mode in modes) for modes in printed) / 4
+    weight, value = forecaster.losses(scene, forecast)["imitation"]
+    assert weight * value.item() == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_a_power_below_one_is_refused(name: str) -> None:
+    config = {key: dict(section) for key, section in LEARNED[name].items()}
+    config["objective" if name == "epo" else "forecaster"]["power"] = 0.5
+    with pytest.raises(Exception, match=r"power must be 1 or more, not 0\.5"):
+        build_forecaster(model(**config))

@@ -1,0 +1,141 @@
+"""Which joint mode of trained runs serves which side on which the agents of RPI may pass each other.
+
+    python -m benchmarks.passing_sides runs/rpi/v_lstm_sc/reduced-s0 runs/rpi/v_lstm_epo/reduced-s0
+
+A record of RPI with two equilibria has an executed and an alternative future, on two sides. A run has taught both sides of a
+record if different joint modes are closest to its two futures. If one mode is closest to both, the paper's loss teaches the
+other mode nothing in this record. Records of the test split are counted by the side of their executed future, because a
+run may have taught both sides in the one kind of record and one side in the other. Nothing is written.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.data.rpi.subgames import FUTURE
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.experiment.opening import open_checkpoint, open_data
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
+from epo_lightning.schema import read
+
+BATCH = 1024
+"""Records per batch; it changes no result."""
+
+
+@dataclass(frozen=True)
+class Served:
+    """Means over the records whose executed future passes on one side.
+
+    Attributes:
+        records: number of records.
+        by_one: share of the records in which one joint mode is the closest to both futures.
+        executed: distance [m] of the closest mode from the executed future.
+        alternative: the same for the alternative future.
+        other: distance [m] from the executed future of the mode that is not the closest to it.
+    """
+
+    records: int
+    by_one: float
+    executed: float
+    alternative: float
+    other: float
+
+
+def turns_left(positions: Float[Tensor, "B 2 K 2"]) -> Bool[Tensor, " B"]:
+    """Whether the line of sight from agent 0 to agent 1 turns counter-clockwise in total."""
+    way = positions[:, 1] - positions[:, 0]
+    before, after = way[:, :-1], way[:, 1:]
+    cross = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
+    return torch.atan2(cross, (before * after).sum(-1)).sum(-1) > 0
+
+
+def served(
+    forecast: Float[Tensor, "B M N K 2"], futures: Float[Tensor, "B 2 N K 2"], left: Bool[Tensor, " B"]
+) -> dict[str, Served]:
+    """Means by the side of the executed future, ``left`` and ``right``; sides without records are left out.
+
+    Args:
+        forecast: positions [m] of the M = 2 joint modes.
+        futures: positions [m] of the executed and the alternative future.
+        left: whether the executed future passes on the left.
+    """
+    distance = (forecast[:, :, None] - futures[:, None]).norm(dim=-1).mean((3, 4))  # [B, M, 2 futures]
+    closest, mode = distance.min(1)
+    groups = {"left": left, "right": ~left}
+    return {
+        name: Served(
+            records=int(group.sum()),
+            by_one=float((mode[group, 0] == mode[group, 1]).double().mean()),
+            executed=float(closest[group, 0].mean()),
+            alternative=float(closest[group, 1].mean()),
+            other=float(distance[group, :, 0].amax(1).mean()),
+        )
+        for name, group in groups.items()
+        if group.any()
+    }
+
+
+@torch.no_grad()
+def measure(folder: str) -> tuple[str, dict[str, Served]]:
+    """Title of a run, and its means on the test split of its data.
+
+    Raises:
+        ConfigError: no finished run on RPI with two modes, or its data is missing or has changed.
+    """
+    run = RunFolder.open(folder)
+    settings = read(Settings, run.config())
+    if settings.data["name"] != "rpi":
+        raise ConfigError(f"{folder} was trained on data={settings.data['name']}, but only RPI has two known equilibria")
+    forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
+    data = open_data(run, settings)
+    assert isinstance(data, RPIData)
+    scenes, records = data.open("test"), data.records("test")
+    rows = ((scenes.mode == 0) & (records["modes"][scenes.record] == 2)).nonzero().flatten()
+    if not len(rows):
+        raise ConfigError(f"no record of the test split of {data.folder} has two equilibria: generate more games")
+    forecasts = torch.cat([forecaster.predict(scenes[chunk]).states[..., :2] for chunk in rows.split(BATCH)])
+    if forecasts.shape[1] != 2:
+        raise ConfigError(f"{folder} forecasts {forecasts.shape[1]} joint modes, and two are compared with two equilibria")
+    scene = scenes[rows]
+    futures = records["states"][scene.id][:, :, :, :FUTURE, :2].float()
+    return (
+        f"{settings.title}, seed {settings.seed}",
+        served(forecasts, futures, turns_left(torch.cat((scene.current[:, :, None, :2], futures[:, 0]), 2))),
+    )
+
+
+def main(given: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.passing_sides",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("runs", nargs="+", help="folders of finished runs on RPI")
+    arguments = parser.parse_args(given)
+    torch.set_num_threads(1)
+    assembly.quiet()
+    print(f"{'run':<40}{'executed':<9}{'records':>8}{'by one':>8}{'executed':>10}{'alternative':>12}{'other':>7}")
+    try:
+        for folder in arguments.runs:
+            title, found = measure(folder)
+            for side, of in found.items():
+                print(
+                    f"{title:<40}{side:<9}{of.records:>8}{of.by_one:>8.2f}{of.executed:>10.3f}{of.alternative:>12.3f}"
+                    f"{of.other:>7.3f}"
+                )
+    except ConfigError as error:
+        raise SystemExit(f"passing_sides: {error}") from None
+
+
+if __name__ == "__main__":
+    main()
