@@ -94,7 +94,9 @@ def measure(folder: str) -> tuple[str, dict[str, Served]]:
     run = RunFolder.open(folder)
     settings = read(Settings, run.config())
     if settings.data["name"] != "rpi":
-        raise ConfigError(f"{folder} was trained on data={settings.data['name']}, but only RPI has two known equilibria")
+        raise ConfigError(
+            f"{folder} was trained on data={settings.data['name']}, but only RPI has two known equilibria"
+        )
     forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
     data = open_data(run, settings)
     assert isinstance(data, RPIData)
@@ -104,7 +106,9 @@ def measure(folder: str) -> tuple[str, dict[str, Served]]:
         raise ConfigError(f"no record of the test split of {data.folder} has two equilibria: generate more games")
     forecasts = torch.cat([forecaster.predict(scenes[chunk]).states[..., :2] for chunk in rows.split(BATCH)])
     if forecasts.shape[1] != 2:
-        raise ConfigError(f"{folder} forecasts {forecasts.shape[1]} joint modes, and two are compared with two equilibria")
+        raise ConfigError(
+            f"{folder} forecasts {forecasts.shape[1]} joint modes, and two are compared with two equilibria"
+        )
     scene = scenes[rows]
     futures = records["states"][scene.id][:, :, :, :FUTURE, :2].float()
     return (

@@ -1,4 +1,4 @@
-"""Terms of training objectives (Appendix C.4). Every loss is a mean over scenes.
+"""Terms of training objectives (Appendix E.4). Every loss is a mean over scenes.
 
 Cross entropies take log-probabilities (:attr:`~epo_lightning.scene.JointForecast.log_probabilities`), so that their gradient
 by the logits is softmax - one-hot even if the probability underflows.
@@ -118,7 +118,8 @@ def distances(
     """Mean Euclidean distance [m] of each agent's futures from the observed one, over observed steps; 0 without any.
 
     With a ``power`` above 1, a step's distance is the mean over both coordinates of their absolute errors to that power, as
-    in TGL, which uses 1.05. The squared norm of the trajectory that Appendix E.4 prints is 2 K times the distance of power 2.
+    in TGL, which uses 1.05. The squared norm of a trajectory, which Appendix E.4 prints, is 2 K times the distance of
+    power 2.
 
     The power decides whether modes can stay untaught. If one mode is the closest to two observed futures of the same
     history, the sum of its Euclidean distances from both is the same all along the way between them, so it may stay at one

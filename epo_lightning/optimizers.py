@@ -21,7 +21,7 @@ _SCHEDULES: dict[str, Callable[[float], float]] = {
 @register("optimizer", "adam")
 @dataclass(frozen=True)
 class Adam:
-    """Adam (Appendix C.4), at a constant learning rate as in the paper or with cosine decay to zero.
+    """Adam (Appendix E.4), at a constant learning rate as in the paper or with cosine decay to zero.
 
     Attributes:
         lr: learning rate.

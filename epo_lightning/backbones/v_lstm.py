@@ -17,7 +17,7 @@ from epo_lightning.scene import Scene
 @register("backbone", "v_lstm")
 @dataclass(eq=False, repr=False)
 class VLSTM(PolylineBackbone):
-    """Vector-LSTM: each history through an LSTM, then one layer of attention (Appendix C.1, "Global Interaction")."""
+    """Vector-LSTM: each history through an LSTM, then one layer of attention (Appendix E.1, "Global Interaction")."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -16,7 +16,7 @@ from epo_lightning.scene import Scene
 @register("backbone", "vibes")
 @dataclass(eq=False, repr=False)
 class VIBES(PolylineBackbone):
-    """Vectorized Interaction-based Scene Prediction: V-LSTM's encoders and two stages of attention (Appendix C.1)."""
+    """Vectorized Interaction-based Scene Prediction: V-LSTM's encoders and two stages of attention (Appendix E.1)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -105,7 +105,7 @@ class GivenGoals(nn.Module):
 class GoalDecoder(nn.Module):
     """phi_goal: probability of each of an agent's goal candidates, one network for all agents (after TNT).
 
-    The agent's feature is concatenated to each candidate's position relative to the agent (Appendix C.1, "Goal Decoder").
+    The agent's feature is concatenated to each candidate's position relative to the agent (Appendix E.1, "Goal Decoder").
     Mode m takes every agent's m-th most likely candidate.
 
     Args:

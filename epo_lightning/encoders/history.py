@@ -38,7 +38,7 @@ def history_vectors(scene: Scene, scale: float = 1.0) -> tuple[Float[Tensor, "B 
 
 
 class LSTMHistory(nn.Module):
-    """LSTM over the vectors of an agent's history, oldest first (Appendix C.1, "Agent History Encoder").
+    """LSTM over the vectors of an agent's history, oldest first (Appendix E.1, "Agent History Encoder").
 
     Vectors of unobserved steps are skipped, so that padding does not change the feature.
 
@@ -69,7 +69,7 @@ class LSTMHistory(nn.Module):
 
 
 class TransformerHistory(nn.Module):
-    """Transformer over the vectors of an agent's history (Appendix C.1, after HiVT's temporal encoder).
+    """Transformer over the vectors of an agent's history (Appendix E.1, after HiVT's temporal encoder).
 
     A sinusoidal encoding of its age is added to each vector, and attention is masked to observed vectors, so that padding
     has no effect. The output is the feature of the newest observed vector.

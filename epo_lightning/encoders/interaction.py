@@ -36,7 +36,7 @@ class Attention(nn.Module):
 
 
 class TwoStageAttention(nn.Module):
-    """Attention of agents to the lanes, followed by attention to each other (Appendix C.1, "Global Interaction").
+    """Attention of agents to the lanes, followed by attention to each other (Appendix E.1, "Global Interaction").
 
     Args:
         width: size of the features, in and out.

@@ -15,7 +15,7 @@ VECTOR = 4
 
 
 class LanePolylines(nn.Module):
-    """PointNet-like lane encoder (Appendix C.1, "Lane Encoder"; VectorNet, Section 3.2).
+    """PointNet-like lane encoder (Appendix E.1, "Lane Encoder"; VectorNet, Section 3.2).
 
     Every layer is a linear map, layer normalisation and ReLU of each vector; the maximum over the polyline's vectors is then
     concatenated to each of them. The feature is the maximum over the last layer. (VectorNet concatenates once more before

@@ -1,4 +1,4 @@
-"""Dynamics, the map from controls to states: the dynamically extended unicycle of Appendix C.2, without a loop over time.
+"""Dynamics, the map from controls to states: the dynamically extended unicycle of Appendix E.2, without a loop over time.
 
 Speed and heading are cumulative sums of the controls, and positions are cumulative sums of the velocities that follow, so a
 whole trajectory is three scans. The three integrators differ only in the velocity with which a position step is taken:

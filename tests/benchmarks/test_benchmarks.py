@@ -28,6 +28,7 @@ from benchmarks import (
     generation,
     hard_constraints,
     many_agents,
+    passing_sides,
     reading,
     refinement,
     scaling,
@@ -161,6 +162,40 @@ def test_true_games_are_measured(capsys, tmp_path):
     assert float(lines[0].split("executed ")[1].split()[0]) < 1e-5
     assert "fewer than 4000" in refused(true_game.main, "--records", 4000, *small)
     assert "data=rpi" in refused(true_game.main, "data=drawn")
+
+
+def test_a_side_is_taught_if_another_mode_is_closest_to_it():
+    """Two records: in the first, mode 0 is closest to both futures; in the second, mode 1 is closest to the alternative."""
+    still = torch.zeros(2, 2, 2, 3, 2)  # [B, M, N, K, 2]
+    forecast = still + torch.tensor([[0.1, 0.9], [0.0, 1.0]])[:, :, None, None, None] * torch.tensor([0.0, 1.0])
+    futures = still + torch.tensor([[0.0, 0.4], [0.0, 1.2]])[:, :, None, None, None] * torch.tensor([0.0, 1.0])
+    found = passing_sides.served(forecast, futures, torch.tensor([True, False]))
+    assert dataclasses.astuple(found["left"]) == pytest.approx((1, 1.0, 0.1, 0.3, 0.9))
+    assert dataclasses.astuple(found["right"]) == pytest.approx((1, 0.0, 0.0, 0.2, 1.0))
+    assert set(passing_sides.served(forecast, futures, torch.tensor([False, False]))) == {"right"}
+
+
+def test_the_side_of_a_future_is_the_turn_of_the_line_of_sight():
+    angles = torch.linspace(0.0, 4.0, 30)  # more than half a turn
+    around = torch.stack((angles.cos(), angles.sin()), -1)
+    centre = torch.tensor([5.0, 3.0]).expand(30, 2)
+    pairs = torch.stack((torch.stack((centre, centre + around)), torch.stack((centre, centre + around.flip(0)))))
+    assert passing_sides.turns_left(pairs).tolist() == [True, False]
+
+
+def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
+    small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "callbacks.progress=none"]
+    data = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None)
+    data.generate(workers=1, progress=False)
+    run = train.train(compose("train", ["experiment=rpi/v_lstm_sc", *small, "budget=smoke", f"runs={tmp_path}"])).path
+    capsys.readouterr()
+    passing_sides.main([str(run)])
+    rows = [line.removeprefix("V-LSTM + SC, seed 0").split() for line in capsys.readouterr().out.splitlines()[1:]]
+    assert sum(int(row[1]) for row in rows) == int((data.records("test")["modes"] == 2).sum())
+    assert all(float(row[3]) > 0 and float(row[4]) > 0 for row in rows)
+    assert "no run folder" in refused(passing_sides.main, tmp_path / "nowhere")
+    other = train.train(compose("train", ["experiment=highway/v_lstm_sc", *TINY, f"runs={tmp_path}"])).path
+    assert "only RPI has two known equilibria" in refused(passing_sides.main, other)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Routes: reference lines that an agent may follow, and goal candidates on them (Appendix C.2).
+"""Routes: reference lines that an agent may follow, and goal candidates on them (Appendix E.1).
 
 An agent on a lane may keep to it or change to a neighbouring lane. Its goal candidates are points on the centrelines of
 these three lanes; on a side without a neighbouring lane, they lie on the boundary of its own lane.

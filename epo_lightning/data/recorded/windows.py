@@ -1,4 +1,4 @@
-"""Extraction of scenes from recordings: the choice of agents and moments, and their data (Appendix C.2, "exiD").
+"""Extraction of scenes from recordings: the choice of agents and moments, and their data (Appendix D.2, "exiD").
 
 A window is a moment of a recording (t0) with a focal agent and its neighbours. Windows that pass all filters become scenes.
 Scenes share agents: a vehicle at one moment may be the centre of one scene and a neighbour in others. Its data are stored
