@@ -26,6 +26,25 @@ def test_distances_are_means_over_observed_steps():
     assert losses.distances(positions, future, mask).tolist() == [[[4.0, 0.0]]]
 
 
+@given(st.integers(0, 2**31), st.floats(0.0, 1.0), st.floats(1.05, 3.0))
+def test_only_powers_above_one_put_a_mode_half_way_between_two_futures(seed, share, power):
+    """A mode that serves two futures may stay at one of them under Euclidean distances, but not under higher powers."""
+    drawn = torch.Generator().manual_seed(seed)
+    one, other = torch.randn(2, 3, 5, 2, generator=drawn, dtype=torch.double)
+
+    def both(at: float, power: float) -> float:
+        """Sum of the distances from both futures of a mode at a share of the way between them."""
+        mode = torch.lerp(one, other, at)[None, None]
+        futures = [torch.cat((future, torch.zeros_like(future)), -1)[None] for future in (one, other)]
+        mask = torch.ones(1, 3, 5, dtype=torch.bool)
+        return sum(losses.distances(mode, future, mask, power).mean().item() for future in futures)
+
+    assert both(share, 1.0) == pytest.approx(both(0.0, 1.0))
+    # Each coordinate's error is multiplied by s^p + (1 - s)^p.
+    assert both(share, power) == pytest.approx((share**power + (1 - share) ** power) * both(0.0, power))
+    assert both(0.5, power) <= both(share, power) * (1 + 1e-12)
+
+
 def test_joint_and_marginal_imitation_choose_their_own_modes():
     joint, mode = losses.scene_imitation(DISTANCE, MASK)
     assert (joint.item(), mode.item()) == (2.0, 1)
