@@ -178,7 +178,7 @@ class Ride:
         Float[np.ndarray, "N 2"],
         Int[np.ndarray, " N"],
     ]:
-        """History of the planned vehicle and its neighbours: states, observed steps, who is there, sizes and classes."""
+        """History of the planned vehicle and its neighbours: states, observed steps, presence, sizes and classes."""
         steps, now = WINDOWS.history, self.now
         history, seen = np.zeros((SEEN, steps, 4)), np.zeros((SEEN, steps), dtype=bool)
         size, kind = np.zeros((SEEN, 2)), np.zeros(SEEN, dtype=np.int64)

@@ -102,7 +102,7 @@ class World(Protocol):
 
     def game(self, scene: Scene) -> GameParameters:
         """The games [b, 1, ...] in which the planned agent's own costs are known, over the time that is planned, with
-        controls of zero as initial strategies. ``reference_controls`` are what agents do who keep going, if not zero."""
+        controls of zero as initial strategies. ``reference_controls`` are those of agents that keep going, if not zero."""
         ...
 
     def advance(self, controls: Float[Tensor, "b 2"] | None) -> None:

@@ -1,4 +1,4 @@
-"""Interactive scenes: two agents would collide if nobody reacted, and they do not.
+"""Interactive scenes: two agents would collide if no agent reacted, and they do not.
 
 Average scores hardly show whether a forecaster understands interaction, because in most scenes of traffic no agent has to
 react to another one. Scores on interactive scenes apart show it.
@@ -26,7 +26,7 @@ STEP = 0.1
 
 
 def interactive_scenes(scene: Scene, shape: str = "disc") -> Bool[Tensor, " B"]:
-    """Mask of the scenes in which two agents would collide if nobody reacted, and do not: an agent yields.
+    """Mask of the scenes in which two agents would collide if no agent reacted, and do not: an agent yields.
 
     Two agents i and j interact if both statements hold:
 

@@ -73,14 +73,14 @@ def make(
     excess, excess_slope, steering = costs.excess, costs.excess_slope, costs.steering
 
     @wp.func
-    def roll_tangents(g: Game, game: int, n: int, who: Numbers, at: Layout, work: Array, directions: Array):
+    def roll_tangents(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, directions: Array):
         """Tangents of the trajectories along mu (first half of the place) and along the direction d (second half)."""
         half = 4 * n * (g.K + 1)
         for e in range(lane(), 2 * n, wp.block_dim()):
             along_d = e // n
             i = e - along_d * n
             to = at.tangents + along_d * half
-            row = 2 * (game * g.N + who[i]) * g.K
+            row = 2 * (game * g.N + agents[i]) * g.K
             x = T(0.0)
             y = T(0.0)
             heading = T(0.0)
@@ -184,7 +184,7 @@ def make(
         by: Gradients,
         game: int,
         n: int,
-        who: Numbers,
+        agents: Numbers,
         at: Layout,
         work: Array,
         nearest: Array,
@@ -195,7 +195,7 @@ def make(
         """Backpropagates the suffix sums through a state and adds the cotangents of its own features."""
         each = n * (g.K + 1)
         for i in range(lane(), n, wp.block_dim()):
-            row = game * g.N + who[i]
+            row = game * g.N + agents[i]
             s = 6 * i
             node = 6 * n + 2 * i
             x1 = tangent(g, at, n, work, 0, X, i, state)
@@ -223,7 +223,7 @@ def make(
             if g.own_slot[VEL] >= 0:
                 fast[node + 1] += residual_adjoint(g, by, VEL, row, v, T(1.0), speed1, speed2)
             if g.own_slot[VELREF] >= 0:
-                off = v - g.speeds[(game // g.M) * g.N + who[i]]
+                off = v - g.speeds[(game // g.M) * g.N + agents[i]]
                 fast[node + 1] += residual_adjoint(g, by, VELREF, row, off, T(1.0), speed1, speed2)
             if g.own_slot[VELB] >= 0:
                 over = excess(g, BOUND_VEL, v)
@@ -231,7 +231,7 @@ def make(
                 fast[node + 1] += residual_adjoint(g, by, VELB, row, over, slope, speed1, speed2)
             px = work[trace(at, n, g.K, X, i) + state]
             py = work[trace(at, n, g.K, Y, i) + state]
-            if g.own_slot[LANE] >= 0 and who[g.N + i] >= 0:
+            if g.own_slot[LANE] >= 0 and agents[g.N + i] >= 0:
                 place = i * (g.K + 1) + state
                 pull_to(
                     g,
@@ -284,7 +284,7 @@ def make(
         by: Gradients,
         game: int,
         n: int,
-        who: Numbers,
+        agents: Numbers,
         at: Layout,
         work: Array,
         fast: Array,
@@ -302,7 +302,7 @@ def make(
                         i = pair_first(p, n)
                         j = p - pair_index(i, i + 1, n) + i + 1
                         b = (game // g.M) * g.N
-                        place = game * all_pairs + pair_index(who[i], who[j], g.N)
+                        place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
                         w = g.pair[g.pair_slot[f] * stride + place]
                         margin = T(0.0)
                         if g.margin_slot[f] >= 0:
@@ -322,15 +322,15 @@ def make(
                             dual(c1, -s1 * turn1a, -s1 * turn1b),
                             dual(s1, c1 * turn1a, c1 * turn1b),
                             moving(g, at, n, work, SPEED, i, state),
-                            g.size[2 * (b + who[i])],
-                            g.size[2 * (b + who[i]) + 1],
+                            g.size[2 * (b + agents[i])],
+                            g.size[2 * (b + agents[i]) + 1],
                             moving(g, at, n, work, X, j, state),
                             moving(g, at, n, work, Y, j, state),
                             dual(c2, -s2 * turn2a, -s2 * turn2b),
                             dual(s2, c2 * turn2a, c2 * turn2b),
                             moving(g, at, n, work, SPEED, j, state),
-                            g.size[2 * (b + who[j])],
-                            g.size[2 * (b + who[j]) + 1],
+                            g.size[2 * (b + agents[j])],
+                            g.size[2 * (b + agents[j]) + 1],
                             dual(margin, T(0.0), T(0.0)),
                         )
                         # phi = -w^2 (g mu) (f + g d) with the gradient g of the feature f.
@@ -382,7 +382,7 @@ def make(
         by: Gradients,
         game: int,
         n: int,
-        who: Numbers,
+        agents: Numbers,
         at: Layout,
         work: Array,
         fast: Array,
@@ -393,7 +393,7 @@ def make(
         """Adds to the cotangents of the controls of step k, and of the step before: all of an agent by one thread."""
         per_dt = T(1.0) / g.dt
         for i in range(lane(), n, wp.block_dim()):
-            row = game * g.N + who[i]
+            row = game * g.N + agents[i]
             node = 6 * n + 2 * i
             channels = int(2)
             for channel in range(channels):
@@ -444,7 +444,7 @@ def make(
                 by.controls[u] = by.controls[u] + bar
             if g.own_slot[STEER] >= 0:
                 u = row * g.K * 2 + 2 * k + TURN_RATE
-                wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + who[i])]
+                wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
                 angle, by_turn, by_speed, turn_turn, turn_speed, speed_speed = steering(
                     wheelbase, controls[u], work[trace(at, n, g.K, SPEED, i) + k]
                 )
@@ -468,10 +468,10 @@ def make(
         sync()
 
     @wp.func
-    def pull_states(g: Game, by: Gradients, game: int, n: int, who: Numbers, at: Layout, work: Array):
+    def pull_states(g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array):
         """Adds the pullback of the cotangent of the states to that of the controls."""
         for i in range(lane(), n, wp.block_dim()):
-            row = (game * g.N + who[i]) * g.K
+            row = (game * g.N + agents[i]) * g.K
             x = T(0.0)
             y = T(0.0)
             heading = T(0.0)

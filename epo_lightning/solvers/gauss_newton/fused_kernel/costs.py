@@ -89,7 +89,7 @@ def make(
         g: Game,
         game: int,
         n: int,
-        who: Numbers,
+        agents: Numbers,
         at: Layout,
         work: Array,
         nearest: Array,
@@ -103,7 +103,7 @@ def make(
         ld = 3 * m
         each = n * (g.K + 1)
         for i in range(lane(), n, wp.block_dim()):
-            row = game * g.N + who[i]
+            row = game * g.N + agents[i]
             v = work[trace(at, n, g.K, SPEED, i) + state]
             energy = T(0.0)
             force = T(0.0)
@@ -111,7 +111,7 @@ def make(
             if g.own_slot[VEL] >= 0:
                 energy, force, stiffness = add(weight(g, VEL, row), v, T(1.0), energy, force, stiffness)
             if g.own_slot[VELREF] >= 0:
-                apart = v - g.speeds[(game // g.M) * g.N + who[i]]
+                apart = v - g.speeds[(game // g.M) * g.N + agents[i]]
                 energy, force, stiffness = add(weight(g, VELREF, row), apart, T(1.0), energy, force, stiffness)
             if g.own_slot[VELB] >= 0:
                 over = excess(g, BOUND_VEL, v)
@@ -136,7 +136,7 @@ def make(
             xx = T(0.0)
             xy = T(0.0)
             yy = T(0.0)
-            if g.own_slot[LANE] >= 0 and who[g.N + i] >= 0:
+            if g.own_slot[LANE] >= 0 and agents[g.N + i] >= 0:
                 w = weight(g, LANE, row)
                 place = i * (g.K + 1) + state
                 energy, fx, xx = add(w, px - nearest[NEAR_X * each + place], T(1.0), energy, fx, xx)
@@ -169,7 +169,7 @@ def make(
 
     @func
     def pair_costs(
-        g: Game, game: int, n: int, who: Numbers, at: Layout, work: Array, fast: Array, state: int, curved: int
+        g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, fast: Array, state: int, curved: int
     ):
         """Adds the costs of all pair features at a state: each pair by one thread, then the pairs of each block of P."""
         m = 2 * n
@@ -185,7 +185,7 @@ def make(
                         i = pair_first(p, n)
                         j = p - pair_index(i, i + 1, n) + i + 1
                         b = (game // g.M) * g.N
-                        place = game * all_pairs + pair_index(who[i], who[j], g.N)
+                        place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
                         w = g.pair[g.pair_slot[f] * g.G * all_pairs + place]
                         margin = T(0.0)
                         if g.margin_slot[f] >= 0:
@@ -197,15 +197,15 @@ def make(
                             work[trace(at, n, g.K, COSINE, i) + state],
                             work[trace(at, n, g.K, SINE, i) + state],
                             work[trace(at, n, g.K, SPEED, i) + state],
-                            g.size[2 * (b + who[i])],
-                            g.size[2 * (b + who[i]) + 1],
+                            g.size[2 * (b + agents[i])],
+                            g.size[2 * (b + agents[i]) + 1],
                             work[trace(at, n, g.K, X, j) + state],
                             work[trace(at, n, g.K, Y, j) + state],
                             work[trace(at, n, g.K, COSINE, j) + state],
                             work[trace(at, n, g.K, SINE, j) + state],
                             work[trace(at, n, g.K, SPEED, j) + state],
-                            g.size[2 * (b + who[j])],
-                            g.size[2 * (b + who[j]) + 1],
+                            g.size[2 * (b + agents[j])],
+                            g.size[2 * (b + agents[j]) + 1],
                             margin,
                         )
                         pushed = w * value
@@ -264,13 +264,13 @@ def make(
 
     @func
     def control_costs(
-        g: Game, game: int, n: int, who: Numbers, at: Layout, work: Array, fast: Array, controls: Array, k: int
+        g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, fast: Array, controls: Array, k: int
     ):
         """Costs of the controls of step k, of their rates and of the steering angle; also sets Z."""
         for r in range(lane(), 2 * n, wp.block_dim()):
             i = r // 2
             turning = r == 2 * i
-            row = game * g.N + who[i]
+            row = game * g.N + agents[i]
             u = row * g.K * 2 + 2 * k + wp.where(turning, TURN_RATE, ACCELERATION)
             value = controls[u]
             plain = wp.where(turning, TURNR, ACC)
@@ -321,7 +321,7 @@ def make(
                 speed_stiffness = T(0.0)
                 coupling = T(0.0)
                 if g.own_slot[STEER] >= 0:
-                    wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + who[i])]
+                    wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
                     angle, by_turn, by_speed, turn_turn, turn_speed, speed_speed = steering(
                         wheelbase, value, work[trace(at, n, g.K, SPEED, i) + k]
                     )

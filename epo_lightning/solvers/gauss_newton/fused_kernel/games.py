@@ -190,8 +190,8 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
     # ---- A game: its agents, their lines and whether its inputs are finite
 
     @func
-    def set_up(g: Game, game: int, who: Numbers):
-        """The n present agents in ``who[0..n)``, and the starts of their lines (-1 without one) in ``who[N..N+n)``."""
+    def set_up(g: Game, game: int, agents: Numbers):
+        """The n present agents in ``agents[0..n)``, and the starts of their lines (-1 without one) in ``agents[N..N+n)``."""
         b = game // g.M
         n = int(0)
         for a in range(g.N):
@@ -203,8 +203,8 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
                         if chosen >= 0 and chosen < g.lines:
                             if g.exists[(b * g.N + a) * g.lines + chosen] != wp.uint8(0):
                                 line = ((b * g.N + a) * g.lines + chosen) * g.points * 2
-                    who[n] = a
-                    who[g.N + n] = line
+                    agents[n] = a
+                    agents[g.N + n] = line
                 n += 1
         sync()
         return n
@@ -216,12 +216,12 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
         return wp.clamp(int(g.ends[game // g.M]), 0, g.K)
 
     @func
-    def valid(g: Game, game: int, n: int, who: Numbers):
+    def valid(g: Game, game: int, n: int, agents: Numbers):
         """Whether inputs are finite whose NaN may not show in the result, and whether the lines exist."""
         b = game // g.M
         flag = 2 * g.N
         if lane() == 0:
-            who[flag] = 1
+            agents[flag] = 1
         sync()
         any_pair = int(0)
         features = int(PAIRS)  # a variable, or the loops would be unrolled
@@ -229,7 +229,7 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
             if g.pair_slot[f] >= 0:
                 any_pair = 1
         for i in range(lane(), n, wp.block_dim()):
-            a = who[i]
+            a = agents[i]
             row = b * g.N + a
             sound = int(1)
             for e in range(4):
@@ -246,12 +246,12 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
                 chosen = int(g.reference[game * g.N + a])
                 if chosen < 0 or chosen >= g.lines:
                     sound = 0
-                if who[g.N + i] >= 0:
+                if agents[g.N + i] >= 0:
                     for e in range(2 * g.points):
-                        if not wp.isfinite(g.references[who[g.N + i] + e]):
+                        if not wp.isfinite(g.references[agents[g.N + i] + e]):
                             sound = 0
             for j in range(i + 1, n):
-                c = who[j]
+                c = agents[j]
                 entry = game * ((g.N * (g.N - 1)) // 2) + pair_index(a, c, g.N)
                 all_pairs = g.G * ((g.N * (g.N - 1)) // 2)
                 for f in range(features):
@@ -262,9 +262,9 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
                             if not wp.isfinite(g.margins[g.margin_slot[f] * all_pairs + entry]):
                                 sound = 0
             if sound == 0:
-                who[flag] = 0
+                agents[flag] = 0
         sync()
-        return who[flag]
+        return agents[flag]
 
     @wp.func
     def weight(g: Game, feature: int, row: int):
@@ -281,9 +281,9 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
         return at.path + (quantity * n + i) * (K + 1)
 
     @func
-    def roll(g: Game, game: int, n: int, who: Numbers, at: Layout, work: Array, controls: Array):
+    def roll(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, controls: Array):
         for i in range(lane(), n, wp.block_dim()):
-            a = who[i]
+            a = agents[i]
             start = 4 * ((game // g.M) * g.N + a)
             u = (game * g.N + a) * g.K * 2
             x = trace(at, n, g.K, X, i)
@@ -333,12 +333,12 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
             fast[z + 3] = g.dt * s
 
     @func
-    def find_nearest(g: Game, n: int, who: Numbers, at: Layout, work: Array, nearest: Array):
+    def find_nearest(g: Game, n: int, agents: Numbers, at: Layout, work: Array, nearest: Array):
         if g.own_slot[LANE] >= 0:
             for e in range(lane(), n * g.K, wp.block_dim()):
                 i = e // g.K
                 k = e - i * g.K + 1
-                line = who[g.N + i]
+                line = agents[g.N + i]
                 x = work[trace(at, n, g.K, X, i) + k]
                 y = work[trace(at, n, g.K, Y, i) + k]
                 best = T(wp.inf)

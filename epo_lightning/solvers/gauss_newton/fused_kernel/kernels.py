@@ -85,12 +85,14 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
         work = part(run.work, wp.int64(block) * wp.int64(run.work_numbers), run.work_numbers)
         rest = work.ptr + wp.uint64((14 * g.N * (g.K + 1) + 4 * g.N * g.K) * bytes_each)
         fast = wp.array(ptr=fast_memory(rest), shape=(run.work_numbers,), dtype=T)
-        who = wp.array(ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32)
+        agents = wp.array(
+            ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
+        )
         for game in range(block, g.G, run.blocks):
-            n = set_up(g, game, who)
+            n = set_up(g, game, agents)
             at = layout(n, g.K)
             end = end_of(g, game)
-            sound = valid(g, game, n, who)
+            sound = valid(g, game, n, agents)
             status = SOLVED
             if sound == 0:
                 status = STOPPED
@@ -109,14 +111,14 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
                 nearest = part(run.nearest, tape * wp.int64(each_nearest), each_nearest)
                 for e in range(lane(), row, wp.block_dim()):
                     directions[game * row + e] = T(0.0)
-                roll(g, game, n, who, at, work, controls)
-                find_nearest(g, n, who, at, work, nearest)
+                roll(g, game, n, agents, at, work, controls)
+                find_nearest(g, n, agents, at, work, nearest)
                 raised = T(0.0)
                 positive = int(0)
                 attempt = int(0)
                 while positive == 0 and attempt <= RETRIES:
                     positive = solve_step(
-                        g, game, n, who, at, work, nearest, fast, factors, controls, end, raised, directions
+                        g, game, n, agents, at, work, nearest, fast, factors, controls, end, raised, directions
                     )
                     if positive == 0:
                         status = wp.max(status, DAMPED)
@@ -126,14 +128,14 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
                     run.initial_energy[game] = total(n, at, fast)
                 flag = 2 * g.N
                 if lane() == 0:
-                    who[flag] = sound * positive
+                    agents[flag] = sound * positive
                 sync()
                 for e in range(lane(), row, wp.block_dim()):
                     moved = controls[game * row + e] + g.step_size * directions[game * row + e]
                     if not wp.isfinite(moved):
-                        who[flag] = 0
+                        agents[flag] = 0
                 sync()
-                taken = who[flag]
+                taken = agents[flag]
                 if taken == 0:
                     status = STOPPED
                 for e in range(lane(), row, wp.block_dim()):
@@ -149,9 +151,9 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
             final = part(
                 run.nearest, wp.int64(run.steps * run.record * g.G + slot) * wp.int64(each_nearest), each_nearest
             )
-            roll(g, game, n, who, at, work, last)
-            find_nearest(g, n, who, at, work, final)
-            energy, squared = evaluate(g, game, n, who, at, work, final, fast, last, end)
+            roll(g, game, n, agents, at, work, last)
+            find_nearest(g, n, agents, at, work, final)
+            energy, squared = evaluate(g, game, n, agents, at, work, final, fast, last, end)
             if lane() == 0:
                 run.energy[game] = energy
                 run.gradient_norm[game] = wp.sqrt(squared)
@@ -164,7 +166,7 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
             for e in range(lane(), n * g.K, wp.block_dim()):
                 i = e // g.K
                 k = e - i * g.K
-                to = ((game * g.N + who[i]) * g.K + k) * 4
+                to = ((game * g.N + agents[i]) * g.K + k) * 4
                 for q in range(4):
                     run.states[to + q] = work[trace(at, n, g.K, q, i) + k + 1]
             sync()
@@ -179,17 +181,25 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
         work = part(run.work, wp.int64(block) * wp.int64(run.work_numbers), run.work_numbers)
         rest = work.ptr + wp.uint64((14 * g.N * (g.K + 1) + 4 * g.N * g.K) * bytes_each)
         fast = wp.array(ptr=fast_memory(rest), shape=(run.work_numbers,), dtype=T)
-        who = wp.array(ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32)
+        agents = wp.array(
+            ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
+        )
         for game in range(block, g.G, run.blocks):
-            n = set_up(g, game, who)
+            n = set_up(g, game, agents)
             at = layout(n, g.K)
             m = 2 * n
             end = end_of(g, game)
             if by.along_states == 1:
                 roll(
-                    g, game, n, who, at, work, part(run.iterates, wp.int64(run.steps) * run.iterate_stride, everything)
+                    g,
+                    game,
+                    n,
+                    agents,
+                    at,
+                    work,
+                    part(run.iterates, wp.int64(run.steps) * run.iterate_stride, everything),
                 )
-                pull_states(g, by, game, n, who, at, work)
+                pull_states(g, by, game, n, agents, at, work)
             for turn in range(run.steps + 1):
                 s = run.steps - turn
                 if s < run.steps:
@@ -199,7 +209,7 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
                         tape = wp.int64(s * g.G + game)
                         factors = part(run.factors, tape * wp.int64(each_factor), each_factor)
                         nearest = part(run.nearest, tape * wp.int64(each_nearest), each_nearest)
-                        roll(g, game, n, who, at, work, controls)
+                        roll(g, game, n, agents, at, work, controls)
                         # mu = alpha H^-1 times the cotangent; zero after the end of the game.
                         for e in range(lane(), m * g.K, wp.block_dim()):
                             work[at.mu + e] = T(0.0)
@@ -211,7 +221,7 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
                             set_motions(g, n, at, work, fast, k)
                             for r in range(lane(), m, wp.block_dim()):
                                 i = r // 2
-                                u = 2 * ((game * g.N + who[i]) * g.K + k) + wp.where(
+                                u = 2 * ((game * g.N + agents[i]) * g.K + k) + wp.where(
                                     r == 2 * i, TURN_RATE, ACCELERATION
                                 )
                                 work[at.h + k * m + r] = -g.step_size * by.controls[u]
@@ -229,16 +239,16 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
                                 work,
                                 at.h + k * m,
                             )
-                        push_all(g, game, n, who, at, work, fast, factors, end, work, 1)
-                        roll_tangents(g, game, n, who, at, work, directions)
+                        push_all(g, game, n, agents, at, work, fast, factors, end, work, 1)
+                        roll_tangents(g, game, n, agents, at, work, directions)
                         for e in range(lane(), 8 * n, wp.block_dim()):
                             fast[e] = T(0.0)
                         sync()
                         for back in range(end):
                             k = end - 1 - back
-                            state_adjoint(g, by, game, n, who, at, work, nearest, fast, k + 1, end)
-                            pair_adjoint(g, by, game, n, who, at, work, fast, k + 1)
-                            control_adjoint(g, by, game, n, who, at, work, fast, controls, directions, k)
+                            state_adjoint(g, by, game, n, agents, at, work, nearest, fast, k + 1, end)
+                            pair_adjoint(g, by, game, n, agents, at, work, fast, k + 1)
+                            control_adjoint(g, by, game, n, agents, at, work, fast, controls, directions, k)
                 if by.along_iterates == 1:
                     for e in range(lane(), row, wp.block_dim()):
                         u = game * row + e

@@ -45,7 +45,7 @@ def make(
         g: Game,
         game: int,
         n: int,
-        who: Numbers,
+        agents: Numbers,
         at: Layout,
         work: Array,
         fast: Array,
@@ -68,7 +68,7 @@ def make(
                 i = r // 2
                 place = at.mu + 2 * (i * g.K + k)
                 if own_rows == 0:
-                    place = 2 * ((game * g.N + who[i]) * g.K + k)
+                    place = 2 * ((game * g.N + agents[i]) * g.K + k)
                 to[place + wp.where(r == 2 * i, TURN_RATE, ACCELERATION)] = fast[at.c + r]
             sync()
 
@@ -77,7 +77,7 @@ def make(
         g: Game,
         game: int,
         n: int,
-        who: Numbers,
+        agents: Numbers,
         at: Layout,
         work: Array,
         nearest: Array,
@@ -94,11 +94,11 @@ def make(
         forget(n, at, fast, 1)
         for back in range(end):
             k = end - 1 - back
-            state_costs(g, game, n, who, at, work, nearest, fast, k + 1, end, 1)
-            pair_costs(g, game, n, who, at, work, fast, k + 1, 1)
-            control_costs(g, game, n, who, at, work, fast, controls, k)
+            state_costs(g, game, n, agents, at, work, nearest, fast, k + 1, end, 1)
+            pair_costs(g, game, n, agents, at, work, fast, k + 1, 1)
+            control_costs(g, game, n, agents, at, work, fast, controls, k)
             for r in range(lane(), m, wp.block_dim()):
-                given = g.damping[game * g.N + who[r // 2]]
+                given = g.damping[game * g.N + agents[r // 2]]
                 fast[at.damped + r] += given
                 if raised > T(0.0):
                     fast[at.damped + r] += raised * wp.max(given, T(LEAST_RAISED_DAMPING))
@@ -124,7 +124,7 @@ def make(
             for e in range(lane(), 3 * m * m, wp.block_dim()):
                 factors[k * 4 * m * m + m * m + e] = fast[at.G + e]
             sync()
-        push_all(g, game, n, who, at, work, fast, factors, end, directions, 0)
+        push_all(g, game, n, agents, at, work, fast, factors, end, directions, 0)
         return positive
 
     @func
@@ -132,7 +132,7 @@ def make(
         g: Game,
         game: int,
         n: int,
-        who: Numbers,
+        agents: Numbers,
         at: Layout,
         work: Array,
         nearest: Array,
@@ -145,9 +145,9 @@ def make(
         forget(n, at, fast, 0)
         for back in range(end):
             k = end - 1 - back
-            state_costs(g, game, n, who, at, work, nearest, fast, k + 1, end, 0)
-            pair_costs(g, game, n, who, at, work, fast, k + 1, 0)
-            control_costs(g, game, n, who, at, work, fast, controls, k)
+            state_costs(g, game, n, agents, at, work, nearest, fast, k + 1, end, 0)
+            pair_costs(g, game, n, agents, at, work, fast, k + 1, 0)
+            control_costs(g, game, n, agents, at, work, fast, controls, k)
             for r in range(lane(), m, wp.block_dim()):
                 slope = fast[at.pull + r] - fast[at.y + 2 * m + r] + g.dt * fast[at.y + m + r]
                 fast[at.norm + r] += slope * slope
