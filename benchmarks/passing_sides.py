@@ -85,8 +85,8 @@ def served(
 
 
 @torch.no_grad()
-def measure(folder: str) -> tuple[str, dict[str, Served]]:
-    """Title of a run, and its means on the test split of its data.
+def measure(folder: str) -> dict[str, Served]:
+    """Means of a run on the test split of its data, by the side of the executed future.
 
     Raises:
         ConfigError: no finished run on RPI with two modes, or its data is missing or has changed.
@@ -111,10 +111,7 @@ def measure(folder: str) -> tuple[str, dict[str, Served]]:
         )
     scene = scenes[rows]
     futures = records["states"][scene.id][:, :, :, :FUTURE, :2].float()
-    return (
-        f"{settings.title}, seed {settings.seed}",
-        served(forecasts, futures, turns_left(torch.cat((scene.current[:, :, None, :2], futures[:, 0]), 2))),
-    )
+    return served(forecasts, futures, turns_left(torch.cat((scene.current[:, :, None, :2], futures[:, 0]), 2)))
 
 
 def main(given: Sequence[str] | None = None) -> None:
@@ -128,14 +125,14 @@ def main(given: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(given)
     torch.set_num_threads(1)
     assembly.quiet()
-    print(f"{'run':<40}{'executed':<9}{'records':>8}{'by one':>8}{'executed':>10}{'alternative':>12}{'other':>7}")
+    width = 2 + max(map(len, arguments.runs))
+    print(f"{'run':<{width}}{'side':<6}{'records':>8}{'by one':>8}{'executed':>10}{'alternative':>12}{'other':>7}")
     try:
         for folder in arguments.runs:
-            title, found = measure(folder)
-            for side, of in found.items():
+            for side, of in measure(folder).items():
                 print(
-                    f"{title:<40}{side:<9}{of.records:>8}{of.by_one:>8.2f}{of.executed:>10.3f}{of.alternative:>12.3f}"
-                    f"{of.other:>7.3f}"
+                    f"{folder:<{width}}{side:<6}{of.records:>8}{of.by_one:>8.2f}{of.executed:>10.3f}"
+                    f"{of.alternative:>12.3f}{of.other:>7.3f}"
                 )
     except ConfigError as error:
         raise SystemExit(f"passing_sides: {error}") from None

@@ -190,7 +190,7 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     run = train.train(compose("train", ["experiment=rpi/v_lstm_sc", *small, "budget=smoke", f"runs={tmp_path}"])).path
     capsys.readouterr()
     passing_sides.main([str(run)])
-    rows = [line.removeprefix("V-LSTM + SC, seed 0").split() for line in capsys.readouterr().out.splitlines()[1:]]
+    rows = [line.removeprefix(str(run)).split() for line in capsys.readouterr().out.splitlines()[1:]]
     assert sum(int(row[1]) for row in rows) == int((data.records("test")["modes"] == 2).sum())
     assert all(float(row[3]) > 0 and float(row[4]) > 0 for row in rows)
     assert "no run folder" in refused(passing_sides.main, tmp_path / "nowhere")
