@@ -18,17 +18,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.data.rpi.scenes import RPIData
-from epo_lightning.data.rpi.subgames import FUTURE
+from benchmarks.rpi_runs import forecasts
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder
-from epo_lightning.schema import read
-
-BATCH = 1024
-"""Records per batch; it changes no result."""
 
 
 @dataclass(frozen=True)
@@ -84,34 +76,20 @@ def served(
     }
 
 
-@torch.no_grad()
 def measure(folder: str) -> dict[str, Served]:
     """Means of a run on the test split of its data, by the side of the executed future.
 
     Raises:
-        ConfigError: no finished run on RPI with two modes, or its data is missing or has changed.
+        ConfigError: no finished run on RPI with two modes, its data is missing or has changed, or no record has two
+            equilibria.
     """
-    run = RunFolder.open(folder)
-    settings = read(Settings, run.config())
-    if settings.data["name"] != "rpi":
-        raise ConfigError(
-            f"{folder} was trained on data={settings.data['name']}, but only RPI has two known equilibria"
-        )
-    forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
-    data = open_data(run, settings)
-    assert isinstance(data, RPIData)
-    scenes, records = data.open("test"), data.records("test")
-    rows = ((scenes.mode == 0) & (records["modes"][scenes.record] == 2)).nonzero().flatten()
-    if not len(rows):
-        raise ConfigError(f"no record of the test split of {data.folder} has two equilibria: generate more games")
-    forecasts = torch.cat([forecaster.predict(scenes[chunk]).states[..., :2] for chunk in rows.split(BATCH)])
-    if forecasts.shape[1] != 2:
-        raise ConfigError(
-            f"{folder} forecasts {forecasts.shape[1]} joint modes, and two are compared with two equilibria"
-        )
-    scene = scenes[rows]
-    futures = records["states"][scene.id][:, :, :, :FUTURE, :2].float()
-    return served(forecasts, futures, turns_left(torch.cat((scene.current[:, :, None, :2], futures[:, 0]), 2)))
+    found = forecasts(folder)
+    if found.modes.shape[1] != 2:
+        raise ConfigError(f"{folder} has {found.modes.shape[1]} joint modes, but two are compared with two equilibria")
+    if not found.both.any():
+        raise ConfigError(f"no test record of {folder} has two equilibria: generate more games")
+    modes, futures, start = found.modes[found.both], found.futures[found.both], found.start[found.both]
+    return served(modes, futures, turns_left(torch.cat((start[:, :, None], futures[:, 0]), 2)))
 
 
 def main(given: Sequence[str] | None = None) -> None:

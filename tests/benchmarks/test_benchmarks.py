@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import math
 import re
 import sys
 from pathlib import Path
@@ -20,6 +21,7 @@ from benchmarks import (
     dashboards,
     decentralised,
     devices,
+    distance_by_weight,
     epo_layer,
     explore,
     extraction,
@@ -193,9 +195,28 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     rows = [line.removeprefix(str(run)).split() for line in capsys.readouterr().out.splitlines()[1:]]
     assert sum(int(row[1]) for row in rows) == int((data.records("test")["modes"] == 2).sum())
     assert all(float(row[3]) > 0 and float(row[4]) > 0 for row in rows)
+    distance_by_weight.main([str(run)])
+    true, forecast = (line.removeprefix(str(run)).split() for line in capsys.readouterr().out.splitlines()[1:])
+    assert (true[0], forecast[0]) == ("true", "forecast")
+    assert float(true[2]) > 0.5, "discs do not touch"
     assert "no run folder" in refused(passing_sides.main, tmp_path / "nowhere")
     other = train.train(compose("train", ["experiment=highway/v_lstm_sc", *TINY, f"runs={tmp_path}"])).path
-    assert "only RPI has two known equilibria" in refused(passing_sides.main, other)
+    assert "only RPI has known equilibria" in refused(passing_sides.main, other)
+    assert "only RPI has known equilibria" in refused(distance_by_weight.main, other)
+
+
+def test_smallest_distances_are_ranked_against_the_weight():
+    """Agents on parallel lines that are w metres apart, but for one pair that keeps less than its w."""
+    weight = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    along = torch.linspace(0.0, 1.0, 5)
+    apart = torch.tensor([1.0, 2.0, 1.5, 4.0])
+    lines = torch.stack((along.expand(4, 5), torch.zeros(4, 5)), -1)
+    positions = torch.stack((lines, lines + torch.stack((torch.zeros(4), apart), -1)[:, None]), 1)
+    distance = distance_by_weight.smallest(positions)
+    torch.testing.assert_close(distance, apart)
+    found = distance_by_weight.by_weight(distance, weight)
+    assert dataclasses.astuple(found) == pytest.approx((0.8, 1.0, 4.0))
+    assert math.isnan(distance_by_weight.by_weight(distance, torch.ones(4)).correlation), "one weight has no rank"
 
 
 @pytest.mark.slow

@@ -1,0 +1,65 @@
+"""Forecasts of trained runs for the test records of RPI, whose equilibria and true weights are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.data.rpi.subgames import FUTURE
+from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.experiment.opening import open_checkpoint, open_data
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
+from epo_lightning.schema import read
+
+BATCH = 1024
+"""Records per batch; it changes no result."""
+
+
+@dataclass(frozen=True)
+class Forecasts:
+    """Forecasts of one run for all records of the test split, as positions [m].
+
+    Attributes:
+        modes: joint modes of the forecast.
+        futures: executed and alternative future; zeros for a record without an alternative.
+        both: whether a record has both futures.
+        start: positions at t0.
+        weight: true weight w of the interaction in the record's game.
+    """
+
+    modes: Float[Tensor, "B M N K 2"]
+    futures: Float[Tensor, "B 2 N K 2"]
+    both: Bool[Tensor, " B"]
+    start: Float[Tensor, "B N 2"]
+    weight: Float[Tensor, " B"]
+
+
+@torch.no_grad()
+def forecasts(folder: str) -> Forecasts:
+    """The forecasts of a finished run.
+
+    Raises:
+        ConfigError: no finished run on RPI, or its data is missing or has changed.
+    """
+    run = RunFolder.open(folder)
+    settings = read(Settings, run.config())
+    if settings.data["name"] != "rpi":
+        raise ConfigError(f"{folder} was trained on data={settings.data['name']}, but only RPI has known equilibria")
+    forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
+    data = open_data(run, settings)
+    assert isinstance(data, RPIData)
+    scenes, records = data.open("test"), data.records("test")
+    scene = scenes[(scenes.mode == 0).nonzero().flatten()]  # type: ignore[attr-defined]
+    chunks = torch.arange(len(scene.history)).split(BATCH)
+    return Forecasts(
+        modes=torch.cat([forecaster.predict(scene[chunk]).states[..., :2] for chunk in chunks]),
+        futures=records["states"][scene.id][:, :, :, :FUTURE, :2].float(),
+        both=records["modes"][scene.id] == 2,
+        start=scene.current[..., :2],
+        weight=records["weight"][scene.id],
+    )
