@@ -123,9 +123,9 @@ lint: $(TESTABLE)
 docs: $(DOCUMENTABLE)
 	$(BIN)/python -m sphinx -q -W --keep-going -j auto -b $(BUILDER) docs build/docs
 
-tables: $(patsubst results/%.json,docs/tables/%/results.md,$(wildcard results/*.json)) docs/results.md
+tables: $(patsubst results/%.json,docs/tables/%/results.md,$(wildcard results/*.json)) $(patsubst %.j2,%,$(wildcard docs/*.md.j2))
 
-docs/results.md: docs/results.md.j2 $(wildcard results/*.json) $(INSTALLED)
+docs/%.md: docs/%.md.j2 $(wildcard results/*.json) $(INSTALLED)
 	$(EPO) report template=$<
 
 docs/tables/%/results.md: results/%.json $(INSTALLED)

@@ -241,28 +241,13 @@ def test_the_page_of_rpi_has_the_steps() -> None:
             assert text == short(value, len(text) - 1)
 
 
-HIGHWAYS, URBAN = ((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8") for page in ("highway_results", "urban"))
+URBAN = (ROOT / "docs" / "urban.md").read_text(encoding="utf-8")
 BACKBONES = ("V-LSTM", "VIBES", "HiVT-M")
-ON_HIGHWAYS = pytest.mark.parametrize(
-    ("heading", "file"),
-    [
-        ("Simulated highways", "highway_sim"),
-        ("Simulated highways, without the layer", "highway_sim_parts"),
-        ("Simulated highways, twice the budget", "highway_sim_long"),
-        ("Simulated highways, fixed axes", "highway_sim_fixed"),
-        ("US-101", "us101"),
-    ],
-)
 
 
-def lines_of_roads(heading: str) -> list[str]:
-    """The lines of a section on highways, or of the one with results on urban roads."""
-    return (
-        (URBAN if heading == "Results" else HIGHWAYS)
-        .partition(f"\n## {heading}\n")[2]
-        .partition("\n## ")[0]
-        .splitlines()
-    )
+def lines_of_roads() -> list[str]:
+    """The lines of the section with results on urban roads."""
+    return URBAN.partition("\n## Results\n")[2].partition("\n## ")[0].splitlines()
 
 
 def on_roads(file: str) -> dict[str, dict[int, EvaluatedRun]]:
@@ -274,63 +259,19 @@ def on_roads(file: str) -> dict[str, dict[int, EvaluatedRun]]:
     return found
 
 
-@ON_HIGHWAYS
-def test_the_page_of_highways_has_the_scores_of_its_files(heading: str, file: str) -> None:
-    section, found = lines_of_roads(heading), on_roads(file)
-    for title, runs in found.items():
-        assert sorted(runs) in ([0, 1], [0, 1, 2], [0, 1, 2, 3, 4])
-        cells = numbers(next(line for line in section if line.startswith(f"| {title} |")))
-        if file == "highway_sim_long":
-            assert cells.pop(0) == str(len(runs)), title
-        for cell, metric in zip(cells, ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp"), strict=False):
-            values = [run.metrics[metric] for run in runs.values()]
-            spread = f" ± {short(stdev(values), 3)}" if stdev(values) else ""
-            assert cell == f"{short(fmean(values), 3)}{spread}", (title, metric)
-
-
 def test_the_page_of_urban_scenes_has_the_scores_of_its_file() -> None:
     for title, runs in on_roads("urban").items():
         assert sorted(runs) == [0, 1, 2]
-        line = next(line for line in lines_of_roads("Results") if line.startswith(f"| {title} |"))
+        line = next(line for line in lines_of_roads() if line.startswith(f"| {title} |"))
         metrics = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "minSADE_1")
         found = [[run.metrics[metric] for run in runs.values()] for metric in metrics]
         assert numbers(line)[:7] == ["3", *(f"{short(fmean(v), 3)} ± {short(stdev(v), 3)}" for v in found)], title
 
 
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_the_page_of_highways_has_the_differences_of_every_backbone(backbone: str) -> None:
-    found = on_roads("highway_sim_long")
-    section = lines_of_roads("Simulated highways, twice the budget")
-    cells = numbers(next(line for line in section if line.startswith(f"| {backbone}: +EPO - +SC |")))
-    ours, theirs = found[f"{backbone} + EPO"], found[f"{backbone} + SC"]
-    assert cells.pop(0) == str(len(ours))
-    for cell, metric in zip(cells, ("minSADE", "minSFDE", "overlap_jfp", "minSADE_1"), strict=False):
-        assert cell == interval([ours[seed].metrics[metric] - theirs[seed].metrics[metric] for seed in ours])
-
-
-@pytest.mark.parametrize(
-    ("line", "first", "second"),
-    [
-        ("+EPO - S = 0", " + EPO", " + EPO, S = 0"),
-        ("S = 0 - +SC", " + EPO, S = 0", " + SC"),
-        ("+EPO - +SC", " + EPO", " + SC"),
-    ],
-)
-def test_the_page_of_highways_has_the_differences_without_the_layer(line: str, first: str, second: str) -> None:
-    found, section = on_roads("highway_sim_parts"), lines_of_roads("Simulated highways, without the layer")
-    cells = numbers(next(text for text in section if text.startswith(f"| {line} |")))
-    one, other = found[f"V-LSTM{first}"], found[f"V-LSTM{second}"]
-    for cell, metric in zip(cells, ("minSADE", "minSFDE", "overlap_jfp", "interactive/minSADE"), strict=True):
-        assert cell == interval([one[seed].metrics[metric] - other[seed].metrics[metric] for seed in one])
-
-
-@pytest.mark.parametrize(
-    ("heading", "file"), [("Simulated highways", "highway_sim"), ("US-101", "us101"), ("Results", "urban")]
-)
 @pytest.mark.parametrize("unit", ["all nine pairs", "three seeds, each the mean of its backbones"])
-def test_the_pages_of_roads_have_the_differences_of_their_files(heading: str, file: str, unit: str) -> None:
-    found = on_roads(file)
-    line = next(line for line in lines_of_roads(heading) if line.startswith(f"| +EPO - +SC, {unit} |"))
+def test_the_page_of_urban_scenes_has_the_differences_of_its_file(unit: str) -> None:
+    found = on_roads("urban")
+    line = next(line for line in lines_of_roads() if line.startswith(f"| +EPO - +SC, {unit} |"))
     for cell, metric in zip(numbers(line), ("minSADE", "minSFDE", "overlap_jfp"), strict=False):
         pairs = [
             [found[f"{b} + EPO"][seed].metrics[metric] - found[f"{b} + SC"][seed].metrics[metric] for b in BACKBONES]

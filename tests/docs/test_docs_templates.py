@@ -1,0 +1,22 @@
+"""Pages whose numbers are looked up in results files: their templates write them byte for byte."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from docs.pages import ROOT
+
+from epo_lightning.report.template import write_page
+
+TEMPLATES = sorted((ROOT / "docs").glob("*.md.j2"))
+
+
+def test_there_are_templates() -> None:
+    assert {template.stem for template in TEMPLATES} >= {"results.md", "highway_results.md"}
+
+
+@pytest.mark.parametrize("template", TEMPLATES, ids=lambda template: template.stem)
+def test_a_page_is_rebuilt_from_the_results_files_byte_for_byte(template: Path, tmp_path: Path) -> None:
+    written = write_page(template, ROOT / "results", tmp_path).read_text(encoding="utf-8")
+    assert written == template.with_suffix("").read_text(encoding="utf-8"), "make tables writes it again"
