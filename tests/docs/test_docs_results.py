@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from math import sqrt
 from pathlib import Path
 from statistics import fmean, stdev
@@ -132,79 +131,12 @@ def test_the_page_has_the_paired_differences_over_all_backbones(words: str, othe
         assert cell == interval(found, digits)
 
 
-RPI = (ROOT / "docs" / "rpi_results.md").read_text(encoding="utf-8")
-OF_RPI = {
-    "V-LSTM, relaxed": "V-LSTM, relaxed",
-    "V-LSTM + SC, relaxed": "V-LSTM + SC, relaxed",
-    "V-LSTM + EPO, relaxed": "V-LSTM + EPO, relaxed",
-    "V-LSTM + EPO, relaxed, no pair": "the same without its pair term, trained so",
-    "V-LSTM + EPO, game, refined by S = 2": "V-LSTM + EPO, game, refined by S = 2",
-    "V-LSTM": "V-LSTM",
-    "V-LSTM + SC": "V-LSTM + SC",
-    "V-LSTM + EPO": "V-LSTM + EPO",
-}
-"""Rows on the page by their titles in the results files."""
-
-
-@pytest.mark.parametrize(
-    ("heading", "file", "rows"),
-    [
-        ("The hard split", "rpi_hard_settled", 4),
-        ("Ten epochs", "rpi_hard", 4),
-        ("The paper's split", "rpi_paper_split", 3),
-        ("The paper's split", "rpi_paper_split_game", 1),
-        ("A search of the settings", "rpi_search_winners", 2),
-        ("Searched settings on the paper's split", "rpi_paper_split_winners", 3),
-        ("The paper's loss", "rpi_hard", 3),
-        ("The paper's loss on the paper's split", "rpi_paper_split_loss", 4),
-        ("The number of steps S", "rpi_steps_loss", 5),
-    ],
-)
-def test_the_page_of_rpi_has_the_scores_of_its_files(heading: str, file: str, rows: int) -> None:
-    section = RPI.partition(f"\n## {heading}\n")[2].partition("\n## ")[0].splitlines()
-    found = 0
-    rows_of_file = distinct(build_tables(read_results(ROOT / "results" / f"{file}.json").evaluated))
-    titles = Counter(row.title for row in rows_of_file)
-    for row in rows_of_file:
-        name = OF_RPI.get(row.title)
-        if titles[row.title] > 1:
-            name = f"{name}, S = {row.runs[0].config['solver']['steps']}"
-        for line in section:
-            if line.startswith(f"| {name} |"):
-                cells = [row.cells[metric] for metric in ("minSADE", "minSFDE")]
-                shown = [f"{short(cell.mean, 4)} ± {short(cell.deviation or 0, 4)}" for cell in cells]
-                assert numbers(line)[:3] == [str(cells[0].n), *shown], row.title
-                found += 1
-    assert found == rows
-
-
 def test_the_page_of_feedback_players_has_the_scores_of_its_file() -> None:
     page = (ROOT / "docs" / "rpi.md").read_text(encoding="utf-8")
     for row in distinct(build_tables(read_results(ROOT / "results" / "rpi_feedback.json").evaluated)):
         line = next(line for line in page.splitlines() if line.startswith(f"| {row.title} |"))
         cells = [row.cells[metric] for metric in ("minSADE", "minSFDE")]
         assert numbers(line)[:2] == [f"{short(c.mean, 4)} ± {short(c.deviation or 0, 4)}" for c in cells], row.title
-
-
-@pytest.mark.parametrize(
-    ("heading", "file", "rows"),
-    [
-        ("A search of the settings", "rpi_search", {"+SC": " + SC", "+EPO": " + EPO"}),
-        (
-            "Searched settings on the paper's split",
-            "rpi_paper_split_search",
-            {"marginal": "", "+SC": " + SC", "+EPO": " + EPO"},
-        ),
-    ],
-)
-def test_the_page_of_rpi_has_the_searches(heading: str, file: str, rows: dict[str, str]) -> None:
-    runs = read_results(ROOT / "results" / f"{file}.json").evaluated
-    section = RPI.partition(f"\n## {heading}\n")[2].partition("\n## ")[0].splitlines()
-    for shown, name in rows.items():
-        own = [run for run in runs if run.name == f"V-LSTM{name}, relaxed"]
-        own.sort(key=lambda run: (run.config["optimizer"]["lr"], run.config["backbone"]["dropout"]))
-        line = next(line for line in section if line.startswith(f"| {shown} |"))
-        assert numbers(line) == [short(run.metrics["minSADE"], 4) for run in own]
 
 
 SIDES = ("executed/minSADE", "alternative/minSADE")
@@ -227,18 +159,6 @@ def test_the_page_of_the_family_has_the_scores_of_its_rows(file: str, heading: s
         cells = [row.cells[metric] for metric in metrics]
         shown = [f"{short(cell.mean, 3)} ± {short(cell.deviation or 0, 3)}" for cell in cells]
         assert numbers(line)[: 1 + len(metrics)] == [str(cells[0].n), *shown], row.title
-
-
-def test_the_page_of_rpi_has_the_steps() -> None:
-    rows = {
-        row.runs[0].config["solver"]["steps"]: row.cells
-        for row in distinct(build_tables(read_results(ROOT / "results" / "rpi_steps.json").evaluated))
-    }
-    for steps, cells in rows.items():
-        line = next(line for line in RPI.splitlines() if line.startswith(f"| {steps} |"))
-        mean, spread = numbers(line)[1].split(" ± ")
-        for text, value in ((mean, cells["minSADE"].mean), (spread, cells["minSADE"].deviation)):
-            assert text == short(value, len(text) - 1)
 
 
 URBAN = (ROOT / "docs" / "urban.md").read_text(encoding="utf-8")
@@ -279,53 +199,6 @@ def test_the_page_of_urban_scenes_has_the_differences_of_its_file(unit: str) -> 
         ]
         values = [fmean(pair) for pair in pairs] if unit.startswith("three") else [v for pair in pairs for v in pair]
         assert cell == interval(values)
-
-
-def test_the_page_of_rpi_has_what_the_layer_adds() -> None:
-    found = on_roads("rpi_parts")
-    section = RPI.partition("\n## What the layer adds\n")[2].partition("\n## ")[0].splitlines()
-    for title, runs in found.items():
-        cells = numbers(next(line for line in section if line.startswith(f"| {title} |")))
-        for cell, metric in zip(cells[1:3], ("minSADE", "minSFDE"), strict=True):
-            values = [run.metrics[metric] for run in runs.values()]
-            assert cell == f"{short(fmean(values), 4)} ± {short(stdev(values), 4)}", (title, metric)
-    rows = {"+EPO": "", "+EPO without goal": ", no goal", "S = 0": ", S = 0"}
-    for line, first, second in (
-        ("+EPO without goal - +SC", "+EPO without goal", "+SC"),
-        ("+EPO - S = 0", "+EPO", "S = 0"),
-    ):
-        one, other = (
-            found["V-LSTM + SC, relaxed" if row == "+SC" else f"V-LSTM + EPO, relaxed{rows[row]}"]
-            for row in (first, second)
-        )
-        cells = numbers(next(text for text in section if text.startswith(f"| {line} |")))
-        for cell, metric in zip(cells[1:], ("minSADE", "minSFDE"), strict=True):
-            assert cell == interval([one[seed].metrics[metric] - other[seed].metrics[metric] for seed in one], 4)
-
-
-def test_the_page_of_rpi_has_the_scores_on_shares_of_the_games() -> None:
-    found: dict[tuple[str, float], list[float]] = {}
-    for run in sorted(read_results(ROOT / "results" / "rpi_games_share.json").evaluated, key=lambda run: run.seed):
-        share = run.config["data"].get("games_share", 1.0)
-        found.setdefault((run.experiment.removeprefix("rpi/"), share), []).append(run.metrics["minSADE"])
-    shares = (0.01, 0.03, 0.1, 0.3, 1.0)
-    section = RPI.partition("\n## Fewer games\n")[2].partition("\n## ")[0].splitlines()
-    for start, row, digits in (
-        ("V-LSTM + SC, relaxed", "v_lstm_sc_relaxed", 4),
-        ("V-LSTM + EPO, relaxed:", "v_lstm_epo_relaxed", 4),
-        ("V-LSTM + EPO, game, refined", "v_lstm_epo_game_refined", 4),
-        ("V-LSTM + EPO, game: inferred", "v_lstm_epo_game", 5),
-    ):
-        line = numbers(next(line for line in section if line.startswith(f"| {start}")))
-        for cell, share in zip(line, shares, strict=True):
-            values = found[row, share]
-            assert len(values) == 3
-            assert cell == f"{short(fmean(values), digits)} ± {short(stdev(values), digits)}", (row, share)
-    for start, row in (("the paper's energy", "v_lstm_epo_relaxed"), ("game, refined", "v_lstm_epo_game_refined")):
-        line = numbers(next(line for line in section if line.startswith(f"| {start}")))
-        for cell, share in zip(line, shares, strict=True):
-            pairs = zip(found[row, share], found["v_lstm_sc_relaxed", share], strict=True)
-            assert cell == interval([ours - theirs for ours, theirs in pairs], 4), (row, share)
 
 
 def test_the_page_of_games_has_the_scores_of_games_of_another_class() -> None:

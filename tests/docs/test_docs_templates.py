@@ -13,7 +13,7 @@ TEMPLATES = sorted((ROOT / "docs").glob("*.md.j2"))
 
 
 def test_there_are_templates() -> None:
-    assert {template.stem for template in TEMPLATES} >= {"results.md", "highway_results.md"}
+    assert {template.stem for template in TEMPLATES} >= {"results.md", "highway_results.md", "rpi_results.md"}
 
 
 @pytest.mark.parametrize("template", TEMPLATES, ids=lambda template: template.stem)
