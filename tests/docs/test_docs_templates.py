@@ -12,8 +12,11 @@ from epo_lightning.report.template import write_page
 TEMPLATES = sorted((ROOT / "docs").glob("*.md.j2"))
 
 
-def test_there_are_templates() -> None:
-    assert {template.stem for template in TEMPLATES} >= {"results.md", "highway_results.md", "rpi_results.md"}
+def test_the_pages_of_results_have_templates() -> None:
+    pages = {template.stem for template in TEMPLATES}
+    assert pages == {
+        f"{page}.md" for page in ("results", "rpi", "rpi_results", "highway_results", "urban", "family", "game")
+    }
 
 
 @pytest.mark.parametrize("template", TEMPLATES, ids=lambda template: template.stem)
