@@ -351,4 +351,5 @@ def _lines(header: Sequence[str], lines: Iterable[Sequence[str]], left: int = 1)
 
 def _decimal(value: float, digits: int, sign: bool = False) -> str:
     """A number with fixed decimals and without a zero before the point: ``.013``, ``+.013``."""
+    value = value if sign else round(value, digits) + 0.0  # no -.000 without a sign
     return re.sub(r"^([+-]?)0\.", r"\1.", f"{value:{'+' if sign else ''}.{digits}f}")

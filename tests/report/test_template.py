@@ -71,7 +71,8 @@ def test_an_average_takes_the_seed_as_the_unit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(0.5, ".5000"), (-0.5, "-.5000"), (10.5, "10.5000"), (0.0, ".0000"), (-10.25, "-10.2500")]
+    ("value", "text"),
+    [(0.5, ".5000"), (-0.5, "-.5000"), (10.5, "10.5000"), (0.0, ".0000"), (-1e-9, ".0000"), (-10.25, "-10.2500")],
 )
 def test_only_a_zero_before_the_point_is_left_out(value: float, text: str) -> None:
     assert Scores("row", {0: {"x": value}}, 4).text("x") == text
