@@ -102,10 +102,10 @@ def checked_power(power: float) -> float:
     """The exponent of :func:`distances`.
 
     Raises:
-        ValueError: a power below 1, whose gradient has no bound near a distance of zero.
+        ValueError: a power below 1, whose gradient has no bound near a distance of zero, or an infinite one.
     """
-    if not power >= 1:
-        raise ValueError(f"power must be 1 or more, not {power}")
+    if not 1 <= power < math.inf:
+        raise ValueError(f"power must be 1 or more, and finite, not {power}")
     return power
 
 

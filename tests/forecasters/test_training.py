@@ -178,9 +178,10 @@ def test_squared_rows_have_the_loss_that_the_appendix_prints(row: str) -> None:
     assert weight * value.item() == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.parametrize("power", [0.5, float("inf")])
 @pytest.mark.parametrize("name", LEARNED)
-def test_a_power_below_one_is_refused(name: str) -> None:
+def test_a_power_below_one_or_without_end_is_refused(name: str, power: float) -> None:
     config = {key: dict(section) for key, section in LEARNED[name].items()}
-    config["objective" if name == "epo" else "forecaster"]["power"] = 0.5
-    with pytest.raises(Exception, match=r"power must be 1 or more, not 0\.5"):
+    config["objective" if name == "epo" else "forecaster"]["power"] = power
+    with pytest.raises(Exception, match="power must be 1 or more, and finite, not"):
         build_forecaster(model(**config))
