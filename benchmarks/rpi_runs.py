@@ -44,12 +44,19 @@ def forecasts(folder: str) -> Forecasts:
     """The forecasts of a finished run.
 
     Raises:
-        ConfigError: no finished run on RPI, or its data is missing or has changed.
+        ConfigError: no finished run on RPI, one whose targets are sampled, or its data is missing or has changed.
     """
     run = RunFolder.open(folder)
+    if not run.finished:
+        raise ConfigError(f"{folder} is not finished: continue it by epo train resume={folder}")
     settings = read(Settings, run.config())
     if settings.data["name"] != "rpi":
         raise ConfigError(f"{folder} was trained on data={settings.data['name']}, but only RPI has known equilibria")
+    if settings.data.get("targets") == "sampled":
+        raise ConfigError(
+            f"{folder} has data.targets=sampled, which keeps one future of every record; "
+            "choose a run with data.targets=both or executed"
+        )
     forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
     data = open_data(run, settings)
     assert isinstance(data, RPIData)

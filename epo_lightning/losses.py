@@ -94,18 +94,26 @@ def soft_minimum(distance: Tensor, temperature: float) -> Tensor:
 def _rounded(distance: Tensor, temperature: float) -> Tensor:
     """h(d) = sqrt(d^2 + T^2) - T, without the cancellation for small d; infinite for an infinite d, without a gradient."""
     known = distance.isfinite()
-    square = torch.where(known, distance, 0.0).square()
-    return torch.where(known, square / ((square + temperature**2).sqrt() + temperature), distance)
+    ratio = torch.where(known, distance, 0.0) / temperature
+    # With s = sqrt(r^2 + 1), h = T r^2 / (s + 1); hypot and the order of factors do not overflow for a large d.
+    stretched = torch.hypot(ratio, torch.ones_like(ratio))
+    return torch.where(known, distance * (ratio / (stretched + 1.0)), distance)
 
 
-def checked_power(power: float) -> float:
-    """The exponent of :func:`distances`.
+def checked_power(power: float, annealing: Annealing) -> float:
+    """The exponent of :func:`distances`, for a loss with this annealing.
 
     Raises:
-        ValueError: a power below 1, whose gradient has no bound near a distance of zero, or an infinite one.
+        ValueError: a power below 1, whose gradient has no bound near a distance of zero, or an infinite one; or a power
+            other than 1 with annealing, whose temperature is a distance in metres.
     """
     if not 1 <= power < math.inf:
         raise ValueError(f"power must be 1 or more, and finite, not {power}")
+    if power != 1 and annealing.temperature > 0:
+        raise ValueError(
+            f"annealing={annealing.temperature:g} and power={power:g} exclude each other: the temperature is a "
+            "distance [m], and errors to a power have another unit; choose one of both"
+        )
     return power
 
 

@@ -135,6 +135,23 @@ def test_annealing_reaches_all_modes_when_hot_and_is_the_hard_loss_when_cold(imi
     assert torch.equal(off, hard)
 
 
+@pytest.mark.parametrize("far", [1e15, 1e20, 1e38])
+def test_a_very_distant_mode_changes_no_soft_minimum(far):
+    distance = torch.tensor([[far, 1.0]], requires_grad=True)
+    soft = losses.soft_minimum(distance, 0.5)
+    torch.testing.assert_close(soft, losses.soft_minimum(torch.tensor([[1e3, 1.0]]), 0.5))
+    soft.sum().backward()
+    assert distance.grad.isfinite().all()
+    assert losses.soft_minimum(torch.tensor([[far, far]]), 0.5).item() == pytest.approx(far)
+
+
+def test_a_power_other_than_one_and_a_temperature_in_metres_exclude_each_other():
+    assert losses.checked_power(1.0, losses.Annealing(0.3)) == 1.0
+    assert losses.checked_power(2.0, losses.Annealing()) == 2.0
+    with pytest.raises(ValueError, match=r"annealing=0.3 and power=1.05 exclude each other"):
+        losses.checked_power(1.05, losses.Annealing(0.3))
+
+
 def test_modes_at_an_infinite_distance_do_not_count():
     distance = torch.tensor([[1.0, 3.0, math.inf]], requires_grad=True)
     soft = losses.soft_minimum(distance, 2.0)

@@ -52,7 +52,7 @@ class Marginal(Forecaster):
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.annealing = losses.Annealing(annealing, annealing_steps)
-        self.power = losses.checked_power(power)
+        self.power = losses.checked_power(power, self.annealing)
         self.decoder = Trajectories(backbone.width, modes, task.horizon, task.scale)
 
     def forward(self, scene: Scene) -> JointForecast:

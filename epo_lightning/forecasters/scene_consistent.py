@@ -58,7 +58,7 @@ class SceneConsistent(Forecaster):
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.annealing = losses.Annealing(annealing, annealing_steps)
-        self.power = losses.checked_power(power)
+        self.power = losses.checked_power(power, self.annealing)
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
         self.probabilities = PROBABILITIES[probabilities](backbone.width, modes, task.horizon, task.scale)
 

@@ -46,9 +46,9 @@ class Imitation(Objective):
         annealing_steps: int = 2000,
     ) -> None:
         self.weights = checked_weights(weights, self.term_names)
-        self.power = losses.checked_power(power)
         self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
         self.annealing = losses.Annealing(annealing, annealing_steps)
+        self.power = losses.checked_power(power, self.annealing)
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
         how = self.relaxation.at(step), self.power, self.annealing.at(step)

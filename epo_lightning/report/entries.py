@@ -77,7 +77,7 @@ _CONFIGURATION: dict[str, Check] = {
 }
 """Entries of a configuration on which reports depend."""
 _SETTINGS: dict[str, dict[str, Check]] = {
-    **{section: {"relaxation": NUMBER, "annealing": NUMBER} for section in ("forecaster", "objective")},
+    **{section: dict.fromkeys(("power", "relaxation", "annealing"), NUMBER) for section in ("forecaster", "objective")},
     "solver": {"steps": _or_null(WHOLE)},
 }
 """Entries of sections of a configuration with which reports compute."""

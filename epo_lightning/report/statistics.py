@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from epo_lightning.report.columns import Column
 from epo_lightning.report.paper import is_papers
 from epo_lightning.report.rows import Row
-from epo_lightning.report.tables import Table
+from epo_lightning.report.tables import Table, loss_of
 
 CONFIDENCE = 0.95
 EQUAL = 1e-9
@@ -104,7 +104,7 @@ def compare_rows(one: Row, other: Row, metrics: Sequence[str]) -> Comparison:
 
 
 def build_comparisons(tables: Sequence[Table]) -> list[Comparisons]:
-    """Comparisons of each +EPO row with each +SC row of the same backbone and goal, for every main table."""
+    """Comparisons of +EPO rows with +SC rows of the same backbone, goal and power of the loss, for every main table."""
     found = []
     for table in (table for table in tables if table.main):
         metrics = [column.metric for column in table.columns]
@@ -114,6 +114,7 @@ def build_comparisons(tables: Sequence[Table]) -> list[Comparisons]:
             for other in table.rows
             if (one.forecaster, other.forecaster) == ("epo", "scene_consistent")
             and one.group == other.group
+            and loss_of(one)[0] == loss_of(other)[0]
             and is_papers("epo", one.runs[0].config)
         )
         if pairs:

@@ -149,25 +149,25 @@ def build_rows(runs: Sequence[EvaluatedRun]) -> tuple[Row, ...]:
     rows = plain_rows(runs)
     backbones = list(dict.fromkeys([*BACKBONES, *(row.group[0] for row in rows)]))
     titles = list(dict.fromkeys(row.title for row in rows))
-    losses = list(dict.fromkeys(_loss(row) for row in rows))
+    losses = list(dict.fromkeys(loss_of(row) for row in rows))
 
     def order(row: Row) -> tuple[object, ...]:
         """Sort key: the paper's goal first, rows of one loss together, baselines without a backbone last."""
         backbone, goal = row.group
         rank = FORECASTERS.index(row.forecaster) if row.forecaster in FORECASTERS else len(FORECASTERS)
         place = backbones.index(backbone)
-        loss = losses.index(_loss(row))
+        loss = losses.index(loss_of(row))
         return backbone == "", place, goal != "energy", goal, loss, rank, titles.index(row.title), natural(row.settings)
 
     return _with_ranks(sorted(rows, key=order))
 
 
-def _loss(row: Row) -> tuple[float, float]:
-    """Share of all modes and temperature of the row's imitation loss at the beginning of the training; 0 for the paper's."""
+def loss_of(row: Row) -> tuple[float, float, float]:
+    """Power, share of all modes and temperature of the row's imitation loss at the beginning of the training."""
     forecaster, objective = (row.runs[0].config.get(section) or {} for section in ("forecaster", "objective"))
     # The objective belongs to EPO alone; the other forecasters have the same settings of their own.
     section = objective if row.forecaster == "epo" else forecaster
-    return float(section.get("relaxation", 0.0)), float(section.get("annealing", 0.0))
+    return float(section.get("power", 1.0)), float(section.get("relaxation", 0.0)), float(section.get("annealing", 0.0))
 
 
 def _with_ranks(rows: Sequence[Row]) -> tuple[Row, ...]:

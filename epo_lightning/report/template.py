@@ -18,6 +18,7 @@ training's log.
 
 from __future__ import annotations
 
+import math
 import re
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -67,7 +68,7 @@ class Scores:
         """The score of every seed, in the order of the seeds.
 
         Raises:
-            ConfigError: the row has no such metric.
+            ConfigError: the row has no such metric, or a seed lacks it or has no finite value of it.
         """
         subset, _, label = metric.partition(" ")
         known = {key for scores in self.by_seed.values() for key in scores}
@@ -75,7 +76,13 @@ class Scores:
         key = next((name for name in names if name in known), None)
         if key is None:
             raise ConfigError(f"row {self.name!r} has no metric {metric!r}; {nearest(names[0], known)}")
-        return [self.by_seed[seed][key] for seed in sorted(self.by_seed)]
+        values = {seed: self.by_seed[seed].get(key, math.nan) for seed in sorted(self.by_seed)}
+        for seed, value in values.items():
+            if not math.isfinite(value):
+                raise ConfigError(
+                    f"row {self.name!r}, seed {seed}: {key} is {value}, and a page needs a finite score of every seed"
+                )
+        return list(values.values())
 
     def mean(self, metric: str, digits: int | None = None) -> str:
         """Mean over seeds: ``.0128``."""
@@ -184,6 +191,8 @@ class Results:
             data = dict.fromkeys(f"{run.data} ({run.data_digest})" for run in runs)
             commits = sorted({run.git_commit[:7] for run in runs})
             seeds = sorted({run.seed for run in runs})
+            if not runs:
+                raise ConfigError(f"results file {name} has no scored runs, so it cannot stand in the list of sources")
             steps = sorted({int(run.records.record["steps"]) for run in runs if run.learned}) or [0]
             lines.append(
                 (
@@ -297,7 +306,7 @@ def write_page(template: str | Path, results: str | Path, out: str | Path | None
         page = environment.from_string(text).render()
     except TemplateSyntaxError as error:
         raise ConfigError(f"{template}, line {error.lineno}: {error.message}") from error
-    except (TemplateError, TypeError, ArithmeticError, ConfigError) as error:
+    except (TemplateError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
         raise ConfigError(f"{template}, line {_line(error)}: {error}") from error
     file = Path(template.parent if out is None else out).expanduser() / template.stem
     write_file(file, page)

@@ -200,6 +200,12 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     assert (true[0], forecast[0]) == ("true", "forecast")
     assert float(true[2]) > 0.5, "discs do not touch"
     assert "no run folder" in refused(passing_sides.main, tmp_path / "nowhere")
+    record = run / "run.json"
+    record.write_text(record.read_text().replace('"finished"', '"training"'))
+    assert "is not finished" in refused(passing_sides.main, run)
+    drawn = ["data.targets=sampled", "budget=smoke", f"runs={tmp_path}"]
+    sampled = train.train(compose("train", ["experiment=rpi/v_lstm_sc", *small, *drawn])).path
+    assert "data.targets=sampled" in refused(passing_sides.main, sampled)
     other = train.train(compose("train", ["experiment=highway/v_lstm_sc", *TINY, f"runs={tmp_path}"])).path
     assert "only RPI has known equilibria" in refused(passing_sides.main, other)
     assert "only RPI has known equilibria" in refused(distance_by_weight.main, other)

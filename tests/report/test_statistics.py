@@ -122,6 +122,25 @@ def test_every_variant_is_compared(tmp_path: Path) -> None:
     assert all(isinstance(pair, Comparison) for pair in found.pairs)
 
 
+def test_rows_with_other_powers_of_the_loss_are_no_pair(tmp_path: Path) -> None:
+    for title, power in (("plain", 1.0), ("squared", 2.0)):
+        make_run(
+            tmp_path / title / "sc",
+            f"SC {title}",
+            "scene_consistent",
+            scores(0.2),
+            settings={"forecaster.power": power},
+        )
+        objective = {"objective.name": "imitation", "objective.power": power}
+        make_run(tmp_path / title / "epo", f"EPO {title}", "epo", scores(0.1), settings=objective)
+    tables = build_tables(collect(tmp_path))
+    (found,) = build_comparisons(tables)
+    names = [(pair.one.name, pair.other.name) for pair in found.pairs]
+    assert names == [("EPO plain", "SC plain"), ("EPO squared", "SC squared")]
+    (main,) = (table for table in tables if table.main)
+    assert [row.name for row in main.rows] == ["SC plain", "EPO plain", "SC squared", "EPO squared"]
+
+
 def test_without_a_pair_there_is_no_comparison(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM + EPO", "epo", scores(0.1))
     assert build_comparisons(build_tables(collect(tmp_path))) == []

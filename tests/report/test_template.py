@@ -83,6 +83,14 @@ def test_a_single_difference_has_no_interval() -> None:
     assert Differences("row", {0: {"x": 0.5}, 1: {"x": 0.5}}).text("x") == "+.500"
 
 
+@pytest.mark.parametrize("missing", [{}, {"x": float("nan")}, {"x": float("inf")}])
+def test_a_score_that_a_seed_lacks_is_no_number_of_a_page(missing: dict[str, float]) -> None:
+    row = Scores("row", {0: {"x": 1.0}, 3: missing})
+    for use in (lambda: row.text("x"), lambda: row.over(row, "x"), lambda: below([row], "x")):
+        with pytest.raises(ConfigError, match=r"row 'row', seed 3: x is (nan|inf), and a page needs a finite score"):
+            use()
+
+
 def test_a_table_has_the_papers_values_beside_its_rows() -> None:
     rows = {
         "ours": Scores("a", {0: {"minSADE": 1.0}, 1: {"minSADE": 2.0}}),
@@ -128,6 +136,9 @@ def test_the_validation_score_is_the_lowest_of_the_log(tmp_path: Path) -> None:
             "line 2: float division by zero",
         ),
         ("a\n{{ nothing.text() }}", "line 2: 'nothing' is undefined"),
+        ('a\n{% set one, two = results("rpi_hard").values() %}', "line 2: too many values to unpack"),
+        ('{{ table("row", {"a": "text"}, "SADE") }}', "line 1: 'str' object has no attribute 'n'"),
+        ('{% set a = results("runtime") %}\n{{ sources() }}', "line 2: results file runtime has no scored runs"),
         ("a\n{% if %}", "line 2: "),
     ],
 )

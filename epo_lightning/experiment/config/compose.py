@@ -100,12 +100,15 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     without the seed. A title from the experiment's file gets the names of backbone and forecaster where they differ from it.
 
     Raises:
-        ConfigError: an interpolation of a key that does not exist, or a value that is still missing.
+        ConfigError: an interpolation of a key that does not exist, a value that is still missing, or settings of an
+            objective for a forecaster that takes none.
     """
     from hydra.core.global_hydra import GlobalHydra
 
     choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
     values = _plain_values(config)
+    if "trainer" in values and "hydra" in config:
+        _check_objective(values, config.hydra.overrides.task)
     if choices.get("experiment"):
         choices["experiment"] = recorded_name(choices["experiment"], choices.get("data", ""))
         values["experiment"] = choices["experiment"]
@@ -119,6 +122,33 @@ def resolve(config: DictConfig) -> dict[str, Any]:
         if written is not None and choices.get("experiment"):
             values["title"] = _true_title(values, written)
     return values
+
+
+def _check_objective(values: Mapping[str, Any], overrides: Iterable[str]) -> None:
+    """Refuse settings of ``objective`` for a forecaster that has its own loss and would silently ignore them.
+
+    Without this check, a table would have rows "power=1" and "power=2" with equal scores.
+
+    Raises:
+        ConfigError: an override sets or chooses the objective, and the forecaster takes none.
+    """
+    given = [word for word in overrides if re.match(r"\+*objective[.=]", word)]
+    name = str(_name(values, "forecaster"))
+    chosen = parts("forecaster").get(name)
+    if not given or chosen is None or "objective" in (own := inspect.signature(chosen).parameters):
+        return
+    key, _, value = given[0].lstrip("+").removeprefix("objective.").partition("=")
+    section = values["forecaster"]
+    known = {"weights": "loss_weights"}.get(key.partition(".")[0], key.partition(".")[0])
+    if known in own:
+        place = ".".join(["forecaster", known, *key.split(".")[1:]])
+        there = f"write {'' if known in section else '+'}{place}={value}"
+    else:
+        there = "leave it out"
+    raise ConfigError(
+        f"{given[0]} has no effect on forecaster={name}, which takes no objective: {there}; in a sweep over several "
+        "forecasters, give every row its own setting in an experiment file, as conf/experiment/rpi/*_squared.yaml do"
+    )
 
 
 def _true_title(values: Mapping[str, Any], written: Mapping[str, Any]) -> Any:
