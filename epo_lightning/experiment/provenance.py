@@ -7,6 +7,8 @@ import subprocess
 from importlib.metadata import PackageNotFoundError, version
 
 from epo_lightning.experiment.config.compose import PACKAGE
+from epo_lightning.solvers.gauss_newton.kernel import interface
+from epo_lightning.solvers.gauss_newton.kernel.build import fingerprint
 
 CODE = ("epo_lightning", "conf", "sweeps", "pyproject.toml")
 """Code and settings in a checkout. Changes elsewhere, such as outputs of earlier commands, decide on no result."""
@@ -14,12 +16,17 @@ PACKAGES = ("epo_lightning", "torch", "lightning", "hydra-core", "omegaconf", "t
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of the packages on which results depend; None for those that are not installed."""
+    """Versions of the packages on which results depend; None for those that are not installed.
+
+    The version of the compiled layer is a hash of its sources. Without it, PyTorch solves the same games with other
+    rounding errors, after which a training may end at other scores.
+    """
     found: dict[str, str | None] = dict.fromkeys(PACKAGES)
     for name in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
-    return found
+    built = not isinstance(interface.find(), str)
+    return {**found, "compiled layer": f"{fingerprint():x}" if built else None}
 
 
 def commit() -> str | None:

@@ -22,6 +22,7 @@ from epo_lightning.experiment.callbacks import RandomStates
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.solvers.gauss_newton.kernel import interface
 
 ROW = "experiment=rpi/v_lstm_sc"
 
@@ -38,6 +39,7 @@ def test_a_run_folder_holds_what_a_run_needs(epo: Epo) -> None:
     assert record["seed"] == config["seed"] == 3
     assert record["data_digest"] == "tiny-64-0"
     assert record["versions"]["torch"]
+    assert bool(record["versions"]["compiled layer"]) == (not isinstance(interface.find(), str))
     assert record["parameters"] > 0
     assert "experiment=rpi/v_lstm_sc" in record["command"]
     assert (run.logs / "metrics.csv").read_text().count("\n") > 2
