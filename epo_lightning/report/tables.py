@@ -149,14 +149,14 @@ def build_rows(runs: Sequence[EvaluatedRun]) -> tuple[Row, ...]:
     rows = plain_rows(runs)
     backbones = list(dict.fromkeys([*BACKBONES, *(row.group[0] for row in rows)]))
     titles = list(dict.fromkeys(row.title for row in rows))
-    losses = list(dict.fromkeys(loss_of(row) for row in rows))
+    remedies = list(dict.fromkeys(loss_of(row)[1:] for row in rows))
 
     def order(row: Row) -> tuple[object, ...]:
         """Sort key: the paper's goal first, rows of one loss together, baselines without a backbone last."""
         backbone, goal = row.group
         rank = FORECASTERS.index(row.forecaster) if row.forecaster in FORECASTERS else len(FORECASTERS)
         place = backbones.index(backbone)
-        loss = losses.index(loss_of(row))
+        loss = remedies.index(loss_of(row)[1:]), loss_of(row)[0]
         return backbone == "", place, goal != "energy", goal, loss, rank, titles.index(row.title), natural(row.settings)
 
     return _with_ranks(sorted(rows, key=order))
