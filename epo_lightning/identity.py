@@ -19,6 +19,8 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from epo_lightning.registry import ConfigError
+
 SECTIONS = (
     *("data", "backbone", "forecaster", "dynamics", "energy", "solver", "backward", "objective", "optimizer"),
     *("trainer", "callbacks", "goal", "seed"),
@@ -63,6 +65,20 @@ def identity(config: Mapping[str, Any], data_digest: str) -> str:
     """The run's identity: sixteen hexadecimal digits of the hash of its essence and its data."""
     content = canonical({**essence(config), "data_digest": data_digest})
     return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def check_unchanged(config: Mapping[str, Any], record: Mapping[str, Any], config_file: object) -> None:
+    """Refuse a config.yaml that describes another run than run.json; records without an identity are not checked.
+
+    Raises:
+        ConfigError: the settings were changed since the run began.
+    """
+    found = identity(config, str(record.get("data_digest")))
+    if found != record.get("identity", found):
+        raise ConfigError(
+            f"{config_file} was changed since the run began: it describes the run {found}, and run.json the run "
+            f"{record['identity']}. Restore the file, or train a new run with the changed settings"
+        )
 
 
 def row_identity(config: Mapping[str, Any], data_digest: str) -> str:

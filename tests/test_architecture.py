@@ -17,7 +17,7 @@ FLOORS = {
     "arguments": {"registry"},
     "schema": {"registry"},
     "task": {"registry"},
-    "identity": set(),
+    "identity": {"registry"},
     "masking": set(),
     "host": set(),
     "pretrained": {"scene"},

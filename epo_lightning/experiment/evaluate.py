@@ -16,9 +16,10 @@ from epo_lightning import pretrained
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
-from epo_lightning.experiment.opening import open_checkpoint, open_data, refuse_changed_config, split_of
+from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
 from epo_lightning.experiment.other_data import OtherData, keys_of, open_other
 from epo_lightning.experiment.truth import TruthTest
+from epo_lightning.identity import check_unchanged
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
@@ -103,7 +104,7 @@ def score(
     forecaster = open_checkpoint(of_run, checkpoint)
     which = settings.checkpoint if settings.checkpoint in ("best", "last") else checkpoint.name
     if settings.data is not None:
-        refuse_changed_config(run)
+        check_unchanged(run.config(), run.record, run.config_file)
         other = open_other(run, of_run, forecaster, settings.data, settings.split, given, settings.workers)
         forecaster.test_metrics = ForecastMetrics(other.task.subsets, other.task.shape)
         metrics, _ = _test(run, of_run, forecaster, other.loader(settings.batch_size), machine, devices)

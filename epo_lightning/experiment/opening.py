@@ -8,7 +8,7 @@ from typing import Any
 import epo_lightning
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.identity import identity
+from epo_lightning.identity import check_unchanged
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 
@@ -61,22 +61,7 @@ def refuse_changed(run: RunFolder, digest: str) -> None:
             f"the data of {run.path} has changed since the run began (digest {began_with}, now {digest}): "
             "restore the data of that digest, or train a new run"
         )
-    refuse_changed_config(run)
-
-
-def refuse_changed_config(run: RunFolder) -> None:
-    """Refuse a run whose config.yaml describes another run than its run.json.
-
-    Raises:
-        ConfigError: the settings were changed since the run began.
-    """
-    record = run.record
-    found = identity(run.config(), str(record.get("data_digest")))
-    if found != record.get("identity", found):
-        raise ConfigError(
-            f"{run.config_file} was changed since the run began: it describes the run {found}, and run.json the run "
-            f"{record['identity']}. Restore the file, or train a new run with the changed settings"
-        )
+    check_unchanged(run.config(), run.record, run.config_file)
 
 
 def split_of(data: Any, split: str) -> Any:

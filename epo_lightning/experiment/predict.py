@@ -12,10 +12,11 @@ from torch import Tensor
 from epo_lightning import pretrained
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import ForecastSettings, PredictSettings, Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data, refuse_changed_config
+from epo_lightning.experiment.opening import open_checkpoint, open_data
 from epo_lightning.experiment.other_data import keys_of, open_other
 from epo_lightning.experiment.pictures import choose, draw, forecast_of, pick, spread
 from epo_lightning.forecasters import Forecaster
+from epo_lightning.identity import check_unchanged
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_file, write_json
 from epo_lightning.scene import KINDS, JointForecast, Scene
@@ -124,7 +125,7 @@ def scenes_of(
         ConfigError: the data is missing, has changed, or cannot be read by the run.
     """
     if settings.data is not None:
-        refuse_changed_config(run)
+        check_unchanged(run.config(), run.record, run.config_file)
         given = keys_of(overrides)
         other = open_other(run, of_run, forecaster, settings.data, settings.split, given, settings.workers)
         for note in other.notes:

@@ -8,7 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from epo_lightning.identity import identity, row_identity
+from epo_lightning.identity import check_unchanged, identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
@@ -103,12 +103,14 @@ def checked_records(run: Records) -> tuple[dict[str, Any], dict[str, Any]]:
     """Configuration and record of a run, whose entries are of the expected kinds, where they are not missing.
 
     Raises:
-        ConfigError: a file is missing or damaged; the message names the file and the entry, and says what to do.
+        ConfigError: a file is missing or damaged, or the configuration was changed since the run began; the message names
+            the file and the entry, and says what to do.
     """
     _require_records(run)
     config, record = _sound(run.config, COPY), _sound(lambda: run.record, COPY)
     check_configuration(config, str(run.path / CONFIG), COPY)
     check_record(record, str(run.path / RECORD), COPY)
+    check_unchanged(config, record, run.path / CONFIG)
     return config, record
 
 

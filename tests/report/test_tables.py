@@ -332,10 +332,20 @@ def test_every_number_has_its_command_commit_data_and_identity(tmp_path: Path) -
     assert (found.data_digest, found.trained_digest) == ("abc", "t")
     assert found.config == run.config()
     assert (found.identity, found.row) == (identity(run.config(), "t"), row_identity(run.config(), "t"))
-    run.update(git_commit=None, versions={"epo_lightning": "0.1.0"}, identity="forged", row="forged")
+    run.update(git_commit=None, versions={"epo_lightning": "0.1.0"}, row="forged")
     (found,) = collect(tmp_path)
     assert found.git_commit == "version 0.1.0"
     assert found.row == row_identity(run.config(), "t")
+
+
+def test_a_configuration_that_was_changed_after_the_training_is_refused(tmp_path: Path) -> None:
+    run = make_run(tmp_path, "V-LSTM", "marginal", scores(0.3))
+    run.update(identity=identity(run.config(), run.record["data_digest"]))
+    assert len(collect(tmp_path)) == 1
+    text = run.config_file.read_text().replace("seed: 0", "seed: 1")
+    run.config_file.write_text(text)
+    with pytest.raises(ConfigError, match=r"config.yaml was changed since the run began.*Restore the file"):
+        collect(tmp_path)
 
 
 def test_a_run_is_in_the_table_of_every_split_with_scores(tmp_path: Path) -> None:

@@ -80,6 +80,8 @@ def _details(sweep: Sweep, job: Job, state: State) -> str:
         return how_far(job)
     if state == "failed":
         return sweep.error(job)
+    if state == "interrupted" and job.run.finished:
+        return "trained, not scored yet"
     if state == "interrupted":
         return how_far(job) if job.run.progress else ""
     return result(job) if state == "done" else ""

@@ -67,7 +67,9 @@ def test_a_sweep_trains_and_scores_every_run_once(epo: Epo, capsys: pytest.Captu
     assert [sweep.state(job) for job in sweep.jobs].count("interrupted") == 2
     capsys.readouterr()
     assert epo("sweep", "status", "rpi_main") == 0
-    assert "6 done, 2 interrupted" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "6 done, 2 interrupted" in shown
+    assert shown.count("trained, not scored yet") == 1
     assert epo(*SWEEP) == 0
     assert {sweep.state(job) for job in sweep.jobs} == {"done"}
     assert {path for path, mark in marks(sweep).items() if mark != before[path]} == {str(first.path), str(second.path)}
