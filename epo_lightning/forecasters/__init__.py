@@ -35,7 +35,7 @@ def check_model(model: Mapping[str, Any]) -> None:
     """Check a model's configuration without building anything: names, keys and the choice of ``goal``.
 
     Raises:
-        ConfigError: an unknown or missing key, with the nearest known name.
+        ConfigError: an unknown or missing key, with the nearest known name; or ``goal=all`` where no network can read goals.
     """
     known = (*SUPPLIED, *TASK_KEYS, "goal", "given")
     for key in model:
@@ -53,6 +53,17 @@ def check_model(model: Mapping[str, Any]) -> None:
         )
     for kind, supplied in SUPPLIED.items():
         check_keys(kind, model[kind], supplied)
+    takes_backbone = "backbone" in _arguments("forecaster", model)
+    if model["goal"] == "all" and takes_backbone and "goal_input" not in _arguments("backbone", model):
+        raise ConfigError(
+            f"goal is 'all', which makes the given goal an input of the network, but backbone {model['backbone']['name']} "
+            "has no argument goal_input: use goal=energy, or let the backbone read scene.goal_candidates if it is set"
+        )
+
+
+def _arguments(kind: str, model: Mapping[str, Any]) -> Mapping[str, inspect.Parameter]:
+    """Arguments of the constructor of a part."""
+    return inspect.signature(lookup(kind, model[kind]["name"])).parameters
 
 
 def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
@@ -69,7 +80,7 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
     """
     check_model(model)
     task = Task.from_config(model)
-    named = inspect.signature(lookup("forecaster", model["forecaster"]["name"])).parameters
+    named = _arguments("forecaster", model)
     parts: dict[str, Any] = {"task": task}
     # Parts that the forecaster does not take are not built: drawing their initial weights would use random numbers, and the
     # initial weights of the other parts would change.
