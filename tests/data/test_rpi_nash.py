@@ -11,7 +11,8 @@ from scipy.optimize import minimize
 from epo_lightning.data.rpi.game import GameConstants, MainGame, generator, main_game
 from epo_lightning.data.rpi.kernels import costs, passage, rollout
 from epo_lightning.data.rpi.modes import cheapest
-from epo_lightning.data.rpi.solve import solve
+from epo_lightning.data.rpi.scenes import SOLVERS
+from epo_lightning.data.rpi.solve import SETTINGS, solve
 from epo_lightning.data.rpi.subgames import main_starts, random_starts
 
 from . import dense
@@ -116,3 +117,32 @@ def test_the_feedback_solver_finds_both_modes_near_the_open_loop_ones():
         a, b = open_loop.states[ours[side]], feedback.states[theirs[side]]
         robot = np.linalg.norm(a[:, :2] - b[:, :2], axis=1).mean()
         assert 1e-3 < robot < 0.6
+
+
+def test_solvers_of_the_configuration_are_those_with_settings():
+    assert set(SOLVERS) == set(SETTINGS)
+
+
+@pytest.mark.parametrize(("solver", "spread"), [("feedback", (0.01, 0.5)), ("feedback_converged", (0.0, 0.01))])
+def test_solutions_of_feedback_players_depend_on_their_starts_unless_they_converge(
+    solver: str, spread: tuple[float, float]
+) -> None:
+    game = main_game(0, 0, 5, 38, CONSTANTS)
+    found = solve(game.start, main_starts(generator(1), CONSTANTS.steps), C, game.goals, game.weight, solver)
+    assert found.converged.all()
+    for side in (-1, 1):
+        positions = found.states[np.sign(found.rotation) == side][:, :, [0, 1, 4, 5]]
+        assert spread[0] < np.ptp(positions, axis=0).max() < spread[1]
+
+
+def test_converged_feedback_players_continue_what_they_have_planned():
+    """Feedback equilibria are subgame perfect: solved again from a later state, the rest of the plan stays as it is."""
+    game = main_game(0, 0, 5, 38, CONSTANTS)
+    moved = {}
+    for solver in ("feedback", "feedback_converged"):
+        main = solve(game.start, main_starts(generator(1), CONSTANTS.steps), C, game.goals, game.weight, solver)
+        plan = next(iter(cheapest(main, CONSTANTS).values()))
+        states, controls = main.states[plan], main.controls[plan]
+        again = solve(states[25], controls[None, 25:], C, game.goals, game.weight, solver)
+        moved[solver] = np.abs(again.states[0] - states[25:]).max()
+    assert moved["feedback_converged"] < 5e-3 < moved["feedback"]

@@ -22,7 +22,7 @@ from safetensors.numpy import save
 
 from epo_lightning.data import cache
 from epo_lightning.data.rpi.game import GameConstants, main_game
-from epo_lightning.data.rpi.solve import FeedbackSettings, PotentialSettings
+from epo_lightning.data.rpi.solve import SETTINGS
 from epo_lightning.data.rpi.splits import assign
 from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, MAIN_STARTS, RANDOM_STARTS, Records, play
 from epo_lightning.data.workers import Report, finished
@@ -37,14 +37,13 @@ DOUBLE = ("cost", "agent_cost", "weight", "phi")
 
 def pool_config(seed: int, games: int, placements: int, solver: str) -> dict[str, Any]:
     """Configuration of a pool: all values that its records depend on."""
-    settings = FeedbackSettings() if solver == "feedback" else PotentialSettings()
     return {
         "recipe": RECIPE,
         "seed": seed,
         "games": games,
         "placements": placements,
         "solver": solver,
-        "settings": dataclasses.asdict(settings),
+        "settings": dataclasses.asdict(SETTINGS[solver]),
         "constants": dataclasses.asdict(GameConstants()),
         "history": HISTORY,
         "future": FUTURE,

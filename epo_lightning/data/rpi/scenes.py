@@ -21,7 +21,7 @@ from epo_lightning.scene import Scene
 from epo_lightning.task import Task
 
 TARGETS = ("executed", "sampled", "both")
-SOLVERS = ("potential", "feedback")
+SOLVERS = ("potential", "feedback", "feedback_converged")
 SUBSETS = ("executed", "alternative")
 DISC_DIAMETER = 0.5
 """Length and width [m] of an agent: a disc of radius 0.25 m."""
@@ -97,7 +97,8 @@ class RPIData(SceneDataModule):
         games: number of main games, each with its own w. A tenth of them (at least one) is for validation, and another
             tenth for testing.
         placements: start positions of the pedestrian per main game.
-        solver: ``potential`` (open-loop Nash equilibrium) or ``feedback`` (iterative LQ game).
+        solver: ``potential`` (open-loop Nash equilibrium), ``feedback`` (iterative LQ game) or ``feedback_converged`` (the
+            same, iterated until the solution does not depend on the start strategy).
         split: ``paper`` (unseen games) or ``hard`` (unseen w and directions).
         sizes: largest numbers of records of training, validation and test; None for all.
         targets: ``both``, ``executed`` or ``sampled``; see :class:`RPIDataset`.

@@ -2,12 +2,14 @@
 
 ``potential``: open-loop Nash equilibrium, as the minimiser of the exact potential (iterative LQR).
 ``feedback``: feedback Nash equilibrium, by the general-sum iterative linear-quadratic game of Fridovich-Keil et al. (2020)
-with the settings of Peters (2020).
+with the settings of Peters (2020). Its tolerance of 5 cm leaves solutions that depend on the start strategy.
+``feedback_converged``: the same with a tolerance of 1 mm.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +19,6 @@ from numpy.typing import NDArray
 from epo_lightning.data.rpi import kernels as game
 from epo_lightning.data.rpi.game import Array
 from epo_lightning.data.rpi.lq import lq_game, lq_minimum
-
-SOLVERS = ("potential", "feedback")
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class PotentialSettings:
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """Settings of the feedback solver.
+    """Settings of the feedback solver, by default those of Peters (2020).
 
     Attributes:
         step: initial step length of an iteration; it is halved until the change of the states is small enough.
@@ -66,6 +66,14 @@ class FeedbackSettings:
     def array(self) -> Array:
         """The settings as the vector that the compiled solver reads."""
         return np.array(dataclasses.astuple(self), dtype=np.float64)
+
+
+SETTINGS: Mapping[str, PotentialSettings | FeedbackSettings] = {
+    "potential": PotentialSettings(),
+    "feedback": FeedbackSettings(),
+    "feedback_converged": FeedbackSettings(tolerance=1e-3, iterations=1000),
+}
+"""Settings by the name of a solver (``data.solver``)."""
 
 
 @njit(cache=True)
@@ -220,8 +228,8 @@ def solve(
 
     The loop over the starts is not compiled, because compiling it would compile both solvers again.
     """
-    feedback = solver == "feedback"
-    settings, both = (FeedbackSettings() if feedback else PotentialSettings()).array(), np.ones(2)
+    chosen, both = SETTINGS[solver], np.ones(2)
+    settings, feedback = chosen.array(), isinstance(chosen, FeedbackSettings)
     count, steps = starts.shape[:2]
     states, controls = np.empty((count, steps + 1, 8)), np.empty((count, steps, 4))
     converged, facts = np.empty(count, dtype=np.bool_), np.empty((count, 7))
