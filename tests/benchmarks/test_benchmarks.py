@@ -29,6 +29,7 @@ from benchmarks import (
     forecast_speed,
     generation,
     hard_constraints,
+    label_noise,
     many_agents,
     passing_sides,
     reading,
@@ -164,6 +165,15 @@ def test_true_games_are_measured(capsys, tmp_path):
     assert float(lines[0].split("executed ")[1].split()[0]) < 1e-5
     assert "fewer than 4000" in refused(true_game.main, "--records", 4000, *small)
     assert "data=rpi" in refused(true_game.main, "data=drawn")
+
+
+def test_the_noise_of_recorded_futures_is_measured(capsys):
+    label_noise.main(["--games", "3"])
+    rows = dict(re.findall(r"^\| (\w+) \| \d+ \| (.+) \|$", capsys.readouterr().out, re.MULTILINE))
+    means = {solver: [float(cell.split()[0]) for cell in cells.split(" | ")] for solver, cells in rows.items()}
+    assert list(means) == ["potential", "feedback", "feedback_converged"]
+    assert max(means["potential"]) < 1e-4
+    assert max(means["feedback_converged"]) < 0.01 < min(means["feedback"])
 
 
 def test_a_side_is_taught_if_another_mode_is_closest_to_it():
