@@ -222,7 +222,7 @@ def _single(arguments: Arguments) -> None:
         _resume(resumed[-1].partition("=")[2], [word for word in arguments.overrides if word not in resumed])
         return
     words = list(arguments.overrides)
-    if arguments.verb == "train" and not words:  # the defaults would train a nameless row, for a day
+    if arguments.verb == "train" and not words:  # the defaults would train a nameless row, for an hour
         raise ConfigError(
             "choose what to train: experiment=<row>, for example `epo train experiment=rpi/v_lstm_epo budget=short`; "
             "`epo train --help` lists rows and budgets"
