@@ -90,6 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--games", type=positive, default=40, help="number of main games")
     parser.add_argument("--seed", type=int, default=0, help="seed of the games")
     given = parser.parse_args(arguments)
+    if given.seed < 0:
+        parser.error(f"--seed is {given.seed}, expected 0 or more")
     print(f"{given.games} main games of seed {given.seed}; mean (largest) distance in m")
     print("| data.solver | iterations | two draws: executed | alternative | recorded minus played |")
     print("|:--|--:|--:|--:|--:|")
