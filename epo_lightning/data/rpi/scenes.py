@@ -98,7 +98,7 @@ class RPIData(SceneDataModule):
             tenth for testing.
         placements: start positions of the pedestrian per main game.
         solver: ``potential`` (open-loop Nash equilibrium), ``feedback`` (iterative LQ game) or ``feedback_converged`` (the
-            same, iterated until the solution does not depend on the start strategy).
+            same, iterated until a step changes less than 1 mm).
         split: ``paper`` (unseen games) or ``hard`` (unseen w and directions).
         sizes: largest numbers of records of training, validation and test; None for all.
         targets: ``both``, ``executed`` or ``sampled``; see :class:`RPIDataset`.
