@@ -17,6 +17,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from epo_lightning.registry import ConfigError
@@ -67,7 +68,7 @@ def identity(config: Mapping[str, Any], data_digest: str) -> str:
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-def check_unchanged(config: Mapping[str, Any], record: Mapping[str, Any], config_file: object) -> None:
+def check_unchanged(config: Mapping[str, Any], record: Mapping[str, Any], config_file: Path) -> None:
     """Refuse a config.yaml that describes another run than run.json; records without an identity are not checked.
 
     Raises:

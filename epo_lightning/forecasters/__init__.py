@@ -57,7 +57,7 @@ def check_model(model: Mapping[str, Any]) -> None:
     if model["goal"] == "all" and takes_backbone and "goal_input" not in _arguments("backbone", model):
         raise ConfigError(
             f"goal is 'all', which makes the given goal an input of the network, but backbone {model['backbone']['name']} "
-            "has no argument goal_input: use goal=energy, or let the backbone read scene.goal_candidates if it is set"
+            "has no argument goal_input: use goal=energy, or add it, and read scene.goal_candidates where it is true"
         )
 
 
