@@ -5,7 +5,8 @@
 Every main game is solved at a random placement, and one sub-game of each of its executed modes is solved twice, with other
 random starts. *Two draws* is the mean distance between the futures that would be recorded in both cases. If the noise is
 Gaussian, the mean error of the best possible forecast is this distance divided by the root of two. *Recorded minus played*
-is the distance of the recorded executed future from what the agents then do in the main game.
+is the distance of the recorded executed future from what the agents then do in the main game. Modes that only one draw finds
+have no distance; they are counted.
 """
 
 from __future__ import annotations
@@ -35,18 +36,20 @@ class Noise:
         executed, alternative: distances between the futures of two draws, one entry per sub-game that has the mode.
         played: distances of the recorded executed future from what the agents then do.
         iterations: mean number of iterations of every sub-game.
+        single: whether only one draw found the alternative, one entry per sub-game in which a draw found it.
     """
 
     executed: list[float]
     alternative: list[float]
     played: list[float]
     iterations: list[float]
+    single: list[bool]
 
 
 def measure(solver: str, games: int, seed: int) -> Noise:
     """The noise of one solver of ``data.solver`` over the first main games of a seed."""
     constants, random = GameConstants(), generator(seed, 99)
-    noise = Noise([], [], [], [])
+    noise = Noise([], [], [], [], [])
     for number in range(games):
         placement = int(random.integers(PLACEMENTS))
         game = main_game(seed, number, placement, PLACEMENTS, constants)
@@ -71,6 +74,8 @@ def measure(solver: str, games: int, seed: int) -> Noise:
             for mode, distances in ((side, noise.executed), (-side, noise.alternative)):
                 if mode in one and mode in other:
                     distances.append(_distance(one[mode], other[mode]))
+            if -side in one or -side in other:
+                noise.single.append((-side in one) != (-side in other))
             if side in one:
                 noise.played.append(_distance(one[side], _positions(states[k:])))
     return noise
@@ -92,17 +97,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     if given.seed < 0:
         parser.error(f"--seed is {given.seed}, expected 0 or more")
-    print(f"{given.games} main games of seed {given.seed}; mean (largest) distance in m")
-    print("| data.solver | iterations | two draws: executed | alternative | recorded minus played |")
-    print("|:--|--:|--:|--:|--:|")
+    print(f"{given.games} main games of seed {given.seed}; mean (largest) distance in m, number of sub-games")
+    print(
+        "| data.solver | iterations | two draws: executed | alternative | found by one only | recorded minus played |"
+    )
+    print("|:--|--:|--:|--:|--:|--:|")
     for solver in SETTINGS:
         noise = measure(solver, given.games, given.seed)
-        cells = (_cell(values) for values in (noise.executed, noise.alternative, noise.played))
-        print(f"| {solver} | {np.mean(noise.iterations):.0f} | {' | '.join(cells)} |", flush=True)
+        executed, alternative, played = map(_cell, (noise.executed, noise.alternative, noise.played))
+        single = f"{sum(noise.single)} of {len(noise.single)}"
+        iterations = f"{np.mean(noise.iterations):.0f}"
+        print(f"| {solver} | {iterations} | {executed} | {alternative} | {single} | {played} |", flush=True)
 
 
 def _cell(values: Sequence[float]) -> str:
-    return f"{np.mean(values):.4f} ({np.max(values):.4f})" if values else "-"
+    return f"{np.mean(values):.4f} ({np.max(values):.4f}), {len(values)}" if values else "-"
 
 
 if __name__ == "__main__":

@@ -72,14 +72,30 @@ def check_unchanged(config: Mapping[str, Any], record: Mapping[str, Any], config
     """Refuse a config.yaml that describes another run than run.json; records without an identity are not checked.
 
     Raises:
-        ConfigError: the settings were changed since the run began.
+        ConfigError: the settings or the names of the run were changed since it began, or run.json is damaged.
     """
-    found = identity(config, str(record.get("data_digest")))
-    if found != record.get("identity", found):
-        raise ConfigError(
-            f"{config_file} was changed since the run began: it describes the run {found}, and run.json the run "
-            f"{record['identity']}. Restore the file, or train a new run with the changed settings"
-        )
+    if "identity" not in record:
+        return
+    for key in ("identity", "data_digest"):
+        if not isinstance(record.get(key), str):
+            raise ConfigError(
+                f"{config_file.with_name('run.json')}: {key} is {record.get(key)!r}, expected text of hexadecimal digits; "
+                "was the file edited? Restore it, or train the run again in another folder"
+            )
+    described = {"identity": identity(config, record["data_digest"]), **_names(config)}
+    for key, found in described.items():
+        if found is not None and found != record.get(key, found):
+            raise ConfigError(
+                f"{config_file} or run.json beside it was changed since the run began: {key} is {found!r} by config.yaml "
+                f"and {record[key]!r} by run.json. Restore the file, or train a new run with the changed settings"
+            )
+
+
+def _names(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Names of a run's row, which are no part of its identity, by their keys in run.json."""
+    budget = config.get("budget")
+    names = {"title": config.get("title"), "experiment": config.get("experiment")}
+    return {**names, "budget": budget.get("name") if isinstance(budget, Mapping) else None}
 
 
 def row_identity(config: Mapping[str, Any], data_digest: str) -> str:

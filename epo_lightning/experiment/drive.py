@@ -23,13 +23,12 @@ from epo_lightning.drive.progress import Progress
 from epo_lightning.drive.world import World
 from epo_lightning.drive.worlds import BEST_RESPONSE, CONSTANT_VELOCITY, DRIVER, Place, place
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import DriveSettings, Settings
-from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.experiment.config.settings import DriveSettings
+from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.experiment.provenance import commit
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder, write_file, write_json
-from epo_lightning.schema import read
 
 ROUNDS = 3
 """Best responses of every agent in turn."""
@@ -186,7 +185,7 @@ def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make
     """Planners by name, made for a world."""
     paths = settings.run if settings.ways else []
     runs = [RunFolder.open(path) for path in paths]
-    configs = [read(Settings, run.config()) for run in runs]
+    configs = [settings_of(run) for run in runs]
     titles = _titles(paths, [run.path.resolve() for run in runs], [of_run.title for of_run in configs])
     baselines = where.baselines if settings.baselines is None else settings.baselines
     lacking: list[str] = []

@@ -16,11 +16,10 @@ from epo_lightning import pretrained
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
-from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
+from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
 from epo_lightning.experiment.other_data import OtherData, keys_of, open_other
 from epo_lightning.experiment.precision import PLUGINS
 from epo_lightning.experiment.truth import TruthTest
-from epo_lightning.identity import check_unchanged
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
@@ -100,12 +99,11 @@ def score(
     """
     if not run.finished:
         raise ConfigError(f"{run.path} is not finished: continue it with `epo train resume={run.path}`")
-    of_run = read(Settings, run.config())
+    of_run = settings_of(run)
     checkpoint = run.checkpoint(settings.checkpoint)
     forecaster = open_checkpoint(of_run, checkpoint)
     which = settings.checkpoint if settings.checkpoint in ("best", "last") else checkpoint.name
     if settings.data is not None:
-        check_unchanged(run.config(), run.record, run.config_file)
         other = open_other(run, of_run, forecaster, settings.data, settings.split, given, settings.workers)
         forecaster.test_metrics = ForecastMetrics(other.task.subsets, other.task.shape)
         metrics, _ = _test(run, of_run, forecaster, other.loader(settings.batch_size), machine, devices)

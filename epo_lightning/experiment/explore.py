@@ -6,13 +6,12 @@ import socket
 from collections.abc import Callable, Sequence
 
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import ExploreSettings, Settings
-from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.experiment.config.settings import ExploreSettings
+from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.experiment.predict import scenes_of
 from epo_lightning.explore.session import Session
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.schema import read
 
 HOST = "127.0.0.1"
 """Address of the page: it cannot be reached from other machines."""
@@ -39,7 +38,7 @@ def explore(settings: ExploreSettings, overrides: Sequence[str], tell: Callable[
         ) from error
     assembly.quiet()
     run = RunFolder.open(settings.run)
-    of_run = read(Settings, run.config())
+    of_run = settings_of(run)
     forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
     chosen = scenes_of(run, of_run, settings, forecaster, overrides)
     session = Session(forecaster, chosen.scenes, of_run.title, tuple(chosen.about["subsets"]))

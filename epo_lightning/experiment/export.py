@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import ExportSettings, Settings
-from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.experiment.config.settings import ExportSettings
+from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.experiment.predict import MEANING, scenes_of
 from epo_lightning.experiment.program_files import FORMATS, Format, Run, Tensors
 from epo_lightning.forecasters.base import Forecaster
@@ -26,7 +26,6 @@ from epo_lightning.forecasters.refined import Refined
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import FIELDS, Scene
-from epo_lightning.schema import read
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 OUTPUTS = ("states", "probabilities")
@@ -72,7 +71,7 @@ def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Pat
     check_file(file, form)
     assembly.quiet()
     run = RunFolder.open(settings.run)
-    of_run = read(Settings, run.config())
+    of_run = settings_of(run)
     forecaster: Forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
     check_exportable(forecaster, of_run.title, form)
     scenes = scenes_of(run, of_run, settings, forecaster, overrides).scenes

@@ -11,6 +11,7 @@ from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.identity import check_unchanged
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
+from epo_lightning.schema import read
 
 ARCHITECTURE = ("forecaster", "backbone", "energy", "dynamics", "solver", "backward")
 """Sections that a checkpoint has to share with its run."""
@@ -49,11 +50,22 @@ def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None)
     return data
 
 
-def refuse_changed(run: RunFolder, digest: str) -> None:
-    """Refuse to continue or score a run with other data or other settings than it began with.
+def settings_of(run: RunFolder) -> Settings:
+    """The settings that a run began with.
 
     Raises:
-        ConfigError: the data has another digest now, or config.yaml describes another run than run.json.
+        ConfigError: config.yaml is missing or damaged, or describes another run than run.json.
+    """
+    config = run.config()
+    check_unchanged(config, run.record, run.config_file)
+    return read(Settings, config)
+
+
+def refuse_changed(run: RunFolder, digest: str) -> None:
+    """Refuse to continue or score a run with other data than it began with.
+
+    Raises:
+        ConfigError: the data has another digest now.
     """
     began_with = run.record.get("data_digest")
     if began_with != digest:
@@ -61,7 +73,6 @@ def refuse_changed(run: RunFolder, digest: str) -> None:
             f"the data of {run.path} has changed since the run began (digest {began_with}, now {digest}): "
             "restore the data of that digest, or train a new run"
         )
-    check_unchanged(run.config(), run.record, run.config_file)
 
 
 def split_of(data: Any, split: str) -> Any:

@@ -12,15 +12,13 @@ from torch import Tensor
 from epo_lightning import pretrained
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import ForecastSettings, PredictSettings, Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data
+from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
 from epo_lightning.experiment.other_data import keys_of, open_other
 from epo_lightning.experiment.pictures import choose, draw, forecast_of, pick, spread
 from epo_lightning.forecasters import Forecaster
-from epo_lightning.identity import check_unchanged
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_file, write_json
 from epo_lightning.scene import KINDS, JointForecast, Scene
-from epo_lightning.schema import read
 
 MEANING = {
     "states": "[B, M, N, K, 4] x, y [m], heading [rad], speed [m/s] of every joint mode",
@@ -90,7 +88,7 @@ def predict(settings: PredictSettings, overrides: Sequence[str] = ()) -> list[Pa
     tensors_file, index_file = out / "forecasts.safetensors", out / "index.json"
     if index_file.exists():
         raise ConfigError(f"{out} holds forecasts already: nothing is overwritten; choose another out=<folder>")
-    of_run = read(Settings, run.config())
+    of_run = settings_of(run)
     forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
     chosen = scenes_of(run, of_run, settings, forecaster, overrides)
     scenes = chosen.scenes
@@ -125,7 +123,6 @@ def scenes_of(
         ConfigError: the data is missing, has changed, or cannot be read by the run.
     """
     if settings.data is not None:
-        check_unchanged(run.config(), run.record, run.config_file)
         given = keys_of(overrides)
         other = open_other(run, of_run, forecaster, settings.data, settings.split, given, settings.workers)
         for note in other.notes:

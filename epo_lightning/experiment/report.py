@@ -12,7 +12,7 @@ from typing import Any
 
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import ReportSettings, Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data
+from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
 from epo_lightning.experiment.pictures import choose, eventful, forecast_of, is_traffic, pairs, spread
 from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.identity import ELSEWHERE
@@ -25,7 +25,6 @@ from epo_lightning.report.runs import scored, scored_elsewhere
 from epo_lightning.report.tables import distinct
 from epo_lightning.report.write import is_measured, is_timed, why_left_out
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.schema import read
 
 SCENES, GAMES = 4, 512
 """How many scenes are drawn, and over how many the distribution of learned weights is taken."""
@@ -186,7 +185,7 @@ def draw(rows: Iterable[Row], folder: Path) -> tuple[list[Path], list[str]]:
     for row in _best_of_titles(rows):
         run = RunFolder(row.runs[0].path)
         try:
-            settings = read(Settings, run.config())
+            settings = settings_of(run)
             forecasters[row.name] = open_checkpoint(settings, run.checkpoint())
             runs[row.name] = run, settings
         except ConfigError as error:

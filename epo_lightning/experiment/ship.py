@@ -19,9 +19,9 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.card import SCORES, Recipe, card, recipe_of, recipes
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.config import compose
-from epo_lightning.experiment.config.settings import EvaluateSettings, Settings
+from epo_lightning.experiment.config.settings import EvaluateSettings
 from epo_lightning.experiment.evaluate import score
-from epo_lightning.experiment.opening import open_data, split_of
+from epo_lightning.experiment.opening import open_data, settings_of, split_of
 from epo_lightning.experiment.pictures import choose
 from epo_lightning.experiment.train import train
 from epo_lightning.experiment.verbs import generate_and_print
@@ -29,7 +29,6 @@ from epo_lightning.forecasters import load
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, read_json, write_file, write_json
-from epo_lightning.schema import read
 
 SCENES = 16
 """Example scenes that ship with a run."""
@@ -79,7 +78,7 @@ def ship(run: RunFolder, name: str, recipe: Recipe, folder: Path) -> Path:
 def _pack(run: RunFolder, packed: RunFolder) -> RunFolder:
     """Write everything but the card of a packed run."""
     content = torch.load(run.checkpoint("best"), map_location="cpu", weights_only=True)
-    data = open_data(run, read(Settings, run.config()))
+    data = open_data(run, settings_of(run))
     scenes, _ = choose(data, "test", SCENES)
     fields = {field.name: getattr(scenes, field.name) for field in dataclasses.fields(scenes)}
     tensors = {name: value.contiguous() for name, value in fields.items() if isinstance(value, Tensor)}

@@ -18,10 +18,10 @@ from lightning.pytorch.callbacks import Timer
 from epo_lightning.experiment import assembly, callbacks, debugging, distributed, follower, gpus, logs
 from epo_lightning.experiment.config.settings import EvaluateSettings, Measured, Settings
 from epo_lightning.experiment.evaluate import score
-from epo_lightning.experiment.opening import refuse_changed
+from epo_lightning.experiment.opening import refuse_changed, settings_of
 from epo_lightning.experiment.provenance import commit, versions
 from epo_lightning.forecasters.checkpoint import read_checkpoint
-from epo_lightning.identity import differences, identity, row_identity
+from epo_lightning.identity import check_unchanged, differences, identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
 from epo_lightning.schema import read
@@ -93,13 +93,13 @@ def resume(run: RunFolder) -> None:
     """Continue a run that was stopped, with its own configuration, from its last finished epoch.
 
     Raises:
-        ConfigError: the run is finished, its data has changed, its checkpoint is damaged or belongs to another
-            architecture, or another process works on the run.
+        ConfigError: the run is finished, its settings or its data have changed, its checkpoint is damaged or belongs to
+            another architecture, or another process works on the run.
     """
-    config = run.config()
-    if run.finished and distributed.here(read(Settings, config).trainer.devices).leads:
+    settings = settings_of(run)
+    if run.finished and distributed.here(settings.trainer.devices).leads:
         raise ConfigError(f"{run.path} is finished: score it with `epo evaluate run={run.path}`")
-    train(config, begun=run)
+    train(run.config(), begun=run)
 
 
 def fit(
@@ -180,6 +180,7 @@ def refuse_other(run: RunFolder, config: dict[str, Any], data_digest: str) -> No
     Raises:
         ConfigError: the configuration or the data has changed; the message names the difference.
     """
+    check_unchanged(run.config(), run.record, run.config_file)
     if differing := differences(run.config(), config):
         shown = ", ".join(f"{key}: {there!r} there, {here!r} here" for key, there, here in differing[:5])
         raise ConfigError(

@@ -5,6 +5,7 @@ Keys are (data, backbone, forecaster) by their registered names. Displacements i
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -101,11 +102,13 @@ def paper_values(
     """The paper's values of a row by metric; empty where the paper has none, as it gives known goals to the energy only.
 
     Args:
+        data: name of the data set (:func:`.runs.data_name`); the paper's values are shown beside any kind of RPI's players.
         split: ``test`` for the tables, ``val`` for the figure over S.
         steps: the solver's steps S; None for a forecaster without a solver.
     """
     if goal != "energy":
         return {}
+    data = re.sub(r", \w+ players$", "", data)
     if split == "val":
         return STEPS.get(steps or 0, {}) if (data, backbone, forecaster) == ("rpi", "v_lstm", "epo") else {}
     if split != "test" or (forecaster == "epo" and steps not in (None, TABLE_STEPS)):

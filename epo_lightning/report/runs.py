@@ -286,12 +286,14 @@ def _evaluated(
 def data_name(section: Mapping[str, Any]) -> str:
     """Name of a data set in tables and captions, from the ``data`` section of a configuration.
 
-    RPI's hard split is ``rpi_hard``, a training on a share of the games is not compared with one on all of them, and scenes
-    drawn in the shapes of two tasks are two data sets.
+    RPI's hard split is ``rpi_hard``, and each kind of its players is a data set. A training on a share of the games is not
+    compared with one on all of them, and scenes drawn in the shapes of two tasks are two data sets.
     """
     name = str(section.get("dataset") or section["name"])
     if section.get("split") == "hard":
         name = f"{name}_hard"
+    if section.get("solver", "potential") != "potential":
+        name = f"{name}, {section['solver']} players"
     share = section.get("games_share", 1)
     if isinstance(share, int | float) and share < 1:
         return f"{name}, {100 * share:.10g}% of the training games"

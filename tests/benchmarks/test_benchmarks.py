@@ -170,7 +170,10 @@ def test_true_games_are_measured(capsys, tmp_path):
 def test_the_noise_of_recorded_futures_is_measured(capsys):
     label_noise.main(["--games", "3"])
     rows = dict(re.findall(r"^\| (\w+) \| \d+ \| (.+) \|$", capsys.readouterr().out, re.MULTILINE))
-    means = {solver: [float(cell.split()[0]) for cell in cells.split(" | ")] for solver, cells in rows.items()}
+    means = {solver: [float(mean) for mean in re.findall(r"(\S+) \(", cells)] for solver, cells in rows.items()}
+    single = {solver: re.findall(r"(\d+) of (\d+)", cells) for solver, cells in rows.items()}
+    assert all(len(distances) == 3 for distances in means.values())
+    assert all(int(alone) <= int(found) for ((alone, found),) in single.values())
     assert list(means) == ["potential", "feedback", "feedback_converged"]
     assert max(means["potential"]) < 1e-4
     assert max(means["feedback_converged"]) < 0.01 < min(means["feedback"])

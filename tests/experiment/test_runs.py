@@ -20,6 +20,7 @@ from experiment.conftest import TINY, Epo
 import epo_lightning
 from epo_lightning.experiment.callbacks import RandomStates
 from epo_lightning.forecasters.checkpoint import read_checkpoint
+from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json
 from epo_lightning.solvers.gauss_newton.kernel import interface
@@ -148,8 +149,9 @@ def test_another_configuration_does_not_continue_a_run(epo: Epo, refused: Callab
     RunFolder(Path("run")).update(status="training")
     assert "solver.steps" in refused("train", ROW, *TINY, "run_dir=run", "existing=continue", "solver.steps=5")
     assert "keeps its own configuration" in refused("train", "resume=run", "seed=4")
-    RunFolder(Path("run")).update(data_digest="other")
-    assert "data" in refused("train", "resume=run")
+    run = RunFolder(Path("run"))
+    run.update(data_digest="other", identity=identity(run.config(), "other"))
+    assert "the data of run has changed" in refused("train", "resume=run")
 
 
 def test_a_changed_config_file_is_refused(epo: Epo, refused: Callable[..., str]) -> None:
@@ -159,13 +161,31 @@ def test_a_changed_config_file_is_refused(epo: Epo, refused: Callable[..., str])
     file.write_text(text.replace("goal: energy", "goal: all"))
     assert file.read_text() != text
     RunFolder(Path("run")).update(status="training")
-    assert "run/config.yaml was changed since the run began" in refused("train", "resume=run")
+    changed = "was changed since the run began"
+    assert f"run/config.yaml or run.json beside it {changed}" in refused("train", "resume=run")
     RunFolder(Path("run")).update(status="finished")
-    file.write_text(text.replace("seed: 0", "seed: 1"))
-    assert "was changed since the run began" in refused("evaluate", "run=run")
-    assert "was changed since the run began" in refused("predict", "run=run", "out=out")
+    # Also where the changed settings name data that do not exist, and where only the name of the row was changed.
+    for before, after in (
+        ("seed: 0", "seed: 1"),
+        ("name: tiny,", "name: tiny, seed: 77,"),
+        ("title: V-LSTM", "title: EPO"),
+    ):
+        file.write_text(text.replace(before, after, 1))
+        assert file.read_text() != text
+        for words in (("evaluate",), ("predict", "out=out"), ("export", "out=out.pt2"), ("drive",), ("explore",)):
+            assert changed in refused(*words, "run=run")
+        assert changed in refused("train", ROW, *TINY, "run_dir=run", "existing=continue")
     file.write_text(text)
     assert epo("evaluate", "run=run") == 0
+
+
+@pytest.mark.parametrize(("key", "value"), [("identity", 7), ("data_digest", None)])
+def test_a_damaged_record_is_not_blamed_on_the_configuration(
+    epo: Epo, refused: Callable[..., str], key: str, value: object
+) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run") == 0
+    RunFolder(Path("run")).update(**{key: value})
+    assert f"run/run.json: {key} is {value!r}, expected text" in refused("evaluate", "run=run")
 
 
 def test_checkpoints_that_do_not_fit_are_refused(epo: Epo, refused: Callable[..., str]) -> None:

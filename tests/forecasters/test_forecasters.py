@@ -13,7 +13,7 @@ from games import random_scene
 from suites import LOSS_WEIGHTS, OWN, ForecasterSuite, highway_model, model
 
 import epo_lightning
-from epo_lightning.forecasters import build_forecaster
+from epo_lightning.forecasters import build_forecaster, check_model
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
@@ -21,6 +21,7 @@ from epo_lightning.scene import Scene
 class TestConstantVelocity(ForecasterSuite):
     config = {"name": "constant_velocity"}
     modes = 1
+    goals = ("energy",)
 
     def test_constant_velocity_continues_straight(self):
         scene = Scene(torch.tensor([[[[1.0, 2.0, math.pi / 2, 3.0]]]]), 0.1)
@@ -261,3 +262,9 @@ def test_a_given_goal_is_told_to_the_network_if_asked_for_alone(config):
         here = forecaster.predict(scene).states
         scene.goal_candidates[:] += 1.0
         assert torch.equal(forecaster.predict(scene).states, here) != told
+
+
+@pytest.mark.parametrize("forecaster", ["constant_velocity", "refined"])
+def test_forecasters_without_a_network_of_their_own_read_no_goals(forecaster: str):
+    with pytest.raises(ConfigError, match=f"forecaster {forecaster} has no network of its own: use goal=energy"):
+        check_model(model({"name": forecaster}, goal="all"))

@@ -52,6 +52,16 @@ def test_mean_deviation_and_order_equal_hand_computed_values(tmp_path: Path) -> 
     assert rows["V-LSTM"].cells["minSADE"].deviation is None
 
 
+def test_players_of_another_kind_are_another_data_set_beside_the_same_values_of_the_paper(tmp_path: Path) -> None:
+    for number, players in enumerate(("potential", "feedback")):
+        make_run(
+            tmp_path / players, "V-LSTM", "marginal", scores(0.3), settings={"data.solver": players}, digest=str(number)
+        )
+    tables = {table.data: table for table in build_tables(collect(tmp_path))}
+    assert set(tables) == {"rpi", "rpi, feedback players"}
+    assert [table.rows[0].cells["overlap_jfp"].paper for table in tables.values()] == [0.006, 0.006]
+
+
 def test_rows_that_the_paper_does_not_have_follow_in_the_order_of_the_runs(tmp_path: Path) -> None:
     rows = [
         *(("Zeta", "epo", "own_net"), ("V-LSTM + EPO", "epo", "v_lstm"), ("Mine", "epo", "v_lstm")),
@@ -344,7 +354,7 @@ def test_a_configuration_that_was_changed_after_the_training_is_refused(tmp_path
     assert len(collect(tmp_path)) == 1
     text = run.config_file.read_text().replace("seed: 0", "seed: 1")
     run.config_file.write_text(text)
-    with pytest.raises(ConfigError, match=r"config.yaml was changed since the run began.*Restore the file"):
+    with pytest.raises(ConfigError, match=r"config.yaml or run.json beside it was changed.*Restore the file"):
         collect(tmp_path)
 
 

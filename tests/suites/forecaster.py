@@ -22,7 +22,7 @@ class ForecasterSuite:
     Attributes:
         config: the forecaster's own section.
         modes: how many joint modes it forecasts.
-        goals: who may be told the goal of its scenes.
+        goals: uses of a given goal that the forecaster allows.
         lessons: in how many optimisation steps it should have learned something.
         tolerance: relative and absolute, of positions that two ways of computing should agree on.
     """
