@@ -20,14 +20,12 @@ import torch
 
 from benchmarks.refinement import forecasts
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.energy import FEATURES
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution
-from epo_lightning.schema import read
 from epo_lightning.solvers.base import Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.solvers.gauss_newton.best_response import ORDERS, BestResponse
@@ -46,7 +44,7 @@ def opened(folder: str) -> EPO:
         ConfigError: no finished run, or its forecaster has no such game.
     """
     run = RunFolder.open(folder)
-    settings = read(Settings, run.config())
+    settings = settings_of(run)
     forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
     if not isinstance(forecaster, EPO) or FEATURES not in forecaster.energy.offers:
         raise ConfigError(f"{folder}: {settings.title} infers no game of features; choose a row of forecaster=epo")

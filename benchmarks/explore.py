@@ -23,8 +23,8 @@ from PIL import Image
 
 from benchmarks.measure import positive
 from epo_lightning.experiment.config.compose import compose
-from epo_lightning.experiment.config.settings import ExploreSettings, Settings
-from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.experiment.config.settings import ExploreSettings
+from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.experiment.predict import scenes_of
 from epo_lightning.explore.edit import Edit
 from epo_lightning.explore.session import Session
@@ -41,7 +41,7 @@ def open_session(words: Sequence[str]) -> Session:
     """The games of a run, from the overrides of ``epo explore``."""
     settings = read(ExploreSettings, compose("explore", words))
     run = RunFolder.open(settings.run)
-    of_run = read(Settings, run.config())
+    of_run = settings_of(run)
     forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
     chosen = scenes_of(run, of_run, settings, forecaster, words)
     return Session(forecaster, chosen.scenes, of_run.title)

@@ -24,14 +24,13 @@ from torch import Tensor
 
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data
+from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
 from epo_lightning.experiment.truth import compare, inferred_costs
 from epo_lightning.game.features import PAIR_FEATURES, PairFeature
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.figures import joint_predictions
 from epo_lightning.report.style import MODES, OTHER, save, style
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.schema import read
 
 LENGTH, WIDTH, MARGIN = 4.5, 1.9, 1.0
 """Size of both vehicles, and the margin of pair features that take one [m]."""
@@ -151,7 +150,7 @@ def _open(folder: str) -> tuple[Settings, Any, RPIData]:
         ConfigError: a run on other data than RPI.
     """
     run = RunFolder.open(folder)
-    settings = read(Settings, run.config())
+    settings = settings_of(run)
     forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings)
     if not isinstance(data, RPIData):
         raise ConfigError(f"{folder} was trained on other data than RPI, whose weights are not known")

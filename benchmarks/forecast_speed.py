@@ -31,14 +31,12 @@ from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.drive.world import EGO
 from epo_lightning.drive.worlds import place
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import ACCELERATION, HEADING, SPEED, GameParameters, Scene
-from epo_lightning.schema import read
 
 AHEAD = (2, 4)
 """Times [s] after which forecasts are compared with what happened."""
@@ -159,7 +157,7 @@ def report(runs: Sequence[str], traffic: str, episodes: int, watched: int, seed:
     forecasters: dict[str, Forecaster | None] = {KEEPING: None}
     for path in runs:
         run = RunFolder.open(path)
-        settings = read(Settings, run.config())
+        settings = settings_of(run)
         if reason := where.refuse(settings.data):
             raise ConfigError(f"{path} was trained on data={settings.data['name']}, and world=sumo {reason}")
         forecasters[settings.title] = open_checkpoint(settings, run.checkpoint("best"))

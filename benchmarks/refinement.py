@@ -23,12 +23,11 @@ from torch import Tensor
 from epo_lightning import FeatureEnergy, JointForecast, Scene, refine
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint
+from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.refinement import INVERSE_TEMPERATURE, NOISE, WEIGHTS
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.schema import read
 
 SCORES = {"minSADE": "SADE", "minSFDE": "SFDE", "minSADE_1": "k=1", "overlap_jfp": "OR"}
 REPEATS = 101
@@ -46,7 +45,7 @@ def forecasts(folder: str, share: float | None, split: str) -> tuple[Settings, F
         ConfigError: no finished run, or its data is missing.
     """
     run = RunFolder.open(folder)
-    settings = read(Settings, run.config())
+    settings = settings_of(run)
     forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
     section = {**settings.data, "batch_size": 256, **({} if share is None else {"share": share})}
     data = assembly.build_data(section)

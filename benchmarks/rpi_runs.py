@@ -10,11 +10,9 @@ from torch import Tensor
 
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.subgames import FUTURE
-from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data
+from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.schema import read
 
 BATCH = 1024
 """Records per batch; it changes no result."""
@@ -49,7 +47,7 @@ def forecasts(folder: str) -> Forecasts:
     run = RunFolder.open(folder)
     if not run.finished:
         raise ConfigError(f"{folder} is not finished: continue it by epo train resume={folder}")
-    settings = read(Settings, run.config())
+    settings = settings_of(run)
     if settings.data["name"] != "rpi":
         raise ConfigError(f"{folder} was trained on data={settings.data['name']}, but only RPI has known equilibria")
     if settings.data.get("targets") == "sampled":

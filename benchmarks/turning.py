@@ -19,13 +19,11 @@ from torch import Tensor
 
 from benchmarks.goals import TURNING
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data, split_of
+from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import HEADING, Scene
-from epo_lightning.schema import read
 
 SCORES = {"minADE": "ADE", "minFDE": "FDE", "minSADE": "SADE", "minSFDE": "SFDE"}
 """Displacements [m] and their headings."""
@@ -48,7 +46,7 @@ def scores(folder: str) -> tuple[str, dict[str, tuple[int, Mapping[str, float]]]
         ConfigError: no finished run, or its data is missing or has changed.
     """
     run = RunFolder.open(folder)
-    settings = read(Settings, run.config())
+    settings = settings_of(run)
     forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings, 256)
     metrics = {name: ForecastMetrics(shape=data.task.shape) for name in ("turning", "others")}
     counts = dict.fromkeys(metrics, 0)

@@ -34,15 +34,19 @@ from benchmarks import (
     passing_sides,
     reading,
     refinement,
+    repeat,
     scaling,
     training_step,
     true_game,
 )
+from epo_lightning import cli
 from epo_lightning.data.recorded.formats.argoverse2 import argoverse2
 from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import train
 from epo_lightning.experiment.config.compose import compose
+from epo_lightning.report.results import read_results
+from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import Scene
 
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
@@ -222,6 +226,26 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     other = train.train(compose("train", ["experiment=highway/v_lstm_sc", *TINY, f"runs={tmp_path}"])).path
     assert "only RPI has known equilibria" in refused(passing_sides.main, other)
     assert "only RPI has known equilibria" in refused(distance_by_weight.main, other)
+
+
+def test_a_run_of_a_results_file_is_trained_again(capsys, tmp_path):
+    small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "callbacks.progress=none"]
+    RPIData(root=str(tmp_path), games=3, placements=1, sizes=None).generate(workers=1, progress=False)
+    for row in ("v_lstm", "v_lstm_epo"):
+        words = [f"experiment=rpi/{row}", *small, "budget=smoke", "score=test", f"runs={tmp_path / 'runs'}"]
+        train.train(compose("train", words))
+    file = tmp_path / "small.json"
+    cli.main(["report", f"runs={tmp_path / 'runs'}", f"save={file}", f"out={tmp_path / 'report'}"])
+    capsys.readouterr()
+    repeat.main([str(file), f"data.root={tmp_path}", "--out", str(tmp_path / "again")])
+    row = capsys.readouterr().out.splitlines()[-1]
+    assert row.startswith("| small | V-LSTM + EPO, seed 0 | ")
+    assert row.endswith(" | 0 |")
+    saved, again = repeat.chosen(read_results(file).runs), RunFolder(tmp_path / "again" / "small")
+    saved.scores["metrics.json"]["metrics"]["minSFDE"] += 0.25
+    assert repeat.distance(saved, again)[0] == pytest.approx(0.25)
+    repeat.main([str(file), "data.root=nowhere", "--out", str(tmp_path / "third")])
+    assert "not repeated: no RPI data at nowhere" in capsys.readouterr().out
 
 
 def test_smallest_distances_are_ranked_against_the_weight():

@@ -1,0 +1,120 @@
+"""Runs of results files, trained again by the code at hand: do the tables still come out of it?
+
+    python -m benchmarks.repeat results/rpi_hard.json results/us101.json
+
+Of every file one run is trained from its saved settings: the shortest one with a game layer, or the shortest one if there is
+none. Its validation scores and, where the file has them, its scores on the test split are compared with the saved ones. On
+processors of one kind, with one version of PyTorch, they agree digit by digit as long as no change of the code affects
+them; elsewhere rounding differs, and training amplifies the difference. The new runs stay in ``--out``, and finished ones
+are not trained again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from epo_lightning.experiment.config.compose import compose
+from epo_lightning.experiment.train import train
+from epo_lightning.identity import ELSEWHERE, check_unchanged
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.curves import METRIC
+from epo_lightning.report.records import Records
+from epo_lightning.report.results import SavedRun, read_results, results_name
+from epo_lightning.run_folder import RunFolder, read_json
+
+SPLITS = {"metrics.json": "test", "metrics-val.json": "val"}
+"""Split by the name of the file of its scores."""
+
+
+def chosen(runs: Sequence[Records]) -> SavedRun:
+    """The shortest run with a game layer that was trained, or the shortest of all trained runs.
+
+    Raises:
+        ConfigError: no run was trained.
+    """
+    trained = [
+        run for run in runs if isinstance(run, SavedRun) and run.record.get("steps") and run.record.get("seconds")
+    ]
+    if not trained:
+        raise ConfigError("no run was trained")
+    layered = [run for run in trained if run.settings["forecaster"]["name"] == "epo"]
+    return min(layered or trained, key=lambda run: run.record["seconds"])
+
+
+def repeated(saved: SavedRun, folder: Path, overrides: Sequence[str]) -> RunFolder:
+    """Train and score a saved run again.
+
+    Args:
+        saved: the run of a results file, which has no places of data.
+        folder: run folder of the new run.
+        overrides: settings of ``epo train`` that do not decide on the result, such as ``data.folder=...``.
+
+    Raises:
+        ConfigError: its data is missing or has changed, its settings have another meaning now, or it cannot be trained.
+    """
+    check_unchanged(saved.settings, saved.record, saved.path / "config.yaml")
+    splits = [split for name, split in SPLITS.items() if name in saved.scores]
+    section = saved.settings["data"]
+    rest = compose("train", [f"data={section.get('dataset', section['name'])}", *overrides])
+    placed = {
+        name: {**elsewhere(rest[name], name), **saved.settings[name]} for name in ("data", "trainer", "callbacks")
+    }
+    again = train({**rest, **saved.settings, **placed, "run_dir": str(folder), "score": splits, "existing": "continue"})
+    if again.record["identity"] != saved.record["identity"]:
+        raise ConfigError(
+            f"its data has another digest now, {again.record['data_digest']} instead of {saved.record['data_digest']}"
+        )
+    return again
+
+
+def elsewhere(section: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """The part of a section that does not decide on the result: places of data, the machine, and progress."""
+    return {key: value for key, value in section.items() if f"{name}.{key}" in ELSEWHERE}
+
+
+def distance(saved: SavedRun, again: RunFolder) -> tuple[float, int]:
+    """Largest difference of a validation or test score, and the number of scores that both runs have."""
+    pairs = [(float(a[METRIC]), float(b[METRIC])) for a, b in zip(saved.log(), validated(again), strict=True)]
+    for name, split in SPLITS.items():
+        if name in saved.scores:
+            before: Mapping[str, Any] = saved.scores[name]["metrics"]
+            now: Mapping[str, Any] = read_json(again.metrics_file(split))["metrics"]
+            pairs += [(before[metric], now[metric]) for metric in before if metric in now]
+    return max(0.0 if a == b or (math.isnan(a) and math.isnan(b)) else abs(a - b) for a, b in pairs), len(pairs)
+
+
+def validated(run: RunFolder) -> list[dict[str, str]]:
+    """Rows of a run's log with a validation."""
+    return [row for row in run.log() if METRIC in row]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.repeat", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("words", nargs="+", help="results files, and overrides such as data.folder=<recordings>")
+    parser.add_argument("--out", type=Path, default=Path("build/repeat"), help="folder of the new runs")
+    parser.add_argument("--longest", type=float, default=math.inf, help="longest training [s] that is repeated")
+    given = parser.parse_args(arguments)
+    overrides = ["callbacks.progress=none", *(word for word in given.words if "=" in word)]
+    print("| results file | run | commit | steps | scores | largest difference |")
+    print("|:--|:--|:--|--:|--:|--:|")
+    for file in (word for word in given.words if "=" not in word):
+        try:
+            saved = chosen(read_results(file).runs)
+            about = f"{saved.settings['title']}, seed {saved.settings['seed']} | {saved.record['git_commit'][:7]} | "
+            if saved.record["seconds"] > given.longest:
+                raise ConfigError(f"it took {saved.record['seconds']:.0f} s, more than --longest")
+            largest, scores = distance(saved, repeated(saved, given.out / results_name(file), overrides))
+            print(f"| {results_name(file)} | {about}{saved.record['steps']} | {scores} | {largest:.2g} |", flush=True)
+        except ConfigError as error:
+            print(f"| {results_name(file)} | not repeated: {' '.join(str(error).split())} | | | | |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
