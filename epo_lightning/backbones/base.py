@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
@@ -15,22 +14,9 @@ from epo_lightning.scene import Scene
 
 
 class Backbone(nn.Module):
-    """Observation encoder phi_glob: ``forward(scene)`` returns features z [B, N, width] of all agents (Section 4.1).
-
-    Attributes:
-        width: size of the features.
-        rounded_to: precision of the products of matrices inside, which a run may lower (``trainer.precision=bf16-mixed``).
-    """
+    """Observation encoder phi_glob: ``forward(scene)`` returns features z [B, N, width] of all agents (Section 4.1)."""
 
     width: int
-    rounded_to: torch.dtype | None = None
-
-    def __call__(self, scene: Scene) -> Float[Tensor, "B N {self.width}"]:
-        """The features, in the precision of the scene."""
-        if self.rounded_to is None:
-            return super().__call__(scene)
-        with torch.autocast(scene.history.device.type, self.rounded_to):
-            return super().__call__(scene).to(scene.history.dtype)
 
 
 @dataclass(eq=False, repr=False)

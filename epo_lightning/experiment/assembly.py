@@ -16,6 +16,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins import DoublePrecision
 from lightning.pytorch.strategies import Strategy
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
@@ -25,7 +26,6 @@ from epo_lightning.experiment import debugging
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings
 from epo_lightning.experiment.dashboards import mlflow
-from epo_lightning.experiment.precision import PLUGINS
 from epo_lightning.forecasters import SUPPLIED, build_forecaster
 from epo_lightning.metrics.forecast import SCORES
 from epo_lightning.registry import ConfigError, nearest
@@ -152,6 +152,13 @@ def quiet() -> None:
         warnings.filterwarnings("ignore", message=text)
 
 
+class Double(DoublePrecision):
+    """Lightning's double precision, extended to scenes: its own conversion refuses frozen data classes."""
+
+    def convert_input(self, data: Any) -> Any:
+        return data.to(torch.double)
+
+
 def build_trainer(
     settings: TrainerSettings,
     run: RunFolder,
@@ -176,6 +183,7 @@ def build_trainer(
     torch.set_num_threads(settings.threads)
     # With deterministic algorithms, PyTorch would fill every new tensor with NaN before it is written, 5 % of a step's time.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    double = settings.precision == "64-true"
     with naming(settings, run):
         return Trainer(
             default_root_dir=run.path,
@@ -185,9 +193,10 @@ def build_trainer(
             # In a Slurm job, Lightning would otherwise install its signal handlers and compare the number of tasks.
             plugins=[
                 WholeCheckpoints(),
-                PLUGINS[settings.precision](),
                 *([LightningEnvironment()] if strategy is None else []),
+                *([Double()] if double else []),
             ],
+            precision=None if double else settings.precision,  # type: ignore[arg-type]
             max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,
             max_steps=settings.max_steps,
             check_val_every_n_epoch=settings.validate_every if settings.validate_steps is None else None,

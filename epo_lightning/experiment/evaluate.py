@@ -18,7 +18,6 @@ from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
 from epo_lightning.experiment.other_data import OtherData, keys_of, open_other
-from epo_lightning.experiment.precision import PLUGINS
 from epo_lightning.experiment.truth import TruthTest
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
@@ -143,11 +142,13 @@ def _test(
     seed_everything(of_run.seed, workers=True, verbose=False)
     machine = machine or of_run.trainer
     torch.set_num_threads(machine.threads)
+    double = of_run.trainer.precision == "64-true"
     with assembly.naming(machine, run):
         trainer = Trainer(
             accelerator=machine.accelerator,
             devices=devices if machine.devices == 1 else 1,
-            plugins=[PLUGINS[of_run.trainer.precision]()],
+            precision=None if double else of_run.trainer.precision,  # type: ignore[arg-type]
+            plugins=[assembly.Double()] if double else None,
             deterministic=of_run.trainer.deterministic,
             inference_mode=False,  # the layer differentiates its energy also when it only forecasts
             callbacks=[] if truths is None else [truths],

@@ -20,8 +20,8 @@ PARTS = ("data", "backbone", "forecaster", "dynamics", "energy", "solver", "back
 MOST_PROCESSES = 1024
 """Largest number of threads, devices or workers. A larger number is a typing error, and would crash the process without a
 clear message."""
-PRECISIONS = ("32-true", "64-true", "bf16-mixed")
-"""Precisions that a run may have, by Lightning's names; the solvers support the first two (:mod:`..precision`)."""
+PRECISIONS = ("32-true", "64-true")
+"""Precisions that the solvers support, by Lightning's names."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class TrainerSettings:
         if self.precision not in PRECISIONS:
             raise ConfigError(
                 f"trainer.precision must be one of {', '.join(PRECISIONS)}, not {self.precision!r}: solvers factorise "
-                "matrices, for which 16 bits have too few digits (bf16-mixed rounds the backbone alone)"
+                "matrices, for which 16 bits have too few digits"
             )
         if self.max_steps < -1:
             raise ConfigError(f"trainer.max_steps must be 0 or more, or -1 for no limit, not {self.max_steps}")
