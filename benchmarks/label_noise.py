@@ -6,7 +6,7 @@ Every main game is solved at a random placement, and one sub-game of each of its
 random starts. *Two draws* is the mean distance between the futures that would be recorded in both cases. If the noise is
 Gaussian, the mean error of the best possible forecast is this distance divided by the root of two. *Recorded minus played*
 is the distance of the recorded executed future from what the agents then do in the main game. Modes that only one draw finds
-have no distance; they are counted.
+have no distance; such alternatives are counted.
 """
 
 from __future__ import annotations

@@ -84,10 +84,10 @@ def check_unchanged(config: Mapping[str, Any], record: Mapping[str, Any], config
             )
     described = {"identity": identity(config, record["data_digest"]), **_names(config)}
     for key, found in described.items():
-        if found is not None and found != record.get(key, found):
+        if key in record and found != record[key]:
             raise ConfigError(
                 f"{config_file} or run.json beside it was changed since the run began: {key} is {found!r} by config.yaml "
-                f"and {record[key]!r} by run.json. Restore the file, or train a new run with the changed settings"
+                f"and {record[key]!r} by run.json. Restore the edited file, or train a new run with the changed settings"
             )
 
 
@@ -95,7 +95,7 @@ def _names(config: Mapping[str, Any]) -> dict[str, Any]:
     """Names of a run's row, which are no part of its identity, by their keys in run.json."""
     budget = config.get("budget")
     names = {"title": config.get("title"), "experiment": config.get("experiment")}
-    return {**names, "budget": budget.get("name") if isinstance(budget, Mapping) else None}
+    return {**names, "budget": budget.get("name") if isinstance(budget, Mapping) else budget}
 
 
 def row_identity(config: Mapping[str, Any], data_digest: str) -> str:
@@ -119,8 +119,11 @@ def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[
 
 
 def canonical(content: Any) -> str:
-    """JSON text that is the same for equal values of equal types. (Python's ``==`` takes 1 and True for equal.)"""
-    return json.dumps(content, sort_keys=True)
+    """JSON text that is the same for equal values of equal types. (Python's ``==`` takes 1 and True for equal.)
+
+    Values that JSON does not have, such as a date in an edited file, are text.
+    """
+    return json.dumps(content, sort_keys=True, default=str)
 
 
 def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -72,8 +72,22 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
     data.order_seed = settings.seed
     check_divisible(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)
     forecaster = build_model(settings, data)
+    check_goal(settings, forecaster)
     check_monitor(settings.callbacks.monitor, data.task)
     return data, forecaster
+
+
+def check_goal(settings: Settings, forecaster: LightningModule) -> None:
+    """Refuse ``goal=all`` for a forecaster without a backbone of its own, whose forecasts it would not change.
+
+    Raises:
+        ConfigError: no network could read the goals.
+    """
+    if settings.goal == "all" and not hasattr(forecaster, "backbone"):
+        raise ConfigError(
+            "goal is 'all', which makes the given goal an input of the network, but forecaster "
+            f"{settings.forecaster['name']} has no network of its own: use goal=energy"
+        )
 
 
 def check_monitor(monitor: str, task: Task) -> None:
@@ -200,7 +214,7 @@ def build_trainer(
             max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,
             max_steps=settings.max_steps,
             check_val_every_n_epoch=settings.validate_every if settings.validate_steps is None else None,
-            val_check_interval=settings.validate_steps,
+            val_check_interval=_steps_between_validations(settings),
             limit_train_batches=settings.limit_train_batches,
             limit_val_batches=settings.limit_val_batches,
             log_every_n_steps=settings.log_every,
@@ -212,6 +226,13 @@ def build_trainer(
             num_sanity_val_steps=0,
             inference_mode=False,  # the layer differentiates its energy also when it only forecasts
         )
+
+
+def _steps_between_validations(settings: TrainerSettings) -> int | None:
+    """Steps between two validations; a training that is shorter is validated at its end."""
+    if settings.validate_steps is None or settings.max_steps < 1:
+        return settings.validate_steps
+    return min(settings.validate_steps, settings.max_steps)
 
 
 @contextmanager

@@ -98,7 +98,7 @@ def resume(run: RunFolder) -> None:
     """
     settings = settings_of(run)
     if run.finished and distributed.here(settings.trainer.devices).leads:
-        raise ConfigError(f"{run.path} is finished: score it with `epo evaluate run={run.path}`")
+        raise ConfigError(f"{run.path} is finished: `epo evaluate run={run.path}` scores it")
     train(run.config(), begun=run)
 
 

@@ -53,12 +53,8 @@ def check_model(model: Mapping[str, Any]) -> None:
         )
     for kind, supplied in SUPPLIED.items():
         check_keys(kind, model[kind], supplied)
-    if model["goal"] == "all" and "backbone" not in _arguments("forecaster", model):
-        raise ConfigError(
-            "goal is 'all', which makes the given goal an input of the network, but forecaster "
-            f"{model['forecaster']['name']} has no network of its own: use goal=energy"
-        )
-    if model["goal"] == "all" and "goal_input" not in _arguments("backbone", model):
+    takes_backbone = "backbone" in _arguments("forecaster", model)
+    if model["goal"] == "all" and takes_backbone and "goal_input" not in _arguments("backbone", model):
         raise ConfigError(
             f"goal is 'all', which makes the given goal an input of the network, but backbone {model['backbone']['name']} "
             "has no argument goal_input: use goal=energy, or add it, and read scene.goal_candidates where it is true"

@@ -40,6 +40,7 @@ from epo_lightning.forecasters.epo_settings import (
     check_start,
 )
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError, build, register
@@ -52,7 +53,8 @@ from epo_lightning.task import Task
 EXAMINED = 512
 """Number of test scenes, spread evenly, in which the Nash gap is measured if this is slow.
 
-It is fast for energies of named features and for solutions with tables of candidates; then it is measured in all scenes."""
+It is fast for energies of declared features and for solutions with tables of candidates; then it is measured in all
+scenes."""
 
 
 @register("forecaster", "epo")
@@ -359,7 +361,8 @@ class EPO(Forecaster):
         """The forecast with its distance from an equilibrium, and with the solutions of its games without pair terms."""
         forecast = dataclasses.replace(forecast, states_without_pairs=self._states_without_pairs(scene, forecast))
         assert forecast.solution is not None
-        cheap = FEATURES in self.energy.offers or forecast.solution.tables is not None
+        undeclared = isinstance(self.energy, FeatureEnergy) and self.energy.undeclared is not None
+        cheap = (FEATURES in self.energy.offers and not undeclared) or forecast.solution.tables is not None
         scenes = len(scene.history)
         stride = 1 if cheap else max(1, self._batches * scenes // EXAMINED)
         chosen = torch.arange(0, scenes, stride, device=scene.history.device)

@@ -292,8 +292,8 @@ def data_name(section: Mapping[str, Any]) -> str:
     name = str(section.get("dataset") or section["name"])
     if section.get("split") == "hard":
         name = f"{name}_hard"
-    if section.get("solver", "potential") != "potential":
-        name = f"{name}, {section['solver']} players"
+    if (players := section.get("solver")) not in (None, "potential"):
+        name = f"{name}, {players} players"
     share = section.get("games_share", 1)
     if isinstance(share, int | float) and share < 1:
         return f"{name}, {100 * share:.10g}% of the training games"

@@ -238,6 +238,7 @@ MISTAKES = {
     "train -m forecaster=epo,scene_consistent objective.relaxation=0.1": "write forecaster.relaxation=0.1",
     "train objective.power=2 +objective.annealing=0.3": "exclude each other",
     "train forecaster=scene_consistent +forecaster.power=2 +forecaster.annealing=0.3": "exclude each other",
+    "train forecaster=constant_velocity goal=all": "has no network of its own: use goal=energy",
     "train backbone.width=0": "backbone.width=0",
     "train optimizer.lr=-1": "optimizer.lr",
     "train seed=0,1": "--multirun",

@@ -168,7 +168,10 @@ def test_a_changed_config_file_is_refused(epo: Epo, refused: Callable[..., str])
     for before, after in (
         ("seed: 0", "seed: 1"),
         ("name: tiny,", "name: tiny, seed: 77,"),
+        ("name: tiny,", "name: tiny, when: 2020-01-01,"),
         ("title: V-LSTM", "title: EPO"),
+        ("experiment: rpi", "was: rpi"),
+        ("budget: {name: smoke}", "budget: smoke, but longer"),
     ):
         file.write_text(text.replace(before, after, 1))
         assert file.read_text() != text

@@ -99,6 +99,11 @@ def test_progress_lines_of_a_resumed_run_know_its_best_score(
     assert "epoch 5/9, step 50, loss 1.0000, val/minSADE 0.3000 (best 0.1000)" in capsys.readouterr().out
 
 
+def test_a_training_that_is_shorter_than_the_steps_between_validations_is_validated_at_its_end(epo: Epo) -> None:
+    assert epo(*WORDS, "trainer.max_steps=3", "trainer.validate_steps=200", "run_dir=run") == 0
+    assert validated("run") == [2]
+
+
 def test_a_training_that_ends_before_its_first_validation_says_so(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     assert epo(*WORDS, "trainer.max_steps=2", "trainer.validate_every=4", "run_dir=run") == 2
     assert "ended after 2 steps, before its first validation" in capsys.readouterr().err

@@ -13,7 +13,8 @@ from games import random_scene
 from suites import LOSS_WEIGHTS, OWN, ForecasterSuite, highway_model, model
 
 import epo_lightning
-from epo_lightning.forecasters import build_forecaster, check_model
+from epo_lightning.forecasters import build_forecaster
+from epo_lightning.game import features
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
@@ -21,7 +22,6 @@ from epo_lightning.scene import Scene
 class TestConstantVelocity(ForecasterSuite):
     config = {"name": "constant_velocity"}
     modes = 1
-    goals = ("energy",)
 
     def test_constant_velocity_continues_straight(self):
         scene = Scene(torch.tensor([[[[1.0, 2.0, math.pi / 2, 3.0]]]]), 0.1)
@@ -264,7 +264,16 @@ def test_a_given_goal_is_told_to_the_network_if_asked_for_alone(config):
         assert torch.equal(forecaster.predict(scene).states, here) != told
 
 
-@pytest.mark.parametrize("forecaster", ["constant_velocity", "refined"])
-def test_forecasters_without_a_network_of_their_own_read_no_goals(forecaster: str):
-    with pytest.raises(ConfigError, match=f"forecaster {forecaster} has no network of its own: use goal=energy"):
-        check_model(model({"name": forecaster}, goal="all"))
+def test_nash_gaps_of_undeclared_features_are_measured_in_some_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their derivatives are automatic, and all scenes of a test split would take minutes."""
+    monkeypatch.setattr("epo_lightning.forecasters.epo.EXAMINED", 2)
+    undeclared = features.OwnFeature(
+        features.Source.TRAJECTORY, "sway", function=lambda states, controls: controls[..., 1]
+    )
+    monkeypatch.setitem(features.OWN_FEATURES, "sway", undeclared)
+    for own, measured in ((["goal", "acc", "turnr"], 4), (["goal", "acc", "turnr", "sway"], 2)):
+        energy = {"name": "features", "own": own, "pair": ["proximity"]}
+        forecaster = build_forecaster(model({"name": "epo", "modes": 2}, energy=energy)).eval()
+        scene = random_scene(4, 2)
+        found = forecaster.examine(scene, forecaster(scene)).equilibrium
+        assert int(found.nash_gap.isfinite().all(1).sum()) == measured

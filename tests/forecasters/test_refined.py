@@ -70,7 +70,6 @@ class Refinements:
 
 
 class TestRefined(Refinements, ForecasterSuite):
-    goals = ("energy",)
     tolerance = {"rtol": 0.0, "atol": 1e-2}  # the solution of a game with random futures amplifies rounding errors
 
     def model(self, **changes: Any) -> dict[str, Any]:

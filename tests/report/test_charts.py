@@ -269,3 +269,12 @@ def test_labels_do_not_overlap() -> None:
             assert one.x1 <= edges.x1 + 1
             assert not any(one.overlaps(other) for other in boxes[i + 1 :])
     assert np.isfinite([box.x0 for box in boxes]).all()
+
+
+@pytest.mark.parametrize("players", ["potential", "feedback_converged"])
+def test_the_figure_over_s_has_the_papers_curve_for_every_kind_of_players(tmp_path: Path, players: str) -> None:
+    for steps in (1, 2):
+        settings = {"data.solver": players, "solver.steps": steps}
+        make_run(tmp_path / str(steps), "V-LSTM + EPO", "epo", scores(0.1), settings=settings)
+    (curve,) = steps_curves(distinct(build_tables(collect(tmp_path))))
+    assert curve.paper

@@ -21,7 +21,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, write_report
 from epo_lightning.report.render import legend
 from epo_lightning.report.rows import Cell, Row
-from epo_lightning.report.runs import collect, find_runs
+from epo_lightning.report.runs import collect, data_name, find_runs
 from epo_lightning.report.tables import build_tables, distinct
 from epo_lightning.run_folder import RunFolder, write_json
 
@@ -60,6 +60,7 @@ def test_players_of_another_kind_are_another_data_set_beside_the_same_values_of_
     tables = {table.data: table for table in build_tables(collect(tmp_path))}
     assert set(tables) == {"rpi", "rpi, feedback players"}
     assert [table.rows[0].cells["overlap_jfp"].paper for table in tables.values()] == [0.006, 0.006]
+    assert data_name({"name": "rpi", "solver": None, "split": "hard"}) == "rpi_hard"
 
 
 def test_rows_that_the_paper_does_not_have_follow_in_the_order_of_the_runs(tmp_path: Path) -> None:
@@ -354,7 +355,7 @@ def test_a_configuration_that_was_changed_after_the_training_is_refused(tmp_path
     assert len(collect(tmp_path)) == 1
     text = run.config_file.read_text().replace("seed: 0", "seed: 1")
     run.config_file.write_text(text)
-    with pytest.raises(ConfigError, match=r"config.yaml or run.json beside it was changed.*Restore the file"):
+    with pytest.raises(ConfigError, match=r"config.yaml or run.json beside it was changed.*Restore the edited file"):
         collect(tmp_path)
 
 

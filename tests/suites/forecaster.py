@@ -22,7 +22,7 @@ class ForecasterSuite:
     Attributes:
         config: the forecaster's own section.
         modes: how many joint modes it forecasts.
-        goals: uses of a given goal that the forecaster allows.
+        goals: values of ``goal`` with which the forecaster is built.
         lessons: in how many optimisation steps it should have learned something.
         tolerance: relative and absolute, of positions that two ways of computing should agree on.
     """

@@ -173,10 +173,10 @@ def main() -> None:
     parser.add_argument("--sanitize", action="store_true", help=f"build {SANITIZED.name}, with ASan and UBSan")
     arguments = parser.parse_args()
     target = SANITIZED if arguments.sanitize else LIBRARY
-    print("building the compiled layer takes a minute or two ...")
     try:
+        print("the compiled layer is built unless it is up to date, which takes a minute or two ...")
         build(target, arguments.portable)
-        print(f"{target} is up to date")
+        print(f"{target} is ready")
     except OSError as error:
         sys.exit(f"the compiled layer was not built: {error}")
 
