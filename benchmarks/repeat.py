@@ -19,7 +19,7 @@ from typing import Any
 
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.train import train
-from epo_lightning.identity import ELSEWHERE, check_unchanged
+from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.curves import METRIC
 from epo_lightning.report.records import Records
@@ -56,7 +56,6 @@ def repeated(saved: SavedRun, folder: Path, overrides: Sequence[str]) -> RunFold
     Raises:
         ConfigError: its data is missing or has changed, its settings have another meaning now, or it cannot be trained.
     """
-    check_unchanged(saved.settings, saved.record, saved.path / "config.yaml")
     splits = [split for name, split in SPLITS.items() if name in saved.scores]
     section = saved.settings["data"]
     rest = compose("train", [f"data={section.get('dataset', section['name'])}", *overrides])
@@ -64,9 +63,10 @@ def repeated(saved: SavedRun, folder: Path, overrides: Sequence[str]) -> RunFold
         name: {**elsewhere(rest[name], name), **saved.settings[name]} for name in ("data", "trainer", "callbacks")
     }
     again = train({**rest, **saved.settings, **placed, "run_dir": str(folder), "score": splits, "existing": "continue"})
-    if again.record["identity"] != saved.record["identity"]:
+    if again.record["identity"] != saved.record.get("identity"):
         raise ConfigError(
-            f"its data has another digest now, {again.record['data_digest']} instead of {saved.record['data_digest']}"
+            f"it is another run now: its data has the digest {again.record['data_digest']}, and had "
+            f"{saved.record['data_digest']}; where the digests are equal, its settings have another meaning"
         )
     return again
 
@@ -77,13 +77,19 @@ def elsewhere(section: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def distance(saved: SavedRun, again: RunFolder) -> tuple[float, int]:
-    """Largest difference of a validation or test score, and the number of scores that both runs have."""
-    pairs = [(float(a[METRIC]), float(b[METRIC])) for a, b in zip(saved.log(), validated(again), strict=True)]
+    """Largest difference of a validation or test score, and the number of scores that both runs have.
+
+    Raises:
+        ConfigError: the runs were not validated equally often.
+    """
+    before, now = saved.log(), validated(again)
+    if len(before) != len(now):
+        raise ConfigError(f"it was validated {len(now)} times, and {len(before)} times before")
+    pairs = [(float(a[METRIC]), float(b[METRIC])) for a, b in zip(before, now, strict=True)]
     for name, split in SPLITS.items():
         if name in saved.scores:
-            before: Mapping[str, Any] = saved.scores[name]["metrics"]
-            now: Mapping[str, Any] = read_json(again.metrics_file(split))["metrics"]
-            pairs += [(before[metric], now[metric]) for metric in before if metric in now]
+            old, new = saved.scores[name]["metrics"], read_json(again.metrics_file(split))["metrics"]
+            pairs += [(old[metric], new[metric]) for metric in old if metric in new]
     return max(0.0 if a == b or (math.isnan(a) and math.isnan(b)) else abs(a - b) for a, b in pairs), len(pairs)
 
 
@@ -107,7 +113,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for file in (word for word in given.words if "=" not in word):
         try:
             saved = chosen(read_results(file).runs)
-            about = f"{saved.settings['title']}, seed {saved.settings['seed']} | {saved.record['git_commit'][:7]} | "
+            commit = str(saved.record.get("git_commit"))[:7]
+            about = f"{saved.settings['title']}, seed {saved.settings['seed']} | {commit} | "
             if saved.record["seconds"] > given.longest:
                 raise ConfigError(f"it took {saved.record['seconds']:.0f} s, more than --longest")
             largest, scores = distance(saved, repeated(saved, given.out / results_name(file), overrides))
