@@ -26,6 +26,12 @@ CHEAPER = {
     "epo report rpi_relaxed": ["runs=swept"],
 }
 """Words that make a command cheap; later words win. The sweep has its own folder, as the first run has other settings."""
+COLUMNS = (
+    "epo generate data=rpi_hard data.placements=8 data.solver=feedback_converged",
+    "epo sweep rpi_relaxed data=rpi_hard data.placements=8 data.solver=feedback_converged budget=reduced seed=0,1,2,3,4",
+    "epo generate data=rpi data.solver=feedback",
+    "epo sweep rpi_squared budget=reduced trainer.max_epochs=3",
+)
 NOT_RUN = {
     "make run": "installs, and takes minutes",
     "make test": "these tests",
@@ -36,6 +42,7 @@ NOT_RUN = {
     "epo train experiment=highway/vibes_epo data=highway_sim budget=short": "needs that set; make smoke trains the row",
     "epo train experiment=urban/v_lstm_epo data=interaction data.folder=data/interaction": "needs those recordings",
     "epo evaluate run=runs/highway_sim/vibes_epo/short-s0 data=us101 data.folder=data/us101": "needs run and recordings",
+    **dict.fromkeys(COLUMNS, "a column of the table of results, up to half an hour; test_docs_commands.py composes it"),
 }
 
 
