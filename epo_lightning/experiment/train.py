@@ -180,9 +180,13 @@ def refuse_other(run: RunFolder, config: dict[str, Any], data_digest: str) -> No
     Raises:
         ConfigError: the configuration or the data has changed; the message names the difference.
     """
-    check_unchanged(run.config(), run.record, run.config_file)
-    if differing := differences(run.config(), config):
-        shown = ", ".join(f"{key}: {there!r} there, {here!r} here" for key, there, here in differing[:5])
+    differing = differences(run.config(), config)
+    shown = ", ".join(f"{key}: {there!r} there, {here!r} here" for key, there, here in differing[:5])
+    try:
+        check_unchanged(run.config(), run.record, run.config_file)
+    except ConfigError as changed:
+        raise ConfigError(f"{changed} ({shown or 'no difference to the settings of this command'})") from changed
+    if differing:
         raise ConfigError(
             f"{run.path} was begun with another configuration ({shown}): "
             f"continue it as it is with `epo train resume={run.path}`, or choose another run_dir"

@@ -22,6 +22,7 @@ from experiment.conftest import TINY, Epo
 from epo_lightning.experiment.config.compose import compose, jobs
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
 from epo_lightning.experiment.sweeps.watch import names_of, result
+from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
 
@@ -239,8 +240,8 @@ def test_damaged_runs_are_named_before_anything_runs(epo: Epo, refused: Callable
     job.run.config_file.write_text(config.replace("lr: 0.001", "lr: 0.5"))
     assert "optimizer.lr: 0.5 there, 0.001 here" in refused(*words)
     job.run.config_file.write_text(config)
-    job.run.update(data_digest="other")
-    assert "data" in refused(*words)
+    job.run.update(data_digest="other", identity=identity(job.run.config(), "other"))
+    assert "has changed since the run began (digest other" in refused(*words)
 
 
 def test_invalid_sweeps_are_refused(refused: Callable[..., str]) -> None:
