@@ -180,10 +180,11 @@ def refuse_other(run: RunFolder, config: dict[str, Any], data_digest: str) -> No
     Raises:
         ConfigError: the configuration or the data has changed; the message names the difference.
     """
-    differing = differences(run.config(), config)
+    begun_with = run.config()
+    differing = differences(begun_with, config)
     shown = ", ".join(f"{key}: {there!r} there, {here!r} here" for key, there, here in differing[:5])
     try:
-        check_unchanged(run.config(), run.record, run.config_file)
+        check_unchanged(begun_with, run.record, run.config_file)
     except ConfigError as changed:
         raise ConfigError(f"{changed} ({shown or 'no difference to the settings of this command'})") from changed
     if differing:

@@ -90,7 +90,7 @@ def interacts(config: Mapping[str, Any]) -> bool:
     return (config.get("energy") or {}).get("pair") != []
 
 
-def whatever_players(data: str) -> str:
+def without_players(data: str) -> str:
     """A data set's name without the kind of RPI's players, since the paper has one."""
     return re.sub(r", \S+ players$", "", data)
 
@@ -113,7 +113,7 @@ def paper_values(
     """
     if goal != "energy":
         return {}
-    data = whatever_players(data)
+    data = without_players(data)
     if split == "val":
         return STEPS.get(steps or 0, {}) if (data, backbone, forecaster) == ("rpi", "v_lstm", "epo") else {}
     if split != "test" or (forecaster == "epo" and steps not in (None, TABLE_STEPS)):
