@@ -27,6 +27,8 @@ ASTRAY = 5.0
 """Offset [m] from a centreline that counts as much as a heading error of one radian, where lanes overlap."""
 HOPS = 6
 """Number of consecutive lanes that an agent may pass within a time step."""
+ROUNDING = 1e-6
+"""Difference of arc lengths [m] that rounding explains, kilometres from the origin."""
 
 
 class Polylines:
@@ -79,7 +81,9 @@ class Polylines:
         way = position - nearest
         beyond = (tangent * way).sum(1)
         along = np.where(along <= 0, along + np.minimum(beyond, 0.0), along)
-        along = np.where(along >= self.length[line], along + np.maximum(beyond, 0.0), along)
+        # Shapely adds the segments up in another order: the arc length of a line's end may differ by its rounding.
+        at_end = along >= self.length[line] - ROUNDING
+        along = np.where(at_end, along + np.maximum(beyond, 0.0), along)
         nearest, tangent = self.at(line, along)
         way = position - nearest
         side = np.where(tangent[:, 0] * way[:, 1] - tangent[:, 1] * way[:, 0] < 0, -1.0, 1.0)

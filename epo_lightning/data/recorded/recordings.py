@@ -35,7 +35,9 @@ from epo_lightning.schema import read
 from epo_lightning.task import Task
 
 VERSION = 2
-"""Version of the extraction: raised whenever the same recordings would give other scenes."""
+"""Version of the extraction: raised whenever the same recordings would give scenes that differ by a centimetre or more."""
+VERSION_OF_JUNCTIONS = 3
+"""The same for scenes with reference lines through junctions (``windows.lines``)."""
 DUPLICATES = ("keep", "once")
 
 
@@ -215,7 +217,7 @@ class RecordedData(SceneDataModule):
     def _settings(self) -> dict[str, Any]:
         """The part of the data set's configuration that does not depend on the recordings."""
         return {
-            "version": VERSION,
+            "version": VERSION if self.windows.lines is None else VERSION_OF_JUNCTIONS,
             "dataset": self.dataset_name,
             "format": self.format,
             "windows": identifying(self.windows),

@@ -40,6 +40,24 @@ def test_projection_is_the_nearest_point_of_a_line_that_goes_straight_on(seed):
         assert np.sign(offset[i]) == (np.sign(tangent[i, 0] * way[1] - tangent[i, 1] * way[0]) or 1)
 
 
+@given(st.integers(0, 10_000), st.floats(-1e6, 1e6))
+def test_lines_go_straight_on_beyond_both_ends(seed, shift):
+    """Shapely and numpy add segments up in other orders: a line's end must not be missed by the rounding of its length."""
+    random = np.random.default_rng(seed)
+    turns = np.cumsum(random.normal(scale=0.05, size=(20, 30)), axis=1)  # gentle bends: the end is the nearest point
+    steps = random.uniform(2.0, 6.0, turns.shape)[..., None] * np.stack((np.cos(turns), np.sin(turns)), -1)
+    lines = np.cumsum(steps, axis=1) + [shift, -shift]
+    which, beyond, left = np.arange(20), random.uniform(0.0, 10.0, 20), random.uniform(-3.0, 3.0, 20)
+    length = np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(1)
+    for end, turn, expected in ((lines[:, -1], turns[:, -1], length + beyond), (lines[:, 0], turns[:, 1], -beyond)):
+        ahead = np.stack((np.cos(turn), np.sin(turn)), -1)
+        way = np.sign(expected - length / 2)[:, None] * beyond[:, None] * ahead
+        position = end + way + left[:, None] * np.stack((-ahead[:, 1], ahead[:, 0]), -1)
+        along, offset = Polylines(list(lines)).project(which, position)
+        np.testing.assert_allclose(along, expected, atol=1e-5)
+        np.testing.assert_allclose(offset, left, atol=1e-5)
+
+
 @given(st.floats(150, 2000), st.floats(-3, 3), st.integers(0, 10_000))
 @settings(max_examples=25)
 def test_agents_are_found_on_their_lanes_wherever_the_road_lies(radius, turn, seed):
