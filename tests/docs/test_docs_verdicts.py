@@ -1,4 +1,4 @@
-"""The page of verdicts: every claim has all its parts and one verdict."""
+"""Verdicts and evidence: every claim has all its parts and one verdict, which the page of verdicts repeats."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import pytest
 from docs.pages import ROOT
 
 PAGE = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-SECTIONS = re.findall(r"^### (\d+)\. (.*?)\n(.*?)(?=^##|\Z)", PAGE, re.DOTALL | re.MULTILINE)
+EVIDENCE = (ROOT / "docs" / "claims.md").read_text(encoding="utf-8")
+SECTIONS = re.findall(r"^### (\d+)\. (.*?)\n(.*?)(?=^##|\Z)", EVIDENCE, re.DOTALL | re.MULTILINE)
 VERDICTS = ("holds", "holds weakly", "holds in part", "does not hold", "undecided", "not tested")
 
 
@@ -22,7 +23,7 @@ def test_a_claim_has_all_its_parts_and_one_verdict(number: str, title: str, text
     verdict = re.match(r": (.*)\.\n", rest)
     assert verdict is not None
     assert verdict[1] in VERDICTS
-    assert re.search(rf"^\| \[{number} .*\]\(#{number}-.*\) \| {verdict[1]} \| .*\|$", PAGE, re.MULTILINE), title
+    assert re.search(rf"^\| \[{number} .*\]\(claims\.md#{number}-.*\) \| {verdict[1]} \| .*\|$", PAGE, re.MULTILINE), title
 
 
 def test_the_summary_has_every_claim_once() -> None:
