@@ -46,7 +46,7 @@ def test_lines_go_straight_on_beyond_both_ends(seed, shift):
     random = np.random.default_rng(seed)
     turns = np.cumsum(random.normal(scale=0.05, size=(20, 30)), axis=1)  # gentle bends: the end is the nearest point
     steps = random.uniform(2.0, 6.0, turns.shape)[..., None] * np.stack((np.cos(turns), np.sin(turns)), -1)
-    lines = np.cumsum(steps, axis=1) + [shift, -shift]
+    lines = np.array([shift, -shift]) + np.cumsum(steps, axis=1)
     which, beyond, left = np.arange(20), random.uniform(0.0, 10.0, 20), random.uniform(-3.0, 3.0, 20)
     length = np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(1)
     for end, turn, expected in ((lines[:, -1], turns[:, -1], length + beyond), (lines[:, 0], turns[:, 1], -beyond)):
