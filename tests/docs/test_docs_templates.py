@@ -15,7 +15,8 @@ TEMPLATES = sorted((ROOT / "docs").glob("*.md.j2"))
 def test_the_pages_of_results_have_templates() -> None:
     pages = {template.stem for template in TEMPLATES}
     assert pages == {
-        f"{page}.md" for page in ("results", "claims", "rpi", "rpi_results", "highway_results", "urban", "family", "game")
+        f"{page}.md"
+        for page in ("results", "claims", "rpi", "rpi_results", "highway_results", "urban", "family", "game")
     }
 
 

@@ -23,7 +23,9 @@ def test_a_claim_has_all_its_parts_and_one_verdict(number: str, title: str, text
     verdict = re.match(r": (.*)\.\n", rest)
     assert verdict is not None
     assert verdict[1] in VERDICTS
-    assert re.search(rf"^\| \[{number} .*\]\(claims\.md#{number}-.*\) \| {verdict[1]} \| .*\|$", PAGE, re.MULTILINE), title
+    assert re.search(rf"^\| \[{number} .*\]\(claims\.md#{number}-.*\) \| {verdict[1]} \| .*\|$", PAGE, re.MULTILINE), (
+        title
+    )
 
 
 def test_the_summary_has_every_claim_once() -> None:
