@@ -261,7 +261,7 @@ def _evaluated(
         path=run.path,
         name=mask(setting("title")),
         seed=seed,
-        data=str(result.get("data", trained_data)),
+        data=_tested_data(result, trained_data),
         trained_data=trained_data,
         backbone=setting("backbone", "name"),
         forecaster=setting("forecaster", "name"),
@@ -281,6 +281,14 @@ def _evaluated(
         config=config,
         records=run,
     )
+
+
+def _tested_data(result: Mapping[str, Any], trained: str) -> str:
+    """Name of the data set of a file of scores: its own, or that of the run's training if it names none."""
+    settings = result.get("settings")
+    if isinstance(settings, Mapping) and "name" in settings:
+        return data_name(settings)
+    return str(result.get("data", trained))
 
 
 def data_name(section: Mapping[str, Any]) -> str:

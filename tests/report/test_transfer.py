@@ -125,6 +125,16 @@ def test_damaged_settings_of_a_test_make_no_part(tmp_path: Path, settings: Any) 
     assert read_parts(run) == []
 
 
+def test_players_of_games_are_told_apart_by_their_settings(tmp_path: Path) -> None:
+    """The hard split of RPI and its kinds of players are data sets of their own, as in the tables of trainings."""
+    run = make_run(tmp_path / "sc", "SC", "scene_consistent", scores(1.0), data="a", digest="A")
+    for place, players in enumerate(("potential", "feedback")):
+        settings = {"name": "rpi", "split": "hard", "solver": players}
+        on(run, "rpi", 2.0 + place, f"-{place}", split="test", data_digest=players, test=players, settings=settings)
+    (sheet, *_) = transfer_sheets(transfers([run]))
+    assert sheet.header[4:] == ("rpi_hard, test", "rpi_hard, feedback players, test")
+
+
 def test_rows_of_several_data_sets_share_the_columns_of_the_same_scenes(tmp_path: Path) -> None:
     one = make_run(tmp_path / "one", "SC", "scene_consistent", scores(1.0), data="a", digest="A")
     other = make_run(tmp_path / "other", "SC", "scene_consistent", scores(2.0), data="b", digest="B")
