@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from epo_lightning.experiment.assembly import build_data
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.train import train
 from epo_lightning.identity import ELSEWHERE
@@ -62,12 +63,12 @@ def repeated(saved: SavedRun, folder: Path, overrides: Sequence[str]) -> RunFold
     placed = {
         name: {**elsewhere(rest[name], name), **saved.settings[name]} for name in ("data", "trainer", "callbacks")
     }
+    digest = build_data(placed["data"]).digest
+    if digest != saved.record.get("data_digest"):
+        raise ConfigError(f"its data has the digest {digest} now, and had {saved.record.get('data_digest')}")
     again = train({**rest, **saved.settings, **placed, "run_dir": str(folder), "score": splits, "existing": "continue"})
     if again.record["identity"] != saved.record.get("identity"):
-        raise ConfigError(
-            f"it is another run now: its data has the digest {again.record['data_digest']}, and had "
-            f"{saved.record['data_digest']}; where the digests are equal, its settings have another meaning"
-        )
+        raise ConfigError("it is another run now: its settings have another meaning")
     return again
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import epo_lightning
+from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.identity import check_unchanged
@@ -46,7 +47,7 @@ def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None)
         section["batch_size"] = batch_size
     data = assembly.build_data(section)
     data.setup("test")
-    refuse_changed(run, data.digest)
+    refuse_changed(run, data)
     return data
 
 
@@ -61,18 +62,26 @@ def settings_of(run: RunFolder) -> Settings:
     return read(Settings, config)
 
 
-def refuse_changed(run: RunFolder, digest: str) -> None:
+def refuse_changed(run: RunFolder, data: Any) -> None:
     """Refuse to continue or score a run with other data than it began with.
 
     Raises:
         ConfigError: the data has another digest now.
     """
     began_with = run.record.get("data_digest")
-    if began_with != digest:
+    if began_with == data.digest:
+        return
+    if isinstance(data, RecordedData) and data.is_older(str(began_with)):
         raise ConfigError(
-            f"the data of {run.path} has changed since the run began (digest {began_with}, now {digest}): "
-            "restore the data of that digest, or train a new run"
+            f"the scenes of {run.path} were extracted from the same recordings by an older version of epo_lightning (digest "
+            f"{began_with}, now {data.digest}): train the run again, or use the version of its commit, "
+            f"{run.record.get('git_commit', 'unknown')}; `epo evaluate run={run.path} data={data.dataset_name} split=test` "
+            "scores it on the scenes of this version"
         )
+    raise ConfigError(
+        f"the data of {run.path} has changed since the run began (digest {began_with}, now {data.digest}): "
+        "restore the data of that digest, or train a new run"
+    )
 
 
 def split_of(data: Any, split: str) -> Any:

@@ -238,9 +238,15 @@ def _usual_split(run: RunFolder, section: Mapping[str, Any]) -> str:
     if not isinstance(data, RecordedData):
         return "test"
     try:
-        return "test" if data.digest == run.record.get("data_digest") else ALL
+        return "test" if _is_own(data, run) else ALL
     except ConfigError:  # too few recordings for three splits, or none: this is said when they are read
         return ALL
+
+
+def _is_own(data: RecordedData, run: RunFolder) -> bool:
+    """Whether these are the recordings and splits of the run, extracted by this or an older version."""
+    digest = str(run.record.get("data_digest"))
+    return data.digest == digest or data.is_older(digest)
 
 
 def _opened(data: Any, split: str) -> SceneDataset:
@@ -258,7 +264,7 @@ def _of_training(run: RunFolder, of_run: Settings) -> set[str] | None:
     if not isinstance(data, RecordedData):
         return set()
     try:
-        if data.digest != run.record.get("data_digest"):
+        if not _is_own(data, run):
             return None
         splits = data.config["splits"]
         files = _files(data)

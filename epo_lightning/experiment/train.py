@@ -74,7 +74,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
     patience = None if settings.sweep and begun is None else 2.0
     with run.lock(wait=patience), gpus.placed(settings.trainer) as devices:
         if run.record_file.is_file():
-            refuse_other(run, config, data.digest)
+            refuse_other(run, config, data)
             if not run.finished:
                 run.update(status=TRAINING, error=None)
         else:
@@ -174,7 +174,7 @@ def measure(run: RunFolder, settings: Settings, which: Measured, devices: int | 
         score(run, EvaluateSettings(run=str(run.path), split=which), settings.trainer, devices)
 
 
-def refuse_other(run: RunFolder, config: dict[str, Any], data_digest: str) -> None:
+def refuse_other(run: RunFolder, config: dict[str, Any], data: Any) -> None:
     """Refuse to continue a run with another configuration or other data than it began with.
 
     Raises:
@@ -192,7 +192,7 @@ def refuse_other(run: RunFolder, config: dict[str, Any], data_digest: str) -> No
             f"{run.path} was begun with another configuration ({shown}): "
             f"continue it as it is with `epo train resume={run.path}`, or choose another run_dir"
         )
-    refuse_changed(run, data_digest)
+    refuse_changed(run, data)
 
 
 def _keep_unlearned(trainer: Trainer, model: LightningModule, data: Any, run: RunFolder) -> None:

@@ -286,8 +286,8 @@ def _evaluated(
 def _tested_data(result: Mapping[str, Any], trained: str) -> str:
     """Name of the data set of a file of scores: its own, or that of the run's training if it names none."""
     settings = result.get("settings")
-    if isinstance(settings, Mapping) and "name" in settings:
-        return data_name(settings)
+    if isinstance(settings, Mapping) and isinstance(settings.get("name"), str):
+        return data_name({**settings, "games_share": 1})  # the share is that of the training games
     return str(result.get("data", trained))
 
 

@@ -16,6 +16,7 @@ from experiment import tiny
 from experiment.conftest import Epo
 
 from epo_lightning import cli
+from epo_lightning.data.recorded import recordings
 from epo_lightning.experiment.assembly import build_data
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
@@ -265,6 +266,24 @@ def test_recordings_of_the_training_are_found_in_any_folder(
     assert epo("evaluate", *moved, "workers=1", "data.windows.radius=9") == 0
     (last,) = [file for file in others(tmp_path / "run") if file not in (own, new)]
     assert "is unknown: its own data is not here" in content(last)["notes"][0]
+
+
+def test_a_run_on_scenes_of_an_older_version_keeps_its_splits(
+    epo: Epo, tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for place in range(4):
+        square(tmp_path / "data", f"square{place}", seed=place)
+    words = ("data=ucy", f"data.folder={tmp_path / 'data'}", "data.val_share=0.3")
+    assert epo("generate", *words, "workers=1", "progress=false") == 0
+    assert epo("train", "experiment=ucy/const_vel", *words, *SMALL, "run_dir=run", "score=test") == 0
+    monkeypatch.setattr(recordings, "VERSION", recordings.VERSION + 1)
+    assert epo("generate", *words, "workers=1", "progress=false") == 0
+    message = refused("evaluate", "run=run")
+    assert "were extracted from the same recordings by an older version of epo_lightning" in message
+    assert "`epo evaluate run=run data=ucy split=test`" in message
+    assert epo("evaluate", "run=run", *words, "workers=1") == 0
+    (scores,) = others(tmp_path / "run")
+    assert (content(scores)["split"], content(scores)["notes"]) == ("test", [])
 
 
 def test_renamed_files_are_the_same_recordings() -> None:

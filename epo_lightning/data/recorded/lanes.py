@@ -74,16 +74,18 @@ class Polylines:
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Arc length of the point of a line that is nearest to a position, and the position's offset to the left of it [m].
 
-        Lines are extended straight at both ends; there, the arc length is negative or more than the line's length.
+        Where an end is nearest, the line goes straight on beyond it; there, the arc length is negative or more than the
+        line's length.
         """
         along = shapely.line_locate_point(self.geometry[line], shapely.points(position))
-        nearest, tangent = self.at(line, along)
-        way = position - nearest
-        beyond = (tangent * way).sum(1)
-        along = np.where(along <= 0, along + np.minimum(beyond, 0.0), along)
+        length = self.length[line]
+        start, ahead = self.at(line, np.zeros_like(length))
+        before = (ahead * (position - start)).sum(1)
+        end, ahead = self.at(line, length)
+        beyond = (ahead * (position - end)).sum(1)
+        along = np.where((along <= 0) & (before < 0), before, along)
         # Shapely adds the segments up in another order: the arc length of a line's end may differ by its rounding.
-        at_end = along >= self.length[line] - ROUNDING
-        along = np.where(at_end, along + np.maximum(beyond, 0.0), along)
+        along = np.where((along >= length - ROUNDING) & (beyond > 0), length + beyond, along)
         nearest, tangent = self.at(line, along)
         way = position - nearest
         side = np.where(tangent[:, 0] * way[:, 1] - tangent[:, 1] * way[:, 0] < 0, -1.0, 1.0)

@@ -35,9 +35,13 @@ from epo_lightning.schema import read
 from epo_lightning.task import Task
 
 VERSION = 2
-"""Version of the extraction: raised whenever the same recordings would give scenes that differ by a centimetre or more."""
+"""Version of the extraction: raised whenever the same recordings would give other scenes.
+
+Version 2 has one exception: its reference lines were mended where an agent is beside the end of a lane. On simulated
+highways nine of 554,676 agents have lines that are moved by at most 7 mm, on US-101 none.
+"""
 VERSION_OF_JUNCTIONS = 3
-"""The same for scenes with reference lines through junctions (``windows.lines``)."""
+"""The same for scenes with reference lines through junctions (``windows.lines``), of which the mended ones are many."""
 DUPLICATES = ("keep", "once")
 
 
@@ -217,7 +221,7 @@ class RecordedData(SceneDataModule):
     def _settings(self) -> dict[str, Any]:
         """The part of the data set's configuration that does not depend on the recordings."""
         return {
-            "version": VERSION if self.windows.lines is None else VERSION_OF_JUNCTIONS,
+            "version": VERSION_OF_JUNCTIONS if self.task.map and self.windows.lines is not None else VERSION,
             "dataset": self.dataset_name,
             "format": self.format,
             "windows": identifying(self.windows),
@@ -268,7 +272,15 @@ class RecordedData(SceneDataModule):
     @property
     def digest(self) -> str:
         """Hash of everything that a run's data depends on."""
-        return cache.digest({"set": self.config, "frame": self.frame})[:16]
+        return self._digest(self.config)
+
+    def _digest(self, config: Mapping[str, Any]) -> str:
+        return cache.digest({"set": config, "frame": self.frame})[:16]
+
+    def is_older(self, digest: str) -> bool:
+        """Whether a digest is that of the same recordings, splits and settings, extracted by an older version."""
+        versions = range(1, self.config["version"])
+        return any(self._digest({**self.config, "version": version}) == digest for version in versions)
 
     @property
     def command(self) -> str:

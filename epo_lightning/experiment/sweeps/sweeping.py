@@ -106,7 +106,7 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
         config = compose.compose("train", overrides, extra)
         job = Job.of(config, overrides)
         if job.run.record_file.is_file():
-            training.refuse_other(job.run, config, assembly.build_data(config["data"]).digest)
+            training.refuse_other(job.run, config, assembly.build_data(config["data"]))
         elif job.run.exists:
             raise ConfigError(
                 f"{job.run.path} exists and is not a run folder: move it away, or choose another runs=<folder>"

@@ -58,6 +58,19 @@ def test_lines_go_straight_on_beyond_both_ends(seed, shift):
         np.testing.assert_allclose(offset, left, atol=1e-5)
 
 
+@given(st.integers(0, 10_000), st.sampled_from([1e-7, 1e-5, 1e-2]))
+def test_a_short_last_segment_is_extended_along_itself(seed, short):
+    """Positions beside the segment before it are not beyond the line, though its end is within rounding."""
+    random = np.random.default_rng(seed)
+    ends = random.uniform(1.0, 10.0, 20)
+    lines = [np.array([[0.0, 0.0], [end, 0.0], [end, short]]) for end in ends]  # the last segment turns left
+    position = np.stack([ends + random.uniform(0.1, 3.0, 20), random.uniform(-3.0, 3.0, 20)], -1)
+    along, offset = Polylines(lines).project(np.arange(20), position)
+    np.testing.assert_allclose(along, ends + np.maximum(position[:, 1], 0.0), atol=2 * short)
+    below = np.minimum(position[:, 1], 0.0)
+    np.testing.assert_allclose(np.abs(offset), np.hypot(position[:, 0] - ends, below), atol=2 * short)
+
+
 @given(st.floats(150, 2000), st.floats(-3, 3), st.integers(0, 10_000))
 @settings(max_examples=25)
 def test_agents_are_found_on_their_lanes_wherever_the_road_lies(radius, turn, seed):

@@ -63,6 +63,20 @@ def data(folder: Path, **changes) -> RecordedData:
     return RecordedData(**{**arguments, **where, **changes})
 
 
+@pytest.mark.parametrize(("lines", "map", "version"), [(None, True, 2), (8, True, 3), (8, False, 2)])
+def test_lines_through_junctions_have_a_version_of_their_own(folder, lines, map, version):
+    module = data(folder, windows={**WINDOWS, "lines": lines, "lane_change": False}, map=map)
+    assert module.config["version"] == version
+    digests = [
+        cache.digest({"set": {**module.config, "version": older}, "frame": module.frame})[:16]
+        for older in range(1, version)
+    ]
+    assert all(module.is_older(digest) for digest in digests)
+    assert not module.is_older(module.digest)
+    changed = data(folder, windows={**WINDOWS, "lines": lines, "lane_change": False, "every": 2}, map=map)
+    assert not any(changed.is_older(digest) for digest in digests)
+
+
 def test_generate_once_then_train_from_the_cache(folder):
     module = data(folder)
     made = module.generate(workers=1, progress=False)
