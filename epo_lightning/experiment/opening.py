@@ -75,8 +75,8 @@ def refuse_changed(run: RunFolder, data: Any) -> None:
         raise ConfigError(
             f"the scenes of {run.path} were extracted from the same recordings by an older version of epo_lightning (digest "
             f"{began_with}, now {data.digest}): train the run again, or use the version of its commit, "
-            f"{run.record.get('git_commit', 'unknown')}; `epo evaluate run={run.path} data={data.dataset_name} split=test` "
-            "scores it on the scenes of this version"
+            f"{run.record.get('git_commit', 'unknown')}; `epo evaluate run={run.path} data={data.dataset_name} "
+            f"data.folder={data.folder_of_recordings} split=test` scores it on the scenes of this version"
         )
     raise ConfigError(
         f"the data of {run.path} has changed since the run began (digest {began_with}, now {data.digest}): "

@@ -280,7 +280,7 @@ def test_a_run_on_scenes_of_an_older_version_keeps_its_splits(
     assert epo("generate", *words, "workers=1", "progress=false") == 0
     message = refused("evaluate", "run=run")
     assert "were extracted from the same recordings by an older version of epo_lightning" in message
-    assert "`epo evaluate run=run data=ucy split=test`" in message
+    assert f"`epo evaluate run=run data=ucy data.folder={tmp_path / 'data'} split=test`" in message
     assert epo("evaluate", "run=run", *words, "workers=1") == 0
     (scores,) = others(tmp_path / "run")
     assert (content(scores)["split"], content(scores)["notes"]) == ("test", [])

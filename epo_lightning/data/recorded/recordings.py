@@ -38,7 +38,8 @@ VERSION = 2
 """Version of the extraction: raised whenever the same recordings would give other scenes.
 
 Version 2 has one exception: its reference lines were mended where an agent is beside the end of a lane. On simulated
-highways nine of 554,676 agents have lines that are moved by at most 7 mm, on US-101 none.
+highways nine of 554,676 agents have lines that are moved, by at most 7 mm, on US-101 none; on Lankershim Boulevard, with
+three lines per agent, six of 8,407, by up to 27 cm.
 """
 VERSION_OF_JUNCTIONS = 3
 """The same for scenes with reference lines through junctions (``windows.lines``), of which the mended ones are many."""
