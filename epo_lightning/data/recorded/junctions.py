@@ -94,8 +94,8 @@ def ways(
     for _, _, neighbour, before, gone, cost in sorted(changes):
         if neighbour in seen or len(found) >= MOST_WAYS:
             continue
-        # A lane that begins ahead, a turning bay, is reached over the lanes before it.
-        before = () if lanes.predecessors[neighbour] else before
+        # A lane that begins ahead (a turning bay, or a road that joins from another direction) is reached over the lanes
+        # of the agent's way before it, because its own predecessors may be far from the agent.
         for path, _ in _followed(neighbour, gone, far, lanes, length):
             found.append(Way((*before, *path), cost))
             seen |= set(path)

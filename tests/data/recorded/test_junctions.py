@@ -87,6 +87,8 @@ def test_ways_change_lane_once_at_most_and_only_to_driving_lanes(seed):
         assert len(jumps) <= (way.cost >= CHANGE)
         if way.cost >= CHANGE:
             assert any(lane in driving for lane in way.lanes)
+        first = {0, 1} | {int(side[lane]) for lane in (0, 1) for side in (lanes.left_of, lanes.right_of)}
+        assert way.lanes[0] in first, "every way begins on a lane of the agent or beside one"
 
 
 @given(st.integers(0, 10_000), st.integers(1, 4))
@@ -197,6 +199,28 @@ def test_a_turning_bay_that_begins_ahead_is_reached_over_the_lanes_before_it():
     turning = route.candidates[0].reshape(4, PER_LINE, 2)[1]
     assert turning[-1, 1] > 20
     assert np.linalg.norm(turning - (30.0, WIDTH), axis=1).min() < 2.0
+
+
+def test_a_lane_that_joins_from_another_road_is_reached_over_the_lanes_before_it():
+    # The agent turns left into a road; the lane on the right of its lane there comes straight from the south.
+    turned = [[60.0, 10.0], [60.0, 120.0]]
+    joining = [[60.0 + WIDTH, 10.0], [60.0 + WIDTH, 120.0]]
+    lanes = graph(
+        [
+            [[0.0, 0.0], [50.0, 0.0], [57.0, 3.0], [60.0, 10.0]],
+            turned,
+            joining,
+            [[60.0 + WIDTH, -90.0], [60.0 + WIDTH, 10.0]],
+        ],
+        [(1,), (), (), (2,)],
+        right=[-1, 2, -1, -1],
+    )
+    route = lines_of(lanes, 8, (5.0, 0.0), 0.0, 10.0)
+    lines = route.references[0, : route.count[0]]
+    assert route.count[0] >= 2
+    assert np.linalg.norm(lines - (5.0, 0.0), axis=2).min(1).max() < 5.0, "every line passes the agent"
+    ends = route.candidates[0].reshape(8, PER_LINE, 2)[: route.count[0], -1]
+    assert np.isclose(ends[:, 0], 60.0 + WIDTH).any(), "the joining lane can be reached"
 
 
 WINDOWS = WindowConfig(lane_change=False, lines=9, lanes=None)

@@ -63,7 +63,7 @@ def data(folder: Path, **changes) -> RecordedData:
     return RecordedData(**{**arguments, **where, **changes})
 
 
-@pytest.mark.parametrize(("lines", "map", "version"), [(None, True, 2), (8, True, 3), (8, False, 2)])
+@pytest.mark.parametrize(("lines", "map", "version"), [(None, True, 2), (8, True, 4), (8, False, 2)])
 def test_lines_through_junctions_have_a_version_of_their_own(folder, lines, map, version):
     module = data(folder, windows={**WINDOWS, "lines": lines, "lane_change": False}, map=map)
     assert module.config["version"] == version
