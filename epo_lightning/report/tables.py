@@ -23,6 +23,7 @@ from epo_lightning.report.columns import (
     TRUTH,
     Column,
 )
+from epo_lightning.report.folds import named_by_fold
 from epo_lightning.report.labels import natural
 from epo_lightning.report.paper import PAPER
 from epo_lightning.report.rows import Row, plain_rows, require_comparable
@@ -60,13 +61,14 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
 
     The further tables show scores by subset, of the k most likely modes, of probabilities and missed alternatives, of
     initial beside solved strategies, the effect of pair terms, the distance of forecasts from an equilibrium of their
-    game, and of inferred costs from the true ones. They contain the rows that have such scores.
+    game, and of inferred costs from the true ones. They contain the rows that have such scores. Runs on one data set that
+    were tested on different groups of recordings are in different tables.
 
     Raises:
         ConfigError: rows of one table that were trained under different conditions, or the same run twice.
     """
     parts: dict[tuple[str, str], list[EvaluatedRun]] = {}
-    for run in runs:
+    for run in named_by_fold(runs):
         parts.setdefault((run.data, run.split), []).append(run)
     tables = []
     for (data, split), members in sorted(parts.items()):

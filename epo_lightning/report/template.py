@@ -11,6 +11,8 @@ A template gets rows by :meth:`Results.rows`, under the name ``results``, and as
     {{ table("hard split", {"+SC": sc, "+EPO": epo}, "SADE", "SFDE") }}
     {{ table("paired difference", {"+EPO - +SC": epo - sc}, "SADE", "SFDE") }}
 
+``folds("urban_folds")`` has the same rows with the test split of a cross-validation as the unit, instead of the seed.
+
 Metrics are named as in the tables of reports (``SADE``, ``OR``, ``SADE, k=1``) or as in ``metrics.json``. The name of a
 subset or of a stage stands before them: ``interactive SADE``, ``initial SADE``; ``validation SADE`` is the lowest one of the
 training's log.
@@ -29,8 +31,10 @@ from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.columns import EQUILIBRIUM, MAIN, MISSING, PROBABILITIES, TRUTH
 from epo_lightning.report.costs import last_fifth
 from epo_lightning.report.curves import METRIC, validation_log
+from epo_lightning.report.folds import fold_of
+from epo_lightning.report.labels import value_text
 from epo_lightning.report.results import read_results
-from epo_lightning.report.rows import Row, plain_rows
+from epo_lightning.report.rows import plain_rows
 from epo_lightning.report.runs import EvaluatedRun, read_parts
 from epo_lightning.report.statistics import compare
 from epo_lightning.run_folder import errors_naming, write_file
@@ -51,7 +55,7 @@ class Scores:
 
     Attributes:
         name: name of the row, for error messages.
-        by_seed: scores by metric of every seed.
+        by_seed: scores by metric of every seed; of a cross-validation, of every fold.
         digits: number of decimals in texts.
     """
 
@@ -164,6 +168,45 @@ class Results:
         Raises:
             ConfigError: no such file or data set, or a damaged file.
         """
+        file, runs = self._read(name)
+        found = dict.fromkeys(run.data for run in runs)
+        if (data is None and len(found) > 1) or (data is not None and data not in found):
+            raise ConfigError(
+                f"{file}: data must name one of its data sets, found {data}; {nearest(data or '', found)}"
+            )
+        rows = plain_rows(run for run in runs if data in (None, run.data))
+        known = {row.name: Scores(row.name, {run.seed: _scores(run) for run in row.runs}, digits) for row in rows}
+        return Rows(file, known)
+
+    def folds(self, name: str, digits: int = 3) -> Rows:
+        """The rows of a cross-validation by title, with the test split as the unit instead of the seed.
+
+        Args:
+            name: name of the file without ``.json``.
+            digits: number of decimals in texts of these rows.
+
+        Raises:
+            ConfigError: no such file, a damaged file, or rows of one title and test split that differ in more than the seed.
+        """
+        file, runs = self._read(name)
+        tests = sorted({fold_of(run) for run in runs})
+        members: dict[str, dict[int, list[EvaluatedRun]]] = {}
+        for run in runs:
+            members.setdefault(run.name, {}).setdefault(tests.index(fold_of(run)), []).append(run)
+        found = {}
+        for title, folds in members.items():
+            for number, same in folds.items():
+                if len({run.row for run in same}) > 1:
+                    test = f"data.test={value_text([*tests[number]])}" if tests[number] else "a drawn test split"
+                    raise ConfigError(
+                        f"{file}: runs of {title!r} with {test} differ in more than their seed: give them different titles"
+                    )
+            by_fold = {number: _mean(map(_scores, same)) for number, same in folds.items()}
+            found[title] = Scores(title, by_fold, digits)
+        return Rows(file, found)
+
+    def _read(self, name: str) -> tuple[Path, list[EvaluatedRun]]:
+        """A results file and its runs, scored on the test split, or on the one split that the file has."""
         file = self.folder / f"{name}.json"
         if not file.exists():
             raise ConfigError(
@@ -171,14 +214,8 @@ class Results:
             )
         report = read_results(file)
         runs = [*report.evaluated, *(part for run in report.runs for part in read_parts(run))]
-        runs = [run for run in runs if run.split == "test"] or runs
-        self.used[name] = runs
-        found = dict.fromkeys(run.data for run in runs)
-        if (data is None and len(found) > 1) or (data is not None and data not in found):
-            raise ConfigError(
-                f"{file}: data must name one of its data sets, found {data}; {nearest(data or '', found)}"
-            )
-        return Rows(file, plain_rows(run for run in runs if data in (None, run.data)), digits)
+        self.used[name] = [run for run in runs if run.split == "test"] or runs
+        return file, self.used[name]
 
     def sources(self) -> str:
         """Table of the results files that were used, with what their runs saw, and how far they had settled.
@@ -212,9 +249,8 @@ class Results:
 class Rows(Mapping[str, Scores]):
     """Rows of one results file by name."""
 
-    def __init__(self, file: Path, rows: Iterable[Row], digits: int) -> None:
-        self._file = file
-        self._rows = {row.name: Scores(row.name, {run.seed: _scores(run) for run in row.runs}, digits) for row in rows}
+    def __init__(self, file: Path, rows: Mapping[str, Scores]) -> None:
+        self._file, self._rows = file, rows
 
     def __getitem__(self, name: str) -> Scores:
         if name not in self._rows:
@@ -242,8 +278,7 @@ def average(rows: Iterable[Scores]) -> Scores:
     seeds = sorted(set.intersection(*({*row.by_seed} for row in rows)))
     if not seeds:
         raise ConfigError(f"rows {', '.join(repr(row.name) for row in rows)} have no seed in common")
-    metrics = set.intersection(*({*row.by_seed[seed]} for row in rows for seed in seeds))
-    found = {seed: {key: statistics.fmean(row.by_seed[seed][key] for row in rows) for key in metrics} for seed in seeds}
+    found = {seed: _mean(row.by_seed[seed] for row in rows) for seed in seeds}
     return type(rows[0])(f"mean of {', '.join(row.name for row in rows)}", found, rows[0].digits)
 
 
@@ -301,7 +336,9 @@ def write_page(template: str | Path, results: str | Path, out: str | Path | None
     environment = Environment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
-    environment.globals.update(results=source.rows, average=average, below=below, table=table, sources=source.sources)
+    environment.globals.update(
+        results=source.rows, folds=source.folds, sources=source.sources, average=average, below=below, table=table
+    )
     try:
         page = environment.from_string(text).render()
     except TemplateSyntaxError as error:
@@ -317,6 +354,13 @@ def _scores(run: EvaluatedRun) -> Mapping[str, float]:
     """The scores of a run, with the lowest validation score of its training."""
     log = _validations(run)
     return {**run.metrics, f"validation/{METRIC.partition('/')[2]}": min(log.values())} if log else run.metrics
+
+
+def _mean(scores: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Means of the metrics that all of several scores have."""
+    scores = list(scores)
+    known = set.intersection(*({*each} for each in scores))
+    return {key: statistics.fmean(each[key] for each in scores) for key in known}
 
 
 def _validations(run: EvaluatedRun) -> Mapping[int, float]:

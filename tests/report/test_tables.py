@@ -488,3 +488,18 @@ def test_damaged_errors_of_costs_are_one_message(tmp_path: Path, truth: Any) -> 
     write_json(run.path / "metrics.json", {**content, "truth": truth})
     with pytest.raises(ConfigError, match=r"metrics.json: truth must be numbers by name; epo evaluate"):
         collect(tmp_path)
+
+
+def test_runs_that_were_tested_on_other_recordings_are_in_tables_of_their_own(tmp_path: Path) -> None:
+    for fold, test in enumerate((["a", "b"], ["c"])):
+        for title, forecaster in (("V-LSTM + SC", "scene_consistent"), ("V-LSTM + EPO", "epo")):
+            path = tmp_path / f"{forecaster}{fold}"
+            settings = {"data.test": test}
+            make_run(path, title, forecaster, scores(0.1), data="square", settings=settings, digest=str(fold))
+    tables = build_tables(collect(tmp_path))
+    names = {table.data: [row.name for row in table.rows] for table in tables}
+    both = ["V-LSTM + SC", "V-LSTM + EPO"]
+    assert names == {"square, test a, b": both, "square, test c": both}
+    shutil.rmtree(tmp_path / "epo1")
+    shutil.rmtree(tmp_path / "scene_consistent1")
+    assert {table.data for table in build_tables(collect(tmp_path))} == {"square"}, "one test split needs no name"

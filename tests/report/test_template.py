@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from math import sqrt
 from pathlib import Path
+from random import Random
 from statistics import fmean, stdev
+from typing import Any
 
 import pytest
 from scipy.stats import t as student
@@ -12,8 +14,12 @@ from scipy.stats import t as student
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import report_page
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.results import read_results
-from epo_lightning.report.template import Differences, Scores, average, below, table, write_page
+from epo_lightning.report import Report
+from epo_lightning.report.results import read_results, save_results
+from epo_lightning.report.template import Differences, Results, Scores, average, below, table, write_page
+
+from .run_folders import make_run
+from .run_folders import scores as make_scores
 
 RESULTS = Path(__file__).parents[2] / "results"
 
@@ -102,6 +108,43 @@ def test_a_table_has_the_papers_values_beside_its_rows() -> None:
         "| ours | 2 | 1.500 ± .707 | .99 |",
         "| other | 1 | 3.000 |  |",
     ]
+
+
+def cross_validation(folder: Path, **more: dict[str, Any]) -> Path:
+    """A folder with a results file of two rows, three folds and two seeds; ``more`` are settings of one run more."""
+    random = Random(0)
+    for title, forecaster in (("V-LSTM + SC", "scene_consistent"), ("V-LSTM + EPO", "epo")):
+        for test in ("a", "b", "c"):
+            for seed in (0, 1):
+                path, found = folder / "runs" / f"{forecaster}-{test}-{seed}", make_scores(random.uniform(0.1, 0.9))
+                make_run(path, title, forecaster, found, seed=seed, settings={"data.test": [test]}, digest=test)
+    for name, settings in more.items():
+        make_run(
+            folder / "runs" / name, "V-LSTM + SC", "scene_consistent", make_scores(0.5), settings=settings, digest="c"
+        )
+    save_results(Report.of_folder(folder / "runs"), folder / "results" / "folds.json")
+    return folder / "results"
+
+
+def test_in_a_cross_validation_the_test_split_is_the_unit(tmp_path: Path) -> None:
+    rows = Results(cross_validation(tmp_path)).folds("folds")
+    means: dict[str, list[float]] = {}
+    for run in read_results(tmp_path / "results" / "folds.json").evaluated:
+        means.setdefault(run.name + run.config["data"]["test"][0], []).append(run.metrics["minSADE"])
+    expected = {title: [fmean(means[title + test]) for test in "abc"] for title in ("V-LSTM + SC", "V-LSTM + EPO")}
+    assert set(rows) == set(expected)
+    for title, row in rows.items():
+        assert row.values("SADE") == pytest.approx(expected[title])
+    found = (rows["V-LSTM + EPO"] - rows["V-LSTM + SC"]).values("SADE")
+    assert found == pytest.approx(
+        [e - s for e, s in zip(expected["V-LSTM + EPO"], expected["V-LSTM + SC"], strict=True)]
+    )
+
+
+def test_a_fold_of_several_rows_is_refused(tmp_path: Path) -> None:
+    results = cross_validation(tmp_path, wide={"data.test": ["c"], "backbone.width": 7})
+    with pytest.raises(ConfigError, match=r"'V-LSTM \+ SC' with data.test=\[c\] differ in more than their seed"):
+        Results(results).folds("folds")
 
 
 def test_the_sources_are_the_files_that_were_used(tmp_path: Path) -> None:
