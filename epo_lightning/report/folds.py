@@ -1,31 +1,55 @@
 """Folds: runs on one data set whose test splits differ, as in a cross-validation over recordings.
 
-The groups of the test split are ``data.test``. Runs that were tested on other groups are in tables of their own; a page
-takes their differences with the fold as the unit (:meth:`epo_lightning.report.template.Results.folds`).
+The groups of the test split are ``data.test``. Runs that were tested on different groups are in different tables
+(:func:`named_by_fold`), and rows are compared with the fold as the unit instead of the seed (:func:`one_per_fold`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from epo_lightning.report.runs import EvaluatedRun
 
 
-def fold_of(run: EvaluatedRun) -> tuple[str, ...]:
-    """Groups of the test split that a run's configuration names; empty if the split is drawn."""
-    return tuple(sorted(map(str, run.config["data"].get("test") or ())))
-
-
 def named_by_fold(runs: Iterable[EvaluatedRun]) -> list[EvaluatedRun]:
     """Runs whose data set has the groups of their test split in its name, if runs on it have different ones."""
     runs = list(runs)
-    folds: dict[str, set[tuple[str, ...]]] = {}
+    folds: dict[str, set[str]] = {}
     for run in runs:
-        folds.setdefault(run.data, set()).add(fold_of(run))
+        folds.setdefault(run.data, set()).add(_ending(run))
+    return [replace(run, data=run.data + _ending(run)) if len(folds[run.data]) > 1 else run for run in runs]
+
+
+def whole_data(run: EvaluatedRun) -> str:
+    """Name of the data set of which a run named by :func:`named_by_fold` is a fold; empty for all other runs."""
+    ending = _ending(run)
+    return run.data.removesuffix(ending) if ending and run.data.endswith(ending) else ""
+
+
+def one_per_fold(runs: Sequence[Sequence[EvaluatedRun]], row: str) -> list[EvaluatedRun]:
+    """One run for each fold, with the number of the fold as its seed and the mean scores of the fold's runs.
+
+    Args:
+        runs: the runs of one row in each fold; a fold may have none.
+        row: name and identity of the row.
+    """
     return [
-        replace(run, data=f"{run.data}, test {', '.join(fold_of(run))}")
-        if len(folds[run.data]) > 1 and fold_of(run)
-        else run
-        for run in runs
+        replace(same[0], name=row, row=row, seed=number, metrics=mean_scores(run.metrics for run in same))
+        for number, same in enumerate(runs)
+        if same
     ]
+
+
+def mean_scores(scores: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Means of the metrics that all of several scores have."""
+    scores = list(scores)
+    known = set.intersection(*({*each} for each in scores))
+    return {key: statistics.fmean(each[key] for each in scores) for key in known}
+
+
+def _ending(run: EvaluatedRun) -> str:
+    """The groups of the test split that a run's configuration names; empty if the split is drawn."""
+    groups = run.config["data"].get("test")
+    return f", test {', '.join(map(str, groups))}" if groups else ""

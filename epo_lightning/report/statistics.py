@@ -1,4 +1,4 @@
-"""Paired comparisons of two rows over the seeds that both have.
+"""Paired comparisons of two rows over the seeds that both have, or over the folds of a cross-validation.
 
 With the same seed, two rows see the same batches in the same order, so differences within pairs vary less than scores
 between seeds. The test is Student's two-sided paired t-test.
@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from epo_lightning.report.columns import Column
 from epo_lightning.report.paper import is_papers
 from epo_lightning.report.rows import Row
-from epo_lightning.report.tables import Table, loss_of
+from epo_lightning.report.tables import Table, loss_of, over_folds
 
 CONFIDENCE = 0.95
 EQUAL = 1e-9
@@ -104,9 +104,13 @@ def compare_rows(one: Row, other: Row, metrics: Sequence[str]) -> Comparison:
 
 
 def build_comparisons(tables: Sequence[Table]) -> list[Comparisons]:
-    """Comparisons of +EPO rows with +SC rows of the same backbone, goal and power of the loss, for every main table."""
+    """Comparisons of +EPO rows with +SC rows of the same backbone, goal and power of the loss, for every main table.
+
+    If the tables are folds of a cross-validation, comparisons over the folds stand first.
+    """
     found = []
-    for table in (table for table in tables if table.main):
+    of_folds = [(table, "fold by fold (mean of its seeds)") for table in over_folds(tables)]
+    for table, pairing in (*of_folds, *((table, "seed by seed") for table in tables if table.main)):
         metrics = [column.metric for column in table.columns]
         pairs = tuple(
             compare_rows(one, other, metrics)
@@ -118,5 +122,5 @@ def build_comparisons(tables: Sequence[Table]) -> list[Comparisons]:
             and is_papers("epo", one.runs[0].config)
         )
         if pairs:
-            found.append(Comparisons(f"{table.title}: +EPO against +SC, seed by seed", table.columns, pairs))
+            found.append(Comparisons(f"{table.title}: +EPO against +SC, {pairing}", table.columns, pairs))
     return found

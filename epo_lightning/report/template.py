@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 import re
 import statistics
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,12 +31,12 @@ from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.columns import EQUILIBRIUM, MAIN, MISSING, PROBABILITIES, TRUTH
 from epo_lightning.report.costs import last_fifth
 from epo_lightning.report.curves import METRIC, validation_log
-from epo_lightning.report.folds import fold_of
-from epo_lightning.report.labels import value_text
+from epo_lightning.report.folds import mean_scores
 from epo_lightning.report.results import read_results
-from epo_lightning.report.rows import plain_rows
+from epo_lightning.report.rows import Row, plain_rows
 from epo_lightning.report.runs import EvaluatedRun, read_parts
 from epo_lightning.report.statistics import compare
+from epo_lightning.report.tables import build_tables, over_folds
 from epo_lightning.run_folder import errors_naming, write_file
 
 ENDING = ".j2"
@@ -175,8 +175,7 @@ class Results:
                 f"{file}: data must name one of its data sets, found {data}; {nearest(data or '', found)}"
             )
         rows = plain_rows(run for run in runs if data in (None, run.data))
-        known = {row.name: Scores(row.name, {run.seed: _scores(run) for run in row.runs}, digits) for row in rows}
-        return Rows(file, known)
+        return Rows(file, _by_unit(rows, digits, _scores))
 
     def folds(self, name: str, digits: int = 3) -> Rows:
         """The rows of a cross-validation by title, with the test split as the unit instead of the seed.
@@ -186,24 +185,15 @@ class Results:
             digits: number of decimals in texts of these rows.
 
         Raises:
-            ConfigError: no such file, a damaged file, or rows of one title and test split that differ in more than the seed.
+            ConfigError: no such file, a damaged file, or not exactly one data set with several test splits.
         """
         file, runs = self._read(name)
-        tests = sorted({fold_of(run) for run in runs})
-        members: dict[str, dict[int, list[EvaluatedRun]]] = {}
-        for run in runs:
-            members.setdefault(run.name, {}).setdefault(tests.index(fold_of(run)), []).append(run)
-        found = {}
-        for title, folds in members.items():
-            for number, same in folds.items():
-                if len({run.row for run in same}) > 1:
-                    test = f"data.test={value_text([*tests[number]])}" if tests[number] else "a drawn test split"
-                    raise ConfigError(
-                        f"{file}: runs of {title!r} with {test} differ in more than their seed: give them different titles"
-                    )
-            by_fold = {number: _mean(map(_scores, same)) for number, same in folds.items()}
-            found[title] = Scores(title, by_fold, digits)
-        return Rows(file, found)
+        tables = over_folds(build_tables(runs))
+        if len(tables) != 1:
+            raise ConfigError(
+                f"{file}: folds of one data set were expected, found {len(tables)} data sets with several"
+            )
+        return Rows(file, _by_unit(tables[0].rows, digits, lambda run: run.metrics))
 
     def _read(self, name: str) -> tuple[Path, list[EvaluatedRun]]:
         """A results file and its runs, scored on the test split, or on the one split that the file has."""
@@ -278,7 +268,7 @@ def average(rows: Iterable[Scores]) -> Scores:
     seeds = sorted(set.intersection(*({*row.by_seed} for row in rows)))
     if not seeds:
         raise ConfigError(f"rows {', '.join(repr(row.name) for row in rows)} have no seed in common")
-    found = {seed: _mean(row.by_seed[seed] for row in rows) for seed in seeds}
+    found = {seed: mean_scores(row.by_seed[seed] for row in rows) for seed in seeds}
     return type(rows[0])(f"mean of {', '.join(row.name for row in rows)}", found, rows[0].digits)
 
 
@@ -356,11 +346,10 @@ def _scores(run: EvaluatedRun) -> Mapping[str, float]:
     return {**run.metrics, f"validation/{METRIC.partition('/')[2]}": min(log.values())} if log else run.metrics
 
 
-def _mean(scores: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Means of the metrics that all of several scores have."""
-    scores = list(scores)
-    known = set.intersection(*({*each} for each in scores))
-    return {key: statistics.fmean(each[key] for each in scores) for key in known}
+def _by_unit(
+    rows: Iterable[Row], digits: int, scores: Callable[[EvaluatedRun], Mapping[str, float]]
+) -> dict[str, Scores]:
+    return {row.name: Scores(row.name, {run.seed: scores(run) for run in row.runs}, digits) for row in rows}
 
 
 def _validations(run: EvaluatedRun) -> Mapping[int, float]:

@@ -6,7 +6,6 @@ from math import sqrt
 from pathlib import Path
 from random import Random
 from statistics import fmean, stdev
-from typing import Any
 
 import pytest
 from scipy.stats import t as student
@@ -110,18 +109,14 @@ def test_a_table_has_the_papers_values_beside_its_rows() -> None:
     ]
 
 
-def cross_validation(folder: Path, **more: dict[str, Any]) -> Path:
-    """A folder with a results file of two rows, three folds and two seeds; ``more`` are settings of one run more."""
+def cross_validation(folder: Path) -> Path:
+    """A folder with a results file of two rows, three folds and two seeds."""
     random = Random(0)
     for title, forecaster in (("V-LSTM + SC", "scene_consistent"), ("V-LSTM + EPO", "epo")):
         for test in ("a", "b", "c"):
             for seed in (0, 1):
                 path, found = folder / "runs" / f"{forecaster}-{test}-{seed}", make_scores(random.uniform(0.1, 0.9))
                 make_run(path, title, forecaster, found, seed=seed, settings={"data.test": [test]}, digest=test)
-    for name, settings in more.items():
-        make_run(
-            folder / "runs" / name, "V-LSTM + SC", "scene_consistent", make_scores(0.5), settings=settings, digest="c"
-        )
     save_results(Report.of_folder(folder / "runs"), folder / "results" / "folds.json")
     return folder / "results"
 
@@ -141,10 +136,9 @@ def test_in_a_cross_validation_the_test_split_is_the_unit(tmp_path: Path) -> Non
     )
 
 
-def test_a_fold_of_several_rows_is_refused(tmp_path: Path) -> None:
-    results = cross_validation(tmp_path, wide={"data.test": ["c"], "backbone.width": 7})
-    with pytest.raises(ConfigError, match=r"'V-LSTM \+ SC' with data.test=\[c\] differ in more than their seed"):
-        Results(results).folds("folds")
+def test_folds_are_those_of_one_data_set(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="folds of one data set were expected, found 0 data sets"):
+        Results(RESULTS).folds("rpi_hard_settled")
 
 
 def test_the_sources_are_the_files_that_were_used(tmp_path: Path) -> None:
