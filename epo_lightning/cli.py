@@ -250,15 +250,15 @@ def _resume(folder: str, others: Sequence[str]) -> None:
 
 
 def _multirun(arguments: Arguments) -> None:
-    """Check every job, then let Hydra launch them; evaluations run one after the other."""
-    if arguments.verb == "evaluate":
+    """Check every job, then let Hydra launch them; data sets and evaluations are made one after the other."""
+    if arguments.verb in ("generate", "evaluate"):
         from epo_lightning.experiment.config import compose
 
-        for words in compose.jobs("evaluate", arguments.overrides, arguments.extra):
-            _single(Arguments("evaluate", words, extra=arguments.extra))
+        for words in compose.jobs(arguments.verb, arguments.overrides, arguments.extra):
+            _single(Arguments(arguments.verb, words, extra=arguments.extra))
         return
     if arguments.verb != "train":
-        raise ConfigError(f"epo {arguments.verb} has no option -m: use runs=<folder> for several runs")
+        raise ConfigError(f"epo {arguments.verb} has no option -m: only epo generate, train and evaluate have it")
     from epo_lightning.experiment.config import compose
 
     listed = compose.jobs("train", arguments.overrides, arguments.extra)

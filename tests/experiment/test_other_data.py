@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from experiment import tiny
+from experiment import pedestrians, tiny
 from experiment.conftest import Epo
 
 from epo_lightning import cli
@@ -55,22 +55,6 @@ def home(trained: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def square(folder: Path, name: str = "square", seed: int = 0, frames: int = 30) -> Path:
-    """Six pedestrians who wander over a square, in UCY's format at 2.5 Hz."""
-    random = np.random.default_rng(seed)
-    rows = []
-    for person in range(6):
-        velocity = random.normal(size=2) + 0.1 * random.normal(size=(frames, 2)).cumsum(0)
-        place = random.uniform(-5, 5, size=2) + 0.4 * velocity.cumsum(0)
-        rows += [
-            f"{10 * k} {person} {place[k, 0]:.5f} 0 {place[k, 1]:.5f} {velocity[k, 0]:.5f} 0 {velocity[k, 1]:.5f}"
-            for k in range(frames)
-        ]
-    (folder / name).mkdir(parents=True, exist_ok=True)
-    (folder / name / "obsmat.txt").write_text("\n".join(rows))
-    return folder
-
-
 def others(run: Path) -> list[Path]:
     return sorted(run.glob("scores-on-*.json"))
 
@@ -96,7 +80,7 @@ def test_own_data_by_the_other_way_gives_the_same_scores(epo: Epo, home: Path) -
 def test_a_run_of_roads_is_scored_on_pedestrians_without_a_map(
     epo: Epo, home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, folder = home / "runs" / "v_lstm_epo", square(home / "data")
+    run, folder = home / "runs" / "v_lstm_epo", pedestrians.square(home / "data")
     assert epo("evaluate", f"run={run}", "data=ucy", f"data.folder={folder}", "workers=1") == 0
     printed = capsys.readouterr().out
     (file,) = others(run)
@@ -120,7 +104,7 @@ def test_a_run_of_roads_is_scored_on_pedestrians_without_a_map(
     assert file.read_bytes() == written
     assert epo("evaluate", f"run={run}", "data=ucy", f"data.folder={folder}", "workers=1", "checkpoint=last") == 0
     assert len(others(run)) == 2
-    square(folder, seed=1)  # the recordings have changed
+    pedestrians.square(folder, seed=1)  # the recordings have changed
     assert epo("evaluate", f"run={run}", "data=ucy", f"data.folder={folder}", "workers=1") == 0
     assert len(others(run)) == 3
     assert len({content(file)["data_digest"] for file in others(run)}) == 2
@@ -128,7 +112,7 @@ def test_a_run_of_roads_is_scored_on_pedestrians_without_a_map(
 
 
 def test_scores_of_another_version_are_kept_beside_the_first(epo: Epo, home: Path) -> None:
-    run, folder = home / "runs" / "const_vel", square(home / "data")
+    run, folder = home / "runs" / "const_vel", pedestrians.square(home / "data")
     words = ("evaluate", f"run={run}", "data=ucy", f"data.folder={folder}", "workers=1")
     assert epo(*words) == 0
     (file,) = others(run)
@@ -146,7 +130,7 @@ def test_scores_of_another_version_are_kept_beside_the_first(epo: Epo, home: Pat
 def test_the_windows_lie_on_the_recorded_frames(epo: Epo, home: Path) -> None:
     from safetensors.torch import load_file
 
-    run, folder = home / "runs" / "v_lstm_epo", square(home / "data")
+    run, folder = home / "runs" / "v_lstm_epo", pedestrians.square(home / "data")
     assert (
         epo(
             "predict",
@@ -215,7 +199,7 @@ def test_what_does_not_fit_is_refused_with_a_reason(
     epo: Epo, trained: Path, home: Path, refused: Callable[..., str]
 ) -> None:
     run, game = f"run={home / 'runs' / 'v_lstm_epo'}", f"run={home / 'rpi' / 'v_lstm_epo'}"
-    folder = f"data.folder={square(home / 'data')}"
+    folder = f"data.folder={pedestrians.square(home / 'data')}"
     assert "data.folder needs a choice of data: add data=<one of" in refused("evaluate", run, "data.folder=x")
     told = refused("evaluate", run, "solver=best_response")
     assert "unknown key 'solver' of epo evaluate: solver is a choice of epo train, and a run keeps it" in told
@@ -242,7 +226,7 @@ def test_recordings_of_the_training_are_found_in_any_folder(
 ) -> None:
     folder = tmp_path / "one"
     for place in range(4):
-        square(folder, f"square{place}", seed=place)
+        pedestrians.square(folder, f"square{place}", seed=place)
     words = ("data=ucy", f"data.folder={folder}", "data.val_share=0.3")
     assert epo("generate", *words, "workers=1", "progress=false") == 0
     assert epo("train", "experiment=ucy/const_vel", *words, *SMALL, "run_dir=run", "score=test") == 0
@@ -252,7 +236,7 @@ def test_recordings_of_the_training_are_found_in_any_folder(
     assert content(own)["metrics"] == content(tmp_path / "run" / "metrics.json")["metrics"]
 
     folder.rename(tmp_path / "two")
-    square(tmp_path / "two", "square9", seed=9)
+    pedestrians.square(tmp_path / "two", "square9", seed=9)
     moved = ("run=run", "data=ucy", f"data.folder={tmp_path / 'two'}")
     message = refused("evaluate", *moved)
     seen = len(content(next((tmp_path / "cache").glob("ucy-*/manifest.json")))["report"]["recordings"]["test"])
@@ -272,7 +256,7 @@ def test_a_run_on_scenes_of_an_older_version_keeps_its_splits(
     epo: Epo, tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for place in range(4):
-        square(tmp_path / "data", f"square{place}", seed=place)
+        pedestrians.square(tmp_path / "data", f"square{place}", seed=place)
     words = ("data=ucy", f"data.folder={tmp_path / 'data'}", "data.val_share=0.3")
     assert epo("generate", *words, "workers=1", "progress=false") == 0
     assert epo("train", "experiment=ucy/const_vel", *words, *SMALL, "run_dir=run", "score=test") == 0
@@ -294,7 +278,9 @@ def test_renamed_files_are_the_same_recordings() -> None:
 
 def test_a_run_without_goals_is_scored_on_any_recordings(epo: Epo, home: Path) -> None:
     run = home / "rpi" / "v_lstm_sc"
-    assert epo("evaluate", f"run={run}", "data=ucy", f"data.folder={square(home / 'data')}", "workers=1") == 0
+    assert (
+        epo("evaluate", f"run={run}", "data=ucy", f"data.folder={pedestrians.square(home / 'data')}", "workers=1") == 0
+    )
     (file,) = others(run)
     windows = content(file)["settings"]["windows"]
     wanted = {"dt": 0.1, "history": 19, "horizon": 40, "agents": 2, "least_agents": 2, "every": 4}
@@ -305,7 +291,7 @@ def test_a_run_without_goals_is_scored_on_any_recordings(epo: Epo, home: Path) -
 def test_all_runs_on_several_data_sets_and_the_table_of_them(
     epo: Epo, home: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
 ) -> None:
-    folder = square(home / "data")
+    folder = pedestrians.square(home / "data")
     shutil.copytree(home / "rpi" / "v_lstm_epo", home / "runs" / "rpi")
     assert epo("evaluate", "runs=runs", "data=ucy", f"data.folder={folder}", "workers=1") == 0
     printed = capsys.readouterr().out
@@ -336,7 +322,7 @@ def test_all_runs_on_several_data_sets_and_the_table_of_them(
 
 
 def test_a_changed_run_is_not_scored_anywhere(epo: Epo, home: Path, refused: Callable[..., str]) -> None:
-    run, folder = home / "runs" / "v_lstm_epo", square(home / "data")
+    run, folder = home / "runs" / "v_lstm_epo", pedestrians.square(home / "data")
     file = run / "config.yaml"
     file.write_text(file.read_text().replace("seed: 0", "seed: 1"))
     for verb in (("evaluate",), ("predict", "out=o")):
