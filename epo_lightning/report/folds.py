@@ -31,14 +31,17 @@ def whole_data(run: EvaluatedRun) -> str:
 def one_per_fold(runs: Sequence[Sequence[EvaluatedRun]], row: str) -> list[EvaluatedRun]:
     """One run for each fold, with the number of the fold as its seed and the mean scores of the fold's runs.
 
+    Scores that a fold lacks, as those of interactive scenes where it has none, are left out of all.
+
     Args:
         runs: the runs of one row in each fold; a fold may have none.
         row: name and identity of the row.
     """
+    scores = {number: mean_scores(run.metrics for run in same) for number, same in enumerate(runs) if same}
+    known = set.intersection(*map(set, scores.values()))
     return [
-        replace(same[0], name=row, row=row, seed=number, metrics=mean_scores(run.metrics for run in same))
-        for number, same in enumerate(runs)
-        if same
+        replace(runs[number][0], name=row, row=row, seed=number, metrics={key: found[key] for key in sorted(known)})
+        for number, found in scores.items()
     ]
 
 

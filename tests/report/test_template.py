@@ -116,6 +116,8 @@ def cross_validation(folder: Path) -> Path:
         for test in ("a", "b", "c"):
             for seed in (0, 1):
                 path, found = folder / "runs" / f"{forecaster}-{test}-{seed}", make_scores(random.uniform(0.1, 0.9))
+                if test != "b":  # a fold may have no interactive scenes
+                    found["interactive/minSADE"] = 1.0
                 make_run(path, title, forecaster, found, seed=seed, settings={"data.test": [test]}, digest=test)
     save_results(Report.of_folder(folder / "runs"), folder / "results" / "folds.json")
     return folder / "results"
@@ -130,6 +132,8 @@ def test_in_a_cross_validation_the_test_split_is_the_unit(tmp_path: Path) -> Non
     assert set(rows) == set(expected)
     for title, row in rows.items():
         assert row.values("SADE") == pytest.approx(expected[title])
+    with pytest.raises(ConfigError, match="has no metric 'interactive SADE'"):
+        rows["V-LSTM + SC"].values("interactive SADE")
     found = (rows["V-LSTM + EPO"] - rows["V-LSTM + SC"]).values("SADE")
     assert found == pytest.approx(
         [e - s for e, s in zip(expected["V-LSTM + EPO"], expected["V-LSTM + SC"], strict=True)]
