@@ -250,12 +250,9 @@ def _resume(folder: str, others: Sequence[str]) -> None:
 
 
 def _multirun(arguments: Arguments) -> None:
-    """Check every job, then let Hydra launch them; data sets and evaluations are made one after the other."""
+    """Check every training, then let Hydra launch them; data sets and evaluations are made one after the other."""
     if arguments.verb in ("generate", "evaluate"):
-        from epo_lightning.experiment.config import compose
-
-        for words in compose.jobs(arguments.verb, arguments.overrides, arguments.extra):
-            _single(Arguments(arguments.verb, words, extra=arguments.extra))
+        _one_after_the_other(arguments)
         return
     if arguments.verb != "train":
         raise ConfigError(f"epo {arguments.verb} has no option -m: only epo generate, train and evaluate have it")
@@ -277,6 +274,20 @@ def _multirun(arguments: Arguments) -> None:
                 raise done._return_value  # Hydra's `done.return_value` would print the overrides before it raises
         return
     compose.multirun("train", arguments.overrides, job_of_sweep, arguments.extra)
+
+
+def _one_after_the_other(arguments: Arguments) -> None:
+    """Make the data sets, or the evaluations, of all combinations of the given values."""
+    from epo_lightning.experiment.config import compose
+
+    listed = compose.jobs(arguments.verb, arguments.overrides, arguments.extra)
+    if not listed:
+        raise ConfigError(f"epo {arguments.verb} -m takes lists of values: a sweeper that searches is for epo train")
+    of_hydra = [
+        word for word in arguments.overrides if word.startswith(("hydra/", "hydra."))
+    ]  # as a launcher, for each
+    for words in listed:
+        _single(Arguments(arguments.verb, [*words, *of_hydra], extra=arguments.extra))
 
 
 def _sweep(arguments: Arguments) -> None:

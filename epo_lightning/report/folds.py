@@ -1,7 +1,7 @@
 """Folds: runs on one data set whose test splits differ, as in a cross-validation over recordings.
 
 The groups of the test split are ``data.test``. Runs that were tested on different groups are in different tables
-(:func:`named_by_fold`), and rows are compared with the fold as the unit instead of the seed (:func:`one_per_fold`).
+(:func:`named_by_fold`), and rows are compared with the fold as the unit instead of the seed (:func:`joined`).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
+from epo_lightning.identity import row_identity
 from epo_lightning.report.runs import EvaluatedRun
 
 
@@ -28,21 +29,43 @@ def whole_data(run: EvaluatedRun) -> str:
     return run.data.removesuffix(ending) if ending and run.data.endswith(ending) else ""
 
 
-def one_per_fold(runs: Sequence[Sequence[EvaluatedRun]], row: str) -> list[EvaluatedRun]:
-    """One run for each fold, with the number of the fold as its seed and the mean scores of the fold's runs.
+def joined(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
+    """One run for each row and fold, with the number of the fold as its seed and the mean scores over the seeds.
 
-    Scores that a fold lacks, as those of interactive scenes where it has none, are left out of all.
+    Rows are equal in everything but seed and test split. Folds are numbered in the order of their groups. Scores that a fold
+    lacks, as those of interactive scenes where it has none, are left out of all.
 
     Args:
-        runs: the runs of one row in each fold; a fold may have none.
-        row: name and identity of the row.
+        runs: runs on the folds of one data set.
+
+    Returns:
+        the runs; none if there are fewer than two folds, or if folds have groups in common.
     """
-    scores = {number: mean_scores(run.metrics for run in same) for number, same in enumerate(runs) if same}
-    known = set.intersection(*map(set, scores.values()))
-    return [
-        replace(runs[number][0], name=row, row=row, seed=number, metrics={key: found[key] for key in sorted(known)})
-        for number, found in scores.items()
-    ]
+    folds = sorted({_groups(run) for run in runs})
+    groups = [group for fold in folds for group in fold]
+    if len(folds) < 2 or len({*groups}) < len(groups):
+        return []
+    rows: dict[str, dict[int, list[EvaluatedRun]]] = {}
+    for run in runs:
+        rows.setdefault(row_identity(_without_test(run), ""), {}).setdefault(folds.index(_groups(run)), []).append(run)
+    digests = ", ".join(sorted({run.data_digest for run in runs}))
+    found = []
+    for row, members in rows.items():
+        scores = {number: mean_scores(run.metrics for run in same) for number, same in sorted(members.items())}
+        known = sorted(set.intersection(*map(set, scores.values())))
+        found += [
+            replace(
+                members[number][0],
+                data=whole_data(members[number][0]),
+                data_digest=digests,
+                config=_without_test(members[number][0]),
+                row=row,
+                seed=number,
+                metrics={metric: means[metric] for metric in known},
+            )
+            for number, means in scores.items()
+        ]
+    return found
 
 
 def mean_scores(scores: Iterable[Mapping[str, float]]) -> dict[str, float]:
@@ -52,7 +75,15 @@ def mean_scores(scores: Iterable[Mapping[str, float]]) -> dict[str, float]:
     return {key: statistics.fmean(each[key] for each in scores) for key in known}
 
 
+def _groups(run: EvaluatedRun) -> tuple[str, ...]:
+    """The groups of the test split that a run's configuration names, in one order; empty if the split is drawn."""
+    named = run.config["data"].get("test")
+    return tuple(sorted({*map(str, named)})) if isinstance(named, list | tuple) else ()
+
+
 def _ending(run: EvaluatedRun) -> str:
-    """The groups of the test split that a run's configuration names; empty if the split is drawn."""
-    groups = run.config["data"].get("test")
-    return f", test {', '.join(map(str, groups))}" if groups else ""
+    return f", test {', '.join(_groups(run))}" if _groups(run) else ""
+
+
+def _without_test(run: EvaluatedRun) -> Mapping[str, object]:
+    return {**run.config, "data": {**run.config["data"], "test": None}}

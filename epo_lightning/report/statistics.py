@@ -106,10 +106,10 @@ def compare_rows(one: Row, other: Row, metrics: Sequence[str]) -> Comparison:
 def build_comparisons(tables: Sequence[Table]) -> list[Comparisons]:
     """Comparisons of +EPO rows with +SC rows of the same backbone, goal and power of the loss, for every main table.
 
-    If the tables are folds of a cross-validation, comparisons over the folds stand first.
+    If the tables are folds of a cross-validation, comparisons with the fold as the unit stand first.
     """
     found = []
-    of_folds = [(table, "fold by fold (mean of its seeds)") for table in over_folds(tables)]
+    of_folds = [(table, "split by split (mean of its seeds)") for table in over_folds(tables)]
     for table, pairing in (*of_folds, *((table, "seed by seed") for table in tables if table.main)):
         metrics = [column.metric for column in table.columns]
         pairs = tuple(

@@ -23,7 +23,7 @@ from epo_lightning.report.columns import (
     TRUTH,
     Column,
 )
-from epo_lightning.report.folds import named_by_fold, one_per_fold, whole_data
+from epo_lightning.report.folds import joined, named_by_fold, whole_data
 from epo_lightning.report.labels import natural
 from epo_lightning.report.paper import PAPER
 from epo_lightning.report.rows import Row, plain_rows, require_comparable
@@ -105,26 +105,20 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
 
 
 def over_folds(tables: Iterable[Table]) -> list[Table]:
-    """The main tables of the folds of a cross-validation as one, whose rows have a score per fold instead of per seed.
+    """The main tables of the test splits of a cross-validation as one, whose rows have a score per fold instead of per seed.
 
-    Folds are numbered in the order of the tables. There is one table for every data set with several test splits.
+    There is one table for every data set with several test splits that have no group in common.
     """
-    folds: dict[tuple[str, str], list[Table]] = {}
-    for table in tables:
-        if table.main and (data := whole_data(table.rows[0].runs[0])):
-            folds.setdefault((data, table.split), []).append(table)
-    found = []
-    for (data, split), same in folds.items():
-        names = dict.fromkeys(row.name for table in same for row in table.rows)
-        runs = [
-            run
-            for name in names
-            for run in one_per_fold(
-                [[run for row in t.rows if row.name == name for run in row.runs] for t in same], name
-            )
-        ]
-        found.append(Table(f"{data}, {split} split, {len(same)} folds", MAIN, tuple(plain_rows(runs))))
-    return found
+    folds: dict[str, list[EvaluatedRun]] = {}
+    for table in (table for table in tables if table.main and table.split == "test"):
+        for run in (run for row in table.rows for run in row.runs if whole_data(run)):
+            folds.setdefault(whole_data(run), []).append(run)
+    tables_of_folds = []
+    for data, runs in folds.items():
+        if units := joined(runs):
+            number = len({run.seed for run in units})
+            tables_of_folds.append(Table(f"{data}, {number} test splits", MAIN, tuple(plain_rows(units))))
+    return tables_of_folds
 
 
 def subset_columns(rows: Iterable[Row], columns: Sequence[Column]) -> tuple[Column, ...]:

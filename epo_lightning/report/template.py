@@ -170,30 +170,29 @@ class Results:
         """
         file, runs = self._read(name)
         found = dict.fromkeys(run.data for run in runs)
-        if (data is None and len(found) > 1) or (data is not None and data not in found):
-            raise ConfigError(
-                f"{file}: data must name one of its data sets, found {data}; {nearest(data or '', found)}"
-            )
+        _require_name(file, data, found)
         rows = plain_rows(run for run in runs if data in (None, run.data))
         return Rows(file, _by_unit(rows, digits, _scores))
 
-    def folds(self, name: str, digits: int = 3) -> Rows:
+    def folds(self, name: str, data: str | None = None, digits: int = 3) -> Rows:
         """The rows of a cross-validation by title, with the test split as the unit instead of the seed.
 
         Args:
             name: name of the file without ``.json``.
+            data: name of the data set, where the file has several with folds.
             digits: number of decimals in texts of these rows.
 
         Raises:
-            ConfigError: no such file, a damaged file, or not exactly one data set with several test splits.
+            ConfigError: no such file or data set, a damaged file, or no data set with several test splits.
         """
         file, runs = self._read(name)
-        tables = over_folds(build_tables(runs))
-        if len(tables) != 1:
+        found = {table.data: table.rows for table in over_folds(build_tables(runs))}
+        if not found:
             raise ConfigError(
-                f"{file}: folds of one data set were expected, found {len(tables)} data sets with several"
+                f"{file} has no cross-validation: runs on one data set with different groups in data.test"
             )
-        return Rows(file, _by_unit(tables[0].rows, digits, lambda run: run.metrics))
+        _require_name(file, data, found)
+        return Rows(file, _by_unit(found[data or next(iter(found))], digits, lambda run: run.metrics))
 
     def _read(self, name: str) -> tuple[Path, list[EvaluatedRun]]:
         """A results file and its runs, scored on the test split, or on the one split that the file has."""
@@ -259,7 +258,7 @@ class Rows(Mapping[str, Scores]):
 
 
 def average(rows: Iterable[Scores]) -> Scores:
-    """Mean of several rows, or of several differences, seed by seed, over the seeds and metrics that all of them have.
+    """Mean of several rows, or of several differences, seed by seed, over the seeds that all of them have.
 
     Raises:
         ConfigError: the rows have no seed in common.
@@ -344,6 +343,13 @@ def _scores(run: EvaluatedRun) -> Mapping[str, float]:
     """The scores of a run, with the lowest validation score of its training."""
     log = _validations(run)
     return {**run.metrics, f"validation/{METRIC.partition('/')[2]}": min(log.values())} if log else run.metrics
+
+
+def _require_name(file: Path, data: str | None, known: Iterable[str]) -> None:
+    """Check that ``data`` names one of the known data sets; it may be None if there is one alone."""
+    known = list(known)
+    if (data is None and len(known) > 1) or (data is not None and data not in known):
+        raise ConfigError(f"{file}: data must name one of its data sets, found {data}; {nearest(data or '', known)}")
 
 
 def _by_unit(

@@ -260,6 +260,7 @@ MISTAKES = {
     "report runs=nowhere": "nowhere",
     "report -m runs=a,b": "has no option -m",
     "generate worker=3": "'workers'",
+    "generate -m data.solver=potential,feedback hydra/sweeper=optuna": "takes lists of values",
 }
 
 

@@ -31,3 +31,11 @@ def test_every_fold_has_a_data_set_a_run_and_a_table(epo: Epo, tmp_path: Path) -
     (row,) = Results(tmp_path / "results").folds("folds").values()
     assert row.n == 2
     assert len({*row.values("SADE")}) == 2, "the folds have different scenes"
+
+
+def test_each_data_set_of_several_is_made_by_the_jobs_of_a_launcher(epo: Epo, tmp_path: Path) -> None:
+    for place in range(4):
+        folder = pedestrians.square(tmp_path / "data", f"square{place}", seed=place)
+    words = ("data=ucy", f"data.folder={folder}", "data.val_share=0.3", "data.test=[square0],[square1]")
+    assert epo("generate", "-m", *words, "hydra/launcher=local", "jobs=2", "progress=false") == 0
+    assert len([*(tmp_path / "cache").glob("ucy-*/manifest.json")]) == 2

@@ -23,7 +23,7 @@ from epo_lightning.report.render import legend
 from epo_lightning.report.rows import Cell, Row
 from epo_lightning.report.runs import collect, data_name, find_runs
 from epo_lightning.report.statistics import build_comparisons
-from epo_lightning.report.tables import build_tables, distinct
+from epo_lightning.report.tables import build_tables, distinct, over_folds
 from epo_lightning.run_folder import RunFolder, write_json
 
 from .run_folders import make_run, scores
@@ -503,8 +503,37 @@ def test_runs_that_were_tested_on_other_recordings_are_in_tables_of_their_own(tm
     both = ["V-LSTM + SC", "V-LSTM + EPO"]
     assert names == {"square, test a, b": both, "square, test c": both}
     by_fold, *_ = build_comparisons(tables)
-    assert by_fold.title == "square, test split, 2 folds: +EPO against +SC, fold by fold (mean of its seeds)"
+    assert by_fold.title == "square, 2 test splits: +EPO against +SC, split by split (mean of its seeds)"
     assert [pair.differences["minSADE"].mean for pair in by_fold.pairs] == pytest.approx([-0.02])
     shutil.rmtree(tmp_path / "epo1")
     shutil.rmtree(tmp_path / "scene_consistent1")
     assert {table.data for table in build_tables(collect(tmp_path))} == {"square"}, "one test split needs no name"
+
+
+def test_over_folds_rows_are_those_of_equal_settings(tmp_path: Path) -> None:
+    def run(name: str, test: list[str], steps: int, value: float, split: str = "test") -> None:
+        settings = {"data.test": test, "solver.steps": steps}
+        digest = " ".join(sorted(test))
+        make_run(tmp_path / name, "EPO", "epo", scores(value), data="s", settings=settings, digest=digest, split=split)
+
+    run("a2", ["a"], 2, 0.1)
+    run("b8", ["b", "c"], 8, 0.2)
+    (table,) = over_folds(build_tables(collect(tmp_path)))
+    assert {row.name: row.seeds for row in table.rows} == {"EPO, steps=2": [0], "EPO, steps=8": [1]}, "not one row"
+    run("a8", ["a"], 8, 0.3)
+    (table,) = over_folds(build_tables(collect(tmp_path)))
+    found = {row.name: [run.metrics["minSADE"] for run in row.runs] for row in table.rows}
+    assert found == {"EPO, steps=2": [0.1], "EPO, steps=8": [0.3, 0.2]}
+    assert (table.data, table.title) == ("s", "s, 2 test splits")
+    run("a2", ["a"], 2, 0.1, split="val")
+    assert len(over_folds(build_tables(collect(tmp_path)))) == 1, "validation splits may be the same in several folds"
+    run("ab", ["a", "b"], 8, 0.3)
+    assert not over_folds(build_tables(collect(tmp_path))), "folds with a group in common are no cross-validation"
+
+
+def test_a_test_split_beside_a_drawn_one_is_no_cross_validation(tmp_path: Path) -> None:
+    make_run(tmp_path / "a", "EPO", "epo", scores(0.1), data="s", settings={"data.test": ["a"]}, digest="a")
+    make_run(tmp_path / "drawn", "EPO", "epo", scores(0.1), data="s", settings={"data.test": None}, digest="d")
+    tables = build_tables(collect(tmp_path))
+    assert {table.data for table in tables} == {"s", "s, test a"}
+    assert not over_folds(tables)
