@@ -25,6 +25,7 @@ from epo_lightning.data.recorded.routes import (
     POINTS,
     SHORTEST,
     Route,
+    direction,
     follow,
     polyline_length,
     reach,
@@ -88,7 +89,9 @@ def ways(
             found.append(Way(path, cost))
             for place, (each, gone) in enumerate(zip(path, begins, strict=True)):
                 for neighbour in (int(lanes.left_of[each]), int(lanes.right_of[each])):
-                    if neighbour >= 0 and lanes.kind[neighbour] != SHOULDER:
+                    if neighbour < 0 or lanes.kind[neighbour] == SHOULDER:
+                        continue
+                    if place == 0 or not _begins_behind(neighbour, each, lanes):
                         changes.append((max(gone, 0.0), len(changes), neighbour, path[:place], gone, cost + CHANGE))
     seen = {lane for way in found for lane in way.lanes}
     for _, _, neighbour, before, gone, cost in sorted(changes):
@@ -100,6 +103,13 @@ def ways(
             found.append(Way((*before, *path), cost))
             seen |= set(path)
     return sorted(found, key=lambda way: way.cost)[:MOST_WAYS]
+
+
+def _begins_behind(lane: int, beside: int, lanes: LaneGraph) -> bool:
+    """Whether a lane begins so far behind the lane beside it that a way over the beginnings of both would lead back."""
+    start = lanes.centre[beside][0]
+    ahead = (lanes.centre[lane][0] - start) @ direction(lanes.centre[beside], at_end=False)
+    return bool(ahead < -BEHIND)
 
 
 def _followed(

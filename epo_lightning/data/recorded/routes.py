@@ -122,13 +122,14 @@ def straightest(following: Sequence[tuple[int, ...]], lanes: LaneGraph, forwards
     found = np.full(len(lanes), -1)
     for lane, others in enumerate(following):
         if others:
-            here = _direction(lanes.centre[lane], at_end=forwards)
-            turns = [float(here @ _direction(lanes.centre[other], at_end=not forwards)) for other in others]
+            here = direction(lanes.centre[lane], at_end=forwards)
+            turns = [float(here @ direction(lanes.centre[other], at_end=not forwards)) for other in others]
             found[lane] = others[int(np.argmax(turns))]
     return found
 
 
-def _direction(line: Polyline, at_end: bool) -> Float[np.ndarray, " 2"]:
+def direction(line: Polyline, at_end: bool) -> Float[np.ndarray, " 2"]:
+    """Unit vector of a line's direction at its beginning or end."""
     points = line[np.append(True, (np.diff(line, axis=0) != 0).any(1))]
     way = points[-1] - points[-2] if at_end else points[1] - points[0]
     return way / np.linalg.norm(way)

@@ -21,7 +21,7 @@ from epo_lightning.data.recorded.junctions import (
     ways,
 )
 from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph
-from epo_lightning.data.recorded.routes import BRAKING, PER_LINE, Routes, reach
+from epo_lightning.data.recorded.routes import BEHIND, BRAKING, PER_LINE, Routes, reach
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.surroundings import reachable_pieces
 from epo_lightning.data.recorded.windows import WindowConfig, extract, identifying
@@ -64,6 +64,12 @@ def test_all_successors_within_reach_are_followed(seed, begin, far):
         np.testing.assert_allclose(begins, begin + np.cumsum([0, *(length[lane] for lane in path[:-1])]))
 
 
+def ahead_of(lanes: LaneGraph, one: int, other: int) -> float:
+    """How far one straight lane begins ahead of another one."""
+    way = lanes.centre[other][1] - lanes.centre[other][0]
+    return float((lanes.centre[one][0] - lanes.centre[other][0]) @ way / np.linalg.norm(way))
+
+
 @given(st.integers(0, 10_000))
 @settings(max_examples=25)
 def test_ways_change_lane_once_at_most_and_only_to_driving_lanes(seed):
@@ -79,9 +85,12 @@ def test_ways_change_lane_once_at_most_and_only_to_driving_lanes(seed):
         path for lane, along, _ in starts for path, _ in _followed(lane, -along, far, lanes, length)
     }
     kept = {lane for way in found if way.cost < CHANGE for lane in way.lanes}
-    beside = {int(side[lane]) for lane in kept for side in (lanes.left_of, lanes.right_of)} - {-1}
-    driving = {lane for lane in beside if lanes.kind[lane] != SHOULDER}
-    assert driving <= {lane for way in found for lane in way.lanes}, "every lane beside a way can be reached"
+    beside = {(lane, int(side[lane])) for lane in kept for side in (lanes.left_of, lanes.right_of)}
+    pairs = {(lane, other) for lane, other in beside if other >= 0 and lanes.kind[other] != SHOULDER}
+    driving = {other for lane, other in pairs if lane in (0, 1) or ahead_of(lanes, other, lane) >= -BEHIND}
+    assert driving <= {lane for way in found for lane in way.lanes}, (
+        "every lane that begins beside a way can be reached"
+    )
     for way in found:
         jumps = [(one, other) for one, other in itertools.pairwise(way.lanes) if other not in lanes.successors[one]]
         assert len(jumps) <= (way.cost >= CHANGE)
@@ -221,6 +230,22 @@ def test_a_lane_that_joins_from_another_road_is_reached_over_the_lanes_before_it
     assert np.linalg.norm(lines - (5.0, 0.0), axis=2).min(1).max() < 5.0, "every line passes the agent"
     ends = route.candidates[0].reshape(8, PER_LINE, 2)[: route.count[0], -1]
     assert np.isclose(ends[:, 0], 60.0 + WIDTH).any(), "the joining lane can be reached"
+
+
+def test_no_line_leads_back_to_the_beginning_of_a_long_lane_that_joins():
+    turned = [[60.0, 10.0], [60.0, 120.0]]
+    lanes = graph(
+        [
+            [[0.0, 0.0], [50.0, 0.0], [57.0, 3.0], [60.0, 10.0]],
+            turned,
+            [[60.0 + WIDTH, -90.0], [60.0 + WIDTH, 120.0]],
+        ],
+        [(1,), (), ()],
+        right=[-1, 2, -1],
+    )
+    route = lines_of(lanes, 8, (5.0, 0.0), 0.0, 10.0)
+    steps = np.diff(route.references[0, : route.count[0]], axis=1)
+    assert (steps[..., 1] > -0.1).all(), "south"
 
 
 WINDOWS = WindowConfig(lane_change=False, lines=9, lanes=None)
