@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -63,6 +64,9 @@ class Chart:
     numbers: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
 
+
+LONGEST_WORD = 40
+"""Largest number of characters of a data set's name in the name of a file."""
 
 LEARNING, STEPS, EFFICIENCY, RUNTIMES = "Learning curves", "S curve", "Data efficiency", "Runtime"
 
@@ -223,5 +227,8 @@ def _timing_numbers(timing: Timing) -> tuple[str, ...]:
 
 
 def _word(text: str) -> str:
-    """Text with everything but letters, digits and underscores replaced, for a file name."""
-    return re.sub(r"\W+", "_", text)
+    """Text with everything but letters, digits and underscores replaced, for a file name; a long one ends with a hash."""
+    word = re.sub(r"\W+", "_", text)
+    return (
+        word if len(word) <= LONGEST_WORD else f"{word[:LONGEST_WORD]}_{hashlib.sha256(text.encode()).hexdigest()[:6]}"
+    )

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.charts import charts_of
+from epo_lightning.report.charts import _word, charts_of
 from epo_lightning.report.curves import Curve, draw_learning, draw_steps, learning_curves, steps_curves, validation_log
 from epo_lightning.report.efficiency import draw_efficiency, efficiencies
 from epo_lightning.report.made import how_made
@@ -278,3 +278,9 @@ def test_the_figure_over_s_has_the_papers_curve_for_every_kind_of_players(tmp_pa
         make_run(tmp_path / str(steps), "V-LSTM + EPO", "epo", scores(0.1), settings=settings)
     (curve,) = steps_curves(distinct(build_tables(collect(tmp_path))))
     assert curve.paper
+
+
+def test_long_names_of_data_sets_give_short_and_different_file_names() -> None:
+    names = [_word(f"square, test {', '.join(f'group{i}' for i in range(100))}, {last}") for last in "ab"]
+    assert names[0] != names[1]
+    assert max(map(len, names)) < 60
