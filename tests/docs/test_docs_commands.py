@@ -70,7 +70,7 @@ def composes(words: list[str]) -> None:
         arguments.multirun = True
     if verb == "report" and overrides and "=" not in overrides[0]:
         assert overrides.pop(0) in sweeping.known(arguments.extra)
-    if verb == "evaluate" and arguments.multirun:
+    if verb in ("generate", "evaluate") and arguments.multirun:
         overrides = compose.jobs(verb, overrides, arguments.extra)[0]
     if verb != "train":
         verbs.check_settings(verb, compose.compose(verb, overrides, arguments.extra))
