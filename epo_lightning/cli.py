@@ -283,9 +283,8 @@ def _one_after_the_other(arguments: Arguments) -> None:
     listed = compose.jobs(arguments.verb, arguments.overrides, arguments.extra)
     if not listed:
         raise ConfigError(f"epo {arguments.verb} -m takes lists of values: a sweeper that searches is for epo train")
-    of_hydra = [
-        word for word in arguments.overrides if word.startswith(("hydra/", "hydra."))
-    ]  # as a launcher, for each
+    # The listed words are without those of Hydra itself, of which each data set needs its launcher.
+    of_hydra = [word for word in arguments.overrides if word.startswith(("hydra/", "hydra."))]
     for words in listed:
         _single(Arguments(arguments.verb, [*words, *of_hydra], extra=arguments.extra))
 

@@ -229,6 +229,6 @@ def _timing_numbers(timing: Timing) -> tuple[str, ...]:
 def _word(text: str) -> str:
     """Text with everything but letters, digits and underscores replaced, for a file name; a long one ends with a hash."""
     word = re.sub(r"\W+", "_", text)
-    return (
-        word if len(word) <= LONGEST_WORD else f"{word[:LONGEST_WORD]}_{hashlib.sha256(text.encode()).hexdigest()[:6]}"
-    )
+    if len(word) <= LONGEST_WORD:
+        return word
+    return f"{word[:LONGEST_WORD]}_{hashlib.sha256(text.encode()).hexdigest()[:6]}"

@@ -109,16 +109,18 @@ def over_folds(tables: Iterable[Table]) -> list[Table]:
 
     There is one table for every data set with several test splits that have no group in common.
     """
-    folds: dict[str, list[EvaluatedRun]] = {}
-    for table in (table for table in tables if table.main and table.split == "test"):
-        for run in (run for row in table.rows for run in row.runs if whole_data(run)):
-            folds.setdefault(whole_data(run), []).append(run)
-    tables_of_folds = []
-    for data, runs in folds.items():
+    members: dict[str, list[EvaluatedRun]] = {}
+    for table in tables:
+        if table.main and table.split == "test":
+            for run in (run for row in table.rows for run in row.runs):
+                members.setdefault(whole_data(run), []).append(run)
+    members.pop("", None)  # the runs that are no folds
+    found = []
+    for data, runs in members.items():
         if units := joined(runs):
             number = len({run.seed for run in units})
-            tables_of_folds.append(Table(f"{data}, {number} test splits", MAIN, tuple(plain_rows(units))))
-    return tables_of_folds
+            found.append(Table(f"{data}, {number} test splits", MAIN, tuple(plain_rows(units))))
+    return found
 
 
 def subset_columns(rows: Iterable[Row], columns: Sequence[Column]) -> tuple[Column, ...]:

@@ -140,7 +140,7 @@ def test_in_a_cross_validation_the_test_split_is_the_unit(tmp_path: Path) -> Non
     )
 
 
-def test_folds_are_those_of_one_data_set(tmp_path: Path) -> None:
+def test_a_results_file_without_a_cross_validation_has_no_folds() -> None:
     with pytest.raises(ConfigError, match="has no cross-validation: runs on one data set with different groups"):
         Results(RESULTS).folds("rpi_hard_settled")
 

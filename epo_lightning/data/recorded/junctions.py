@@ -106,7 +106,7 @@ def ways(
 
 
 def _begins_behind(lane: int, beside: int, lanes: LaneGraph) -> bool:
-    """Whether a lane begins so far behind the lane beside it that a way over the beginnings of both would lead back."""
+    """Whether a lane begins more than ``BEHIND`` behind the lane beside it: a way from there onto it would lead back."""
     start = lanes.centre[beside][0]
     ahead = (lanes.centre[lane][0] - start) @ direction(lanes.centre[beside], at_end=False)
     return bool(ahead < -BEHIND)

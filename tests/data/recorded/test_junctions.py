@@ -65,7 +65,7 @@ def test_all_successors_within_reach_are_followed(seed, begin, far):
 
 
 def ahead_of(lanes: LaneGraph, one: int, other: int) -> float:
-    """How far one straight lane begins ahead of another one."""
+    """Distance [m] by which one straight lane begins ahead of another one."""
     way = lanes.centre[other][1] - lanes.centre[other][0]
     return float((lanes.centre[one][0] - lanes.centre[other][0]) @ way / np.linalg.norm(way))
 
@@ -245,7 +245,7 @@ def test_no_line_leads_back_to_the_beginning_of_a_long_lane_that_joins():
     )
     route = lines_of(lanes, 8, (5.0, 0.0), 0.0, 10.0)
     steps = np.diff(route.references[0, : route.count[0]], axis=1)
-    assert (steps[..., 1] > -0.1).all(), "south"
+    assert (steps[..., 1] > -0.1).all(), "no line goes south"
 
 
 WINDOWS = WindowConfig(lane_change=False, lines=9, lanes=None)
