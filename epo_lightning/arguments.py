@@ -36,9 +36,10 @@ Options
 """
 
 SWEEP_USAGE = """\
-epo sweep <name> [key=value ...]         train and score all runs of a sweep that are not finished yet
-epo sweep status [<name or label>]       show the state of its runs
-epo sweep                                list the sweeps
+epo sweep <name> [key=value ...]             train and score all runs of a sweep that are not finished yet
+epo sweep generate <name> [key=value ...]    make the data sets of its runs that do not exist yet
+epo sweep status [<name or label>]           show the state of its runs
+epo sweep                                    list the sweeps
 
   choices=<file>      train experiments with the settings that a search has chosen (choices.yaml of its report)
   --stop-on-failure   start no more runs after one has failed

@@ -290,30 +290,31 @@ def _one_after_the_other(arguments: Arguments) -> None:
 
 
 def _sweep(arguments: Arguments) -> None:
-    """Run, show or list sweeps, as ``SWEEP_USAGE`` describes."""
+    """Run, prepare, show or list sweeps, as ``SWEEP_USAGE`` describes."""
     from textwrap import fill
 
     from epo_lightning.experiment.sweeps import sweeping
 
     words = list(arguments.overrides)
-    looking = words[:1] == ["status"]
-    words = words[1:] if looking else words
+    action = words.pop(0) if words[:1] in (["status"], ["generate"]) else "run"
     name = words.pop(0) if words and "=" not in words[0] else None
-    if looking:
+    if action == "status":
         sweeping.show(name, words)
         return
     known = sweeping.known(arguments.extra)
     if name is None:
-        if words:
-            raise ConfigError(
-                f"the sweep's name is missing: `epo sweep <name> {' '.join(words)}`; known: {', '.join(known)}"
-            )
+        if words or action == "generate":
+            command = " ".join(["epo sweep", *([action] if action == "generate" else []), "<name>", *words])
+            raise ConfigError(f"the sweep's name is missing: `{command}`; known: {', '.join(known)}")
         width = max(map(len, known)) + 2
         for option, says in known.items():
             print(fill(says, 120, initial_indent=f"  {option:<{width}}", subsequent_indent=" " * (width + 2)))
         return
     if name not in known:
         raise ConfigError(f"unknown sweep {name!r}: {nearest(name, known)}")
+    if action == "generate":
+        sweeping.generate(name, words, arguments.extra)
+        return
     if not sweeping.run(name, words, arguments.extra, job_of_sweep, arguments.stop_on_failure):
         raise SystemExit(1)
 

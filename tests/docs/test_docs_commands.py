@@ -59,14 +59,15 @@ def composes(words: list[str]) -> None:
         verb = "train"
         overrides = [word for word in overrides if word not in ("check", "train")]
     if verb == "sweep":
-        if overrides[:1] == ["status"]:
+        if overrides[:1] in (["status"], ["generate"]):
             overrides = overrides[1:]
         if not overrides:
             return
         name, *overrides = overrides
         name = name.partition("-")[0]
         assert name in sweeping.known(arguments.extra), name
-        verb, overrides = "train", [f"sweeps={name}", *(w for w in overrides if not w.startswith(sweeping.CHOICES))]
+        kept = [word for word in overrides if not word.startswith((sweeping.CHOICES, "workers="))]
+        verb, overrides = "train", sweeping.words_of(name, kept, arguments.extra)
         arguments.multirun = True
     if verb == "report" and overrides and "=" not in overrides[0]:
         assert overrides.pop(0) in sweeping.known(arguments.extra)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from experiment import pedestrians
 from experiment.conftest import Epo
 
@@ -39,3 +41,35 @@ def test_each_data_set_of_several_is_made_by_the_jobs_of_a_launcher(epo: Epo, tm
     words = ("data=ucy", f"data.folder={folder}", "data.val_share=0.3", "data.test=[square0],[square1]")
     assert epo("generate", "-m", *words, "hydra/launcher=local", "jobs=2", "progress=false") == 0
     assert len([*(tmp_path / "cache").glob("ucy-*/manifest.json")]) == 2
+
+
+FOLDS = """\
+# @package _global_
+hydra:
+  sweeper:
+    params:
+      experiment: ucy/const_vel
+      data: ucy
+      data.test: "[square0],[square2,square3]"
+      seed: 0,1
+"""
+
+
+def test_a_sweep_makes_its_data_sets(
+    epo: Epo, refused: Callable[..., str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for place in range(4):
+        folder = pedestrians.square(tmp_path / "data", f"square{place}", seed=place)
+    (tmp_path / "conf" / "sweeps").mkdir(parents=True)
+    (tmp_path / "conf" / "sweeps" / "folds.yaml").write_text(FOLDS)
+    conf = f"--config-dir={tmp_path / 'conf'}"
+    words = ("folds", f"data.folder={folder}", "data.val_share=0.3", *SMALL)
+    said = refused(conf, "sweep", *words)
+    assert "`epo sweep generate folds data.folder=" in said, (
+        "data.folder is a setting of the data that the file chooses"
+    )
+    assert epo(conf, "sweep", "generate", *words, "workers=1") == 0
+    assert "data set 2 of 2" in capsys.readouterr().out, "once for all seeds"
+    assert len([*(tmp_path / "cache").glob("ucy-*/manifest.json")]) == 2
+    assert epo(conf, "sweep", *words) == 0
+    assert "4 runs: 4 done" in capsys.readouterr().out

@@ -219,6 +219,23 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
         return [[str(text) for text in job] for batch in batches for job in batch]
 
 
+def fixed_choices(name: str, sweep: str, extra: Sequence[str] = ()) -> dict[str, str]:
+    """The groups of which the file of a sweep chooses one option for all runs, and these options.
+
+    Args:
+        name: configuration of which the sweep has runs.
+        sweep: name of the file in ``sweeps/``.
+        extra: folders that are searched for configurations first.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    with hydra(extra) as instance:
+        params = _composed(instance, name, [f"sweeps={sweep}"], multirun=True).hydra.sweeper.get("params") or {}
+        words = [f"{group}={option}" for group, option in params.items() if options_of(instance, str(group))]
+        parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(words)
+        return {choice.key_or_group: str(choice.value()) for choice in parsed if not choice.is_sweep_override()}
+
+
 def trials(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> int | None:
     """Number of runs that a searching sweeper makes (``n_trials``); None for sweepers without that setting."""
     with hydra(extra) as instance:

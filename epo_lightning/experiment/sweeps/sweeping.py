@@ -10,10 +10,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from epo_lightning.data.cache import CacheError
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config import compose
-from epo_lightning.experiment.config.settings import Settings, TrainerSettings
+from epo_lightning.experiment.config.settings import GenerateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
 from epo_lightning.experiment.sweeps.watch import news, status, summary
 from epo_lightning.masking import mask
@@ -58,12 +59,16 @@ def run(
     sweep = Sweep.of(name, overrides, runs)
     files = [word for word in overrides if word.startswith(CHOICES)]
     choices = read_choices(files[0].removeprefix(CHOICES)) if files else None
-    words = [f"sweeps={name}", *(word for word in overrides if word not in files)]
+    words = words_of(name, [word for word in overrides if word not in files], extra)
     # Absolute, because a worker on another machine may start in any folder.
     places = {"sweep": sweep.folder, "runs": sweep.root, "hydra.sweep.dir": sweep.folder}
     words += [f"{key}={value_text(str(place))}" for key, place in places.items()] + ["existing=continue"]
     words += ["hydra/hydra_logging=none"]  # the printed news replace Hydra's own log
-    jobs = _listed(sweep, words, extra, choices)
+    try:
+        jobs = _listed(sweep, words, extra, choices)
+    except CacheError as error:
+        command = shlex.join(mask(["epo", "sweep", "generate", name, *overrides]))
+        raise ConfigError(f"{error}; or make all data sets of the sweep with `{command}`") from error
     with sweep.lock():
         states = [sweep.state(job) for job in jobs]
         sweep.begin(
@@ -89,6 +94,47 @@ def run(
     if done:
         print(f"next: epo report {sweep.label}" + (f" {word('runs', runs)}" if runs != "runs" else ""))
     return done
+
+
+def generate(name: str, overrides: Sequence[str], extra: Sequence[str]) -> None:
+    """Make the data sets of a sweep's runs, one after the other; those that exist are kept.
+
+    Args:
+        name: name of the file in ``sweeps/``.
+        overrides: overrides of the sweep, and ``workers=<number of processes>``.
+        extra: folders that are searched for configurations first.
+
+    Raises:
+        ConfigError: a mistake in the configuration of any run, or recordings that are missing or cannot be read.
+    """
+    own = [word for word in overrides if word.startswith("workers=")]
+    settings = read(GenerateSettings, compose.compose("generate", own, extra))
+    others = [word for word in overrides if word not in own and not word.startswith(CHOICES)]
+    listed = compose.jobs("train", words_of(name, others, extra), extra)
+    if not listed:
+        raise ConfigError(f"{name} chooses its runs while it searches: make its data by `epo generate data=<name>`")
+    configs = [compose.compose("train", job, extra)["data"] for job in listed]
+    sections = list({json.dumps(section, sort_keys=True): section for section in configs}.values())
+    for number, section in enumerate(sections, 1):
+        data = assembly.build_data(section)
+        print(f"data set {number} of {len(sections)}", flush=True)
+        folder = data.generate(workers=settings.workers, progress=settings.progress)
+        print(f"data in {folder}, digest {data.digest}", flush=True)
+    print(f"next: {shlex.join(['epo', 'sweep', name, *(word for word in overrides if word not in own)])}")
+
+
+def words_of(name: str, overrides: Sequence[str], extra: Sequence[str]) -> list[str]:
+    """The overrides of a sweep, with the options that its file chooses for all runs.
+
+    These choices decide which further settings exist: without ``data=us101``, for example, there is no ``data.folder``.
+    """
+    given = {word.partition("=")[0] for word in overrides}
+    fixed = compose.fixed_choices("train", name, extra)
+    return [
+        f"sweeps={name}",
+        *(f"{group}={option}" for group, option in fixed.items() if group not in given),
+        *overrides,
+    ]
 
 
 def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: Choices | None = None) -> list[Job]:

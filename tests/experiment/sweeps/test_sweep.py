@@ -251,6 +251,8 @@ def test_invalid_sweeps_are_refused(refused: Callable[..., str]) -> None:
     assert "set it by +data.games_share=<value>" in refused("sweep", "rpi_main", "data.games_share=0.1")
     assert "none has" in refused("sweep", "status", "rpi_main")
     assert "run_dir" in refused("sweep", "rpi_main", "run_dir=x")
+    assert "epo sweep generate <name>" in refused("sweep", "generate")
+    assert "while it searches" in refused("sweep", "generate", "rpi_search")
     assert "epo generate" in refused("sweep", "rpi_main", "data.root=nowhere"), "said once, before any run begins"
     assert "belongs to epo sweep" in refused("train", "--stop-on-failure")
 

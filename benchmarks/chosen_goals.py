@@ -1,0 +1,129 @@
+"""Quality of the goals that trained +EPO rows choose, and scores of their games without goals and with the true ones.
+
+    python -m benchmarks.chosen_goals runs/us101/v_lstm_epo/short-s0
+
+Forecasts of the same inferred games are scored with the chosen goals, with goal weights of zero, and with each agent's true
+end as its goal, which no forecaster can know. All scores are means over the scenes of the test split, or of the validation
+split (``--split val``). Nothing is written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import statistics
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from epo_lightning import losses
+from epo_lightning.decoders.goals import goal_candidates
+from epo_lightning.experiment import assembly
+from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
+from epo_lightning.forecasters.epo import EPO
+from epo_lightning.metrics import ForecastMetrics
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
+from epo_lightning.scene import JointForecast, Scene
+
+COLUMNS = ("SADE", "initial", "no goals", "true goals", "goal [m]", "entropy", "uniform")
+"""Scores: SADE [m] with the chosen goals, of the initial strategies, without goals, and with the true ends as goals; the mean
+distance [m] of the chosen goals of all modes from the true ends; the cross entropy of the goal decoder, and that of equal
+probabilities for all candidates."""
+
+
+def ends(scene: Scene) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"]]:
+    """Final positions of all agents [m], and whether they are known.
+
+    Raises:
+        ConfigError: the scenes have no futures.
+    """
+    if scene.future is None or scene.future_mask is None:
+        raise ConfigError("goals are compared with agents' ends, and these scenes have no futures")
+    return scene.future[..., -1, :2], scene.agent_mask & scene.future_mask[..., -1]
+
+
+def with_goals(forecaster: EPO, scene: Scene, forecast: JointForecast, weight: float) -> JointForecast:
+    """The forecast of the same games with other goals: without any (weight 0), or with the known true ends (weight 1)."""
+    assert forecast.parameters is not None
+    assert forecast.parameters.goals is not None
+    known = forecast.parameters.goals
+    end, observed = ends(scene)
+    own = dict(forecast.parameters.own_weights)
+    own["goal"] = own["goal"] * weight
+    goals = torch.where(observed[:, None, :, None], end[:, None], known)
+    changed = dataclasses.replace(forecast.parameters, own_weights=own, goals=goals)
+    states = forecaster.solve(scene, changed).states[..., : forecast.states.shape[-2], :]
+    return dataclasses.replace(forecast, states=states)
+
+
+@torch.no_grad()
+def scores(folder: str, split: str) -> tuple[str, int, list[float]]:
+    """Title of a run, its number of scenes, and the values of :data:`COLUMNS`.
+
+    Raises:
+        ConfigError: no finished run, a row that chooses no goals, or data that is missing or has changed.
+    """
+    run = RunFolder.open(folder)
+    settings = settings_of(run)
+    forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings, 256)
+    if not isinstance(forecaster, EPO) or "goal" not in forecaster.energy.own or data.task.candidates < 2:
+        raise ConfigError(
+            f"{folder}: {settings.title} does not choose goals: name runs of +EPO rows with a goal feature"
+        )
+    measures = [ForecastMetrics(shape=data.task.shape) for _ in range(3)]
+    distances, entropies, uniform = [], [], []
+    count = 0
+    for scene in split_of(data, split):
+        forecast = forecaster.predict(scene)
+        assert forecast.parameters is not None
+        assert forecast.parameters.goals is not None
+        assert forecast.goal_log_probabilities is not None
+        forecasts = (forecast, *(with_goals(forecaster, scene, forecast, weight) for weight in (0.0, 1.0)))
+        for measure, changed in zip(measures, forecasts, strict=True):
+            measure.update(changed, scene)
+        end, observed = ends(scene)
+        candidates, exists = goal_candidates(scene)
+        way = (forecast.parameters.goals - end[:, None]).norm(dim=-1)
+        distances.append(way.transpose(1, 2)[observed & exists.any(-1)].flatten())
+        equal = -exists.sum(-1, keepdim=True).clamp_min(1).log().expand(exists.shape)
+        for values, log_probabilities in ((entropies, forecast.goal_log_probabilities), (uniform, equal)):
+            values.append(len(scene.history) * float(losses.goal(log_probabilities, candidates, exists, end, observed)))
+        count += len(scene.history)
+    chosen, without, true = ({key: float(value) for key, value in each.compute().items()} for each in measures)
+    found = [chosen["minSADE"], chosen["initial/minSADE"], without["minSADE"], true["minSADE"]]
+    found += [float(torch.cat(distances).mean()), *(sum(values) / count for values in (entropies, uniform))]
+    tested = ", ".join(map(str, settings.data.get("test") or ())) or settings.data["name"]
+    return f"{settings.title}, seed {settings.seed}, {split} of {tested}", count, found
+
+
+def main(given: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.chosen_goals",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("runs", nargs="+", help="folders of finished runs of +EPO rows that choose goals")
+    parser.add_argument("--split", choices=("test", "val"), default="test", help="split of the run's data (test)")
+    arguments = parser.parse_args(given)
+    torch.set_num_threads(1)
+    assembly.quiet()
+    print(f"{'scenes':>7}" + "".join(f"{name:>12}" for name in COLUMNS) + "  run")
+    try:
+        rows = []
+        for folder in arguments.runs:
+            title, count, found = scores(folder, arguments.split)
+            rows.append(found)
+            print(f"{count:>7}" + "".join(f"{value:>12.3f}" for value in found) + f"  {title}")
+        if len(rows) > 1:
+            means = [statistics.fmean(column) for column in zip(*rows, strict=True)]
+            print(f"{'':>7}" + "".join(f"{value:>12.3f}" for value in means) + "  mean of the runs")
+    except ConfigError as error:
+        raise SystemExit(f"benchmarks.chosen_goals: {error}") from None
+
+
+if __name__ == "__main__":
+    main()
