@@ -29,7 +29,7 @@ from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import JointForecast, Scene
 
 COLUMNS = ("SADE", "initial", "no goals", "true goals", "goal [m]", "entropy", "uniform")
-"""Scores: SADE [m] with the chosen goals, of the initial strategies, without goals, and with the true ends as goals; the mean
+"""Scores: SADE [m] with the chosen goals, of the initial strategies, without goals, with the true ends as goals; the mean
 distance [m] of the chosen goals of all modes from the true ends; the cross entropy of the goal decoder, and that of equal
 probabilities for all candidates."""
 
