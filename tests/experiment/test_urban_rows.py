@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ from data.recorded.crossings import turning_traffic
 from omegaconf import OmegaConf
 
 import epo_lightning
+from benchmarks.along_across import main as along_and_across
+from benchmarks.chosen_goals import COLUMNS as GOAL_COLUMNS
+from benchmarks.chosen_goals import main as goal_scores
 from benchmarks.goals import main as goals
 from benchmarks.turning import main as turning_scores
 from epo_lightning.data.recorded.tracks import RecordingSource
@@ -159,3 +163,76 @@ def test_goals_of_turning_agents_are_measured_by_a_command(data: list[str], caps
     assert shares["8"][1] < 1.5
     assert shares["8"][2] < 3.0
     assert shares["null"][2] > shares["8"][2] + 1.0, "three lines follow the straightest successor"
+
+
+def test_errors_along_and_across_are_those_of_a_loop(
+    data: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["experiment=urban/v_lstm_sc", "budget=untrained", "callbacks.progress=none", f"runs={tmp_path}", *data]
+    run = train.train(compose("train", words))
+    along_and_across([str(run.path)])
+    shown = capsys.readouterr().out.splitlines()[1].split()[-4:]
+    scenes = build_data(compose("train", words)["data"]).open("test")
+    scene = scenes[torch.arange(len(scenes))]
+    states = epo_lightning.load(run.checkpoint("best")).predict(scene).states
+    found = []
+    for b in range(len(scenes)):
+        agents = [i for i in range(scene.agent_mask.shape[1]) if scene.agent_mask[b, i]]
+        distance = (states[b, ..., :2] - scene.future[b, None, ..., :2]).norm(dim=-1)  # [M, N, K]
+        mode = int(distance[:, agents].mean((1, 2)).argmin())
+        of_agents = []
+        for i in agents:
+            x, y = (states[b, mode, i, -1, :2] - scene.future[b, i, -1, :2]).tolist()
+            angle = math.atan2(y, x) - float(scene.future[b, i, -1, 2])
+            ahead, aside = math.hypot(x, y) * math.cos(angle), math.hypot(x, y) * math.sin(angle)
+            of_agents.append((abs(ahead), abs(aside), ahead))
+        found.append(np.mean(of_agents, axis=0))
+    assert int(shown[0]) == len(scenes)
+    assert [float(value) for value in shown[1:]] == pytest.approx(list(np.mean(found, axis=0)), abs=2e-3)
+
+
+def test_scores_of_chosen_goals_are_those_of_a_loop(
+    data: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["experiment=urban/v_lstm_epo", "budget=untrained", "callbacks.progress=none", f"runs={tmp_path}", *data]
+    run = train.train(compose("train", words))
+    goal_scores([str(run.path)])
+    printed = capsys.readouterr().out.splitlines()[1].split()[1 : 1 + len(GOAL_COLUMNS)]
+    shown = dict(zip(GOAL_COLUMNS, map(float, printed), strict=True))
+    scenes = build_data(compose("train", words)["data"]).open("test")
+    scene = scenes[torch.arange(len(scenes))]
+    forecaster = epo_lightning.load(run.checkpoint("best"))
+    forecast = forecaster.predict(scene)
+    end = scene.future[..., -1, :2]
+
+    def closest(states: torch.Tensor) -> float:
+        agents = scene.agent_mask
+        distance = (states[..., :2] - scene.future[:, None, ..., :2]).norm(dim=-1).mean(-1)  # [B, M, N]
+        return float(np.mean([float(distance[b][:, agents[b]].mean(1).min()) for b in range(len(scenes))]))
+
+    def solved(weight: float, goals: torch.Tensor) -> float:
+        own = {**forecast.parameters.own_weights, "goal": weight * forecast.parameters.own_weights["goal"]}
+        changed = dataclasses.replace(forecast.parameters, own_weights=own, goals=goals)
+        return closest(forecaster.solve(scene, changed).states)
+
+    true = end[:, None].expand(forecast.parameters.goals.shape).contiguous()
+    assert shown["SADE"] == pytest.approx(closest(forecast.states), abs=2e-3)
+    assert shown["initial"] == pytest.approx(closest(forecast.initial_states), abs=2e-3)
+    assert shown["no goals"] == pytest.approx(solved(0.0, true + 40.0), abs=2e-3), "goals without a weight mean nothing"
+    assert shown["true goals"] == pytest.approx(solved(1.0, true), abs=2e-3)
+    assert len({round(shown[name], 2) for name in ("SADE", "initial", "no goals", "true goals")}) > 2
+    losses, counts, ways = [], [], []
+    for b in range(len(scenes)):
+        for i in scene.agent_mask[b].nonzero()[:, 0].tolist():
+            exist = scene.goal_mask[b, i].nonzero()[:, 0]
+            logits = forecast.goal_logits[b, i, exist].double()
+            nearest = int((scene.goal_candidates[b, i, exist] - end[b, i]).norm(dim=-1).argmin())
+            losses.append((b, float(logits.logsumexp(0) - logits[nearest])))
+            counts.append((b, math.log(len(exist))))
+            ways += (forecast.parameters.goals[b, :, i] - end[b, i]).norm(dim=-1).tolist()
+    for name, values in (("entropy", losses), ("uniform", counts)):
+        of_scenes = [np.mean([value for at, value in values if at == b]) for b in range(len(scenes))]
+        assert shown[name] == pytest.approx(np.mean(of_scenes), abs=2e-3)
+    assert shown["goal [m]"] == pytest.approx(np.mean(ways), abs=2e-3)
+    with pytest.raises(SystemExit, match="does not choose goals"):
+        goal_scores([str(train.train(compose("train", [words[0].replace("_epo", "_sc"), *words[1:]])).path)])
