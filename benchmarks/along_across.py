@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
 from epo_lightning.metrics.functional.displacement import closest_mode
 from epo_lightning.registry import ConfigError
@@ -47,9 +48,15 @@ def errors(scene: Scene, forecast: JointForecast) -> Float[Tensor, "B 3"]:
     return values[known].sum(1) / counted[known].sum(1, keepdim=True)
 
 
+def name_of(settings: Settings, split: str) -> str:
+    """Title and seed of a run, and the groups of its test split, or its kind of data if they were drawn."""
+    groups = ", ".join(map(str, settings.data.get("test") or ()))
+    return f"{settings.title}, seed {settings.seed}, {split} of {groups or settings.data['name']}"
+
+
 @torch.no_grad()
 def scores(folder: str) -> tuple[str, int, list[float]]:
-    """Title of a run, its number of scenes, and the values of :data:`COLUMNS`.
+    """Name of a run, its number of scenes, and the values of :data:`COLUMNS`.
 
     Raises:
         ConfigError: no finished run, or its data is missing or has changed.
@@ -58,7 +65,7 @@ def scores(folder: str) -> tuple[str, int, list[float]]:
     settings = settings_of(run)
     forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings, 256)
     found = torch.cat([errors(scene, forecaster.predict(scene)) for scene in split_of(data, "test")])
-    return f"{settings.title}, seed {settings.seed}", len(found), found.mean(0).tolist()
+    return name_of(settings, "test"), len(found), found.mean(0).tolist()
 
 
 def main(given: Sequence[str] | None = None) -> None:
@@ -72,11 +79,11 @@ def main(given: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(given)
     torch.set_num_threads(1)
     assembly.quiet()
-    print(f"{'run':<36}{'scenes':>8}" + "".join(f"{name:>8}" for name in COLUMNS))
+    print(f"{'scenes':>7}" + "".join(f"{name:>8}" for name in COLUMNS) + "  run")
     try:
         for folder in arguments.runs:
-            title, count, found = scores(folder)
-            print(f"{title:<36}{count:>8}" + "".join(f"{value:>8.3f}" for value in found))
+            name, count, found = scores(folder)
+            print(f"{count:>7}" + "".join(f"{value:>8.3f}" for value in found) + f"  {name}")
     except ConfigError as error:
         raise SystemExit(f"benchmarks.along_across: {error}") from None
 

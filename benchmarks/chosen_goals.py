@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.along_across import name_of
 from epo_lightning import losses
 from epo_lightning.decoders.goals import goal_candidates
 from epo_lightning.experiment import assembly
@@ -61,7 +62,7 @@ def with_goals(forecaster: EPO, scene: Scene, forecast: JointForecast, weight: f
 
 @torch.no_grad()
 def scores(folder: str, split: str) -> tuple[str, int, list[float]]:
-    """Title of a run, its number of scenes, and the values of :data:`COLUMNS`.
+    """Name of a run, its number of scenes, and the values of :data:`COLUMNS`.
 
     Raises:
         ConfigError: no finished run, a row that chooses no goals, or data that is missing or has changed.
@@ -95,8 +96,7 @@ def scores(folder: str, split: str) -> tuple[str, int, list[float]]:
     chosen, without, true = ({key: float(value) for key, value in each.compute().items()} for each in measures)
     found = [chosen["minSADE"], chosen["initial/minSADE"], without["minSADE"], true["minSADE"]]
     found += [float(torch.cat(distances).mean()), *(sum(values) / count for values in (entropies, uniform))]
-    tested = ", ".join(map(str, settings.data.get("test") or ())) or settings.data["name"]
-    return f"{settings.title}, seed {settings.seed}, {split} of {tested}", count, found
+    return name_of(settings, split), count, found
 
 
 def main(given: Sequence[str] | None = None) -> None:
@@ -115,9 +115,9 @@ def main(given: Sequence[str] | None = None) -> None:
     try:
         rows = []
         for folder in arguments.runs:
-            title, count, found = scores(folder, arguments.split)
+            name, count, found = scores(folder, arguments.split)
             rows.append(found)
-            print(f"{count:>7}" + "".join(f"{value:>12.3f}" for value in found) + f"  {title}")
+            print(f"{count:>7}" + "".join(f"{value:>12.3f}" for value in found) + f"  {name}")
         if len(rows) > 1:
             means = [statistics.fmean(column) for column in zip(*rows, strict=True)]
             print(f"{'':>7}" + "".join(f"{value:>12.3f}" for value in means) + "  mean of the runs")

@@ -171,7 +171,7 @@ def test_errors_along_and_across_are_those_of_a_loop(
     words = ["experiment=urban/v_lstm_sc", "budget=untrained", "callbacks.progress=none", f"runs={tmp_path}", *data]
     run = train.train(compose("train", words))
     along_and_across([str(run.path)])
-    shown = capsys.readouterr().out.splitlines()[1].split()[-4:]
+    shown = capsys.readouterr().out.splitlines()[1].split()[:4]
     scenes = build_data(compose("train", words)["data"]).open("test")
     scene = scenes[torch.arange(len(scenes))]
     states = epo_lightning.load(run.checkpoint("best")).predict(scene).states
