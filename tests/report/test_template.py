@@ -15,7 +15,8 @@ from epo_lightning.experiment.report import report_page
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report
 from epo_lightning.report.results import read_results, save_results
-from epo_lightning.report.template import Differences, Results, Scores, average, below, table, write_page
+from epo_lightning.report.scores import Differences, Scores, average, below, table
+from epo_lightning.report.template import Results, write_page
 
 from .run_folders import make_run
 from .run_folders import scores as make_scores
