@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from epo_lightning.decoders.mlp import MLP
 from epo_lightning.host import readable
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.scene import Scene
 
 NO_CANDIDATE = -1e9
 """Logit of absent candidates, whose probability is exactly zero. (-inf would give NaN for agents without candidates.)"""
@@ -112,13 +112,11 @@ class GoalDecoder(nn.Module):
         width: size of the agent features.
         scale: unit [m] of positions at the network's inputs.
         games: number M of games, one for each mode or a single one for all modes.
-        ahead: positions are relative to where the agent is after this time [s] if it keeps its velocity; 0, as in the paper,
-            for its present position. Candidates of fast and of slow agents look alike if it is the time of the goals.
     """
 
-    def __init__(self, width: int, scale: float = 1.0, games: int = 1, ahead: float = 0.0) -> None:
+    def __init__(self, width: int, scale: float = 1.0, games: int = 1) -> None:
         super().__init__()
-        self.width, self.scale, self.games, self.ahead = width, scale, games, ahead
+        self.width, self.scale, self.games = width, scale, games
         self.mlp = MLP(width + 2, 64, 1, norm="batch", bias=False)
 
     def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Goals:
@@ -138,7 +136,7 @@ class GoalDecoder(nn.Module):
             ValueError: the scene has no candidates.
         """
         candidates, exists = goal_candidates(scene)
-        way = (candidates - self._origin(scene)[:, :, None]) / self.scale
+        way = (candidates - scene.current[:, :, None, :2]) / self.scale
         # The first layer of the concatenation, without a copy of the agent's feature for every candidate.
         first = self.mlp.hidden[0]
         assert isinstance(first, nn.Linear)
@@ -151,14 +149,6 @@ class GoalDecoder(nn.Module):
         way = torch.where(exists[..., None], way, 0.0)
         logits = self.mlp.after_first(agent[:, :, None] + F.linear(way, of_way))[..., 0]
         return torch.where(exists, logits, NO_CANDIDATE)
-
-    def _origin(self, scene: Scene) -> Float[Tensor, "B N 2"]:
-        """The position of every agent after ``ahead`` seconds at its present velocity."""
-        position, heading = scene.current[..., :2], scene.current[..., HEADING]
-        if not self.ahead:
-            return position
-        direction = torch.stack((heading.cos(), heading.sin()), -1)
-        return position + self.ahead * scene.current[..., SPEED, None] * direction
 
 
 def goal_candidates(scene: Scene) -> tuple[Float[Tensor, "B N G 2"], Bool[Tensor, "B N G"]]:

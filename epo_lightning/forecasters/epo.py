@@ -98,9 +98,6 @@ class EPO(Forecaster):
             (:mod:`~epo_lightning.decoders.probabilities`).
         margin: ``largest`` margin [m] of pair features with a decoded margin, and the margin before training, ``start``;
             2 m and 0.5 m by default. Margins that the energy fixes are not decoded.
-        goal_origin: what positions of goal candidates are relative to at the goal decoder's input: the agent's present
-            ``position``, as in the paper, or its position at the end of the forecast if it keeps its velocity
-            (``constant_velocity``), so that candidates of fast and of slow agents look alike.
         gate: name and settings of a :class:`~epo_lightning.decoders.gates.Gate`, which chooses the pairs of agents that
             interact; None for all pairs.
 
@@ -132,7 +129,6 @@ class EPO(Forecaster):
         probabilities: str = "linear",
         margin: Mapping[str, float] | None = None,
         gate: Mapping[str, Any] | None = None,
-        goal_origin: str = "position",
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         check_needs(energy, task)
@@ -144,7 +140,6 @@ class EPO(Forecaster):
         check_initial(initial, modes, one_game, energy, solver)
         check_choice("own_weights", own_weights, WEIGHTS)
         check_choice("pair_weights", pair_weights, WEIGHTS)
-        check_choice("goal_origin", goal_origin, ("position", "constant_velocity"))
         check_calibration(calibration, energy, solver)
         check_gate(gate, energy)
         # The network decodes probabilities, except where they follow from energies of candidates (TABLES) or from orders.
@@ -164,7 +159,6 @@ class EPO(Forecaster):
         # M initial strategies, one per mode; for solvers that choose, C candidates.
         strategies = solver.strategies(modes)
         width, scale, horizon = backbone.width, task.scale, self.game_horizon
-        ahead = task.horizon * task.dt
         own_names, pair_names = energy.weighted
         start = check_start(own_start, own_names, energy.own)
         ranges = {} if motions is None and initial != "motions" else check_motions(motions)
@@ -191,7 +185,7 @@ class EPO(Forecaster):
         variants = games if order is None or TABLES in solver.provides else modes
         self.goals: GoalDecoder | GivenGoals | NoGoals
         if task.candidates > 1 and energy.needs & {"goals", "goal_headings", "reference"}:
-            self.goals = GoalDecoder(width, scale, variants, ahead if goal_origin == "constant_velocity" else 0.0)
+            self.goals = GoalDecoder(width, scale, variants)
         elif energy.needs & {"goals", "goal_headings"}:
             self.goals = GivenGoals(variants)
         else:
@@ -202,6 +196,7 @@ class EPO(Forecaster):
         limits = check_margin(margin)
         names = energy.decoded_margins
         self.margins = Margins(width, games, names, **limits, symmetric=symmetric_pairs) if names else None
+        ahead = task.horizon * task.dt
         self.gate = None if gate is None else build("gate", gate, ahead=ahead, width=width, scale=scale)
 
     def forward(self, scene: Scene) -> JointForecast:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from epo_lightning.decoders.goals import NO_CANDIDATE, GivenGoals, GoalDecoder, choose, most_likely
 from epo_lightning.decoders.mlp import MLP
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.scene import Scene
 
 
 def concatenated(mlp: MLP, z: torch.Tensor, scene: Scene, scale: float) -> torch.Tensor:
@@ -43,20 +43,6 @@ def test_logits_are_those_of_the_concatenation(training):
     logits = decoder.logits(z, scene)
     torch.testing.assert_close(logits[exists], concatenated(decoder.mlp, z, scene, 50.0), rtol=1e-4, atol=1e-4)
     assert (logits[~exists] == NO_CANDIDATE).all()
-
-
-def test_candidates_of_fast_and_of_slow_agents_look_alike_from_where_they_get():
-    decoder, scene, z = GoalDecoder(8, scale=50.0, ahead=2.0).eval(), highway_scene(4, 3), torch.randn(4, 3, 8)
-    logits = decoder.logits(z, scene)
-    history, heading = scene.history.clone(), scene.current[..., HEADING]
-    history[:, :, -1, SPEED] += 3.0  # m/s, for two seconds
-    farther = scene.goal_candidates + 6.0 * torch.stack((heading.cos(), heading.sin()), -1)[:, :, None]
-    faster = dataclasses.replace(scene, history=history, goal_candidates=farther)
-    torch.testing.assert_close(decoder.logits(z, faster), logits, rtol=1e-4, atol=1e-4)
-    decoder.ahead = 0.0
-    plain = decoder.logits(z, scene)
-    assert not torch.allclose(plain, logits)
-    assert not torch.allclose(decoder.logits(z, faster), plain)
 
 
 @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
