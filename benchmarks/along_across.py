@@ -20,6 +20,7 @@ from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
 from epo_lightning.metrics.functional.displacement import closest_mode
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.runs import data_name
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import HEADING, JointForecast, Scene
 
@@ -49,9 +50,9 @@ def errors(scene: Scene, forecast: JointForecast) -> Float[Tensor, "B 3"]:
 
 
 def name_of(settings: Settings, split: str) -> str:
-    """Title and seed of a run, and the groups of its test split, or its kind of data if they were drawn."""
+    """Title and seed of a run, and the groups of its test split, or its data set if they were drawn."""
     groups = ", ".join(map(str, settings.data.get("test") or ()))
-    return f"{settings.title}, seed {settings.seed}, {split} of {groups or settings.data['name']}"
+    return f"{settings.title}, seed {settings.seed}, {split} of {groups or data_name(settings.data)}"
 
 
 @torch.no_grad()

@@ -2,9 +2,10 @@
 
     python -m benchmarks.chosen_goals runs/us101/v_lstm_epo/short-s0
 
-Forecasts of the same inferred games are scored with the chosen goals, with goal weights of zero, and with each agent's true
-end as its goal, which no forecaster can know. All scores are means over the scenes of the test split, or of the validation
-split (``--split val``). Nothing is written.
+Forecasts of the same inferred games are scored with the chosen goals; without the terms of goals and of the lanes on which
+they lie; and with each agent's true end as its goal, on the lane of the nearest candidate. No forecaster can know that end.
+Agents without candidates have no goal in any of these. Scores are means over the scenes of the test split, or of the
+validation split (``--split val``). Nothing is written.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import statistics
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from jaxtyping import Float
@@ -20,19 +21,19 @@ from torch import Tensor
 
 from benchmarks.along_across import name_of
 from epo_lightning import losses
-from epo_lightning.decoders.goals import goal_candidates
+from epo_lightning.decoders.goals import choose, goal_candidates
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import GameParameters, Scene
 
 COLUMNS = ("SADE", "initial", "no goals", "true goals", "goal [m]", "entropy", "uniform")
 """Scores: SADE [m] with the chosen goals, of the initial strategies, without goals, with the true ends as goals; the mean
-distance [m] of the chosen goals of all modes from the true ends; the cross entropy of the goal decoder, and that of equal
-probabilities for all candidates."""
+distance [m] of the chosen goals of all modes from the true ends, over agents; the cross entropy of the goal decoder, and
+that of equal probabilities for all candidates."""
 
 
 def ends(scene: Scene) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"]]:
@@ -46,18 +47,26 @@ def ends(scene: Scene) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"]]:
     return scene.future[..., -1, :2], scene.agent_mask & scene.future_mask[..., -1]
 
 
-def with_goals(forecaster: EPO, scene: Scene, forecast: JointForecast, weight: float) -> JointForecast:
-    """The forecast of the same games with other goals: without any (weight 0), or with the known true ends (weight 1)."""
-    assert forecast.parameters is not None
-    assert forecast.parameters.goals is not None
-    known = forecast.parameters.goals
+def without_goals(parameters: GameParameters, terms: Collection[str]) -> GameParameters:
+    """The same games without their terms of goals and lanes."""
+    own = parameters.own_weights
+    zero = {name: torch.zeros_like(own[name]) for name in terms if name in own}
+    return dataclasses.replace(parameters, own_weights={**own, **zero})
+
+
+def with_true_goals(parameters: GameParameters, scene: Scene) -> GameParameters:
+    """The same games with the known true ends as goals, on the lanes of the candidates that are nearest to them."""
+    assert parameters.goals is not None
     end, observed = ends(scene)
-    own = dict(forecast.parameters.own_weights)
-    own["goal"] = own["goal"] * weight
-    goals = torch.where(observed[:, None, :, None], end[:, None], known)
-    changed = dataclasses.replace(forecast.parameters, own_weights=own, goals=goals)
-    states = forecaster.solve(scene, changed).states[..., : forecast.states.shape[-2], :]
-    return dataclasses.replace(forecast, states=states)
+    goals = torch.where(observed[:, None, :, None], end[:, None], parameters.goals)
+    if parameters.reference is None:
+        return dataclasses.replace(parameters, goals=goals)
+    candidates, exists = goal_candidates(scene)
+    way = (candidates - end[:, :, None]).norm(dim=-1).where(exists, torch.inf)
+    _, nearest = choose(scene, way.argmin(-1)[:, None])
+    assert nearest is not None
+    reference = torch.where(observed[:, None], nearest, parameters.reference)
+    return dataclasses.replace(parameters, goals=goals, reference=reference)
 
 
 @torch.no_grad()
@@ -76,26 +85,34 @@ def scores(folder: str, split: str) -> tuple[str, int, list[float]]:
         )
     measures = [ForecastMetrics(shape=data.task.shape) for _ in range(3)]
     distances, entropies, uniform = [], [], []
-    count = 0
+    count = with_ends = 0
     for scene in split_of(data, split):
         forecast = forecaster.predict(scene)
         assert forecast.parameters is not None
         assert forecast.parameters.goals is not None
         assert forecast.goal_log_probabilities is not None
-        forecasts = (forecast, *(with_goals(forecaster, scene, forecast, weight) for weight in (0.0, 1.0)))
-        for measure, changed in zip(measures, forecasts, strict=True):
-            measure.update(changed, scene)
+        games = (
+            without_goals(forecast.parameters, forecaster.energy.goal_terms),
+            with_true_goals(forecast.parameters, scene),
+        )
+        horizon = forecast.states.shape[-2]
+        solved = (forecaster.solve(scene, game).states[..., :horizon, :] for game in games)
+        for measure, states in zip(measures, (forecast.states, *solved), strict=True):
+            measure.update(dataclasses.replace(forecast, states=states), scene)
         end, observed = ends(scene)
         candidates, exists = goal_candidates(scene)
+        counted = observed & exists.any(-1)
+        known = counted.any(1)
         way = (forecast.parameters.goals - end[:, None]).norm(dim=-1)
-        distances.append(way.transpose(1, 2)[observed & exists.any(-1)].flatten())
+        distances.append(way.transpose(1, 2)[counted].flatten())
         equal = -exists.sum(-1, keepdim=True).clamp_min(1).log().expand(exists.shape)
         for values, log_probabilities in ((entropies, forecast.goal_log_probabilities), (uniform, equal)):
-            values.append(len(scene.history) * float(losses.goal(log_probabilities, candidates, exists, end, observed)))
-        count += len(scene.history)
+            of_known = (tensor[known] for tensor in (log_probabilities, candidates, exists, end, observed))
+            values.append(int(known.sum()) * float(losses.goal(*of_known)))
+        count, with_ends = count + len(scene.history), with_ends + int(known.sum())
     chosen, without, true = ({key: float(value) for key, value in each.compute().items()} for each in measures)
     found = [chosen["minSADE"], chosen["initial/minSADE"], without["minSADE"], true["minSADE"]]
-    found += [float(torch.cat(distances).mean()), *(sum(values) / count for values in (entropies, uniform))]
+    found += [float(torch.cat(distances).mean()), *(sum(values) / max(with_ends, 1) for values in (entropies, uniform))]
     return name_of(settings, split), count, found
 
 

@@ -51,11 +51,33 @@ def check_settings(verb: str, config: dict[str, Any]) -> Any:
 
 
 def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
-    """Make the data set unless it exists, and print its report."""
+    """Make the data set unless it exists, and print its report and a command that trains on it."""
     settings = check_settings("generate", config)
-    from epo_lightning.experiment import assembly
     from epo_lightning.experiment.config.compose import tree
     from epo_lightning.experiment.config.sources import HIGHWAYS
+
+    data = make_data(settings, overrides)
+    dataset = settings.data.get("dataset", "rpi")
+    row = f"{dataset}/v_lstm_epo"
+    kept = [word for word in overrides if word.startswith(("data=", "data.", "--config-dir="))]
+    if dataset in HIGHWAYS or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
+        words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]
+    else:
+        rows = "ucy" if not data.task.map else "urban" if settings.data.get("windows", {}).get("lines") else "exid"
+        words = [f"experiment={rows}/v_lstm_epo", *kept]
+    print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
+
+
+def make_data(settings: GenerateSettings, overrides: Sequence[str] = ()) -> Any:
+    """Make a data set unless it exists, and print its report.
+
+    Returns:
+        its data module.
+
+    Raises:
+        ConfigError: settings that do not fit this data, or recordings that are missing or cannot be read.
+    """
+    from epo_lightning.experiment import assembly
 
     data = assembly.build_data(settings.data)
     known = inspect.signature(data.generate).parameters
@@ -82,15 +104,7 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     print("\n".join(["", *lines] if lines else []))
     for name, problem in report.get("skipped", {}).items():
         print(f"left out: {name}: {problem}")
-    dataset = settings.data.get("dataset", "rpi")
-    row = f"{dataset}/v_lstm_epo"
-    kept = [word for word in overrides if word.startswith(("data=", "data.", "--config-dir="))]
-    if dataset in HIGHWAYS or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
-        words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]
-    else:
-        rows = "ucy" if not data.task.map else "urban" if settings.data.get("windows", {}).get("lines") else "exid"
-        words = [f"experiment={rows}/v_lstm_epo", *kept]
-    print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
+    return data
 
 
 def _launch(settings: GenerateSettings, overrides: Sequence[str]) -> Any:

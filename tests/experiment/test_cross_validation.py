@@ -51,7 +51,7 @@ hydra:
       experiment: ucy/const_vel
       data: ucy
       data.test: "[square0],[square2,square3]"
-      seed: 0,1
+      data.batch_size: 8,16
 """
 
 
@@ -64,12 +64,16 @@ def test_a_sweep_makes_its_data_sets(
     (tmp_path / "conf" / "sweeps" / "folds.yaml").write_text(FOLDS)
     conf = f"--config-dir={tmp_path / 'conf'}"
     words = ("folds", f"data.folder={folder}", "data.val_share=0.3", *SMALL)
-    said = refused(conf, "sweep", *words)
-    assert "`epo sweep generate folds data.folder=" in said, (
-        "data.folder is a setting of the data that the file chooses"
-    )
-    assert epo(conf, "sweep", "generate", *words, "workers=1") == 0
-    assert "data set 2 of 2" in capsys.readouterr().out, "once for all seeds"
+    said = refused(conf, "sweep", *words)  # data.folder is a setting of the data that the file chooses
+    assert "`epo sweep generate folds data.folder=" in said
+    assert conf in said
+    assert "optimizer.lr" in refused(conf, "sweep", "generate", *words, "optimizer.lr=fast"), "before any data is made"
+    assert "nofile.yaml" in refused(conf, "sweep", "generate", *words, "choices=nofile.yaml")
+    assert epo(conf, "sweep", "generate", *words, "workers=1", "progress=false") == 0
+    out = capsys.readouterr().out
+    assert "data set 2 of 2" in out, "once for all batch sizes"
+    assert "square2" in out, "the report of the data set"
+    assert "next: epo sweep folds data.folder=" in out
     assert len([*(tmp_path / "cache").glob("ucy-*/manifest.json")]) == 2
     assert epo(conf, "sweep", *words) == 0
     assert "4 runs: 4 done" in capsys.readouterr().out

@@ -211,16 +211,22 @@ def test_scores_of_chosen_goals_are_those_of_a_loop(
         distance = (states[..., :2] - scene.future[:, None, ..., :2]).norm(dim=-1).mean(-1)  # [B, M, N]
         return float(np.mean([float(distance[b][:, agents[b]].mean(1).min()) for b in range(len(scenes))]))
 
-    def solved(weight: float, goals: torch.Tensor) -> float:
-        own = {**forecast.parameters.own_weights, "goal": weight * forecast.parameters.own_weights["goal"]}
-        changed = dataclasses.replace(forecast.parameters, own_weights=own, goals=goals)
+    def solved(weight: float, goals: torch.Tensor, reference: torch.Tensor) -> float:
+        own = dict(forecast.parameters.own_weights)
+        own.update({name: weight * own[name] for name in ("goal", "lane")})
+        changed = dataclasses.replace(forecast.parameters, own_weights=own, goals=goals, reference=reference)
         return closest(forecaster.solve(scene, changed).states)
 
-    true = end[:, None].expand(forecast.parameters.goals.shape).contiguous()
+    true, lanes = end[:, None].expand(forecast.parameters.goals.shape).contiguous(), forecast.parameters.reference
+    nearest_lanes = lanes.clone()
+    for b, i in (scene.agent_mask & scene.goal_mask.any(-1)).nonzero().tolist():
+        exist = scene.goal_mask[b, i].nonzero()[:, 0]
+        ways = (scene.goal_candidates[b, i, exist] - end[b, i]).norm(dim=-1)
+        nearest_lanes[b, :, i] = scene.goal_reference[b, i, exist[ways.argmin()]]
     assert shown["SADE"] == pytest.approx(closest(forecast.states), abs=2e-3)
     assert shown["initial"] == pytest.approx(closest(forecast.initial_states), abs=2e-3)
-    assert shown["no goals"] == pytest.approx(solved(0.0, true + 40.0), abs=2e-3), "goals without a weight mean nothing"
-    assert shown["true goals"] == pytest.approx(solved(1.0, true), abs=2e-3)
+    assert shown["no goals"] == pytest.approx(solved(0.0, true + 40.0, lanes * 0), abs=2e-3), "they mean nothing"
+    assert shown["true goals"] == pytest.approx(solved(1.0, true, nearest_lanes), abs=2e-3)
     assert len({round(shown[name], 2) for name in ("SADE", "initial", "no goals", "true goals")}) > 2
     losses, counts, ways = [], [], []
     for b in range(len(scenes)):

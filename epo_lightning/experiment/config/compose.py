@@ -220,7 +220,7 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
 
 
 def fixed_choices(name: str, sweep: str, extra: Sequence[str] = ()) -> dict[str, str]:
-    """The groups of which the file of a sweep chooses one option for all runs, and these options.
+    """The groups of which the file of a sweep chooses one option for all runs, and the overrides that choose it.
 
     Args:
         name: configuration of which the sweep has runs.
@@ -233,7 +233,7 @@ def fixed_choices(name: str, sweep: str, extra: Sequence[str] = ()) -> dict[str,
         params = _composed(instance, name, [f"sweeps={sweep}"], multirun=True).hydra.sweeper.get("params") or {}
         words = [f"{group}={option}" for group, option in params.items() if options_of(instance, str(group))]
         parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(words)
-        return {choice.key_or_group: str(choice.value()) for choice in parsed if not choice.is_sweep_override()}
+        return {one.key_or_group: str(one.input_line) for one in parsed if not one.is_sweep_override()}
 
 
 def trials(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> int | None:

@@ -14,9 +14,10 @@ from epo_lightning.data.cache import CacheError
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config import compose
-from epo_lightning.experiment.config.settings import GenerateSettings, Settings, TrainerSettings
+from epo_lightning.experiment.config.settings import Settings, TrainerSettings
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
 from epo_lightning.experiment.sweeps.watch import news, status, summary
+from epo_lightning.experiment.verbs import check_settings, make_data
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.choices import Choices, read_choices
@@ -50,16 +51,11 @@ def run(
         ConfigError: a mistake in the configuration of any run, before the first one begins; or the sweep runs already.
     """
     assembly.quiet()
-    for given in overrides:
-        if given.split("=")[0] in ("run_dir", "resume", "sweep", "sweeps"):
-            raise ConfigError(
-                f"{given} cannot be set for a sweep, because each run has a folder of its own: leave it out"
-            )
+    _refuse_places(overrides)
     runs = _runs(overrides)
     sweep = Sweep.of(name, overrides, runs)
-    files = [word for word in overrides if word.startswith(CHOICES)]
-    choices = read_choices(files[0].removeprefix(CHOICES)) if files else None
-    words = words_of(name, [word for word in overrides if word not in files], extra)
+    choices, others = _choices_in(overrides)
+    words = words_of(name, others, extra)
     # Absolute, because a worker on another machine may start in any folder.
     places = {"sweep": sweep.folder, "runs": sweep.root, "hydra.sweep.dir": sweep.folder}
     words += [f"{key}={value_text(str(place))}" for key, place in places.items()] + ["existing=continue"]
@@ -67,7 +63,7 @@ def run(
     try:
         jobs = _listed(sweep, words, extra, choices)
     except CacheError as error:
-        command = shlex.join(mask(["epo", "sweep", "generate", name, *overrides]))
+        command = _command(["epo", "sweep", "generate", name, *overrides], extra)
         raise ConfigError(f"{error}; or make all data sets of the sweep with `{command}`") from error
     with sweep.lock():
         states = [sweep.state(job) for job in jobs]
@@ -97,30 +93,70 @@ def run(
 
 
 def generate(name: str, overrides: Sequence[str], extra: Sequence[str]) -> None:
-    """Make the data sets of a sweep's runs, one after the other; those that exist are kept.
+    """Make the data sets of a sweep's runs, one after the other, and print their reports; those that exist are kept.
 
     Args:
         name: name of the file in ``sweeps/``.
-        overrides: overrides of the sweep, and ``workers=<number of processes>``.
+        overrides: those of the sweep, and ``workers``, ``strict`` and ``progress`` of ``epo generate``.
         extra: folders that are searched for configurations first.
 
     Raises:
-        ConfigError: a mistake in the configuration of any run, or recordings that are missing or cannot be read.
+        ConfigError: a mistake in the configuration of any run, before the first data set is made; or recordings that are
+            missing or cannot be read.
     """
-    own = [word for word in overrides if word.startswith("workers=")]
-    settings = read(GenerateSettings, compose.compose("generate", own, extra))
-    others = [word for word in overrides if word not in own and not word.startswith(CHOICES)]
-    listed = compose.jobs("train", words_of(name, others, extra), extra)
+    own = [word for word in overrides if word.partition("=")[0] in ("workers", "strict", "progress")]
+    others = [word for word in overrides if word not in own]
+    making = compose.compose("generate", own, extra)
+    sections: dict[Path, Any] = {}
+    listed = _overrides_of_runs(name, others, extra)
     if not listed:
         raise ConfigError(f"{name} chooses its runs while it searches: make its data by `epo generate data=<name>`")
-    configs = [compose.compose("train", job, extra)["data"] for job in listed]
-    sections = list({json.dumps(section, sort_keys=True): section for section in configs}.values())
-    for number, section in enumerate(sections, 1):
-        data = assembly.build_data(section)
-        print(f"data set {number} of {len(sections)}", flush=True)
-        folder = data.generate(workers=settings.workers, progress=settings.progress)
-        print(f"data in {folder}, digest {data.digest}", flush=True)
-    print(f"next: {shlex.join(['epo', 'sweep', name, *(word for word in overrides if word not in own)])}")
+    for words in listed:
+        settings = read(Settings, compose.compose("train", words, extra))
+        data, _ = assembly.check_buildable(settings)
+        if settings.data["name"] == "drawn":
+            print(f"{settings.title}: its scenes are drawn in memory, there is nothing to make")
+        else:
+            sections.setdefault(data.folder, settings.data)
+    for number, section in enumerate(sections.values(), 1):
+        print(f"\ndata set {number} of {len(sections)}", flush=True)
+        make_data(check_settings("generate", {**making, "data": section}))
+    print(f"\nnext: {_command(['epo', 'sweep', name, *others], extra)}")
+
+
+def _command(words: Sequence[str], extra: Sequence[str]) -> str:
+    """A command line as a user would give it, without passwords."""
+    return shlex.join(mask([*words, *(f"--config-dir={folder}" for folder in extra)]))
+
+
+def _overrides_of_runs(name: str, overrides: Sequence[str], extra: Sequence[str]) -> list[list[str]]:
+    """The overrides of every run of a sweep; none for a sweep that chooses its runs while it searches.
+
+    Raises:
+        ConfigError: an override that each run sets for itself, or a mistake in the file of ``choices=``.
+    """
+    _refuse_places(overrides)
+    choices, others = _choices_in(overrides)
+    listed = compose.jobs("train", words_of(name, others, extra), extra)
+    return _with_choices(listed, choices, extra) if choices else listed
+
+
+def _refuse_places(overrides: Sequence[str]) -> None:
+    """Refuse overrides that each run of a sweep sets for itself."""
+    for given in overrides:
+        if given.split("=")[0] in ("run_dir", "resume", "sweep", "sweeps"):
+            raise ConfigError(
+                f"{given} cannot be set for a sweep, because each run has a folder of its own: leave it out"
+            )
+
+
+def _choices_in(overrides: Sequence[str]) -> tuple[Choices | None, list[str]]:
+    """The contents of the file that ``choices=`` names, if it does, and the other overrides."""
+    files = [word for word in overrides if word.startswith(CHOICES)]
+    return (
+        read_choices(files[0].removeprefix(CHOICES)) if files else None,
+        [word for word in overrides if word not in files],
+    )
 
 
 def words_of(name: str, overrides: Sequence[str], extra: Sequence[str]) -> list[str]:
@@ -130,11 +166,7 @@ def words_of(name: str, overrides: Sequence[str], extra: Sequence[str]) -> list[
     """
     given = {word.partition("=")[0] for word in overrides}
     fixed = compose.fixed_choices("train", name, extra)
-    return [
-        f"sweeps={name}",
-        *(f"{group}={option}" for group, option in fixed.items() if group not in given),
-        *overrides,
-    ]
+    return [f"sweeps={name}", *(choice for group, choice in fixed.items() if group not in given), *overrides]
 
 
 def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: Choices | None = None) -> list[Job]:
