@@ -16,7 +16,7 @@ import statistics
 from collections.abc import Collection, Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks.along_across import name_of
@@ -36,7 +36,7 @@ distance [m] of the chosen goals of all modes from the true ends, over agents; t
 that of equal probabilities for all candidates."""
 
 
-def ends(scene: Scene) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"]]:
+def ends(scene: Scene) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
     """Final positions of all agents [m], and whether they are known.
 
     Raises:

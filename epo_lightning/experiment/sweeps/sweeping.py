@@ -114,10 +114,10 @@ def generate(name: str, overrides: Sequence[str], extra: Sequence[str]) -> None:
     for words in listed:
         settings = read(Settings, compose.compose("train", words, extra))
         data, _ = assembly.check_buildable(settings)
-        if settings.data["name"] == "drawn":
-            print(f"{settings.title}: its scenes are drawn in memory, there is nothing to make")
-        else:
+        if settings.data["name"] != "drawn":
             sections.setdefault(data.folder, settings.data)
+    if not sections:
+        print(f"{name} draws its scenes in memory: there is nothing to make")
     for number, section in enumerate(sections.values(), 1):
         print(f"\ndata set {number} of {len(sections)}", flush=True)
         make_data(check_settings("generate", {**making, "data": section}))
@@ -164,7 +164,7 @@ def words_of(name: str, overrides: Sequence[str], extra: Sequence[str]) -> list[
 
     These choices decide which further settings exist: without ``data=us101``, for example, there is no ``data.folder``.
     """
-    given = {word.partition("=")[0] for word in overrides}
+    given = {word.lstrip("+~").partition("=")[0] for word in overrides}
     fixed = compose.fixed_choices("train", name, extra)
     return [f"sweeps={name}", *(choice for group, choice in fixed.items() if group not in given), *overrides]
 
