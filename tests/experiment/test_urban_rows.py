@@ -26,9 +26,11 @@ from epo_lightning.experiment.config.compose import compose, jobs, tree
 from epo_lightning.experiment.evaluate import evaluate
 from epo_lightning.experiment.predict import predict
 from epo_lightning.experiment.verbs import check_settings
+from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.identity import differences
 from epo_lightning.registry import register
 from epo_lightning.run_folder import read_json
+from epo_lightning.scene import Scene
 
 ROWS = sorted(file.stem for file in (tree() / "conf" / "experiment" / "urban").glob("*.yaml"))
 
@@ -114,20 +116,25 @@ def test_rows_train_on_several_ways_through_a_junction(row: str, data: list[str]
         assert list((out / "figures").glob("scene_*.png"))
 
 
+def untrained(row: str, data: list[str], folder: Path) -> tuple[str, Scene, Forecaster]:
+    """The folder of an untrained run, all test scenes of its data as one batch, and its forecaster."""
+    words = [f"experiment=urban/{row}", "budget=untrained", "callbacks.progress=none", f"runs={folder}", *data]
+    run = train.train(compose("train", words))
+    scenes = build_data(compose("train", words)["data"]).open("test")
+    return str(run.path), scenes[torch.arange(len(scenes))], epo_lightning.load(run.checkpoint("best"))
+
+
 def test_scores_of_turning_agents_are_those_of_a_loop(
     data: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["experiment=urban/v_lstm_sc", "budget=untrained", "callbacks.progress=none", f"runs={tmp_path}", *data]
-    run = train.train(compose("train", words))
-    turning_scores([str(run.path)])
+    run, scene, forecaster = untrained("v_lstm_sc", data, tmp_path)
+    turning_scores([run])
     shown = [line.split()[-6:] for line in capsys.readouterr().out.splitlines()[1:]]
-    scenes = build_data(compose("train", words)["data"]).open("test")
-    scene = scenes[torch.arange(len(scenes))]
-    forecast = epo_lightning.load(run.checkpoint("best")).predict(scene)
+    forecast = forecaster.predict(scene)
     errors = (forecast.states[..., :2] - scene.future[:, None, ..., :2]).norm(dim=-1)  # [B, M, N, K]
     for name, turns in (("turning", True), ("others", False)):
         count, each, joint = 0, [], []
-        for b in range(len(scenes)):
+        for b in range(len(scene.history)):
             turned = [
                 abs(float(scene.future[b, i, -1, 2] - scene.history[b, i, -1, 2])) > math.pi / 6 for i in range(4)
             ]
@@ -169,15 +176,12 @@ def test_goals_of_turning_agents_are_measured_by_a_command(data: list[str], caps
 def test_errors_along_and_across_are_those_of_a_loop(
     data: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["experiment=urban/v_lstm_sc", "budget=untrained", "callbacks.progress=none", f"runs={tmp_path}", *data]
-    run = train.train(compose("train", words))
-    along_and_across([str(run.path)])
+    run, scene, forecaster = untrained("v_lstm_sc", data, tmp_path)
+    along_and_across([run])
     shown = capsys.readouterr().out.splitlines()[1].split()[:4]
-    scenes = build_data(compose("train", words)["data"]).open("test")
-    scene = scenes[torch.arange(len(scenes))]
-    states = epo_lightning.load(run.checkpoint("best")).predict(scene).states
+    states = forecaster.predict(scene).states
     found = []
-    for b in range(len(scenes)):
+    for b in range(len(scene.history)):
         agents = [i for i in range(scene.agent_mask.shape[1]) if scene.agent_mask[b, i]]
         distance = (states[b, ..., :2] - scene.future[b, None, ..., :2]).norm(dim=-1)  # [M, N, K]
         mode = int(distance[:, agents].mean((1, 2)).argmin())
@@ -188,28 +192,24 @@ def test_errors_along_and_across_are_those_of_a_loop(
             ahead, aside = math.hypot(x, y) * math.cos(angle), math.hypot(x, y) * math.sin(angle)
             of_agents.append((abs(ahead), abs(aside), ahead))
         found.append(np.mean(of_agents, axis=0))
-    assert int(shown[0]) == len(scenes)
+    assert int(shown[0]) == len(scene.history)
     assert [float(value) for value in shown[1:]] == pytest.approx(list(np.mean(found, axis=0)), abs=2e-3)
 
 
 def test_scores_of_chosen_goals_are_those_of_a_loop(
     data: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["experiment=urban/v_lstm_epo", "budget=untrained", "callbacks.progress=none", f"runs={tmp_path}", *data]
-    run = train.train(compose("train", words))
-    goal_scores([str(run.path)])
+    run, scene, forecaster = untrained("v_lstm_epo", data, tmp_path)
+    goal_scores([run])
     printed = capsys.readouterr().out.splitlines()[1].split()[1 : 1 + len(GOAL_COLUMNS)]
     shown = dict(zip(GOAL_COLUMNS, map(float, printed), strict=True))
-    scenes = build_data(compose("train", words)["data"]).open("test")
-    scene = scenes[torch.arange(len(scenes))]
-    forecaster = epo_lightning.load(run.checkpoint("best"))
     forecast = forecaster.predict(scene)
     end = scene.future[..., -1, :2]
 
     def closest(states: torch.Tensor) -> float:
         agents = scene.agent_mask
         distance = (states[..., :2] - scene.future[:, None, ..., :2]).norm(dim=-1).mean(-1)  # [B, M, N]
-        return float(np.mean([float(distance[b][:, agents[b]].mean(1).min()) for b in range(len(scenes))]))
+        return float(np.mean([float(distance[b][:, agents[b]].mean(1).min()) for b in range(len(scene.history))]))
 
     def solved(weight: float, goals: torch.Tensor, reference: torch.Tensor) -> float:
         own = dict(forecast.parameters.own_weights)
@@ -229,7 +229,7 @@ def test_scores_of_chosen_goals_are_those_of_a_loop(
     assert shown["true goals"] == pytest.approx(solved(1.0, true, nearest_lanes), abs=2e-3)
     assert len({round(shown[name], 2) for name in ("SADE", "initial", "no goals", "true goals")}) > 2
     losses, counts, ways = [], [], []
-    for b in range(len(scenes)):
+    for b in range(len(scene.history)):
         for i in scene.agent_mask[b].nonzero()[:, 0].tolist():
             exist = scene.goal_mask[b, i].nonzero()[:, 0]
             logits = forecast.goal_logits[b, i, exist].double()
@@ -238,8 +238,8 @@ def test_scores_of_chosen_goals_are_those_of_a_loop(
             counts.append((b, math.log(len(exist))))
             ways += (forecast.parameters.goals[b, :, i] - end[b, i]).norm(dim=-1).tolist()
     for name, values in (("entropy", losses), ("uniform", counts)):
-        of_scenes = [np.mean([value for at, value in values if at == b]) for b in range(len(scenes))]
+        of_scenes = [np.mean([value for at, value in values if at == b]) for b in range(len(scene.history))]
         assert shown[name] == pytest.approx(np.mean(of_scenes), abs=2e-3)
     assert shown["goal [m]"] == pytest.approx(np.mean(ways), abs=2e-3)
     with pytest.raises(SystemExit, match="does not choose goals"):
-        goal_scores([str(train.train(compose("train", [words[0].replace("_epo", "_sc"), *words[1:]])).path)])
+        goal_scores([untrained("v_lstm_sc", data, tmp_path)[0]])

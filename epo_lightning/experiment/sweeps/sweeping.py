@@ -108,7 +108,9 @@ def generate(name: str, overrides: Sequence[str], extra: Sequence[str]) -> None:
     others = [word for word in overrides if word not in own]
     making = compose.compose("generate", own, extra)
     sections: dict[Path, Any] = {}
-    listed = _overrides_of_runs(name, others, extra)
+    _refuse_places(others)
+    choices, of_runs = _choices_in(others)
+    listed = _overrides_of_runs(words_of(name, of_runs, extra), choices, extra)
     if not listed:
         raise ConfigError(f"{name} chooses its runs while it searches: make its data by `epo generate data=<name>`")
     for words in listed:
@@ -129,15 +131,9 @@ def _command(words: Sequence[str], extra: Sequence[str]) -> str:
     return shlex.join(mask([*words, *(f"--config-dir={folder}" for folder in extra)]))
 
 
-def _overrides_of_runs(name: str, overrides: Sequence[str], extra: Sequence[str]) -> list[list[str]]:
-    """The overrides of every run of a sweep; none for a sweep that chooses its runs while it searches.
-
-    Raises:
-        ConfigError: an override that each run sets for itself, or a mistake in the file of ``choices=``.
-    """
-    _refuse_places(overrides)
-    choices, others = _choices_in(overrides)
-    listed = compose.jobs("train", words_of(name, others, extra), extra)
+def _overrides_of_runs(words: Sequence[str], choices: Choices | None, extra: Sequence[str]) -> list[list[str]]:
+    """The overrides of every run of a sweep; none for a sweep that chooses its runs while it searches."""
+    listed = compose.jobs("train", words, extra)
     return _with_choices(listed, choices, extra) if choices else listed
 
 
@@ -179,8 +175,7 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
     """
     jobs: dict[Path, Job] = {}
     ready: set[str] = set()
-    listed = compose.jobs("train", words, extra)
-    for overrides in _with_choices(listed, choices, extra) if choices else listed:
+    for overrides in _overrides_of_runs(words, choices, extra):
         config = compose.compose("train", overrides, extra)
         job = Job.of(config, overrides)
         if job.run.record_file.is_file():
