@@ -209,7 +209,7 @@ def energy_of(action: Callable[[], Any], device: torch.device, seconds: float = 
 
 def sizes(
     setting: str, batches: Sequence[int], device: torch.device, repeats: int, console: Console, **others: int | None
-) -> list[Timing]:
+) -> Iterator[Timing]:
     """Times of all implementations over batch sizes, each within memory and :data:`LONGEST`.
 
     Raises:
@@ -217,7 +217,7 @@ def sizes(
     """
     rate = product_rate(device)
     console.print(f"{device_name(device)}: a large float32 product takes {rate:.0f} GFLOP/s")
-    left, found = list(implementations(device)), []
+    left = list(implementations(device))
     for batch in batches:
         game = make(setting, **{**others, "B": batch}).to(device)
         for name in list(left):
@@ -235,11 +235,10 @@ def sizes(
                 console.print(f"{name}: out of memory at B={batch}")
                 left.remove(name)
                 continue
-            found.append(timing)
             console.print(describe(timing))
+            yield timing
             if timing.forward_backward_ms > LONGEST:
                 left.remove(name)
-    return found
 
 
 def _timing(name: str, game: Game, device: torch.device, rate: float, repeats: int) -> Timing:
@@ -347,10 +346,10 @@ def run(
 ) -> None:
     """Measure everything, and append a JSON line per timing."""
     for setting in settings:
-        found = sizes(setting, batches, device, repeats, console, **others)
-        if path is not None:
-            with path.open("a") as file:
-                file.writelines(json.dumps(asdict(timing)) + "\n" for timing in found)
+        for timing in sizes(setting, batches, device, repeats, console, **others):
+            if path is not None:
+                with path.open("a") as file:
+                    file.write(json.dumps(asdict(timing)) + "\n")
     lane_changes(device, repeats, console)
 
 

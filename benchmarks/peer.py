@@ -60,7 +60,7 @@ def prepare(game: Game, linear_solver: str) -> Callable[[GameParameters], Tensor
         abs_err_tolerance=0.0,
         rel_err_tolerance=0.0,
     )
-    layer = theseus.TheseusLayer(optimizer, vectorize=False)
+    layer = theseus.TheseusLayer(optimizer, vectorize=False).to(start.device)
     options = {"damping": game.damping, "adaptive_damping": False, "backward_mode": "unroll"}
 
     def solve(parameters: GameParameters) -> Tensor:

@@ -12,6 +12,7 @@ import contextlib
 import functools
 import importlib.util
 from collections.abc import Mapping
+from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,15 +23,15 @@ from torch import Tensor
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Solution
 from epo_lightning.solvers.gauss_newton.compiled import take_steps
+from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
 
-MOST_AGENTS = 64
-"""Largest number of agents; the memory of a game grows with its square."""
-SHARED = (4, 8)
-"""Numbers of agents up to which the matrices of a game are in shared memory, each with kernels of its own; those of larger
-games are in global memory."""
+SIZES = (2, 4, 8)
+"""Numbers of agents up to which there are kernels, each with matrices of its own size in shared memory and registers."""
 RESIDENT = 32 * 132
-"""Blocks of a launch that records nothing: at most as many as an H100 can hold. Each solves several games in turn."""
+"""Blocks of a launch: at most as many as an H100 or H200 can hold. Each solves several games in turn."""
+LONGEST = 2**31 - 1
+"""Largest number of entries of an array of Warp."""
 
 
 def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
@@ -50,8 +51,8 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
             return f"the fused kernels do not know the feature {name!r}"
     if energy.bounded_by_kind:
         return f"the fused kernels take bounds of all agents, not bounds of {energy.bounded_by_kind[0]!r} by kind"
-    if agents > MOST_AGENTS:
-        return f"the fused kernels take up to {MOST_AGENTS} agents, not {agents}"
+    if agents > SIZES[-1]:
+        return f"the fused kernels take up to {SIZES[-1]} agents, not {agents}"
     return None
 
 
@@ -95,15 +96,17 @@ def warp() -> Any:
     return wp
 
 
-def kernels(dtype: torch.dtype, agents: int, device: torch.device) -> SimpleNamespace:
-    """The kernels for a type of numbers and a number of agents."""
+def kernels(dtype: torch.dtype, agents: int, device: torch.device, features: Features) -> SimpleNamespace:
+    """The kernels for a type of numbers, a number of agents and, on GPUs, the features of an energy."""
     warp()
     from epo_lightning.solvers.gauss_newton.fused_kernel.kernels import make
 
-    on_gpu = device.type == "cuda"
-    # On a CPU, where all memory is alike, kernels for the largest number do for all: fewer of them have to be compiled.
-    fits = [most for most in (SHARED if on_gpu else SHARED[-1:]) if agents <= most]
-    return make(dtype == torch.float64, fits[0] if fits else 0, on_gpu)
+    return make(dtype == torch.float64, size_for(agents), features if device.type == "cuda" else None)
+
+
+def size_for(agents: int) -> int:
+    """The number of agents of the kernels that solve games of ``agents`` agents."""
+    return next(size for size in SIZES if agents <= size)
 
 
 class _Call:
@@ -131,7 +134,10 @@ class _Call:
         self.others = {"goals": goals, "headings": headings, "reference_controls": references}
         self.inputs = (*self.own, *self.pair, *self.margins, *(x for x in self.others.values() if x is not None))
         self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs))
-        self.kernels = kernels(self.dtype, self.shape[2], controls.device)
+        coupled = energy.pair if self.shape[2] > 1 else ()
+        fixed = [name for name in coupled if name in energy.margins]
+        self.features = Features(tuple(energy.own), tuple(coupled), (*energy.decoded_margins, *fixed))
+        self.kernels = kernels(self.dtype, self.shape[2], controls.device, self.features)
         with torch.no_grad():
             self.kept: list[Tensor] = []
             self._describe(energy, scene, parameters, step_size, damping)
@@ -151,12 +157,11 @@ class _Call:
         game = self.game = self.kernels.Game()
         game.G, game.M, game.N, game.K = batch * modes, modes, agents, horizon
         game.dt, game.step_size = scene.dt, step_size
+        game.own_count, game.pair_count = len(self.features.own), len(self.features.pair)
         game.pair_stride, game.slides = min(energy.pair_stride, horizon + 1), int(energy.lane_slides)
-        coupled = agents > 1
-        fixed = [name for name in energy.pair if name in energy.margins] if coupled else []
-        game.own_slot = _slots(OWN, energy.own, game.own_slot)
-        game.pair_slot = _slots(PAIR, energy.pair if coupled else (), game.pair_slot)
-        game.margin_slot = _slots(PAIR, (*energy.decoded_margins, *fixed) if coupled else (), game.margin_slot)
+        game.own_slot = type(game.own_slot)(*self.features.own_slots)
+        game.pair_feature = type(game.pair_feature)(*self.features.pair_features)
+        game.margin_slot = type(game.margin_slot)(*self.features.margin_slots)
         bounds = [0.0] * (2 * len(SIGNALS))
         for index, name in enumerate(SIGNALS):
             if not isinstance(bound := energy.bounds.get(name, {}), Mapping):
@@ -167,9 +172,10 @@ class _Call:
         size = scene.current.new_zeros(batch, agents, 2) if scene.size is None else scene.size
         game.size = self._array(size)
         game.own = self._array(torch.stack(self.own)) if self.own else self._array(size)
-        if coupled and self.pair:
+        if self.features.pair:
             game.pair = self._array(torch.stack(self.pair))
             pairs = (batch, modes, agents * (agents - 1) // 2)
+            fixed = self.features.margins[len(self.margins) :]
             margins = [*self.margins, *(energy.margin(scene, parameters, name).expand(pairs) for name in fixed)]
             if margins:
                 game.margins = self._array(torch.stack([margin.to(self.dtype) for margin in margins]))
@@ -194,26 +200,28 @@ class _Call:
 
     def _reserve(self, controls: Tensor) -> None:
         """Allocate what the kernels write: results, and what the adjoint reads of all steps if they are recorded."""
-        from epo_lightning.solvers.gauss_newton.fused_kernel import threads
+        from epo_lightning.solvers.gauss_newton.fused_kernel.layout import factor_numbers, layout
 
         batch, modes, agents, horizon, _ = shape = self.shape
         games, new = batch * modes, controls.new_empty
         stacked = self.record or self.keep_iterates
-        on_gpu = controls.device.type == "cuda"
-        self.blocks = (games if self.record else min(games, RESIDENT)) if on_gpu else 1
-        stages, each = (self.steps, games) if self.record else (1, self.blocks)
+        self.blocks = min(games, RESIDENT) if controls.device.type == "cuda" else 1
+        stages, slots = (self.steps, games) if self.record else (1, self.blocks)
         self.iterates = new((self.steps + 1 if stacked else 1, *shape))
         self.directions = new((max(self.steps, 1) if self.record else 1, *shape))
         self.states: Tensor | None = new((*shape[:-1], 4))
         self.initial_energy, self.energy, self.gradient_norm = new((3, batch, modes)).unbind(0)
         self.status = torch.empty(shape[:2], dtype=torch.int64, device=controls.device)
-        self.factors = new(max(stages, 1) * each * 16 * agents**2 * horizon)
-        self.nearest = new((stages + 1) * each * 4 * agents * (horizon + 1))
+        self.factors = new(max(stages, 1) * slots * factor_numbers(size_for(agents)) * horizon)
+        self.nearest = new((stages + 1) * slots * 4 * agents * (horizon + 1))
         self.taken = torch.empty(max(stages, 1) * games, dtype=torch.int32, device=controls.device)
         self.start = controls.detach().contiguous()
-        self.memory = threads.work_numbers(agents, horizon) + threads.fast_numbers(max(agents, *SHARED))
+        places = layout(size_for(agents), horizon, self.game.own_count, self.game.pair_count)
+        self.memory = places.numbers
         run = self.arguments = self.kernels.Run()
-        run.steps, run.record, run.blocks, run.work_numbers = self.steps, int(self.record), self.blocks, self.memory
+        run.steps, run.record, run.blocks, run.slots = self.steps, int(self.record), self.blocks, slots
+        for name, place in asdict(places).items():
+            setattr(run.at, name, place)
         run.iterate_stride = controls.numel() if stacked else 0
         run.direction_stride = controls.numel() if self.record else 0
         for name in (
@@ -282,11 +290,8 @@ class _Call:
 
 
 def _flat(tensor: Tensor) -> Any:
-    """A contiguous tensor as a flat array of Warp in the same memory; None for an empty one."""
-    return warp().from_torch(tensor.view(-1), requires_grad=False) if tensor.numel() else None
+    """A contiguous tensor as a flat array of Warp in the same memory; None for an empty one.
 
-
-def _slots(known: tuple[str, ...], names: Any, like: Any) -> Any:
-    """For every known feature its position among ``names``, or -1."""
-    names = list(names)
-    return type(like)(*(names.index(name) if name in names else -1 for name in known))
+    Larger arrays than Warp's are cut short: the kernels find their parts by pointers.
+    """
+    return warp().from_torch(tensor.view(-1)[:LONGEST], requires_grad=False) if tensor.numel() else None

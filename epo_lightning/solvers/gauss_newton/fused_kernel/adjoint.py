@@ -1,7 +1,6 @@
 """The gradient of phi = -<J mu, r + J d>, with mu and d constant, by controls and parameters; as in `kernel/step.hpp`.
 
-Suffix sums of the derivatives by positions, by their tangents along mu and along d, and by headings and speeds go backwards
-in time. They are at the beginning of the fast memory: six for each agent, and then two for each agent.
+Threads share out pairs and agents at all times; in between, cotangents are summed backwards in time.
 """
 
 from types import SimpleNamespace
@@ -13,7 +12,6 @@ from epo_lightning.game.features import WHEELBASE
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     ACC,
     ACCB,
-    ACCELERATION,
     ACCREF,
     AHEAD_X,
     AHEAD_Y,
@@ -30,7 +28,6 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     LANE,
     NEAR_X,
     NEAR_Y,
-    PAIRS,
     SINE,
     SPEED,
     STEER,
@@ -47,6 +44,7 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     X,
     Y,
 )
+from epo_lightning.solvers.gauss_newton.fused_kernel.layout import PAIR_COTANGENTS
 
 
 @no_type_check
@@ -54,13 +52,13 @@ def make(
     T: Any,
     threads: SimpleNamespace,
     games: SimpleNamespace,
-    costs: SimpleNamespace,
+    expansion: SimpleNamespace,
     pairs: SimpleNamespace,
     func: Any,
 ) -> SimpleNamespace:
     """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
     evaluate_pair, dual = pairs.evaluate, pairs.dual
-    sync, lane = threads.sync, threads.lane
+    sync, lane, sums, sums_back = threads.sync, threads.lane, threads.sums, threads.sums_back
     Game, Gradients, Layout, pair_index, pair_first, weight = (
         games.Game,
         games.Gradients,
@@ -69,81 +67,220 @@ def make(
         games.pair_first,
         games.weight,
     )
-    trace, Array, Numbers = games.trace, games.Array, games.Numbers
-    excess, excess_slope, steering = costs.excess, costs.excess_slope, costs.steering
+    own_slot, own_count, pair_feature, pair_count, margin_slot = (
+        games.own_slot,
+        games.own_count,
+        games.pair_feature,
+        games.pair_count,
+        games.margin_slot,
+    )
+    trace, Array, Numbers, A = games.trace, games.Array, games.Numbers, games.agents
+    P = A * (A - 1) // 2
+    six = wp.types.vector(6, T)
+    ten = wp.types.vector(PAIR_COTANGENTS, T)
+    excess, excess_slope, steering = expansion.excess, expansion.excess_slope, expansion.steering
 
     @wp.func
+    def tangent(at: Layout, K: int, along_d: int, quantity: int, i: int):
+        """Start of one quantity of a tangent of agent i's trajectory, along mu or along the step d."""
+        return at.tangents + ((4 * along_d + quantity) * A + i) * (K + 1)
+
+    @func
     def roll_tangents(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, directions: Array):
-        """Tangents of the trajectories along mu (first half of the place) and along the direction d (second half)."""
-        half = 4 * n * (g.K + 1)
-        for e in range(lane(), 2 * n, wp.block_dim()):
-            along_d = e // n
-            i = e - along_d * n
-            to = at.tangents + along_d * half
-            row = 2 * (game * g.N + agents[i]) * g.K
-            x = T(0.0)
-            y = T(0.0)
-            heading = T(0.0)
-            speed = T(0.0)
-            for k in range(g.K + 1):
-                place = to + i * (g.K + 1) + k
-                work[place + X * n * (g.K + 1)] = x
-                work[place + Y * n * (g.K + 1)] = y
-                work[place + TURNED * n * (g.K + 1)] = heading
-                work[place + SPEED * n * (g.K + 1)] = speed
-                if k < g.K:
-                    s = work[trace(at, n, g.K, SINE, i) + k]
-                    c = work[trace(at, n, g.K, COSINE, i) + k]
-                    across = work[trace(at, n, g.K, SPEED, i) + k] * heading
-                    x += g.dt * (speed * c - across * s)
-                    y += g.dt * (speed * s + across * c)
-                    turn = work[at.mu + 2 * (i * g.K + k) + TURN_RATE]
-                    thrust = work[at.mu + 2 * (i * g.K + k) + ACCELERATION]
-                    if along_d == 1:
-                        turn = directions[row + 2 * k + TURN_RATE]
-                        thrust = directions[row + 2 * k + ACCELERATION]
-                    heading += g.dt * turn
-                    speed += g.dt * thrust
+        """Tangents of the trajectories along mu and along the step d: sums along time, as the trajectories are."""
+        for e in range(lane(), 4 * n, wp.block_dim()):
+            i = e // 4
+            channel = (e // 2) % 2
+            along_d = e % 2
+            to = tangent(at, g.K, along_d, wp.where(channel == TURN_RATE, TURNED, SPEED), i)
+            if along_d == 1:
+                first = (game * g.N + agents[i]) * g.K * 2 + channel
+                sums(directions, first, 2, g.K, T(0.0), g.dt, work, to)
+            else:
+                sums(work, at.mu + 2 * i * g.K + channel, 2, g.K, T(0.0), g.dt, work, to)
+        sync()
+        for e in range(lane(), 2 * n * (g.K + 1), wp.block_dim()):
+            k = e // (2 * n)
+            i = (e - k * 2 * n) // 2
+            along_d = e % 2
+            s = work[trace(at, g.K, SINE, i) + k]
+            c = work[trace(at, g.K, COSINE, i) + k]
+            across = work[trace(at, g.K, SPEED, i) + k] * work[tangent(at, g.K, along_d, TURNED, i) + k]
+            speed = work[tangent(at, g.K, along_d, SPEED, i) + k]
+            work[tangent(at, g.K, along_d, X, i) + k] = g.dt * (speed * c - across * s)
+            work[tangent(at, g.K, along_d, Y, i) + k] = g.dt * (speed * s + across * c)
+        sync()
+        for e in range(lane(), 4 * n, wp.block_dim()):
+            i = e // 4
+            to = tangent(at, g.K, e % 2, wp.where((e // 2) % 2 == 0, X, Y), i)
+            sums(work, to, 1, g.K, T(0.0), T(1.0), work, to)
+        sync()
+
+    # ---- What each cotangent is added to
+
+    @wp.func
+    def along(at: Layout, K: int, quantity: int, i: int):
+        """Start of a cotangent along time: of positions 0 and 1, of their tangents along mu 2 and 3 and along d 4 and 5, of
+        heading 6 and speed 7."""
+        return at.along + (quantity * A + i) * K
+
+    @wp.func
+    def own_product(g: Game, at: Layout, work: Array, feature: int, i: int, k: int, value: T):
+        """Keeps what an own feature at a step adds to the gradient by its weight."""
+        work[at.weights + (own_slot(g, feature) * A + i) * g.K + k] = value
+
+    @wp.func
+    def pair_product(g: Game, at: Layout, K: int, kind: int, slot: int, p: int):
+        """Start of what a pair feature (kind 0) or its margin (1) adds to its gradient along time."""
+        return at.weights + (own_count(g) * A + (kind * pair_count(g) + slot) * P + p) * K
+
+    @func
+    def forget_products(g: Game, at: Layout, work: Array):
+        for e in range(lane(), (own_count(g) * A + 2 * pair_count(g) * P) * g.K, wp.block_dim()):
+            work[at.weights + e] = T(0.0)
+        sync()
+
+    @func
+    def add_products(g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array, end: int):
+        """Adds the sums along time of the products to the gradients by weights and margins."""
+        for e in range(lane(), own_count(g) * n, wp.block_dim()):
+            slot = e // n
+            i = e - slot * n
+            value = T(0.0)
+            for k in range(end):
+                value += work[at.weights + (slot * A + i) * g.K + k]
+            to = slot * g.G * g.N + game * g.N + agents[i]
+            by.own[to] = by.own[to] + value
+        all_pairs = (g.N * (g.N - 1)) // 2
+        for p in range(lane(), (n * (n - 1)) // 2, wp.block_dim()):
+            i = pair_first(p, n)
+            j = p - pair_index(i, i + 1, n) + i + 1
+            place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
+            for slot in range(pair_count(g)):
+                product = pair_product(g, at, g.K, 0, slot, pair_index(i, j, A))
+                by_margin = pair_product(g, at, g.K, 1, slot, pair_index(i, j, A))
+                value = T(0.0)
+                slope = T(0.0)
+                for k in range(end):
+                    value += work[product + k]
+                    slope += work[by_margin + k]
+                to = slot * g.G * all_pairs + place
+                by.pair[to] = by.pair[to] + value
+                if margin_slot(g, slot) >= 0:
+                    to = margin_slot(g, slot) * g.G * all_pairs + place
+                    by.margins[to] = by.margins[to] + slope
         sync()
 
     @wp.func
-    def tangent(g: Game, at: Layout, n: int, work: Array, along_d: int, quantity: int, i: int, state: int):
-        return work[at.tangents + ((4 * along_d + quantity) * n + i) * (g.K + 1) + state]
-
-    @wp.func
-    def add_gradient(to: Array, slot: int, stride: int, place: int, value: T):
-        to[slot * stride + place] = to[slot * stride + place] + value
-
-    @func
     def residual_adjoint(
         g: Game,
-        by: Gradients,
+        at: Layout,
+        work: Array,
         feature: int,
         row: int,
+        i: int,
+        k: int,
         value: T,
         slope: T,
         along_mu: T,
         along_d: T,
     ):
-        """The cotangent of a signal with a residual w c, c'' = 0, and the gradient by the weight."""
+        """The cotangent of a signal with a residual w c, c'' = 0; keeps the product for the gradient by the weight."""
         w = weight(g, feature, row)
-        add_gradient(
-            by.own,
-            g.own_slot[feature],
-            g.G * g.N,
-            row,
-            T(-2.0) * w * slope * along_mu * (value + slope * along_d),
-        )
+        own_product(g, at, work, feature, i, k, T(-2.0) * w * slope * along_mu * (value + slope * along_d))
         return -w * w * slope * slope * along_mu
+
+    # ---- Pairs
+
+    @wp.func
+    def moving(at: Layout, K: int, work: Array, quantity: int, i: int, state: int):
+        """A quantity of a trajectory with its derivatives along mu and d."""
+        return dual(
+            work[trace(at, K, quantity, i) + state],
+            work[tangent(at, K, 0, quantity, i) + state],
+            work[tangent(at, K, 1, quantity, i) + state],
+        )
+
+    @func
+    def pair_adjoint(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, end: int):
+        """The cotangents of all pairs at all states, and the products of their weights and margins."""
+        all_pairs = (g.N * (g.N - 1)) // 2
+        stride = g.G * all_pairs
+        for e in range(lane(), end * P, wp.block_dim()):
+            k = e // P
+            p = e - k * P
+            state = k + 1
+            i = pair_first(p, A)
+            j = p - pair_index(i, i + 1, A) + i + 1
+            found = ten(T(0.0))
+            if j < n and state % g.pair_stride == 0:
+                one = 2 * ((game // g.M) * g.N + agents[i])
+                other = 2 * ((game // g.M) * g.N + agents[j])
+                place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
+                c1 = work[trace(at, g.K, COSINE, i) + state]
+                s1 = work[trace(at, g.K, SINE, i) + state]
+                c2 = work[trace(at, g.K, COSINE, j) + state]
+                s2 = work[trace(at, g.K, SINE, j) + state]
+                turn1 = moving(at, g.K, work, TURNED, i, state)
+                turn2 = moving(at, g.K, work, TURNED, j, state)
+                for slot in range(pair_count(g)):
+                    w = g.pair[slot * stride + place]
+                    margin = T(0.0)
+                    if margin_slot(g, slot) >= 0:
+                        margin = g.margins[margin_slot(g, slot) * stride + place]
+                    value, x, y, h1, v1, h2, v2, by_margin = evaluate_pair(
+                        pair_feature(g, slot),
+                        moving(at, g.K, work, X, i, state),
+                        moving(at, g.K, work, Y, i, state),
+                        dual(c1, -s1 * turn1[1], -s1 * turn1[2]),
+                        dual(s1, c1 * turn1[1], c1 * turn1[2]),
+                        moving(at, g.K, work, SPEED, i, state),
+                        g.size[one],
+                        g.size[one + 1],
+                        moving(at, g.K, work, X, j, state),
+                        moving(at, g.K, work, Y, j, state),
+                        dual(c2, -s2 * turn2[1], -s2 * turn2[2]),
+                        dual(s2, c2 * turn2[1], c2 * turn2[2]),
+                        moving(at, g.K, work, SPEED, j, state),
+                        g.size[other],
+                        g.size[other + 1],
+                        dual(margin, T(0.0), T(0.0)),
+                    )
+                    # phi = -w^2 (g mu) (f + g d) with the gradient g of the feature f.
+                    square = w * w
+                    along_mu = value[1]
+                    ahead = value[0] + value[2]
+                    found += -square * ten(
+                        x[1] * ahead + along_mu * (x[0] + x[2]),
+                        y[1] * ahead + along_mu * (y[0] + y[2]),
+                        ahead * x[0],
+                        ahead * y[0],
+                        along_mu * x[0],
+                        along_mu * y[0],
+                        h1[1] * ahead + along_mu * (h1[0] + h1[2]),
+                        v1[1] * ahead + along_mu * (v1[0] + v1[2]),
+                        h2[1] * ahead + along_mu * (h2[0] + h2[2]),
+                        v2[1] * ahead + along_mu * (v2[0] + v2[2]),
+                    )
+                    work[pair_product(g, at, g.K, 0, slot, p) + k] = T(-2.0) * w * along_mu * ahead
+                    work[pair_product(g, at, g.K, 1, slot, p) + k] = -square * (
+                        by_margin[1] * ahead + along_mu * (by_margin[0] + by_margin[2])
+                    )
+            for q in range(PAIR_COTANGENTS):
+                work[at.touching + (q * P + p) * g.K + k] = found[q]
+        sync()
+
+    # ---- Agents
 
     @wp.func
     def pull_to(
         g: Game,
-        by: Gradients,
+        at: Layout,
+        work: Array,
         feature: int,
         row: int,
-        fast: Array,
-        s: int,
+        i: int,
+        k: int,
         gap_x: T,
         gap_y: T,
         x1: T,
@@ -157,9 +294,9 @@ def make(
         """Cotangents of a position that is drawn to a point, which slides along the unit tangent (tx, ty)."""
         w = weight(g, feature, row)
         square = w * w
-        along = x1 * tx + y1 * ty
-        across_x = x1 - along * tx
-        across_y = y1 - along * ty
+        along_tangent = x1 * tx + y1 * ty
+        across_x = x1 - along_tangent * tx
+        across_y = y1 - along_tangent * ty
         mu_x = x1
         mu_y = y1
         off_x = gap_x + x2
@@ -170,76 +307,37 @@ def make(
             mu_y = across_y
             off_x -= ahead * tx
             off_y -= ahead * ty
-        fast[s] -= square * across_x
-        fast[s + 1] -= square * across_y
-        fast[s + 2] -= square * off_x
-        fast[s + 3] -= square * off_y
-        fast[s + 4] -= square * mu_x
-        fast[s + 5] -= square * mu_y
-        add_gradient(by.own, g.own_slot[feature], g.G * g.N, row, T(-2.0) * w * (mu_x * off_x + mu_y * off_y))
+        own_product(g, at, work, feature, i, k, T(-2.0) * w * (mu_x * off_x + mu_y * off_y))
+        return -square * six(across_x, across_y, off_x, off_y, mu_x, mu_y)
 
     @func
-    def state_adjoint(
-        g: Game,
-        by: Gradients,
-        game: int,
-        n: int,
-        agents: Numbers,
-        at: Layout,
-        work: Array,
-        nearest: Array,
-        fast: Array,
-        state: int,
-        end: int,
+    def position_adjoint(
+        g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array, nearest: Array, end: int
     ):
-        """Backpropagates the suffix sums through a state and adds the cotangents of its own features."""
+        """The cotangents of positions and of their tangents at all states, summed over the states from each on."""
         each = n * (g.K + 1)
-        for i in range(lane(), n, wp.block_dim()):
+        for e in range(lane(), end * n, wp.block_dim()):
+            i = e // end
+            k = e - i * end
+            state = k + 1
             row = game * g.N + agents[i]
-            s = 6 * i
-            node = 6 * n + 2 * i
-            x1 = tangent(g, at, n, work, 0, X, i, state)
-            y1 = tangent(g, at, n, work, 0, Y, i, state)
-            heading1 = tangent(g, at, n, work, 0, TURNED, i, state)
-            speed1 = tangent(g, at, n, work, 0, SPEED, i, state)
-            x2 = tangent(g, at, n, work, 1, X, i, state)
-            y2 = tangent(g, at, n, work, 1, Y, i, state)
-            heading2 = tangent(g, at, n, work, 1, TURNED, i, state)
-            speed2 = tangent(g, at, n, work, 1, SPEED, i, state)
-            v = work[trace(at, n, g.K, SPEED, i) + state]
-            if state < end:
-                c = work[trace(at, n, g.K, COSINE, i) + state]
-                si = work[trace(at, n, g.K, SINE, i) + state]
-                along0 = c * fast[s] + si * fast[s + 1]
-                across0 = c * fast[s + 1] - si * fast[s]
-                along1 = c * fast[s + 2] + si * fast[s + 3]
-                across1 = c * fast[s + 3] - si * fast[s + 2]
-                along2 = c * fast[s + 4] + si * fast[s + 5]
-                across2 = c * fast[s + 5] - si * fast[s + 4]
-                fast[node] += g.dt * (
-                    v * (across0 - along1 * heading1 - along2 * heading2) + across1 * speed1 + across2 * speed2
-                )
-                fast[node + 1] += g.dt * (along0 + across1 * heading1 + across2 * heading2)
-            if g.own_slot[VEL] >= 0:
-                fast[node + 1] += residual_adjoint(g, by, VEL, row, v, T(1.0), speed1, speed2)
-            if g.own_slot[VELREF] >= 0:
-                off = v - g.speeds[(game // g.M) * g.N + agents[i]]
-                fast[node + 1] += residual_adjoint(g, by, VELREF, row, off, T(1.0), speed1, speed2)
-            if g.own_slot[VELB] >= 0:
-                over = excess(g, BOUND_VEL, v)
-                slope = excess_slope(g, BOUND_VEL, v)
-                fast[node + 1] += residual_adjoint(g, by, VELB, row, over, slope, speed1, speed2)
-            px = work[trace(at, n, g.K, X, i) + state]
-            py = work[trace(at, n, g.K, Y, i) + state]
-            if g.own_slot[LANE] >= 0 and agents[g.N + i] >= 0:
+            x1 = work[tangent(at, g.K, 0, X, i) + state]
+            y1 = work[tangent(at, g.K, 0, Y, i) + state]
+            x2 = work[tangent(at, g.K, 1, X, i) + state]
+            y2 = work[tangent(at, g.K, 1, Y, i) + state]
+            px = work[trace(at, g.K, X, i) + state]
+            py = work[trace(at, g.K, Y, i) + state]
+            found = six(T(0.0))
+            if own_slot(g, LANE) >= 0 and agents[g.N + i] >= 0:
                 place = i * (g.K + 1) + state
-                pull_to(
+                found += pull_to(
                     g,
-                    by,
+                    at,
+                    work,
                     LANE,
                     row,
-                    fast,
-                    s,
+                    i,
+                    k,
                     px - nearest[NEAR_X * each + place],
                     py - nearest[NEAR_Y * each + place],
                     x1,
@@ -250,14 +348,15 @@ def make(
                     nearest[AHEAD_Y * each + place],
                     g.slides,
                 )
-            if g.own_slot[GOAL] >= 0 and state == end:
-                pull_to(
+            if own_slot(g, GOAL) >= 0 and state == end:
+                found += pull_to(
                     g,
-                    by,
+                    at,
+                    work,
                     GOAL,
                     row,
-                    fast,
-                    s,
+                    i,
+                    k,
                     px - g.goals[2 * row],
                     py - g.goals[2 * row + 1],
                     x1,
@@ -269,17 +368,25 @@ def make(
                     0,
                 )
                 w = weight(g, GOAL, row)
-                add_gradient(by.goals, 0, 0, 2 * row, w * w * x1)
-                add_gradient(by.goals, 0, 0, 2 * row + 1, w * w * y1)
-            if g.own_slot[HEADING] >= 0 and state == end:
-                off = work[trace(at, n, g.K, TURNED, i) + state] - g.headings[row]
-                force = residual_adjoint(g, by, HEADING, row, off, T(1.0), heading1, heading2)
-                fast[node] += force
-                add_gradient(by.headings, 0, 0, row, -force)
+                by.goals[2 * row] = by.goals[2 * row] + w * w * x1
+                by.goals[2 * row + 1] = by.goals[2 * row + 1] + w * w * y1
+            for other in range(n):
+                if other != i and pair_count(g) > 0:
+                    p = pair_index(wp.min(i, other), wp.max(i, other), A)
+                    sign = wp.where(other < i, T(-1.0), T(1.0))
+                    for q in range(6):
+                        found[q] += sign * work[at.touching + (q * P + p) * g.K + k]
+            for q in range(6):
+                work[along(at, g.K, q, i) + k] = found[q]
+        sync()
+        for e in range(lane(), 6 * n, wp.block_dim()):
+            i = e // 6
+            to = along(at, g.K, e - 6 * i, i)
+            sums_back(work, to, 1, end, work, to)
         sync()
 
     @func
-    def pair_adjoint(
+    def motion_adjoint(
         g: Game,
         by: Gradients,
         game: int,
@@ -287,94 +394,109 @@ def make(
         agents: Numbers,
         at: Layout,
         work: Array,
-        fast: Array,
-        state: int,
+        controls: Array,
+        directions: Array,
+        end: int,
     ):
-        """Adds the cotangents of the pair features at a state: each pair by one thread, then the pairs of each agent."""
-        count = (n * (n - 1)) // 2
-        all_pairs = (g.N * (g.N - 1)) // 2
-        stride = g.G * all_pairs
-        features = int(PAIRS)  # a variable, or the loops would be unrolled
-        if state % g.pair_stride == 0:
-            for f in range(features):
-                if g.pair_slot[f] >= 0:
-                    for p in range(lane(), count, wp.block_dim()):
-                        i = pair_first(p, n)
-                        j = p - pair_index(i, i + 1, n) + i + 1
-                        b = (game // g.M) * g.N
-                        place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
-                        w = g.pair[g.pair_slot[f] * stride + place]
-                        margin = T(0.0)
-                        if g.margin_slot[f] >= 0:
-                            margin = g.margins[g.margin_slot[f] * stride + place]
-                        c1 = work[trace(at, n, g.K, COSINE, i) + state]
-                        s1 = work[trace(at, n, g.K, SINE, i) + state]
-                        c2 = work[trace(at, n, g.K, COSINE, j) + state]
-                        s2 = work[trace(at, n, g.K, SINE, j) + state]
-                        turn1a = tangent(g, at, n, work, 0, TURNED, i, state)
-                        turn1b = tangent(g, at, n, work, 1, TURNED, i, state)
-                        turn2a = tangent(g, at, n, work, 0, TURNED, j, state)
-                        turn2b = tangent(g, at, n, work, 1, TURNED, j, state)
-                        value, x, y, h1, v1, h2, v2, by_margin = evaluate_pair(
-                            f,
-                            moving(g, at, n, work, X, i, state),
-                            moving(g, at, n, work, Y, i, state),
-                            dual(c1, -s1 * turn1a, -s1 * turn1b),
-                            dual(s1, c1 * turn1a, c1 * turn1b),
-                            moving(g, at, n, work, SPEED, i, state),
-                            g.size[2 * (b + agents[i])],
-                            g.size[2 * (b + agents[i]) + 1],
-                            moving(g, at, n, work, X, j, state),
-                            moving(g, at, n, work, Y, j, state),
-                            dual(c2, -s2 * turn2a, -s2 * turn2b),
-                            dual(s2, c2 * turn2a, c2 * turn2b),
-                            moving(g, at, n, work, SPEED, j, state),
-                            g.size[2 * (b + agents[j])],
-                            g.size[2 * (b + agents[j]) + 1],
-                            dual(margin, T(0.0), T(0.0)),
-                        )
-                        # phi = -w^2 (g mu) (f + g d) with the gradient g of the feature f.
-                        square = w * w
-                        along_mu = value[1]
-                        ahead = value[0] + value[2]
-                        rows = at.rows + 10 * p
-                        fast[rows] = -square * (x[1] * ahead + along_mu * (x[0] + x[2]))
-                        fast[rows + 1] = -square * (y[1] * ahead + along_mu * (y[0] + y[2]))
-                        fast[rows + 2] = -square * ahead * x[0]
-                        fast[rows + 3] = -square * ahead * y[0]
-                        fast[rows + 4] = -square * along_mu * x[0]
-                        fast[rows + 5] = -square * along_mu * y[0]
-                        fast[rows + 6] = -square * (h1[1] * ahead + along_mu * (h1[0] + h1[2]))
-                        fast[rows + 7] = -square * (v1[1] * ahead + along_mu * (v1[0] + v1[2]))
-                        fast[rows + 8] = -square * (h2[1] * ahead + along_mu * (h2[0] + h2[2]))
-                        fast[rows + 9] = -square * (v2[1] * ahead + along_mu * (v2[0] + v2[2]))
-                        add_gradient(by.pair, g.pair_slot[f], stride, place, T(-2.0) * w * along_mu * ahead)
-                        if g.margin_slot[f] >= 0:
-                            slope = -square * (by_margin[1] * ahead + along_mu * (by_margin[0] + by_margin[2]))
-                            add_gradient(by.margins, g.margin_slot[f], stride, place, slope)
-                    sync()
-                    for i in range(lane(), n, wp.block_dim()):
-                        for other in range(n):
-                            if other != i:
-                                rows = at.rows + 10 * pair_index(wp.min(i, other), wp.max(i, other), n)
-                                second = other < i
-                                sign = wp.where(second, T(-1.0), T(1.0))
-                                six = int(6)
-                                for e in range(six):
-                                    fast[6 * i + e] += sign * fast[rows + e]
-                                own = rows + wp.where(second, 8, 6)
-                                fast[6 * n + 2 * i] += fast[own]
-                                fast[6 * n + 2 * i + 1] += fast[own + 1]
-                    sync()
+        """The cotangents of headings and speeds, with those of later positions, summed over the states from each on."""
+        for e in range(lane(), end * n, wp.block_dim()):
+            i = e // end
+            k = e - i * end
+            state = k + 1
+            row = game * g.N + agents[i]
+            heading1 = work[tangent(at, g.K, 0, TURNED, i) + state]
+            speed1 = work[tangent(at, g.K, 0, SPEED, i) + state]
+            heading2 = work[tangent(at, g.K, 1, TURNED, i) + state]
+            speed2 = work[tangent(at, g.K, 1, SPEED, i) + state]
+            v = work[trace(at, g.K, SPEED, i) + state]
+            by_heading = T(0.0)
+            by_speed_of = T(0.0)
+            if state < end:
+                c = work[trace(at, g.K, COSINE, i) + state]
+                s = work[trace(at, g.K, SINE, i) + state]
+                x0 = work[along(at, g.K, 0, i) + state]
+                y0 = work[along(at, g.K, 1, i) + state]
+                x_mu = work[along(at, g.K, 2, i) + state]
+                y_mu = work[along(at, g.K, 3, i) + state]
+                x_d = work[along(at, g.K, 4, i) + state]
+                y_d = work[along(at, g.K, 5, i) + state]
+                along0 = c * x0 + s * y0
+                across0 = c * y0 - s * x0
+                along1 = c * x_mu + s * y_mu
+                across1 = c * y_mu - s * x_mu
+                along2 = c * x_d + s * y_d
+                across2 = c * y_d - s * x_d
+                by_heading = g.dt * (
+                    v * (across0 - along1 * heading1 - along2 * heading2) + across1 * speed1 + across2 * speed2
+                )
+                by_speed_of = g.dt * (along0 + across1 * heading1 + across2 * heading2)
+                if own_slot(g, STEER) >= 0:
+                    u = row * g.K * 2 + 2 * state + TURN_RATE
+                    by_speed_of += steering_adjoint(g, game, agents, at, work, controls, directions, i, u, state, 1)
+            if own_slot(g, VEL) >= 0:
+                by_speed_of += residual_adjoint(g, at, work, VEL, row, i, k, v, T(1.0), speed1, speed2)
+            if own_slot(g, VELREF) >= 0:
+                off = v - g.speeds[(game // g.M) * g.N + agents[i]]
+                by_speed_of += residual_adjoint(g, at, work, VELREF, row, i, k, off, T(1.0), speed1, speed2)
+            if own_slot(g, VELB) >= 0:
+                over = excess(g, BOUND_VEL, v)
+                slope = excess_slope(g, BOUND_VEL, v)
+                by_speed_of += residual_adjoint(g, at, work, VELB, row, i, k, over, slope, speed1, speed2)
+            if own_slot(g, HEADING) >= 0 and state == end:
+                off = work[trace(at, g.K, TURNED, i) + state] - g.headings[row]
+                force = residual_adjoint(g, at, work, HEADING, row, i, k, off, T(1.0), heading1, heading2)
+                by_heading += force
+                by.headings[row] = by.headings[row] - force
+            for other in range(n):
+                if other != i and pair_count(g) > 0:
+                    p = pair_index(wp.min(i, other), wp.max(i, other), A)
+                    first = wp.where(other < i, 8, 6)
+                    by_heading += work[at.touching + (first * P + p) * g.K + k]
+                    by_speed_of += work[at.touching + ((first + 1) * P + p) * g.K + k]
+            work[along(at, g.K, 6, i) + k] = by_heading
+            work[along(at, g.K, 7, i) + k] = by_speed_of
+        sync()
+        for e in range(lane(), 2 * n, wp.block_dim()):
+            i = e // 2
+            to = along(at, g.K, 6 + e - 2 * i, i)
+            sums_back(work, to, 1, end, work, to)
+        sync()
 
     @wp.func
-    def moving(g: Game, at: Layout, n: int, work: Array, quantity: int, i: int, state: int):
-        """A quantity of a trajectory with its derivatives along mu and d."""
-        return dual(
-            work[trace(at, n, g.K, quantity, i) + state],
-            tangent(g, at, n, work, 0, quantity, i, state),
-            tangent(g, at, n, work, 1, quantity, i, state),
+    def steering_adjoint(
+        g: Game,
+        game: int,
+        agents: Numbers,
+        at: Layout,
+        work: Array,
+        controls: Array,
+        directions: Array,
+        i: int,
+        u: int,
+        k: int,
+        of_speed: int,
+    ):
+        """The cotangent of the speed before a step, or that of its turn rate, which also keeps the product of the weight."""
+        row = game * g.N + agents[i]
+        wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
+        angle, by_turn, by_speed, turn_turn, turn_speed, speed_speed = steering(
+            wheelbase, controls[u], work[trace(at, g.K, SPEED, i) + k]
         )
+        w = weight(g, STEER, row)
+        turn1 = work[at.mu + 2 * (i * g.K + k) + TURN_RATE]
+        turn2 = directions[u]
+        speed1 = work[tangent(at, g.K, 0, SPEED, i) + k]
+        speed2 = work[tangent(at, g.K, 1, SPEED, i) + k]
+        s1 = by_turn * turn1 + by_speed * speed1
+        value = angle + by_turn * turn2 + by_speed * speed2
+        if of_speed == 1:
+            moves1 = turn_speed * turn1 + speed_speed * speed1
+            moves2 = turn_speed * turn2 + speed_speed * speed2
+            return -w * w * (moves1 * value + s1 * (by_speed + moves2))
+        own_product(g, at, work, STEER, i, k, T(-2.0) * w * s1 * value)
+        moves1 = turn_turn * turn1 + turn_speed * speed1
+        moves2 = turn_turn * turn2 + turn_speed * speed2
+        return -w * w * (moves1 * value + s1 * (by_turn + moves2))
 
     @func
     def control_adjoint(
@@ -385,122 +507,119 @@ def make(
         agents: Numbers,
         at: Layout,
         work: Array,
-        fast: Array,
         controls: Array,
         directions: Array,
-        k: int,
+        end: int,
     ):
-        """Adds to the cotangents of the controls of step k, and of the step before: all of an agent by one thread."""
+        """Adds to the cotangents of all controls."""
         per_dt = T(1.0) / g.dt
-        for i in range(lane(), n, wp.block_dim()):
+        for e in range(lane(), n * end, wp.block_dim()):
+            k = e // n
+            i = e - k * n
             row = game * g.N + agents[i]
-            node = 6 * n + 2 * i
-            channels = int(2)
-            for channel in range(channels):
-                turning = channel == TURN_RATE
+            for channel in range(2):
                 u = row * g.K * 2 + 2 * k + channel
                 mine = at.mu + 2 * (i * g.K + k) + channel
+                turning = channel == TURN_RATE
+                force = T(0.0)
+                if k > 0:
+                    change = (controls[u] - controls[u - 2]) * per_dt
+                    mu_change = (work[mine] - work[mine - 2]) * per_dt
+                    d_change = (directions[u] - directions[u - 2]) * per_dt
+                    rate = wp.where(turning, TURNACC, JERK)
+                    rate_bounded = wp.where(turning, TURNACCB, JERKB)
+                    if own_slot(g, rate) >= 0:
+                        force += residual_adjoint(g, at, work, rate, row, i, k, change, T(1.0), mu_change, d_change)
+                    if own_slot(g, rate_bounded) >= 0:
+                        signal = wp.where(turning, BOUND_TURNACC, BOUND_JERK)
+                        over = excess(g, signal, change)
+                        slope = excess_slope(g, signal, change)
+                        force += residual_adjoint(
+                            g, at, work, rate_bounded, row, i, k, over, slope, mu_change, d_change
+                        )
+                work[at.rates + (channel * A + i) * (g.K + 1) + k] = per_dt * force
+        sync()
+        for e in range(lane(), n * end, wp.block_dim()):
+            k = e // n
+            i = e - k * n
+            row = game * g.N + agents[i]
+            for channel in range(2):
+                u = row * g.K * 2 + 2 * k + channel
+                turning = channel == TURN_RATE
                 value = controls[u]
-                mu = work[mine]
+                mu = work[at.mu + 2 * (i * g.K + k) + channel]
                 d = directions[u]
-                bar = g.dt * wp.where(turning, fast[node], fast[node + 1])
+                rate = at.rates + (channel * A + i) * (g.K + 1) + k
+                bar = g.dt * work[along(at, g.K, wp.where(turning, 6, 7), i) + k] + work[rate]
+                if k + 1 < end:
+                    bar -= work[rate + 1]
                 plain = wp.where(turning, TURNR, ACC)
                 bounded = wp.where(turning, TURNRB, ACCB)
                 referring = wp.where(turning, TURNRREF, ACCREF)
-                if g.own_slot[plain] >= 0:
-                    bar += residual_adjoint(g, by, plain, row, value, T(1.0), mu, d)
-                if g.own_slot[referring] >= 0:
-                    force = residual_adjoint(g, by, referring, row, value - g.reference_controls[u], T(1.0), mu, d)
+                if own_slot(g, plain) >= 0:
+                    bar += residual_adjoint(g, at, work, plain, row, i, k, value, T(1.0), mu, d)
+                if own_slot(g, referring) >= 0:
+                    off = value - g.reference_controls[u]
+                    force = residual_adjoint(g, at, work, referring, row, i, k, off, T(1.0), mu, d)
                     bar += force
-                    add_gradient(by.reference_controls, 0, 0, u, -force)
-                if g.own_slot[bounded] >= 0:
+                    by.reference_controls[u] = by.reference_controls[u] - force
+                if own_slot(g, bounded) >= 0:
                     signal = wp.where(turning, BOUND_TURNR, BOUND_ACC)
-                    bar += residual_adjoint(
-                        g, by, bounded, row, excess(g, signal, value), excess_slope(g, signal, value), mu, d
-                    )
-                if k > 0:
-                    change = (value - controls[u - 2]) * per_dt
-                    mu_change = (mu - work[mine - 2]) * per_dt
-                    d_change = (d - directions[u - 2]) * per_dt
-                    rate = wp.where(turning, TURNACC, JERK)
-                    rate_bounded = wp.where(turning, TURNACCB, JERKB)
-                    force = T(0.0)
-                    if g.own_slot[rate] >= 0:
-                        force += residual_adjoint(g, by, rate, row, change, T(1.0), mu_change, d_change)
-                    if g.own_slot[rate_bounded] >= 0:
-                        signal = wp.where(turning, BOUND_TURNACC, BOUND_JERK)
-                        force += residual_adjoint(
-                            g,
-                            by,
-                            rate_bounded,
-                            row,
-                            excess(g, signal, change),
-                            excess_slope(g, signal, change),
-                            mu_change,
-                            d_change,
-                        )
-                    bar += per_dt * force
-                    by.controls[u - 2] = by.controls[u - 2] - per_dt * force
+                    over = excess(g, signal, value)
+                    slope = excess_slope(g, signal, value)
+                    bar += residual_adjoint(g, at, work, bounded, row, i, k, over, slope, mu, d)
+                if turning and own_slot(g, STEER) >= 0:
+                    bar += steering_adjoint(g, game, agents, at, work, controls, directions, i, u, k, 0)
                 by.controls[u] = by.controls[u] + bar
-            if g.own_slot[STEER] >= 0:
-                u = row * g.K * 2 + 2 * k + TURN_RATE
-                wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
-                angle, by_turn, by_speed, turn_turn, turn_speed, speed_speed = steering(
-                    wheelbase, controls[u], work[trace(at, n, g.K, SPEED, i) + k]
-                )
-                w = weight(g, STEER, row)
-                square = w * w
-                turn1 = work[at.mu + 2 * (i * g.K + k) + TURN_RATE]
-                turn2 = directions[u]
-                speed1 = tangent(g, at, n, work, 0, SPEED, i, k)
-                speed2 = tangent(g, at, n, work, 1, SPEED, i, k)
-                s1 = by_turn * turn1 + by_speed * speed1
-                value = angle + by_turn * turn2 + by_speed * speed2
-                turn_moves1 = turn_turn * turn1 + turn_speed * speed1
-                turn_moves2 = turn_turn * turn2 + turn_speed * speed2
-                speed_moves1 = turn_speed * turn1 + speed_speed * speed1
-                speed_moves2 = turn_speed * turn2 + speed_speed * speed2
-                by.controls[u] = by.controls[u] - square * (turn_moves1 * value + s1 * (by_turn + turn_moves2))
-                # The next state of the loop backpropagates the derivative by the speed before this step; the first is given.
-                if k > 0:
-                    fast[node + 1] -= square * (speed_moves1 * value + s1 * (by_speed + speed_moves2))
-                add_gradient(by.own, g.own_slot[STEER], g.G * g.N, row, T(-2.0) * w * s1 * value)
         sync()
 
-    @wp.func
+    @func
     def pull_states(g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array):
-        """Adds the pullback of the cotangent of the states to that of the controls."""
-        for i in range(lane(), n, wp.block_dim()):
-            row = (game * g.N + agents[i]) * g.K
-            x = T(0.0)
-            y = T(0.0)
-            heading = T(0.0)
-            speed = T(0.0)
-            for back in range(g.K):
-                k = g.K - 1 - back
-                if k + 1 < g.K:
-                    c = work[trace(at, n, g.K, COSINE, i) + k + 1]
-                    s = work[trace(at, n, g.K, SINE, i) + k + 1]
-                    heading += g.dt * work[trace(at, n, g.K, SPEED, i) + k + 1] * (c * y - s * x)
-                    speed += g.dt * (c * x + s * y)
-                x += by.states[4 * (row + k)]
-                y += by.states[4 * (row + k) + 1]
-                heading += by.states[4 * (row + k) + 2]
-                speed += by.states[4 * (row + k) + 3]
-                u = 2 * (row + k)
-                by.controls[u + TURN_RATE] = by.controls[u + TURN_RATE] + g.dt * heading
-                by.controls[u + ACCELERATION] = by.controls[u + ACCELERATION] + g.dt * speed
+        """Adds the pullback of the cotangent of the states to that of the controls: sums backwards in time."""
+        for e in range(lane(), 4 * n, wp.block_dim()):
+            i = e // 4
+            q = e - 4 * i
+            first = 4 * (game * g.N + agents[i]) * g.K + q
+            if q < 2:
+                sums_back(by.states, first, 4, g.K, work, along(at, g.K, q, i))
+        sync()
+        for e in range(lane(), n * g.K, wp.block_dim()):
+            i = e // g.K
+            k = e - i * g.K
+            first = 4 * ((game * g.N + agents[i]) * g.K + k)
+            heading = by.states[first + 2]
+            speed = by.states[first + 3]
+            if k + 1 < g.K:
+                c = work[trace(at, g.K, COSINE, i) + k + 1]
+                s = work[trace(at, g.K, SINE, i) + k + 1]
+                x = work[along(at, g.K, 0, i) + k + 1]
+                y = work[along(at, g.K, 1, i) + k + 1]
+                heading += g.dt * work[trace(at, g.K, SPEED, i) + k + 1] * (c * y - s * x)
+                speed += g.dt * (c * x + s * y)
+            work[along(at, g.K, 6, i) + k] = heading
+            work[along(at, g.K, 7, i) + k] = speed
+        sync()
+        for e in range(lane(), 2 * n, wp.block_dim()):
+            i = e // 2
+            to = along(at, g.K, 6 + e - 2 * i, i)
+            sums_back(work, to, 1, g.K, work, to)
+        sync()
+        for e in range(lane(), 2 * n * g.K, wp.block_dim()):
+            k = e // (2 * n)
+            i = (e - k * 2 * n) // 2
+            channel = e % 2
+            u = 2 * ((game * g.N + agents[i]) * g.K + k) + channel
+            force = work[along(at, g.K, wp.where(channel == TURN_RATE, 6, 7), i) + k]
+            by.controls[u] = by.controls[u] + g.dt * force
         sync()
 
     return SimpleNamespace(
         roll_tangents=roll_tangents,
-        tangent=tangent,
-        add_gradient=add_gradient,
-        residual_adjoint=residual_adjoint,
-        pull_to=pull_to,
-        state_adjoint=state_adjoint,
+        forget_products=forget_products,
+        add_products=add_products,
         pair_adjoint=pair_adjoint,
-        moving=moving,
+        position_adjoint=position_adjoint,
+        motion_adjoint=motion_adjoint,
         control_adjoint=control_adjoint,
         pull_states=pull_states,
     )

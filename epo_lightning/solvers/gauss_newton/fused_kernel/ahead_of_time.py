@@ -16,9 +16,14 @@ from pathlib import Path
 import torch
 
 from epo_lightning.solvers.gauss_newton import fused
+from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 
 ARCHITECTURES = (80, 90)
 """Compute capabilities times ten: A100; H100 and H200."""
+HIGHWAY = Features(("goal", "lane", "velref", "vel", "acc", "jerk", "steer", "turnr", "turnacc"), ("proximity",))
+"""The energy of the highway setting of `benchmarks/games.py`."""
+import os
+BLOCK = int(os.environ.get("EPO_BLOCK", "32"))
 _VALUE, _REGISTERS, _STACK = 0x04, 0x2F, 0x12  # a record with a payload, and the attributes of two of them
 
 
@@ -39,7 +44,9 @@ class Resources:
     code: int
 
 
-def compile_for(architecture: int, double: bool, agents: int, folder: Path) -> dict[str, Resources]:
+def compile_for(
+    architecture: int, double: bool, agents: int, folder: Path, features: Features = HIGHWAY
+) -> dict[str, Resources]:
     """The resources of both kernels.
 
     Args:
@@ -47,12 +54,15 @@ def compile_for(architecture: int, double: bool, agents: int, folder: Path) -> d
         double: whether numbers have double precision.
         agents: number of agents of a game.
         folder: where Warp writes source and machine code.
+        features: the features of the games.
     """
     wp = fused.warp()
-    kernels = fused.kernels(torch.float64 if double else torch.float32, agents, torch.device("cuda"))
+    dtype, device = torch.float64 if double else torch.float32, torch.device("cuda")
+    kernels = fused.kernels(dtype, agents, device, features)
     found = {}
     for name in ("solve", "differentiate"):
         module = getattr(kernels, name).module
+        module.options["block_dim"] = BLOCK
         (path,) = wp.compile_aot_module(module, arch=architecture, use_ptx=False, module_dir=folder)
         found[name] = resources(path.read_bytes())
     return found
@@ -111,7 +121,7 @@ def main(given: Sequence[str] | None = None) -> None:
     print("|---|---|---|---|---|---|---|---|")
     for architecture in arguments.arch:
         for double in (False, True):
-            for agents in fused.SHARED:
+            for agents in fused.SIZES:
                 with tempfile.TemporaryDirectory() as folder:
                     found = compile_for(architecture, double, agents, Path(folder))
                 for name, r in found.items():

@@ -19,3 +19,6 @@ PAIRS = len(PAIR)
 SOLVED, DAMPED, STOPPED = (int(status) for status in (Status.SOLVED, Status.DAMPED, Status.STOPPED))
 X, Y, TURNED, SPEED, SINE, COSINE = range(6)  # arrays of a trajectory
 NEAR_X, NEAR_Y, AHEAD_X, AHEAD_Y = range(4)  # nearest points of reference lines, and unit tangents there
+# Derivatives by the controls of an agent: gradient by turn rate and acceleration, the part of it by their changes, damped
+# second derivatives, the part of them by the changes, that by turn rate and speed, and the motion of the position.
+PULL, RATE, DAMPED_STIFFNESS, RATE_STIFFNESS, COUPLING, MOTION = 0, 2, 4, 6, 8, 9

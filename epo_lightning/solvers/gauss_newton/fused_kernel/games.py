@@ -6,7 +6,6 @@ from typing import Any, no_type_check
 import warp as wp
 
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
-    ACCELERATION,
     AHEAD_X,
     AHEAD_Y,
     COSINE,
@@ -22,27 +21,57 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     X,
     Y,
 )
+from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, SIGNALS
 
 
 @no_type_check
-def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamespace:
+def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespace, func: Any) -> SimpleNamespace:
     """Structures and functions for numbers of type ``T``; ``func`` decorates the longer functions.
 
     Args:
-        most: largest number of agents, for which places in fast memory are constants; 0 for any number.
+        agents: number of agents for which memory is laid out; a game has that many or fewer.
+        features: the only features that the games have, so that the compiler leaves out all others; None for any.
     """
+    A = agents
     bytes_each = 8 if T is wp.float64 else 4
     Array = wp.array(dtype=T)
     Numbers = wp.array(dtype=wp.int32)
     OwnSlots = wp.types.vector(len(OWN), wp.int32)
     PairSlots = wp.types.vector(PAIRS, wp.int32)
     Bounds = wp.types.vector(2 * len(SIGNALS), T)
-    sync, lane = threads.sync, threads.lane
+    known = features or Features((), ())
+    own_slots, pair_features, margin_slots = (
+        OwnSlots(*known.own_slots),
+        PairSlots(*known.pair_features),
+        PairSlots(*known.margin_slots),
+    )
+    own_number, pair_number = len(known.own), len(known.pair)
+    sync, lane, sums = threads.sync, threads.lane, threads.sums
+
+    @wp.struct
+    class Layout:
+        """First numbers of arrays in the memory of a game: see `layout.py`."""
+
+        path: int
+        linear: int
+        mu: int
+        tangents: int
+        costs: int
+        control: int
+        fast: int
+        hessian: int
+        rows: int
+        energy: int
+        along: int
+        rates: int
+        touching: int
+        weights: int
+        numbers: int
 
     @wp.struct
     class Game:
-        """Tensors of G = B M games, contiguous. Slots are positions of features in ``own``, ``pair``, ``margins``, or -1."""
+        """Tensors of G = B M games, contiguous, and the features of their energy, as :class:`Features` has them."""
 
         G: int
         M: int
@@ -53,10 +82,12 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
         pair_stride: int
         slides: int
         cut: int
+        own_count: int
+        pair_count: int
         dt: T
         step_size: T
         own_slot: OwnSlots
-        pair_slot: PairSlots
+        pair_feature: PairSlots
         margin_slot: PairSlots
         bounds: Bounds
         initial: Array
@@ -77,11 +108,13 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
 
     @wp.struct
     class Run:
-        """Steps, results and memory. Factors and nearest points are by step and game if recorded, and otherwise by block."""
+        """Steps, results and memory. Factors and nearest points are by step and game if recorded, and otherwise by block;
+        ``slots`` is the number of games or of blocks."""
 
         steps: int
         record: int
         blocks: int
+        slots: int
         start: Array
         iterates: Array
         iterate_stride: wp.int64
@@ -96,7 +129,7 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
         nearest: Array
         taken: Numbers
         work: Array
-        work_numbers: int
+        at: Layout
         numbers: Numbers
 
     @wp.struct
@@ -115,61 +148,6 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
         headings: Array
         reference_controls: Array
 
-    @wp.struct
-    class Layout:
-        """Places in the fast memory of a game (P is at 0), and from ``path`` on in its slow memory."""
-
-        y: int
-        damped: int
-        pull: int
-        rate_pull: int
-        rate_stiffness: int
-        speed_pull: int
-        speed_stiffness: int
-        coupling: int
-        Z: int
-        x: int
-        c: int
-        L: int
-        G: int
-        energy: int
-        norm: int
-        pair_energy: int
-        rows: int
-        path: int
-        h: int
-        tangents: int
-        mu: int
-
-    @wp.func
-    def layout(n: int, K: int):
-        at = Layout()
-        # With the largest number of agents, the places in fast memory are constants and take no registers.
-        size = wp.static(most) if wp.static(most > 0) else n
-        m = 2 * size
-        at.y = 9 * m * m
-        at.damped = at.y + 3 * m
-        at.pull = at.damped + m
-        at.rate_pull = at.pull + m
-        at.rate_stiffness = at.rate_pull + m
-        at.speed_pull = at.rate_stiffness + m
-        at.speed_stiffness = at.speed_pull + size
-        at.coupling = at.speed_stiffness + size
-        at.Z = at.coupling + size
-        at.x = at.Z + 4 * size
-        at.c = at.x + 3 * m
-        at.L = at.c + m
-        at.G = at.L + m * m
-        at.energy = at.G + 3 * m * m
-        at.norm = at.energy + m
-        at.pair_energy = at.norm + m
-        at.rows = at.pair_energy + size * (size - 1) // 2
-        at.path = 0
-        at.h = 6 * n * (K + 1)
-        at.tangents = at.h + 2 * n * K
-        at.mu = at.tangents + 8 * n * (K + 1)
-        return at
-
     @wp.func
     def part(whole: Array, start: wp.int64, count: int):
         return wp.array(ptr=whole.ptr + wp.uint64(start) * wp.uint64(bytes_each), shape=(count,), dtype=T)
@@ -187,6 +165,52 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
             i += 1
         return i
 
+    # ---- Features: constants if the kernels are compiled for them
+
+    if features is None:
+
+        @wp.func
+        def own_slot(g: Game, feature: int):
+            return g.own_slot[feature]
+
+        @wp.func
+        def pair_feature(g: Game, slot: int):
+            return g.pair_feature[slot]
+
+        @wp.func
+        def margin_slot(g: Game, slot: int):
+            return g.margin_slot[slot]
+
+        @wp.func
+        def own_count(g: Game):
+            return g.own_count
+
+        @wp.func
+        def pair_count(g: Game):
+            return g.pair_count
+
+    else:
+
+        @wp.func
+        def own_slot(g: Game, feature: int):
+            return own_slots[feature]
+
+        @wp.func
+        def pair_feature(g: Game, slot: int):
+            return pair_features[slot]
+
+        @wp.func
+        def margin_slot(g: Game, slot: int):
+            return margin_slots[slot]
+
+        @wp.func
+        def own_count(g: Game):
+            return own_number
+
+        @wp.func
+        def pair_count(g: Game):
+            return pair_number
+
     # ---- A game: its agents, their lines and whether its inputs are finite
 
     @func
@@ -198,7 +222,7 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
             if g.present[b * g.N + a] != wp.uint8(0):
                 if lane() == 0:
                     line = int(-1)
-                    if g.own_slot[LANE] >= 0:
+                    if own_slot(g, LANE) >= 0:
                         chosen = int(g.reference[game * g.N + a])
                         if chosen >= 0 and chosen < g.lines:
                             if g.exists[(b * g.N + a) * g.lines + chosen] != wp.uint8(0):
@@ -223,124 +247,103 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
         if lane() == 0:
             agents[flag] = 1
         sync()
-        any_pair = int(0)
-        features = int(PAIRS)  # a variable, or the loops would be unrolled
-        for f in range(features):
-            if g.pair_slot[f] >= 0:
-                any_pair = 1
+        sound = int(1)
         for i in range(lane(), n, wp.block_dim()):
-            a = agents[i]
-            row = b * g.N + a
-            sound = int(1)
+            row = b * g.N + agents[i]
             for e in range(4):
                 if not wp.isfinite(g.initial[4 * row + e]):
                     sound = 0
-            if any_pair == 1 or g.own_slot[STEER] >= 0:
+            if pair_count(g) > 0 or own_slot(g, STEER) >= 0:
                 if not wp.isfinite(g.size[2 * row]):
                     sound = 0
-            for f in range(2, features):
-                if g.pair_slot[f] >= 0:
+            for slot in range(pair_count(g)):
+                if pair_feature(g, slot) >= 2:  # all but those of discs read the width
                     if not wp.isfinite(g.size[2 * row + 1]):
                         sound = 0
-            if g.own_slot[LANE] >= 0:
-                chosen = int(g.reference[game * g.N + a])
+            if own_slot(g, LANE) >= 0:
+                chosen = int(g.reference[game * g.N + agents[i]])
                 if chosen < 0 or chosen >= g.lines:
                     sound = 0
+        if own_slot(g, LANE) >= 0:
+            for e in range(lane(), n * 2 * g.points, wp.block_dim()):
+                i = e // (2 * g.points)
                 if agents[g.N + i] >= 0:
-                    for e in range(2 * g.points):
-                        if not wp.isfinite(g.references[agents[g.N + i] + e]):
-                            sound = 0
-            for j in range(i + 1, n):
-                c = agents[j]
-                entry = game * ((g.N * (g.N - 1)) // 2) + pair_index(a, c, g.N)
-                all_pairs = g.G * ((g.N * (g.N - 1)) // 2)
-                for f in range(features):
-                    if g.pair_slot[f] >= 0:
-                        if not wp.isfinite(g.pair[g.pair_slot[f] * all_pairs + entry]):
-                            sound = 0
-                        if g.margin_slot[f] >= 0:
-                            if not wp.isfinite(g.margins[g.margin_slot[f] * all_pairs + entry]):
-                                sound = 0
-            if sound == 0:
-                agents[flag] = 0
+                    if not wp.isfinite(g.references[agents[g.N + i] + e - i * 2 * g.points]):
+                        sound = 0
+        all_pairs = (g.N * (g.N - 1)) // 2
+        for e in range(lane(), pair_count(g) * ((n * (n - 1)) // 2), wp.block_dim()):
+            slot = e // ((n * (n - 1)) // 2)
+            p = e - slot * ((n * (n - 1)) // 2)
+            i = pair_first(p, n)
+            j = p - pair_index(i, i + 1, n) + i + 1
+            entry = game * all_pairs + pair_index(agents[i], agents[j], g.N)
+            if not wp.isfinite(g.pair[slot * g.G * all_pairs + entry]):
+                sound = 0
+            if margin_slot(g, slot) >= 0:
+                if not wp.isfinite(g.margins[margin_slot(g, slot) * g.G * all_pairs + entry]):
+                    sound = 0
+        if sound == 0:
+            agents[flag] = 0
         sync()
         return agents[flag]
 
     @wp.func
     def weight(g: Game, feature: int, row: int):
-        slot = g.own_slot[feature]
-        if slot < 0:
-            return T(0.0)
-        return g.own[slot * g.G * g.N + row]
+        """The weight of an own feature that the energy has."""
+        return g.own[own_slot(g, feature) * g.G * g.N + row]
 
     # ---- Trajectories
 
     @wp.func
-    def trace(at: Layout, n: int, K: int, quantity: int, i: int):
-        """Start of one quantity of agent i's trajectory in the slow memory."""
-        return at.path + (quantity * n + i) * (K + 1)
+    def trace(at: Layout, K: int, quantity: int, i: int):
+        """Start of one quantity of agent i's trajectory."""
+        return at.path + (quantity * A + i) * (K + 1)
 
     @func
     def roll(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, controls: Array):
-        for i in range(lane(), n, wp.block_dim()):
-            a = agents[i]
-            start = 4 * ((game // g.M) * g.N + a)
-            u = (game * g.N + a) * g.K * 2
-            x = trace(at, n, g.K, X, i)
-            y = trace(at, n, g.K, Y, i)
-            turned = trace(at, n, g.K, TURNED, i)
-            faster = trace(at, n, g.K, SPEED, i)
-            sine = trace(at, n, g.K, SINE, i)
-            cosine = trace(at, n, g.K, COSINE, i)
-            x0 = g.initial[start]
-            y0 = g.initial[start + 1]
-            heading0 = g.initial[start + 2]
-            speed0 = g.initial[start + 3]
-            # The changes are summed on their own: added to a large coordinate, small ones would lose most of their digits.
-            dx = T(0.0)
-            dy = T(0.0)
-            dh = T(0.0)
-            dv = T(0.0)
-            for k in range(g.K + 1):
-                heading = heading0 + dh
-                speed = speed0 + dv
-                s = wp.sin(heading)
-                c = wp.cos(heading)
-                work[x + k] = x0 + dx
-                work[y + k] = y0 + dy
-                work[turned + k] = heading
-                work[faster + k] = speed
-                work[sine + k] = s
-                work[cosine + k] = c
-                if k < g.K:
-                    dx += g.dt * speed * c
-                    dy += g.dt * speed * s
-                    dh += g.dt * controls[u + 2 * k + TURN_RATE]
-                    dv += g.dt * controls[u + 2 * k + ACCELERATION]
-        sync()
+        """Headings and speeds are sums of the controls along time, and positions are sums of the motions that follow.
 
-    @wp.func
-    def set_motions(g: Game, n: int, at: Layout, work: Array, fast: Array, k: int):
-        """Z of step k; the caller waits."""
-        for i in range(lane(), n, wp.block_dim()):
-            s = work[trace(at, n, g.K, SINE, i) + k]
-            c = work[trace(at, n, g.K, COSINE, i) + k]
-            along = g.dt * work[trace(at, n, g.K, SPEED, i) + k]
-            z = at.Z + 4 * i
-            fast[z] = -along * s
-            fast[z + 1] = along * c
-            fast[z + 2] = g.dt * c
-            fast[z + 3] = g.dt * s
+        The changes are summed on their own: added to a large coordinate, small ones would lose most of their digits.
+        """
+        for e in range(lane(), 2 * n, wp.block_dim()):
+            i = e // 2
+            channel = e - 2 * i
+            row = (game // g.M) * g.N + agents[i]
+            turning = channel == TURN_RATE
+            start = g.initial[4 * row + wp.where(turning, 2, 3)]
+            to = trace(at, g.K, wp.where(turning, TURNED, SPEED), i)
+            sums(controls, (game * g.N + agents[i]) * g.K * 2 + channel, 2, g.K, start, g.dt, work, to)
+        sync()
+        for e in range(lane(), n * (g.K + 1), wp.block_dim()):
+            i = e // (g.K + 1)
+            k = e - i * (g.K + 1)
+            heading = work[trace(at, g.K, TURNED, i) + k]
+            s = wp.sin(heading)
+            c = wp.cos(heading)
+            along = g.dt * work[trace(at, g.K, SPEED, i) + k]
+            work[trace(at, g.K, SINE, i) + k] = s
+            work[trace(at, g.K, COSINE, i) + k] = c
+            work[trace(at, g.K, X, i) + k] = along * c
+            work[trace(at, g.K, Y, i) + k] = along * s
+        sync()
+        for e in range(lane(), 2 * n, wp.block_dim()):
+            i = e // 2
+            axis = e - 2 * i
+            start = g.initial[4 * ((game // g.M) * g.N + agents[i]) + axis]
+            to = trace(at, g.K, wp.where(axis == 0, X, Y), i)
+            sums(work, to, 1, g.K, start, T(1.0), work, to)
+        sync()
 
     @func
     def find_nearest(g: Game, n: int, agents: Numbers, at: Layout, work: Array, nearest: Array):
-        if g.own_slot[LANE] >= 0:
+        """The nearest points of the lines [4, n, K + 1], with the tangents there where the nearest point moves along."""
+        if own_slot(g, LANE) >= 0:
             for e in range(lane(), n * g.K, wp.block_dim()):
                 i = e // g.K
                 k = e - i * g.K + 1
                 line = agents[g.N + i]
-                x = work[trace(at, n, g.K, X, i) + k]
-                y = work[trace(at, n, g.K, Y, i) + k]
+                x = work[trace(at, g.K, X, i) + k]
+                y = work[trace(at, g.K, Y, i) + k]
                 best = T(wp.inf)
                 # If no comparison below is true, an input is NaN, and the nearest point stays NaN.
                 near_x = T(wp.nan)
@@ -352,11 +355,13 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
                     near_x = x
                     near_y = y
                 else:
-                    for q in range(g.points - 1):
-                        from_x = g.references[line + 2 * q]
-                        from_y = g.references[line + 2 * q + 1]
-                        dx = g.references[line + 2 * q + 2] - from_x
-                        dy = g.references[line + 2 * q + 3] - from_y
+                    from_x = g.references[line]
+                    from_y = g.references[line + 1]
+                    for q in range(1, g.points):
+                        to_x = g.references[line + 2 * q]
+                        to_y = g.references[line + 2 * q + 1]
+                        dx = to_x - from_x
+                        dy = to_y - from_y
                         length = dx * dx + dy * dy
                         inverse = T(0.0)
                         if length > T(0.0):
@@ -373,6 +378,8 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
                             ahead_x = dx
                             ahead_y = dy
                             inside = wp.where(along == raw, inverse, T(0.0))
+                        from_x = to_x
+                        from_y = to_y
                 scale = wp.sqrt(inside)
                 place = i * (g.K + 1) + k
                 each = n * (g.K + 1)
@@ -387,7 +394,12 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
         Run=Run,
         Gradients=Gradients,
         Layout=Layout,
-        layout=layout,
+        agents=A,
+        own_slot=own_slot,
+        own_count=own_count,
+        pair_feature=pair_feature,
+        pair_count=pair_count,
+        margin_slot=margin_slot,
         part=part,
         pair_index=pair_index,
         pair_first=pair_first,
@@ -397,7 +409,6 @@ def make(T: Any, most: int, threads: SimpleNamespace, func: Any) -> SimpleNamesp
         weight=weight,
         trace=trace,
         roll=roll,
-        set_motions=set_motions,
         find_nearest=find_nearest,
         Array=Array,
         Numbers=Numbers,

@@ -1,96 +1,100 @@
 """The two kernels: all steps of a game, and their adjoint. Their formulas are those of `kernel/group.hpp` and `step.hpp`."""
 
 import functools
+import os
 from types import SimpleNamespace
 from typing import no_type_check
 
 import warp as wp
 
 from epo_lightning.solvers.gauss_newton.fused_kernel import adjoint as adjoints
-from epo_lightning.solvers.gauss_newton.fused_kernel import costs as all_costs
+from epo_lightning.solvers.gauss_newton.fused_kernel import expansion as expansions
 from epo_lightning.solvers.gauss_newton.fused_kernel import games as all_games
 from epo_lightning.solvers.gauss_newton.fused_kernel import pairs as pair_features
-from epo_lightning.solvers.gauss_newton.fused_kernel import riccati, threads
-from epo_lightning.solvers.gauss_newton.fused_kernel import steps as all_steps
-from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
-    ACCELERATION,
-    DAMPED,
-    SOLVED,
-    STOPPED,
-    TURN_RATE,
-)
+from epo_lightning.solvers.gauss_newton.fused_kernel import recursion as recursions
+from epo_lightning.solvers.gauss_newton.fused_kernel import threads
+from epo_lightning.solvers.gauss_newton.fused_kernel.constants import DAMPED, SOLVED, STOPPED
+from epo_lightning.solvers.gauss_newton.fused_kernel.layout import factor_numbers
 from epo_lightning.solvers.gauss_newton.structured import RETRIES
 
+REGISTERS = int(os.environ.get("EPO_REG", "128"))
 OPTIONS = {"cpu_compiler_flags": "-march=native"}
 """Without Warp's flags for more inlining on CPUs, which double the time of compilation."""
 
 
 @functools.cache
 @no_type_check
-def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> SimpleNamespace:
+def make(
+    double: bool, agents: int, features: all_games.Features | None = None, backwards: bool = False
+) -> SimpleNamespace:
     """The kernels ``solve`` and ``differentiate`` and the structures of their arguments.
 
     Args:
         double: whether numbers have double precision.
-        most: largest number of agents, if fast memory is to be shared memory; 0 for games of any size.
-        inlined: whether long functions are inlined. For CPUs they are not, or they would be compiled as often as they are
-            called. For GPUs they are, because a call would copy its arguments, which describe the game, to the stack.
+        agents: number of agents that a game has at most.
+        features: the features of the games, for kernels that are compiled for them and have all functions inlined, as GPUs
+            need it; None for kernels that solve games with any features and take a few seconds to compile, for CPUs.
         backwards: whether a CPU runs the threads of a game in the opposite order, for tests.
     """
     T = wp.float64 if double else wp.float32
-    bytes_each = 8 if double else 4
-    func = functools.partial(wp.func, inline=None if inlined else False)
-    basics = threads.make(T, most, backwards)
-    games = all_games.make(T, most, basics, func)
-    features = pair_features.make(T)
-    costs = all_costs.make(T, basics, games, features, func)
-    recursion = riccati.make(T, basics, games.Layout, func)
-    steps = all_steps.make(T, basics, games, costs, recursion, func)
-    adjoint = adjoints.make(T, basics, games, costs, features, func)
-    sync, lane, fast_memory = basics.sync, basics.lane, basics.fast_memory
-    Game, Run, Gradients, layout, part, set_up = (
-        games.Game,
-        games.Run,
-        games.Gradients,
-        games.layout,
-        games.part,
-        games.set_up,
-    )
-    end_of, valid, trace, roll, set_motions, find_nearest = (
+    func = functools.partial(wp.func, inline=None if features else False)
+    basics = threads.make(T, backwards)
+    games = all_games.make(T, agents, features, basics, func)
+    features = pair_features.make(T, func)
+    expansion = expansions.make(T, basics, games, features, func)
+    recursion = recursions.make(T, agents, backwards)
+    adjoint = adjoints.make(T, basics, games, expansion, features, func)
+    sync, lane = basics.sync, basics.lane
+    Game, Run, Gradients, part, set_up = games.Game, games.Run, games.Gradients, games.part, games.set_up
+    pair_count = games.pair_count
+    end_of, valid, trace, roll, find_nearest = (
         games.end_of,
         games.valid,
         games.trace,
         games.roll,
-        games.set_motions,
         games.find_nearest,
     )
-    total = costs.total
-    pull = recursion.pull
-    push_all, solve_step, evaluate = steps.push_all, steps.solve_step, steps.evaluate
-    roll_tangents, state_adjoint, pair_adjoint, control_adjoint, pull_states = (
+    set_motions, expand_pairs, expand_controls, expand_states, raise_damping, total, squared_slope = (
+        expansion.set_motions,
+        expansion.expand_pairs,
+        expansion.expand_controls,
+        expansion.expand_states,
+        expansion.raise_damping,
+        expansion.total,
+        expansion.squared_slope,
+    )
+    eliminate, pull, push = recursion.eliminate, recursion.pull, recursion.push
+    roll_tangents, forget_products, add_products = (
         adjoint.roll_tangents,
-        adjoint.state_adjoint,
+        adjoint.forget_products,
+        adjoint.add_products,
+    )
+    pair_adjoint, position_adjoint, motion_adjoint, control_adjoint, pull_states = (
         adjoint.pair_adjoint,
+        adjoint.position_adjoint,
+        adjoint.motion_adjoint,
         adjoint.control_adjoint,
         adjoint.pull_states,
     )
+    each_factor = factor_numbers(agents)
+    rows = 2 * agents
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(
+        enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False, cuda_max_registers=REGISTERS
+    )
     def solve(g: Game, run: Run):
         block, _ = wp.tid()
+        at = run.at
         row = g.N * g.K * 2
         everything = g.G * row
-        each_factor = 16 * g.N * g.N * g.K
+        factors_of_step = each_factor * g.K
         each_nearest = 4 * g.N * (g.K + 1)
-        work = part(run.work, wp.int64(block) * wp.int64(run.work_numbers), run.work_numbers)
-        rest = work.ptr + wp.uint64((14 * g.N * (g.K + 1) + 4 * g.N * g.K) * bytes_each)
-        fast = wp.array(ptr=fast_memory(rest), shape=(run.work_numbers,), dtype=T)
+        work = part(run.work, wp.int64(block) * wp.int64(at.numbers), at.numbers)
         agents = wp.array(
             ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
         )
         for game in range(block, g.G, run.blocks):
             n = set_up(g, game, agents)
-            at = layout(n, g.K)
             end = end_of(g, game)
             sound = valid(g, game, n, agents)
             status = SOLVED
@@ -102,103 +106,113 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
                 first[game * row + e] = wp.where(there, run.start[game * row + e], T(0.0))
             sync()
             slot = wp.where(run.record == 1, game, block)
-            for s in range(run.steps):
+            flag = 2 * g.N
+            # The last turn takes no step: it evaluates the last iterate. Code that is inlined once is shorter than twice.
+            for s in range(run.steps + 1):
+                stepping = wp.where(s < run.steps, 1, 0)
                 controls = part(run.iterates, wp.int64(s) * run.iterate_stride, everything)
-                onward = part(run.iterates, wp.int64(s + 1) * run.iterate_stride, everything)
-                directions = part(run.directions, wp.int64(s) * run.direction_stride, everything)
-                tape = wp.int64(wp.where(run.record == 1, s * g.G, 0) + slot)
-                factors = part(run.factors, tape * wp.int64(each_factor), each_factor)
+                # Nearest points of the last iterate have a place of their own: those of the steps are needed again.
+                tape = wp.int64(wp.where(run.record == 1, s, 0)) * wp.int64(run.slots) + wp.int64(slot)
                 nearest = part(run.nearest, tape * wp.int64(each_nearest), each_nearest)
-                for e in range(lane(), row, wp.block_dim()):
-                    directions[game * row + e] = T(0.0)
                 roll(g, game, n, agents, at, work, controls)
                 find_nearest(g, n, agents, at, work, nearest)
-                raised = T(0.0)
-                positive = int(0)
-                attempt = int(0)
-                while positive == 0 and attempt <= RETRIES:
-                    positive = solve_step(
-                        g, game, n, agents, at, work, nearest, fast, factors, controls, end, raised, directions
+                set_motions(g, n, at, work, end)
+                expand_pairs(g, game, n, agents, at, work, end, stepping)
+                expand_controls(g, game, n, agents, at, work, controls, end)
+                expand_states(g, game, n, agents, at, work, nearest, controls, end, stepping)
+                if s == 0 or stepping == 0:
+                    energy = total(n, at, work, g.K, end)
+                    if lane() == 0:
+                        run.energy[game] = energy
+                        if s == 0:
+                            run.initial_energy[game] = energy
+                if stepping == 1:
+                    onward = part(run.iterates, wp.int64(s + 1) * run.iterate_stride, everything)
+                    directions = part(run.directions, wp.int64(s) * run.direction_stride, everything)
+                    factors = part(run.factors, tape * wp.int64(factors_of_step), factors_of_step)
+                    for e in range(lane(), row, wp.block_dim()):
+                        directions[game * row + e] = T(0.0)
+                    sync()
+                    positive = int(0)
+                    attempt = int(0)
+                    raised = T(0.0)
+                    while positive == 0 and attempt <= RETRIES:
+                        positive = eliminate(work, at.control, at.hessian, at.linear, at.fast, factors, end, g.dt)
+                        if positive == 0:
+                            status = wp.max(status, DAMPED)
+                            more = wp.where(attempt == 0, T(10.0), T(9.0) * raised)
+                            raised += more
+                            raise_damping(g, game, n, agents, at, work, end, more)
+                        attempt += 1
+                    push(
+                        work,
+                        at.control,
+                        at.linear,
+                        at.fast,
+                        factors,
+                        end,
+                        g.dt,
+                        directions,
+                        game * row,
+                        0,
+                        agents,
+                        n,
+                        g.K,
                     )
-                    if positive == 0:
-                        status = wp.max(status, DAMPED)
-                        raised = wp.where(attempt == 0, T(10.0), T(10.0) * raised)
-                    attempt += 1
-                if s == 0 and lane() == 0:
-                    run.initial_energy[game] = total(n, at, fast)
-                flag = 2 * g.N
-                if lane() == 0:
-                    agents[flag] = sound * positive
-                sync()
-                for e in range(lane(), row, wp.block_dim()):
-                    moved = controls[game * row + e] + g.step_size * directions[game * row + e]
-                    if not wp.isfinite(moved):
-                        agents[flag] = 0
-                sync()
-                taken = agents[flag]
-                if taken == 0:
-                    status = STOPPED
-                for e in range(lane(), row, wp.block_dim()):
-                    here = controls[game * row + e]
-                    if taken == 1:
-                        here += g.step_size * directions[game * row + e]
-                    onward[game * row + e] = here
-                if run.record == 1 and lane() == 0:
-                    run.taken[s * g.G + game] = taken
-                sync()
-            last = part(run.iterates, wp.int64(run.steps) * run.iterate_stride, everything)
-            # Nearest points of the last iterate go where those of the first step are, which are needed again if recorded.
-            final = part(
-                run.nearest, wp.int64(run.steps * run.record * g.G + slot) * wp.int64(each_nearest), each_nearest
-            )
-            roll(g, game, n, agents, at, work, last)
-            find_nearest(g, n, agents, at, work, final)
-            energy, squared = evaluate(g, game, n, agents, at, work, final, fast, last, end)
+                    if lane() == 0:
+                        agents[flag] = sound * positive
+                    sync()
+                    for e in range(lane(), row, wp.block_dim()):
+                        moved = controls[game * row + e] + g.step_size * directions[game * row + e]
+                        if not wp.isfinite(moved):
+                            agents[flag] = 0
+                    sync()
+                    taken = agents[flag]
+                    if taken == 0:
+                        status = STOPPED
+                    for e in range(lane(), row, wp.block_dim()):
+                        here = controls[game * row + e]
+                        if taken == 1:
+                            here += g.step_size * directions[game * row + e]
+                        onward[game * row + e] = here
+                    if run.record == 1 and lane() == 0:
+                        run.taken[s * g.G + game] = taken
+                    sync()
+            squared = squared_slope(g, n, at, work, end)
             if lane() == 0:
-                run.energy[game] = energy
                 run.gradient_norm[game] = wp.sqrt(squared)
                 run.status[game] = wp.int64(status)
-                if run.steps == 0:
-                    run.initial_energy[game] = energy
             for e in range(lane(), 2 * row, wp.block_dim()):
                 run.states[game * 2 * row + e] = T(0.0)
             sync()
-            for e in range(lane(), n * g.K, wp.block_dim()):
-                i = e // g.K
-                k = e - i * g.K
-                to = ((game * g.N + agents[i]) * g.K + k) * 4
-                for q in range(4):
-                    run.states[to + q] = work[trace(at, n, g.K, q, i) + k + 1]
+            for e in range(lane(), n * g.K * 4, wp.block_dim()):
+                q = e % 4
+                k = (e // 4) % g.K
+                i = e // (4 * g.K)
+                to = ((game * g.N + agents[i]) * g.K + k) * 4 + q
+                run.states[to] = work[trace(at, g.K, q, i) + k + 1]
             sync()
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(
+        enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False, cuda_max_registers=REGISTERS
+    )
     def differentiate(g: Game, run: Run, by: Gradients):
         block, _ = wp.tid()
+        at = run.at
         row = g.N * g.K * 2
         everything = g.G * row
-        each_factor = 16 * g.N * g.N * g.K
+        factors_of_step = each_factor * g.K
         each_nearest = 4 * g.N * (g.K + 1)
-        work = part(run.work, wp.int64(block) * wp.int64(run.work_numbers), run.work_numbers)
-        rest = work.ptr + wp.uint64((14 * g.N * (g.K + 1) + 4 * g.N * g.K) * bytes_each)
-        fast = wp.array(ptr=fast_memory(rest), shape=(run.work_numbers,), dtype=T)
+        work = part(run.work, wp.int64(block) * wp.int64(at.numbers), at.numbers)
         agents = wp.array(
             ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
         )
         for game in range(block, g.G, run.blocks):
             n = set_up(g, game, agents)
-            at = layout(n, g.K)
-            m = 2 * n
             end = end_of(g, game)
             if by.along_states == 1:
-                roll(
-                    g,
-                    game,
-                    n,
-                    agents,
-                    at,
-                    work,
-                    part(run.iterates, wp.int64(run.steps) * run.iterate_stride, everything),
-                )
+                last = part(run.iterates, wp.int64(run.steps) * run.iterate_stride, everything)
+                roll(g, game, n, agents, at, work, last)
                 pull_states(g, by, game, n, agents, at, work)
             for turn in range(run.steps + 1):
                 s = run.steps - turn
@@ -206,49 +220,48 @@ def make(double: bool, most: int, inlined: bool, backwards: bool = False) -> Sim
                     if run.taken[s * g.G + game] == 1:  # a step that was not taken passes its cotangent on unchanged
                         controls = part(run.iterates, wp.int64(s) * run.iterate_stride, everything)
                         directions = part(run.directions, wp.int64(s) * run.direction_stride, everything)
-                        tape = wp.int64(s * g.G + game)
-                        factors = part(run.factors, tape * wp.int64(each_factor), each_factor)
+                        tape = wp.int64(s) * wp.int64(run.slots) + wp.int64(game)
+                        factors = part(run.factors, tape * wp.int64(factors_of_step), factors_of_step)
                         nearest = part(run.nearest, tape * wp.int64(each_nearest), each_nearest)
                         roll(g, game, n, agents, at, work, controls)
+                        set_motions(g, n, at, work, end)
                         # mu = alpha H^-1 times the cotangent; zero after the end of the game.
+                        m = 2 * n
                         for e in range(lane(), m * g.K, wp.block_dim()):
                             work[at.mu + e] = T(0.0)
-                        for e in range(lane(), 3 * m, wp.block_dim()):
-                            fast[at.y + e] = T(0.0)
+                        for e in range(lane(), rows * end, wp.block_dim()):
+                            k = e // rows
+                            r = e - k * rows  # turn rate and acceleration of each agent
+                            value = T(0.0)
+                            if r < m:
+                                u = 2 * ((game * g.N + agents[r // 2]) * g.K + k) + 1 - r % 2
+                                value = -g.step_size * by.controls[u]
+                            work[at.linear + e] = value
                         sync()
-                        for back in range(end):
-                            k = end - 1 - back
-                            set_motions(g, n, at, work, fast, k)
-                            for r in range(lane(), m, wp.block_dim()):
-                                i = r // 2
-                                u = 2 * ((game * g.N + agents[i]) * g.K + k) + wp.where(
-                                    r == 2 * i, TURN_RATE, ACCELERATION
-                                )
-                                work[at.h + k * m + r] = -g.step_size * by.controls[u]
-                            sync()
-                            first = wp.where(k == 0, 1, 0)
-                            pull(
-                                factors,
-                                k * 4 * m * m,
-                                k * 4 * m * m + m * m,
-                                fast,
-                                at,
-                                n,
-                                g.dt,
-                                first,
-                                work,
-                                at.h + k * m,
-                            )
-                        push_all(g, game, n, agents, at, work, fast, factors, end, work, 1)
+                        pull(work, at.control, at.linear, at.fast, factors, end, g.dt)
+                        push(
+                            work,
+                            at.control,
+                            at.linear,
+                            at.fast,
+                            factors,
+                            end,
+                            g.dt,
+                            work,
+                            at.mu,
+                            1,
+                            agents,
+                            n,
+                            g.K,
+                        )
                         roll_tangents(g, game, n, agents, at, work, directions)
-                        for e in range(lane(), 8 * n, wp.block_dim()):
-                            fast[e] = T(0.0)
-                        sync()
-                        for back in range(end):
-                            k = end - 1 - back
-                            state_adjoint(g, by, game, n, agents, at, work, nearest, fast, k + 1, end)
-                            pair_adjoint(g, by, game, n, agents, at, work, fast, k + 1)
-                            control_adjoint(g, by, game, n, agents, at, work, fast, controls, directions, k)
+                        forget_products(g, at, work)
+                        if pair_count(g) > 0:
+                            pair_adjoint(g, game, n, agents, at, work, end)
+                        position_adjoint(g, by, game, n, agents, at, work, nearest, end)
+                        motion_adjoint(g, by, game, n, agents, at, work, controls, directions, end)
+                        control_adjoint(g, by, game, n, agents, at, work, controls, directions, end)
+                        add_products(g, by, game, n, agents, at, work, end)
                 if by.along_iterates == 1:
                     for e in range(lane(), row, wp.block_dim()):
                         u = game * row + e

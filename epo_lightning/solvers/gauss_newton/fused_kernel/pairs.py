@@ -22,8 +22,8 @@ CLEARANCE, CIRCLES, HEADWAY, LATERAL, CONFLICT = (
 
 
 @no_type_check
-def make(T: Any) -> SimpleNamespace:
-    """The function ``evaluate`` for plain and dual numbers of type ``T``, and the type ``dual``."""
+def make(T: Any, func: Any) -> SimpleNamespace:
+    """The function ``evaluate``, decorated by ``func``, for plain and dual numbers of type ``T``, and the type ``dual``."""
     dual = wp.types.vector(3, T)
     root_half = 0.5**0.5
 
@@ -263,7 +263,7 @@ def make(T: Any) -> SimpleNamespace:
             return zero, zero, zero, zero, zero, zero, zero, zero
         return mul(soon, room), by_x, by_y, turn1, faster1, turn2, faster2, soon
 
-    @wp.func(inline=False)
+    @func
     def evaluate(
         feature: int,
         px: Any,

@@ -1,0 +1,65 @@
+"""The damped step as a linear-quadratic problem: the recursions of `kernel/riccati.hpp` by columns, in C++.
+
+The state of A agents with M = 2 A controls holds the changes of positions p, of z = (heading, speed), and of the controls c
+of the step before:  p+ = p + Z z,  z+ = z + dt c,  c+ = c.  A step eliminates its controls,
+
+    L L' = H_cc,   G = L^-1 H_cx,   P = H_xx - G' G,
+
+and keeps the gains L^-T G for the way forward. A thread owns a column of P, and one more column is the gradient, on which
+the same operations act. L is so small that every thread computes it for itself. Numbers of agents are constants of the
+compiler, so that columns are in registers.
+"""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, no_type_check
+
+import warp as wp
+
+from epo_lightning.solvers.gauss_newton.fused_kernel import constants, layout, threads
+
+
+@no_type_check
+def make(T: Any, agents: int, backwards: bool) -> SimpleNamespace:
+    """The recursions for numbers of type ``T``."""
+    Array = wp.array(dtype=T)
+    source = Path(__file__).with_name("recursion.hpp").read_text()
+    values = {
+        "T": threads.number_type(T),
+        "A": agents,
+        "CPU_LANE": threads.cpu_lane(backwards),
+        "ITEMS": layout.CONTROL_ITEMS,
+        **{name: getattr(constants, name) for name in ("PULL", "RATE", "DAMPED_STIFFNESS", "RATE_STIFFNESS")},
+        **{name: getattr(constants, name) for name in ("COUPLING", "MOTION")},
+    }
+    for name, value in values.items():
+        source = source.replace(f"${name}$", str(value))
+    head, *bodies = source.split("// ---- ")
+    code = dict(body.split("\n", 1) for body in bodies)
+
+    @wp.func_native(head + code["eliminate"])
+    def eliminate(
+        work: Array, control: int, hessian: int, linear: int, scratch: int, factors: Array, end: int, dt: T
+    ) -> int: ...
+
+    @wp.func_native(head + code["stream"] + code["pull"])
+    def pull(work: Array, control: int, linear: int, scratch: int, factors: Array, end: int, dt: T): ...
+
+    @wp.func_native(head + code["stream"] + code["push"])
+    def push(
+        work: Array,
+        control: int,
+        linear: int,
+        scratch: int,
+        factors: Array,
+        end: int,
+        dt: T,
+        to: Array,
+        place: int,
+        own_rows: int,
+        rows: wp.array(dtype=wp.int32),
+        count: int,
+        K: int,
+    ): ...
+
+    return SimpleNamespace(eliminate=eliminate, pull=pull, push=push)
