@@ -36,6 +36,7 @@ ELSEWHERE = (
         "trainer.threads",
         "trainer.log_every",
         "trainer.profiler",
+        "trainer.graph",
     ),
     *("callbacks.progress", "callbacks.refresh"),
 )

@@ -142,12 +142,12 @@ class GoalDecoder(nn.Module):
         assert isinstance(first, nn.Linear)
         of_agent, of_way = first.weight.split([self.width, 2], 1)
         agent = F.linear(z, of_agent, first.bias)
-        if self.training or readable(exists):  # only the candidates that exist, which batch normalisation needs
+        if readable(exists):  # only the candidates that exist, which is fewer rows
             owner = exists.flatten(0, 1).nonzero()[:, 0]
             logits = self.mlp.after_first(agent.flatten(0, 1)[owner] + F.linear(way[exists], of_way))
             return logits.new_full(exists.shape, NO_CANDIDATE).masked_scatter(exists, logits)
         way = torch.where(exists[..., None], way, 0.0)
-        logits = self.mlp.after_first(agent[:, :, None] + F.linear(way, of_way))[..., 0]
+        logits = self.mlp.after_first(agent[:, :, None] + F.linear(way, of_way), exists)[..., 0]
         return torch.where(exists, logits, NO_CANDIDATE)
 
 

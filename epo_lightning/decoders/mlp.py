@@ -10,6 +10,8 @@ import torch.distributed as dist
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from epo_lightning.host import readable
+
 
 class _Sum(torch.autograd.Function):
     """Sum of a tensor over all processes. Its derivative assumes that the losses of all processes are summed as well."""
@@ -42,16 +44,28 @@ class _MaskedBatchNorm(nn.BatchNorm1d):
         if mask is None:
             return normalise(rows).view_as(features)
         present = mask.flatten()
+        if alone and not readable(rows):
+            return self._without_waiting(rows, present).view_as(features)
         normalised = torch.zeros_like(rows)
         normalised[present] = normalise(rows[present])
         return normalised.view_as(features)
 
+    def _without_waiting(self, rows: Tensor, present: Tensor) -> Tensor:
+        """The present rows, normalised as ``nn.BatchNorm1d`` does, and zero for the others.
+
+        On a GPU, the host would have to wait for the number of rows that a selection takes.
+        """
+        assert self.running_mean is not None
+        here = present[:, None]
+        values = torch.where(here, rows, 0.0).to(self.running_mean.dtype)
+        count = present.sum().clamp_min(1).to(values.dtype)
+        mean = values.sum(0) / count
+        square = torch.where(here, values - mean, 0.0).square().sum(0)
+        return torch.where(here, self._normalised(values, mean, square, count), 0.0).to(rows.dtype)
+
     def _together(self, rows: Tensor) -> Tensor:
         """The rows of this process, normalised as ``nn.BatchNorm1d`` does with the rows of all processes."""
         assert self.running_mean is not None
-        assert self.running_var is not None
-        assert self.num_batches_tracked is not None
-        assert self.momentum is not None
         rank, world = dist.get_rank(), dist.get_world_size()
         values = rows.to(self.running_mean.dtype)
         count = values.new_full((1,), len(values))
@@ -65,12 +79,20 @@ class _MaskedBatchNorm(nn.BatchNorm1d):
         total = counts.sum().clamp_min(1)
         mean = (counts * means).sum(0) / total
         square = (squares + counts * (means - mean).square()).sum(0)
+        return self._normalised(values, mean, square, total).to(rows.dtype)
+
+    def _normalised(self, values: Tensor, mean: Tensor, square: Tensor, count: Tensor) -> Tensor:
+        """Values normalised by mean and sum of squared deviations of ``count`` rows; updates the running statistics."""
+        assert self.running_mean is not None
+        assert self.running_var is not None
+        assert self.num_batches_tracked is not None
+        assert self.momentum is not None
         with torch.no_grad():
             self.num_batches_tracked += 1
             self.running_mean.lerp_(mean, self.momentum)
-            self.running_var.lerp_(square / (total - 1).clamp_min(1), self.momentum)
-        normalised = (values - mean) * (square / total + self.eps).rsqrt()
-        return (normalised * self.weight + self.bias).to(rows.dtype)
+            self.running_var.lerp_(square / (count - 1).clamp_min(1), self.momentum)
+        normalised = (values - mean) * (square / count + self.eps).rsqrt()
+        return normalised * self.weight + self.bias
 
 
 class MLP(nn.Module):

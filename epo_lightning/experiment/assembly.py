@@ -22,7 +22,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from epo_lightning import registry
 from epo_lightning.data.datamodule import check_divisible
-from epo_lightning.experiment import debugging
+from epo_lightning.experiment import debugging, step_graph
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings
 from epo_lightning.experiment.dashboards import mlflow
@@ -74,6 +74,7 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
     forecaster = build_model(settings, data)
     check_goal(settings, forecaster)
     check_monitor(settings.callbacks.monitor, data.task)
+    step_graph.check(settings, forecaster)
     return data, forecaster
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from lightning.pytorch import LightningModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import Timer
 
-from epo_lightning.experiment import assembly, callbacks, debugging, distributed, follower, gpus, logs
+from epo_lightning.experiment import assembly, callbacks, debugging, distributed, follower, gpus, logs, step_graph
 from epo_lightning.experiment.config.settings import EvaluateSettings, Measured, Settings
 from epo_lightning.experiment.evaluate import score
 from epo_lightning.experiment.opening import refuse_changed, settings_of
@@ -63,6 +63,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
     settings = read(Settings, config)
     seed_everything(settings.seed, workers=True, verbose=False)
     data, forecaster = assembly.build(settings)
+    step_graph.check_machine(settings)
     run = begun or folder_for(settings)
     if settings.trainer.devices > 1 and follower.trained_as_follower(settings.trainer.devices, run):
         return run
@@ -127,6 +128,8 @@ def fit(
     learns = learned > 0 and settings.trainer.max_steps != 0
     timer = Timer()  # its state is part of the checkpoint, so the time before a kill is counted as well
     watchers = [*callbacks.run_callbacks(settings.callbacks, run, f"{settings.title}, seed {settings.seed}"), timer]
+    if settings.trainer.graph:
+        watchers.append(step_graph.StepGraph())
     strategy = None
     if settings.trainer.devices > 1:
         strategy = distributed.strategy(settings.trainer.devices, run, config, last) if learns else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -30,6 +31,9 @@ class Forecaster(LightningModule):
 
     configuration: dict[str, Any]
     """The model's configuration, from which this forecaster was built; stored in every checkpoint."""
+    step_graph: Callable[[Scene], tuple[Tensor, dict[str, Tensor]]] | None = None
+    """A function that takes the place of :meth:`weighted_losses` and of the backward pass: it leaves the gradients of its
+    losses with the parameters. None for Lightning's usual steps."""
 
     def __init__(self, task: Task, optimizer: Adam) -> None:
         super().__init__()
@@ -87,14 +91,28 @@ class Forecaster(LightningModule):
         """The forecast with further measurements, which are too slow for every validation and are made in tests only."""
         return forecast
 
-    def training_step(self, scene: Scene, _: int) -> Tensor:
+    def weighted_losses(self, scene: Scene) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted sum of the losses, which is minimised, and the value of every term."""
         terms = self.losses(scene, self(scene))
         total = torch.stack([weight * value for weight, value in terms.values()]).sum()
-        values = {f"train/{name}": value.detach() for name, (_, value) in terms.items()}
+        return total, {name: value.detach() for name, (_, value) in terms.items()}
+
+    def training_step(self, scene: Scene, _: int) -> Tensor:
+        total, terms = (self.step_graph or self.weighted_losses)(scene)
         size = len(scene.history)
-        values = {"train/loss": total.detach(), **values}
+        values = {"train/loss": total.detach(), **{f"train/{name}": value for name, value in terms.items()}}
         self.log_dict(values, on_step=False, on_epoch=True, batch_size=size, sync_dist=True)
         return total
+
+    def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
+        """Backward pass; nothing is left to do if the gradients have come with the loss (``step_graph``)."""
+        if self.step_graph is None:
+            super().backward(loss, *args, **kwargs)
+
+    def optimizer_zero_grad(self, *args: Any) -> None:
+        """Drop the gradients of the step before; those of ``step_graph`` are of this step already."""
+        if self.step_graph is None:
+            super().optimizer_zero_grad(*args)
 
     def validation_step(self, scene: Scene, _: int) -> None:
         self.val_metrics.update(self(scene), scene)

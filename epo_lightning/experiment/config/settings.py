@@ -44,6 +44,7 @@ class TrainerSettings:
     overfit_batches: int = 0
     detect_anomaly: bool = False
     profiler: bool = False
+    graph: bool = False
 
     def __post_init__(self) -> None:
         if (self.max_epochs is None or self.max_epochs < 0) and self.max_steps < 0:
@@ -72,6 +73,22 @@ class TrainerSettings:
             value = getattr(self, name)
             if value <= 0 or (isinstance(value, float) and value > 1):
                 raise ConfigError(f"trainer.{name} must be a share in (0, 1] or a number of batches, not {value}")
+        self._check_graph()
+
+    def _check_graph(self) -> None:
+        if not self.graph:
+            return
+        if self.accelerator == "cpu":
+            raise ConfigError(
+                "trainer.graph=true on trainer.accelerator=cpu: CUDA graphs need trainer.accelerator=gpu or auto"
+            )
+        if self.devices > 1:
+            raise ConfigError(f"trainer.graph=true needs trainer.devices=1, not {self.devices}")
+        if self.detect_anomaly:
+            raise ConfigError(
+                "trainer.graph=true and trainer.detect_anomaly=true exclude each other: looking at numbers makes the host "
+                "wait, which a CUDA graph cannot contain"
+            )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,206 @@
+"""A training step as one CUDA graph: forward pass, losses and backward pass are captured once and replayed for every batch.
+
+The networks are small, so a step on a GPU takes as long as the host needs to launch its hundreds of kernels. A replay is one
+launch. Of every batch only the values change: they are copied into the tensors of a static scene, and a replay overwrites
+static losses and gradients. The optimizer, gradient clipping and logging are outside of the graph and stay as they are.
+
+A graph repeats what was launched while it was captured. Nothing in a step may therefore make the host wait, be drawn on the
+CPU, or change from step to step except by tensors on the device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor, nn
+
+from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.forecasters import Forecaster
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import FIELDS, Scene
+
+WARM_UP = 3
+"""Training steps before the capture: they compile kernels and make handles of libraries, which a capture cannot contain."""
+BACKENDS = ("pytorch", "warp")
+"""Values of ``solver.backend`` with which no work of the host is part of a step."""
+SCHEDULES = ("relaxation", "annealing")
+"""Settings of losses that change with the number of the step."""
+
+
+class Outcome(NamedTuple):
+    """What a step computes; a replay overwrites these tensors.
+
+    Attributes:
+        names: names of the loss terms.
+        losses: the weighted sum and every term.
+        gradients: gradient of every parameter; None where the loss does not depend on it.
+    """
+
+    names: tuple[str, ...]
+    losses: Float[Tensor, " _"]
+    gradients: list[Tensor | None]
+
+
+class Recorder:
+    """Runs and captures steps on a stream of its own, as captures need it."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.stream = torch.cuda.Stream(device)
+
+    def run(self, step: Callable[[], Outcome]) -> Outcome:
+        """Run a step."""
+        current = torch.cuda.current_stream(self.stream.device)
+        self.stream.wait_stream(current)
+        with torch.cuda.stream(self.stream):
+            outcome = step()
+        current.wait_stream(self.stream)
+        return outcome
+
+    def record(self, step: Callable[[], Outcome]) -> Callable[[], Outcome]:
+        """A function that replays a step; the step itself is only captured here.
+
+        Raises:
+            RuntimeError: the step cannot be captured.
+        """
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, stream=self.stream):
+            outcome = step()
+
+        def replay() -> Outcome:
+            graph.replay()
+            return outcome
+
+        return replay
+
+
+class StepGraph(Callback):
+    """Callback that lets a :class:`Forecaster` take its training steps from a CUDA graph.
+
+    The first :data:`WARM_UP` batches, and batches of other shapes than the first one, are computed without the graph.
+    """
+
+    def __init__(self) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        """Forget the graph and its memory."""
+        self._steps = 0
+        self._parameters: list[nn.Parameter] = []
+        self._layout: tuple[Any, ...] | None = None
+        self._replay: Callable[[Scene], Outcome] | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, Forecaster)
+        self.begin(pl_module)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        if isinstance(pl_module, Forecaster):
+            pl_module.step_graph = None
+        self._end()
+
+    def begin(self, forecaster: Forecaster) -> None:
+        """Take over the training steps of a forecaster, which is on its device already."""
+        self._forecaster = forecaster
+        self._parameters = [parameter for parameter in forecaster.parameters() if parameter.requires_grad]
+        self._recorder = Recorder(forecaster.device)
+        forecaster.step_graph = self.step
+
+    def step(self, scene: Scene) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted sum of the losses of a batch and every term; the parameters then have the gradients of the sum.
+
+        The host does not wait for the device, except once, for the capture.
+
+        Raises:
+            ConfigError: the step cannot be captured, or it draws numbers on the CPU.
+        """
+        layout = _layout(scene)
+        self._layout = self._layout or layout
+        self._steps += 1
+        if self._steps <= WARM_UP or layout != self._layout:
+            outcome = self._recorder.run(lambda: self._compute(scene))
+        else:
+            self._replay = self._replay or self._capture(scene)
+            outcome = self._replay(scene)
+        # A step without the graph, or a validation, has put other gradients or none in the place of the static ones.
+        for parameter, gradient in zip(self._parameters, outcome.gradients, strict=True):
+            parameter.grad = gradient
+        total, *terms = outcome.losses.clone().unbind()
+        return total, dict(zip(outcome.names, terms, strict=True))
+
+    def _compute(self, scene: Scene) -> Outcome:
+        # Without gradients to add to, the backward pass makes new tensors, which a replay overwrites.
+        for parameter in self._parameters:
+            parameter.grad = None
+        total, terms = self._forecaster.weighted_losses(scene)
+        total.backward()
+        losses = torch.stack([total.detach(), *terms.values()])
+        return Outcome(tuple(terms), losses, [parameter.grad for parameter in self._parameters])
+
+    def _capture(self, scene: Scene) -> Callable[[Scene], Outcome]:
+        """Capture the step; returns a function that replays it with another batch of the same layout."""
+        static = scene.map(torch.clone)
+        before = torch.get_rng_state()
+        try:
+            again = self._recorder.record(lambda: self._compute(static))
+        except RuntimeError as error:
+            cause = error.__context__ or error  # the end of a broken capture has an error of its own
+            raise ConfigError(
+                f"this training step cannot be captured as a CUDA graph ({' '.join(str(cause).split())[:300]}): "
+                "set trainer.graph=false"
+            ) from error
+        if not torch.equal(before, torch.get_rng_state()):
+            raise ConfigError(
+                "this training step draws random numbers on the CPU, which a CUDA graph would repeat in every step: "
+                "set trainer.graph=false"
+            )
+
+        def replay(batch: Scene) -> Outcome:
+            for name in FIELDS:
+                if (target := getattr(static, name)) is not None:
+                    target.copy_(getattr(batch, name))
+            return again()
+
+        return replay
+
+
+def _layout(scene: Scene) -> tuple[Any, ...]:
+    """Everything about a scene that a graph cannot change: its time step, and shapes and number types of its tensors."""
+    tensors = (getattr(scene, name) for name in FIELDS)
+    return scene.dt, *(None if tensor is None else (tensor.shape, tensor.dtype) for tensor in tensors)
+
+
+def check(settings: Settings, forecaster: LightningModule) -> None:
+    """Refuse ``trainer.graph`` for a training whose steps no graph can repeat.
+
+    Raises:
+        ConfigError: the setting that has to change.
+    """
+    if not settings.trainer.graph:
+        return
+    backend = getattr(getattr(forecaster, "solver", None), "backend", BACKENDS[0])
+    if backend not in BACKENDS:
+        raise ConfigError(
+            f"trainer.graph=true with solver.backend={backend}: games would be solved on the host, which a CUDA graph "
+            f"cannot contain; choose solver.backend={' or '.join(reversed(BACKENDS))}"
+        )
+    for section in ("forecaster", "objective"):
+        for name in SCHEDULES:
+            if value := getattr(settings, section).get(name):
+                raise ConfigError(
+                    f"trainer.graph=true with {section}.{name}={value}: a CUDA graph would repeat the loss of one step, and "
+                    f"this one changes from step to step; set {section}.{name}=0 or trainer.graph=false"
+                )
+
+
+def check_machine(settings: Settings) -> None:
+    """Refuse ``trainer.graph`` on a machine without a CUDA device.
+
+    Raises:
+        ConfigError: PyTorch sees none.
+    """
+    if settings.trainer.graph and not torch.cuda.is_available():
+        raise ConfigError("trainer.graph=true needs a CUDA device, and PyTorch sees none here: set trainer.graph=false")

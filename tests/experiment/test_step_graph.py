@@ -1,0 +1,256 @@
+"""Training steps from a CUDA graph: the bookkeeping with a stand-in that computes again, and on a GPU the graph itself."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+from typing import Any
+
+import lightning
+import pytest
+import torch
+from experiment.conftest import Epo
+from games import random_scene
+from suites import IMITATION, model
+from torch import nn
+from torch.utils.data import DataLoader
+
+from epo_lightning.experiment import step_graph
+from epo_lightning.experiment.config.settings import TrainerSettings
+from epo_lightning.experiment.step_graph import WARM_UP, StepGraph
+from epo_lightning.forecasters import Forecaster, build_forecaster
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import Scene
+
+EPO = {"forecaster": {"name": "epo", "modes": 2}, "objective": IMITATION}
+ODD = 3
+"""Number of scenes of the last batch of an epoch; the others have one more."""
+
+
+class Again:
+    """Stand-in for a recorder: a replay computes the step again and overwrites the tensors of its first result."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.runs = self.replays = 0
+
+    def run(self, step: Any) -> Any:
+        self.runs += 1
+        return step()
+
+    def record(self, step: Any) -> Any:
+        kept: list[Any] = []
+
+        def replay() -> Any:
+            self.replays += 1
+            found = step()
+            if not kept:
+                kept.append(found)
+            kept[0].losses.copy_(found.losses)
+            for static, gradient in zip(kept[0].gradients, found.gradients, strict=True):
+                if static is not None:
+                    static.copy_(gradient)
+            return kept[0]
+
+        return replay
+
+
+class Draws(Again):
+    """Stand-in that takes the step while it is captured, as the host does."""
+
+    def record(self, step: Any) -> Any:
+        step()
+        return super().record(step)
+
+
+class Fails(Again):
+    """Stand-in whose capture fails, and its end too."""
+
+    def record(self, step: Any) -> Any:
+        try:
+            raise RuntimeError("operation not permitted\nwhen stream is capturing")
+        except RuntimeError as error:
+            raise RuntimeError("capture failed") from error
+
+
+class Losses(lightning.Callback):
+    """The logged losses of every epoch."""
+
+    def __init__(self) -> None:
+        self.epochs: list[dict[str, float]] = []
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, _: Any) -> None:
+        logged = trainer.callback_metrics.items()
+        self.epochs.append({name: float(value) for name, value in logged if name.startswith("train/")})
+
+
+@pytest.fixture
+def again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(step_graph, "Recorder", Again)
+
+
+def forecaster(**changes: Any) -> Forecaster:
+    torch.manual_seed(1)
+    return build_forecaster(model(**{**EPO, "optimizer": {"name": "adam", "lr": 1e-3, "clip": 0.5}, **changes}))
+
+
+def batches(count: int = 6) -> list[Scene]:
+    """The batches of an epoch, the last one with fewer scenes."""
+    torch.manual_seed(2)
+    scenes = [random_scene(ODD + 1, 2) for _ in range(count)]
+    return [*scenes[:-1], scenes[-1][list(range(ODD))]]
+
+
+def fit(
+    trained: Forecaster, graph: StepGraph | None = None, accelerator: str = "cpu", epochs: int = 3, **options: Any
+) -> list[dict[str, float]]:
+    """Train with a validation after every epoch; returns the logged losses of the epochs."""
+    losses = Losses()
+    trainer = lightning.Trainer(
+        accelerator=accelerator,
+        devices=1,
+        max_epochs=epochs,
+        callbacks=[losses, *([graph] if graph else [])],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        **options,
+    )
+    trainer.fit(trained, *(DataLoader(scenes, batch_size=None) for scenes in (batches(), batches(2))))
+    return losses.epochs
+
+
+def together(trained: Forecaster) -> torch.Tensor:
+    return nn.utils.parameters_to_vector(trained.parameters()).detach().cpu()
+
+
+def test_replayed_steps_train_like_usual_ones_also_between_batches_of_another_size(again) -> None:
+    usual, graphed = forecaster(), forecaster()
+    before = together(usual)
+    graph = StepGraph()
+    torch.manual_seed(3)
+    expected = fit(usual)
+    torch.manual_seed(3)
+    assert fit(graphed, graph) == expected
+    assert set(expected[0]) >= {"train/loss", "train/imitation", "train/probability"}
+    found = graph._recorder
+    assert found.runs == WARM_UP + 3, "the first batches, and the last one of every epoch"
+    assert found.replays == 3 * 5 - WARM_UP
+    assert torch.equal(together(graphed), together(usual))
+    assert (together(graphed) - before).abs().max() > 1e-3
+    for name, value in usual.state_dict().items():  # statistics of batch normalisation too
+        assert torch.equal(graphed.state_dict()[name], value), name
+    assert graphed.step_graph is None, "the graph's memory is free after the training"
+
+
+def test_the_losses_of_a_step_stay_when_the_next_one_overwrites_the_graphs_tensors(again) -> None:
+    trained, graph = forecaster(), StepGraph()
+    graph.begin(trained)
+    steps = [graph.step(scene) for scene in batches()[:5]]
+    values = [[float(total), *map(float, terms.values())] for total, terms in steps]
+    assert len({tuple(each) for each in values}) == 5
+    for scene, each in zip(batches()[3:5], values[3:5], strict=True):
+        total, terms = trained.weighted_losses(scene)
+        torch.testing.assert_close(torch.tensor(each), torch.stack([total, *terms.values()]))
+
+
+def test_another_time_step_or_missing_field_is_another_layout(again) -> None:
+    trained, graph = forecaster(), StepGraph()
+    graph.begin(trained)
+    scene = batches()[0]
+    for _ in range(WARM_UP + 1):
+        graph.step(scene)
+    for other in (
+        dataclasses.replace(scene, id=None),
+        dataclasses.replace(scene, dt=0.2),
+        dataclasses.replace(scene, size=scene.size.double()),
+    ):
+        total, _ = graph.step(other)
+        torch.testing.assert_close(total, trained.weighted_losses(other)[0])
+    assert graph._recorder.replays == 1  # type: ignore[attr-defined]
+
+
+def test_numbers_drawn_on_the_host_are_refused(monkeypatch) -> None:
+    monkeypatch.setattr(step_graph, "Recorder", Draws)
+    backbone = {"name": "v_lstm", "dropout": 0.1}
+    trained, graph = forecaster(backbone=backbone), StepGraph()
+    graph.begin(trained)
+    with pytest.raises(ConfigError, match=r"draws random numbers on the CPU, .* set trainer.graph=false"):
+        for scene in batches():
+            graph.step(scene)
+
+
+def test_a_failed_capture_is_one_sentence_with_its_cause(monkeypatch) -> None:
+    monkeypatch.setattr(step_graph, "Recorder", Fails)
+    graph = StepGraph()
+    graph.begin(forecaster())
+    with pytest.raises(ConfigError) as error:
+        for scene in batches():
+            graph.step(scene)
+    assert "(operation not permitted when stream is capturing): set trainer.graph=false" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"accelerator": "cpu"}, "trainer.accelerator"),
+        ({"devices": 2}, "trainer.devices"),
+        ({"detect_anomaly": True}, "trainer.detect_anomaly"),
+    ],
+)
+def test_settings_that_exclude_a_graph_are_refused(changes: dict[str, Any], named: str) -> None:
+    with pytest.raises(ConfigError, match=rf"trainer\.graph=true .*{named}"):
+        TrainerSettings(**{"accelerator": "gpu", "graph": True, **changes})
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("experiment=rpi/v_lstm_epo",), "solver.backend=auto"),
+        (("experiment=rpi/v_lstm_epo", "solver.backend=host"), "solver.backend=host"),
+        (("experiment=rpi/v_lstm_epo", "solver.backend=warp", "objective.relaxation=0.1"), "objective.relaxation=0.1"),
+        (("experiment=rpi/v_lstm_sc", "+forecaster.annealing=1.0"), "forecaster.annealing=1.0"),
+    ],
+)
+def test_runs_whose_steps_no_graph_can_repeat_are_refused(refused: Any, words: tuple[str, ...], named: str) -> None:
+    message = refused("train", *words, "data=tiny", "budget=smoke", "trainer.accelerator=auto", "trainer.graph=true")
+    assert f"trainer.graph=true with {named}" in message
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_machine_without_a_gpu_is_named(refused: Any) -> None:
+    words = ("experiment=rpi/v_lstm_sc", "data=tiny", "budget=smoke", "trainer.accelerator=auto")
+    assert "trainer.graph=true needs a CUDA device" in refused("train", *words, "trainer.graph=true")
+
+
+def test_a_run_with_a_graph_is_the_same_run(again, epo: Epo, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(step_graph, "check_machine", lambda settings: None)
+    words = (
+        "experiment=rpi/v_lstm_sc",
+        "data=tiny",
+        "budget=smoke",
+        "callbacks.progress=none",
+        "trainer.accelerator=auto",
+    )
+    assert epo("train", *words, "run_dir=usual") == 0
+    assert epo("train", *words, "run_dir=graphed", "trainer.graph=true") == 0
+    one, other = (json.loads((tmp_path / name / "run.json").read_text()) for name in ("usual", "graphed"))
+    assert one["identity"] == other["identity"]
+    assert one["best"] == other["best"]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("backend", ["pytorch", "warp"])
+def test_a_gpu_trains_the_same_weights_with_and_without_a_graph(backend: str) -> None:
+    if backend == "warp":
+        pytest.importorskip("warp")
+    usual = forecaster(solver={"name": "levenberg_marquardt", "steps": 2, "backend": backend})
+    graphed = copy.deepcopy(usual)
+    expected = fit(usual, accelerator="gpu", epochs=4)
+    found = fit(graphed, StepGraph(), accelerator="gpu", epochs=4)
+    torch.testing.assert_close(together(graphed), together(usual), rtol=0, atol=1e-4)
+    for one, other in zip(found, expected, strict=True):
+        for name, value in other.items():
+            assert one[name] == pytest.approx(value, rel=1e-3, abs=1e-4), name
