@@ -1,7 +1,8 @@
 """Time of a training step by stage: ``python -m benchmarks.training_step [--device cuda] [override ...]``.
 
 It measures the forecasters of the paper's RPI experiments on batches of 32 scenes, composed as by `epo train` but without
-Lightning's own bookkeeping. Overrides are those of `epo train`, for example ``solver.backend=pytorch``.
+Lightning's own bookkeeping. Overrides are those of `epo train`, for example ``solver.backend=pytorch``. On a GPU, the last
+lines are the time of whole steps, also from a CUDA graph (``trainer.graph``).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import statistics
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rich.console import Console
@@ -21,7 +22,7 @@ from torch import Tensor, nn
 
 from benchmarks.devices import device_name, require
 from benchmarks.measure import positive
-from epo_lightning.experiment import assembly
+from epo_lightning.experiment import assembly, step_graph
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import Forecaster
@@ -135,25 +136,46 @@ class Edges:
         self.pairs = []
 
 
+class Prepared(NamedTuple):
+    """A forecaster with all that its training steps need; its scenes may be made up."""
+
+    title: str
+    model: Forecaster
+    optimizer: torch.optim.Optimizer
+    batches: Iterator[Scene]
+    made_up: bool
+
+
+def prepare(experiment: str, overrides: Sequence[str], device: torch.device) -> Prepared:
+    """The forecaster of an experiment on a device, in training mode.
+
+    Raises:
+        ConfigError: overrides that cannot work.
+    """
+    settings = read(Settings, compose("train", [f"experiment=rpi/{experiment}", *overrides]))
+    data = assembly.build_data(settings.data)
+    model = assembly.build_model(settings, data)
+    assert isinstance(model, Forecaster)
+    step_graph.check(settings, model)
+    model = model.to(device).train()
+    made_up = False
+    try:
+        data.setup("fit")
+        batches: Iterator[Scene] = _forever(data.train_dataloader())
+    except ConfigError:
+        made_up = True
+        batches = _random_scenes(data.batch_size, data.task.horizon, data.task.dt)
+    if device.type == "cuda":  # batches that are on the device already, as a data set that fits into its memory
+        batches = itertools.cycle([next(batches).to(device) for _ in range(RESIDENT)])
+    optimizer = model.optimizer.configure(model.parameters(), 1000)["optimizer"]
+    return Prepared(settings.title, model, optimizer, batches, made_up)
+
+
 class Step:
     """A forecaster with its data and optimizer, instrumented to time its training steps."""
 
     def __init__(self, experiment: str, overrides: Sequence[str], device: torch.device) -> None:
-        settings = read(Settings, compose("train", [f"experiment=rpi/{experiment}", *overrides]))
-        data = assembly.build_data(settings.data)
-        model = assembly.build_model(settings, data)
-        assert isinstance(model, Forecaster)
-        self.model = model.to(device).train()
-        self.title, self.made_up = settings.title, False
-        try:
-            data.setup("fit")
-            self.batches: Iterator[Scene] = _forever(data.train_dataloader())
-        except ConfigError:
-            self.made_up = True
-            self.batches = _random_scenes(data.batch_size, data.task.horizon, data.task.dt)
-        if device.type == "cuda":  # batches that are on the device already, as a data set that fits into its memory
-            self.batches = itertools.cycle([next(self.batches).to(device) for _ in range(RESIDENT)])
-        self.optimizer = self.model.optimizer.configure(self.model.parameters(), 1000)["optimizer"]
+        self.title, self.model, self.optimizer, self.batches, self.made_up = prepare(experiment, overrides, device)
         self.clock = Clock(device)
         self.cut: Cut | None = None
         if isinstance(self.model, EPO):
@@ -223,6 +245,53 @@ def measure(steps: Sequence[Step], repeats: int) -> list[dict[str, float]]:
     return [{stage: 1e3 * statistics.median(t[stage] for t in spent) for stage in STAGES} for spent in taken]
 
 
+def whole_step(prepared: Prepared, repeats: int, graph: bool) -> float:
+    """Milliseconds of a whole training step, from its batch to its new weights; the host does not wait between two steps.
+
+    Args:
+        prepared: the forecaster.
+        repeats: number of steps.
+        graph: whether forward pass, losses and backward pass are replayed from a CUDA graph.
+
+    Raises:
+        ConfigError: the step cannot be captured.
+    """
+    model, clock = prepared.model, Clock(prepared.model.device)
+    replayed = step_graph.StepGraph()
+    if graph:
+        replayed.begin(model)
+    started = 0.0
+    for number in range(-step_graph.WARM_UP - WARM_UP, repeats):
+        if number == 0:
+            started = clock.now()
+        scene = next(prepared.batches)
+        if graph:
+            replayed.step(scene)
+        else:
+            total, _ = model.weighted_losses(scene)
+            prepared.optimizer.zero_grad()
+            total.backward()
+        prepared.optimizer.step()
+    return 1e3 * (clock.now() - started) / repeats
+
+
+def whole_steps(overrides: Sequence[str], device: torch.device, repeats: int) -> Iterator[str]:
+    """Lines about whole training steps without and with a CUDA graph, and about +EPO compared with +SC."""
+    captured: dict[str, float] = {}
+    for experiment in EXPERIMENTS:
+        usual = prepare(experiment, overrides, device)
+        line = f"a whole step of {usual.title}: {whole_step(usual, repeats, graph=False):.2f} ms"
+        try:
+            with_graph = prepare(experiment, [*overrides, "trainer.accelerator=gpu", "trainer.graph=true"], device)
+            captured[experiment] = whole_step(with_graph, repeats, graph=True)
+            yield f"{line}, {captured[experiment]:.2f} ms from a CUDA graph"
+        except ConfigError as error:
+            yield f"{line}; from a CUDA graph: {error}"
+    if {"v_lstm_sc", "v_lstm_epo"} <= captured.keys():
+        ratio = captured["v_lstm_epo"] / captured["v_lstm_sc"]
+        yield f"from CUDA graphs, a step of +EPO takes {ratio:.2f} times that of +SC"
+
+
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.training_step", description=__doc__)
@@ -253,6 +322,9 @@ def main(given: Sequence[str] | None = None) -> None:
     last = found[-1]
     share = (last["layer, forward"] + last["layer, backward"]) / sum(last.values())
     console.print(f"the layer's share of a step of {steps[-1].title}: {share:.1%} (goal: less than {GOAL:.0%})")
+    if device.type == "cuda":
+        for line in whole_steps(arguments.overrides, device, arguments.repeats):
+            console.print(line)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ CPU, or change from step to step except by tensors on the device.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -67,7 +68,9 @@ class Recorder:
             RuntimeError: the step cannot be captured.
         """
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=self.stream):
+        gc.collect()  # the memory of an earlier graph must not be released in the middle of a capture
+        # The outer context restores the current stream also after a capture that fails, which the inner one does not.
+        with torch.cuda.stream(self.stream), torch.cuda.graph(graph, stream=self.stream):
             outcome = step()
 
         def replay() -> Outcome:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from experiment.replays import Again
 from rich.console import Console
 
 ROOT = Path(__file__).parents[2]
@@ -123,6 +124,19 @@ def test_a_training_step_is_timed_by_stage(capsys, tmp_path):
     last = next(line for line in shown.splitlines() if "layer, forward" in line)
     assert float(last.split("│")[-2].split()[0]) > 0, "the last forecaster has the layer"
     assert "the layer's share of a step" in shown
+
+
+def test_whole_training_steps_are_compared_without_and_with_a_graph(tmp_path, monkeypatch):
+    """With a stand-in for the graph, on the CPU."""
+    words = [f"data.root={tmp_path}", "data.batch_size=4"]
+    monkeypatch.setattr(training_step.step_graph, "Recorder", Again)
+    lines = list(training_step.whole_steps([*words, "solver.backend=pytorch"], torch.device("cpu"), 1))
+    assert [line.startswith("a whole step of V-LSTM") for line in lines] == [True, True, True, False]
+    assert all(line.endswith(" ms from a CUDA graph") for line in lines[:3])
+    assert "a step of +EPO takes" in lines[3]
+    lines = list(training_step.whole_steps(words, torch.device("cpu"), 1))
+    assert len(lines) == 3
+    assert "from a CUDA graph: trainer.graph=true with solver.backend=auto" in lines[2]
 
 
 def test_a_training_step_refuses_what_epo_train_refuses():

@@ -11,6 +11,7 @@ import lightning
 import pytest
 import torch
 from experiment.conftest import Epo
+from experiment.replays import Again
 from games import random_scene
 from suites import IMITATION, model
 from torch import nn
@@ -26,33 +27,6 @@ from epo_lightning.scene import Scene
 EPO = {"forecaster": {"name": "epo", "modes": 2}, "objective": IMITATION}
 ODD = 3
 """Number of scenes of the last batch of an epoch; the others have one more."""
-
-
-class Again:
-    """Stand-in for a recorder: a replay computes the step again and overwrites the tensors of its first result."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.runs = self.replays = 0
-
-    def run(self, step: Any) -> Any:
-        self.runs += 1
-        return step()
-
-    def record(self, step: Any) -> Any:
-        kept: list[Any] = []
-
-        def replay() -> Any:
-            self.replays += 1
-            found = step()
-            if not kept:
-                kept.append(found)
-            kept[0].losses.copy_(found.losses)
-            for static, gradient in zip(kept[0].gradients, found.gradients, strict=True):
-                if static is not None:
-                    static.copy_(gradient)
-            return kept[0]
-
-        return replay
 
 
 class Draws(Again):

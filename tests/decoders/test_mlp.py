@@ -1,0 +1,36 @@
+"""Batch normalisation with absent agents, with a selection of the present ones and without."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import pytest
+import torch
+from backends import HostMustNotWait
+
+from epo_lightning.decoders import mlp
+from epo_lightning.decoders.mlp import MLP
+
+
+@pytest.mark.parametrize("filling", [0.0, 1e6])
+@pytest.mark.parametrize("present", [0.6, 1.0])
+def test_statistics_of_present_rows_need_no_selection(filling, present, monkeypatch):
+    torch.manual_seed(0)
+    network = MLP(5, 8, 3, norm="batch").double().train()
+    state = {name: value.clone() for name, value in network.state_dict().items()}
+    mask = torch.rand(6, 4) < present
+    features = torch.where(mask[..., None], torch.randn(6, 4, 5, dtype=torch.float64), filling)
+    found = []
+    for selects in (True, False):
+        monkeypatch.setattr(mlp, "readable", lambda tensor, selects=selects: selects)
+        network.load_state_dict(state)
+        network.zero_grad()
+        given = features.clone().requires_grad_()
+        with nullcontext() if selects else HostMustNotWait():
+            output = network(given, mask)
+        output[mask].square().sum().backward()
+        gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
+        statistics = [value.clone() for name, value in network.state_dict().items() if "running" in name]
+        found.append([output[mask].detach(), given.grad[mask], *gradients, *statistics])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(other, one, rtol=0, atol=1e-10)
