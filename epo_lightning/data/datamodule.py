@@ -253,7 +253,8 @@ class SceneDataModule(LightningDataModule):
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         """Move a batch; to a GPU from pinned memory, because otherwise the host would wait until the last step has ended."""
         if device.type == "cuda" and isinstance(batch, Scene):
-            return batch.map(lambda tensor: tensor.pin_memory().to(device, non_blocking=True))
+            # An expanded tensor has no pinned copy of its own shape.
+            return batch.map(lambda tensor: tensor.contiguous().pin_memory().to(device, non_blocking=True))
         return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def train_dataloader(self) -> DataLoader:
