@@ -137,7 +137,9 @@ def random_game(
 
 def leaves_of(parameters: GameParameters) -> GameParameters:
     """Game parameters as leaves of a graph, which require gradients."""
-    return parameters.map(lambda tensor: tensor.detach().clone().requires_grad_() if tensor.is_floating_point() else tensor)
+    return parameters.map(
+        lambda tensor: tensor.detach().clone().requires_grad_() if tensor.is_floating_point() else tensor
+    )
 
 
 def widen(parameters: GameParameters, agents: int = 2, filling: float = float("nan")) -> GameParameters:

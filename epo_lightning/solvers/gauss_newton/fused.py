@@ -1,6 +1,6 @@
 """The fused backend in NVIDIA Warp: one launch takes all steps of all games, and another one computes their adjoint.
 
-A game is solved by one warp of a GPU, whose 32 threads share out the entries of each matrix; see
+A game is solved by one warp of a GPU, or by four if there are few games; see
 :mod:`~epo_lightning.solvers.gauss_newton.fused_kernel`. The same source is compiled for CPUs, where it is meant for tests.
 The host never waits: statuses stay on the device, and after a first call (which compiles the kernels) a call can be captured
 in a CUDA graph. ``pip install 'epo_lightning[gpu]'`` brings Warp; it is imported when this backend is first used.
@@ -23,13 +23,16 @@ from torch import Tensor
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Solution
 from epo_lightning.solvers.gauss_newton.compiled import take_steps
+from epo_lightning.solvers.gauss_newton.fused_kernel.constants import TEAM, WARP
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
 
 SIZES = (2, 4, 8)
 """Numbers of agents up to which there are kernels, each with matrices of its own size in shared memory and registers."""
-RESIDENT = 32 * 132
-"""Blocks of a launch: at most as many as an H100 or H200 can hold. Each solves several games in turn."""
+FEW = 2 * 132
+"""Games of a launch up to which each has four warps: two for a multiprocessor of an H100 or H200."""
+RESIDENT = 16 * 132
+"""Blocks of a launch: as many as an H100 or H200 holds at a time. Each solves several games in turn, in the same memory."""
 LONGEST = 2**31 - 1
 """Largest number of entries of an array of Warp."""
 
@@ -96,12 +99,15 @@ def warp() -> Any:
     return wp
 
 
-def kernels(dtype: torch.dtype, agents: int, device: torch.device, features: Features) -> SimpleNamespace:
-    """The kernels for a type of numbers, a number of agents and, on GPUs, the features of an energy."""
+def kernels(dtype: torch.dtype, agents: int, games: int, device: torch.device, features: Features) -> SimpleNamespace:
+    """The kernels for a type of numbers and a number of agents and, on GPUs, for the features and the number of games."""
     warp()
     from epo_lightning.solvers.gauss_newton.fused_kernel.kernels import make
 
-    return make(dtype == torch.float64, size_for(agents), features if device.type == "cuda" else None)
+    double, size = dtype == torch.float64, size_for(agents)
+    if device.type != "cuda":
+        return make(double, size)
+    return make(double, size, features, TEAM if games <= FEW else WARP)
 
 
 def size_for(agents: int) -> int:
@@ -137,7 +143,8 @@ class _Call:
         coupled = energy.pair if self.shape[2] > 1 else ()
         fixed = [name for name in coupled if name in energy.margins]
         self.features = Features(tuple(energy.own), tuple(coupled), (*energy.decoded_margins, *fixed))
-        self.kernels = kernels(self.dtype, self.shape[2], controls.device, self.features)
+        games = self.shape[0] * self.shape[1]
+        self.kernels = kernels(self.dtype, self.shape[2], games, controls.device, self.features)
         with torch.no_grad():
             self.kept: list[Tensor] = []
             self._describe(energy, scene, parameters, step_size, damping)
@@ -240,8 +247,6 @@ class _Call:
 
     def _launch(self, kernel: Any, *inputs: Any) -> None:
         """Launch a kernel on PyTorch's current stream, with memory for its blocks."""
-        from epo_lightning.solvers.gauss_newton.fused_kernel import threads
-
         wp, device = warp(), self.iterates.device
         # Kept until the kernel is enqueued only: PyTorch's allocator hands it out in the order of the stream.
         work = self.iterates.new_empty(self.blocks * self.memory)
@@ -255,7 +260,7 @@ class _Call:
                 kernel,
                 dim=[self.blocks],
                 inputs=[self.game, self.arguments, *inputs],
-                block_dim=threads.THREADS,
+                block_dim=self.kernels.threads,
                 device=wp.device_from_torch(device),
             )
 

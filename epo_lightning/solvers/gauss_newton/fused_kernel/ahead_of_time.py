@@ -7,6 +7,7 @@ shared memory per game of all kernels. Warp brings NVIDIA's compiler; neither a 
 from __future__ import annotations
 
 import argparse
+import itertools
 import struct
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -16,14 +17,13 @@ from pathlib import Path
 import torch
 
 from epo_lightning.solvers.gauss_newton import fused
+from epo_lightning.solvers.gauss_newton.fused_kernel.constants import TEAM, WARP
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 
 ARCHITECTURES = (80, 90)
 """Compute capabilities times ten: A100; H100 and H200."""
 HIGHWAY = Features(("goal", "lane", "velref", "vel", "acc", "jerk", "steer", "turnr", "turnacc"), ("proximity",))
 """The energy of the highway setting of `benchmarks/games.py`."""
-import os
-BLOCK = int(os.environ.get("EPO_BLOCK", "32"))
 _VALUE, _REGISTERS, _STACK = 0x04, 0x2F, 0x12  # a record with a payload, and the attributes of two of them
 
 
@@ -45,7 +45,7 @@ class Resources:
 
 
 def compile_for(
-    architecture: int, double: bool, agents: int, folder: Path, features: Features = HIGHWAY
+    architecture: int, double: bool, agents: int, games: int, folder: Path, features: Features = HIGHWAY
 ) -> dict[str, Resources]:
     """The resources of both kernels.
 
@@ -53,16 +53,17 @@ def compile_for(
         architecture: one of :data:`ARCHITECTURES`.
         double: whether numbers have double precision.
         agents: number of agents of a game.
+        games: number of games of a launch.
         folder: where Warp writes source and machine code.
         features: the features of the games.
     """
     wp = fused.warp()
     dtype, device = torch.float64 if double else torch.float32, torch.device("cuda")
-    kernels = fused.kernels(dtype, agents, device, features)
+    kernels = fused.kernels(dtype, agents, games, device, features)
     found = {}
     for name in ("solve", "differentiate"):
         module = getattr(kernels, name).module
-        module.options["block_dim"] = BLOCK
+        module.options["block_dim"] = kernels.threads
         (path,) = wp.compile_aot_module(module, arch=architecture, use_ptx=False, module_dir=folder)
         found[name] = resources(path.read_bytes())
     return found
@@ -117,17 +118,18 @@ def main(given: Sequence[str] | None = None) -> None:
         "--arch", type=int, nargs="+", default=list(ARCHITECTURES), help="compute capabilities times ten"
     )
     arguments = parser.parse_args(given)
-    print("| arch | numbers | agents | kernel | registers | stack [B] | shared [B] | code [kB] |")
-    print("|---|---|---|---|---|---|---|---|")
-    for architecture in arguments.arch:
-        for double in (False, True):
-            for agents in fused.SIZES:
-                with tempfile.TemporaryDirectory() as folder:
-                    found = compile_for(architecture, double, agents, Path(folder))
-                for name, r in found.items():
-                    numbers = "float64" if double else "float32"
-                    what = f"sm_{architecture} | {numbers} | up to {agents} | {name}"
-                    print(f"| {what} | {r.registers} | {r.stack} | {r.shared} | {r.code / 1000:.0f} |", flush=True)
+    print("| arch | numbers | agents | threads | kernel | registers | stack [B] | shared [B] | code [kB] |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for architecture, double, agents, games in itertools.product(
+        arguments.arch, (False, True), fused.SIZES, (fused.FEW, fused.FEW + 1)
+    ):
+        with tempfile.TemporaryDirectory() as folder:
+            found = compile_for(architecture, double, agents, games, Path(folder))
+        threads = TEAM if games <= fused.FEW else WARP
+        for name, r in found.items():
+            numbers = "float64" if double else "float32"
+            what = f"sm_{architecture} | {numbers} | up to {agents} | {threads} | {name}"
+            print(f"| {what} | {r.registers} | {r.stack} | {r.shared} | {r.code / 1000:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

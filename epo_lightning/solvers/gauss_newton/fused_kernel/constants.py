@@ -22,3 +22,7 @@ NEAR_X, NEAR_Y, AHEAD_X, AHEAD_Y = range(4)  # nearest points of reference lines
 # Derivatives by the controls of an agent: gradient by turn rate and acceleration, the part of it by their changes, damped
 # second derivatives, the part of them by the changes, that by turn rate and speed, and the motion of the position.
 PULL, RATE, DAMPED_STIFFNESS, RATE_STIFFNESS, COUPLING, MOTION = 0, 2, 4, 6, 8, 9
+WARP = 32
+"""Threads of a game on a GPU that has many games to solve: one warp, so that its barrier is cheap."""
+TEAM = 128
+"""Threads of a game on a GPU that has few games to solve: four warps, which share out its work."""

@@ -47,7 +47,7 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
         PairSlots(*known.margin_slots),
     )
     own_number, pair_number = len(known.own), len(known.pair)
-    sync, lane, sums = threads.sync, threads.lane, threads.sums
+    sync, lane, sums, nearest_segment = threads.sync, threads.lane, threads.sums, threads.nearest_segment
 
     @wp.struct
     class Layout:
@@ -344,8 +344,7 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
                 line = agents[g.N + i]
                 x = work[trace(at, g.K, X, i) + k]
                 y = work[trace(at, g.K, Y, i) + k]
-                best = T(wp.inf)
-                # If no comparison below is true, an input is NaN, and the nearest point stays NaN.
+                # Without a nearest segment an input is NaN, and the nearest point stays NaN.
                 near_x = T(wp.nan)
                 near_y = T(wp.nan)
                 ahead_x = T(0.0)
@@ -355,31 +354,21 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
                     near_x = x
                     near_y = y
                 else:
-                    from_x = g.references[line]
-                    from_y = g.references[line + 1]
-                    for q in range(1, g.points):
-                        to_x = g.references[line + 2 * q]
-                        to_y = g.references[line + 2 * q + 1]
-                        dx = to_x - from_x
-                        dy = to_y - from_y
-                        length = dx * dx + dy * dy
+                    segment = nearest_segment(g.references, line, g.points, x, y)
+                    if segment >= 0:
+                        from_x = g.references[line + 2 * segment]
+                        from_y = g.references[line + 2 * segment + 1]
+                        ahead_x = g.references[line + 2 * segment + 2] - from_x
+                        ahead_y = g.references[line + 2 * segment + 3] - from_y
+                        length = ahead_x * ahead_x + ahead_y * ahead_y
                         inverse = T(0.0)
                         if length > T(0.0):
                             inverse = T(1.0) / length
-                        raw = ((x - from_x) * dx + (y - from_y) * dy) * inverse
+                        raw = ((x - from_x) * ahead_x + (y - from_y) * ahead_y) * inverse
                         along = wp.min(wp.max(raw, T(0.0)), T(1.0))
-                        at_x = from_x + along * dx
-                        at_y = from_y + along * dy
-                        square = (x - at_x) * (x - at_x) + (y - at_y) * (y - at_y)
-                        if square < best:
-                            best = square
-                            near_x = at_x
-                            near_y = at_y
-                            ahead_x = dx
-                            ahead_y = dy
-                            inside = wp.where(along == raw, inverse, T(0.0))
-                        from_x = to_x
-                        from_y = to_y
+                        near_x = from_x + along * ahead_x
+                        near_y = from_y + along * ahead_y
+                        inside = wp.where(along == raw, inverse, T(0.0))
                 scale = wp.sqrt(inside)
                 place = i * (g.K + 1) + k
                 each = n * (g.K + 1)

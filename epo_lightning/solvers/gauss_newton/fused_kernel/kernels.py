@@ -1,7 +1,6 @@
 """The two kernels: all steps of a game, and their adjoint. Their formulas are those of `kernel/group.hpp` and `step.hpp`."""
 
 import functools
-import os
 from types import SimpleNamespace
 from typing import no_type_check
 
@@ -13,11 +12,14 @@ from epo_lightning.solvers.gauss_newton.fused_kernel import games as all_games
 from epo_lightning.solvers.gauss_newton.fused_kernel import pairs as pair_features
 from epo_lightning.solvers.gauss_newton.fused_kernel import recursion as recursions
 from epo_lightning.solvers.gauss_newton.fused_kernel import threads
-from epo_lightning.solvers.gauss_newton.fused_kernel.constants import DAMPED, SOLVED, STOPPED
+from epo_lightning.solvers.gauss_newton.fused_kernel.constants import DAMPED, SOLVED, STOPPED, TEAM, WARP
+from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.fused_kernel.layout import factor_numbers
 from epo_lightning.solvers.gauss_newton.structured import RETRIES
 
-REGISTERS = int(os.environ.get("EPO_REG", "128"))
+REGISTERS = {WARP: 128, TEAM: 255}
+"""Registers of a thread on a GPU, at most. With 128, some numbers are in local memory, but twice as many games are solved at
+a time as with 255; that hides the latency of memory where there are many games."""
 OPTIONS = {"cpu_compiler_flags": "-march=native"}
 """Without Warp's flags for more inlining on CPUs, which double the time of compilation."""
 
@@ -25,7 +27,11 @@ OPTIONS = {"cpu_compiler_flags": "-march=native"}
 @functools.cache
 @no_type_check
 def make(
-    double: bool, agents: int, features: all_games.Features | None = None, backwards: bool = False
+    double: bool,
+    agents: int,
+    features: Features | None = None,
+    count: int = WARP,
+    backwards: bool = False,
 ) -> SimpleNamespace:
     """The kernels ``solve`` and ``differentiate`` and the structures of their arguments.
 
@@ -34,6 +40,8 @@ def make(
         agents: number of agents that a game has at most.
         features: the features of the games, for kernels that are compiled for them and have all functions inlined, as GPUs
             need it; None for kernels that solve games with any features and take a few seconds to compile, for CPUs.
+        count: number of threads of a game on a GPU. On a CPU a game has one, unless Warp is set to run blocks of threads
+            there (``warp.config.enable_cpu_blocks``), as tests of the barriers do.
         backwards: whether a CPU runs the threads of a game in the opposite order, for tests.
     """
     T = wp.float64 if double else wp.float32
@@ -76,11 +84,12 @@ def make(
         adjoint.control_adjoint,
         adjoint.pull_states,
     )
+    registers = 255 if double else REGISTERS[count]
     each_factor = factor_numbers(agents)
     rows = 2 * agents
 
     @wp.kernel(
-        enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False, cuda_max_registers=REGISTERS
+        enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False, cuda_max_registers=registers
     )
     def solve(g: Game, run: Run):
         block, _ = wp.tid()
@@ -146,7 +155,6 @@ def make(
                         attempt += 1
                     push(
                         work,
-                        at.control,
                         at.linear,
                         at.fast,
                         factors,
@@ -194,7 +202,7 @@ def make(
             sync()
 
     @wp.kernel(
-        enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False, cuda_max_registers=REGISTERS
+        enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False, cuda_max_registers=registers
     )
     def differentiate(g: Game, run: Run, by: Gradients):
         block, _ = wp.tid()
@@ -224,7 +232,6 @@ def make(
                         factors = part(run.factors, tape * wp.int64(factors_of_step), factors_of_step)
                         nearest = part(run.nearest, tape * wp.int64(each_nearest), each_nearest)
                         roll(g, game, n, agents, at, work, controls)
-                        set_motions(g, n, at, work, end)
                         # mu = alpha H^-1 times the cotangent; zero after the end of the game.
                         m = 2 * n
                         for e in range(lane(), m * g.K, wp.block_dim()):
@@ -238,10 +245,9 @@ def make(
                                 value = -g.step_size * by.controls[u]
                             work[at.linear + e] = value
                         sync()
-                        pull(work, at.control, at.linear, at.fast, factors, end, g.dt)
+                        pull(work, at.linear, at.fast, factors, end, g.dt)
                         push(
                             work,
-                            at.control,
                             at.linear,
                             at.fast,
                             factors,
@@ -272,4 +278,6 @@ def make(
                     by.controls[game * row + e] = T(0.0)
             sync()
 
-    return SimpleNamespace(solve=solve, differentiate=differentiate, Game=Game, Run=Run, Gradients=Gradients)
+    return SimpleNamespace(
+        solve=solve, differentiate=differentiate, Game=Game, Run=Run, Gradients=Gradients, threads=count
+    )

@@ -33,7 +33,7 @@ class Layout:
         along: cotangents of positions (6), heading and speed [8, A, K].
         rates: cotangents of the changes of controls [2, A, K + 1].
         touching: cotangents of pairs [10, P, K].
-        weights: products for the gradient by the weights of own features [O, A, K], of pair features and margins [2, F, P, K].
+        weights: products for the gradients by weights of own features [O, A, K], of pair features and margins [2, F, P, K].
         numbers: of all together.
     """
 
@@ -59,9 +59,10 @@ def layout(agents: int, steps: int, own: int, pair: int) -> Layout:
     A, K, P = agents, steps, agents * (agents - 1) // 2
 
     def places(start: int, *sizes: int) -> list[int]:
+        # Four numbers are read at once, and their place must be a multiple of four.
         found = [start]
         for size in sizes:
-            found.append(found[-1] + size)
+            found.append(found[-1] + -(-size // 4) * 4)
         return found
 
     *shared, start = places(
@@ -83,12 +84,12 @@ def layout(agents: int, steps: int, own: int, pair: int) -> Layout:
 def fast_numbers(agents: int) -> int:
     """Numbers of the recursion's arrays: the value function, two arrays of a row per control, and controls of two steps."""
     controls = 2 * agents
-    way_back = 5 * controls * (3 * controls + 4) + 2 * CONTROL_ITEMS * agents
-    streamed = 7 * controls + 2 * (factor_numbers(agents) + controls + 4 * agents)
+    way_back = 5 * controls * (3 * controls + 4) + 2 * CONTROL_ITEMS * agents + 4
+    streamed = 13 * controls + 4 * (factor_numbers(agents) + controls)
     return max(way_back, streamed)
 
 
 def factor_numbers(agents: int) -> int:
-    """Numbers of a step that the recursion keeps: gains [2 A, 6 A], and second derivatives by the changes of controls."""
+    """Numbers of a step that the recursion keeps: gains [2 A, 6 A], second derivatives by changes of controls, motions."""
     controls = 2 * agents
-    return 3 * controls**2 + controls
+    return 3 * controls**2 + controls + 4 * agents

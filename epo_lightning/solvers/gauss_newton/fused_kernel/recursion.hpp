@@ -1,47 +1,48 @@
 // The bodies of three functions, after what they share. `recursion.py` explains them, joins them and fills in the values
 // between dollar signs. Arrays in fast memory have rows of LD numbers.
     typedef $T$ T;
+    struct alignas(4 * sizeof(T)) Four { T x, y, heading, speed; };
     constexpr int A = $A$, M = 2 * A, D = 3 * M, LD = D + 4, WIDE = 4 * A, ITEMS = $ITEMS$ * A;
-    constexpr int FACTOR = M * D + M;
+    constexpr int FACTOR = M * D + M + WIDE;  // gains [M, D], second derivatives by changes of controls [M], motions [4, A]
 #if defined(__CUDA_ARCH__)
-    // The first warp of a game works, and its other ones wait in EPO_END.
-    constexpr int LANES = 32;
-    const int lane = threadIdx.x, lanes = LANES;
-    #define EPO_SYNC() __syncwarp()
-    #define EPO_FAST(count) __shared__ alignas(16) T fast[count]; if (lane < LANES) {
-    #define EPO_END() } if (WP_TILE_BLOCK_DIM > LANES) __syncthreads(); else __syncwarp();
+    constexpr int LANES = 32, WARPS = WP_TILE_BLOCK_DIM / LANES, THREADS = WP_TILE_BLOCK_DIM;
+    const int thread = threadIdx.x, threads = THREADS, lane = thread % LANES, lanes = LANES, warp = thread / LANES;
+    #define EPO_SYNC() if (WARPS > 1) __syncthreads(); else __syncwarp()
+    #define EPO_SYNC_LANES() __syncwarp()
+    #define EPO_FAST(count) __shared__ alignas(16) T fast[count]
 #else
-    constexpr int LANES = 1;  // at least: so many rows and columns may be those of one thread
-    const int lane = $CPU_LANE$, lanes = WP_TILE_BLOCK_DIM;
+    constexpr int LANES = 1, WARPS = 1, THREADS = 1;  // a CPU may have more of them, and then less work for each
+    const int thread = $CPU_LANE$, threads = WP_TILE_BLOCK_DIM, lane = thread, lanes = threads, warp = 0;
     #define EPO_SYNC() WP_TILE_SYNC()
-    #define EPO_FAST(count) T* const fast = work.data + scratch; {
-    #define EPO_END() }
+    #define EPO_SYNC_LANES() WP_TILE_SYNC()
+    #define EPO_FAST(count) T* const fast = work.data + scratch
 #endif
-    (void)A, (void)LD, (void)WIDE, (void)ITEMS, (void)FACTOR, (void)LANES, (void)M, (void)D;
+    (void)A, (void)LD, (void)WIDE, (void)ITEMS, (void)FACTOR, (void)M, (void)D, (void)lanes, (void)lane, (void)warp;
 
 // ---- eliminate
-#if defined(__CUDA_ARCH__)
-    __shared__ int verdict;
-#endif
-    int positive = 1;
-    EPO_FAST(5 * M * LD + 2 * ITEMS)
+    EPO_FAST(5 * M * LD + 2 * ITEMS + 4);
     T* const P = fast;           // [D, LD]: the value function of the next state, and in column D its gradient
     T* const W = P + D * LD;     // [M, LD]: H_cp, H_cz before the motion, and H_cc = dt W_cz + W_cc
     T* const G = W + M * LD;     // [M, LD]
     T* const items = G + M * LD; // [2, ITEMS]: of this step, and of the one after it or before it
-    constexpr int COLUMNS = (D + LANES) / LANES;  // of a thread, at most
-    constexpr bool EARLY = COLUMNS == 1;          // a thread has the registers to read its costs a step ahead
-    T cost[COLUMNS][WIDE];
-    auto read_costs = [&](int k, int t) {
-        const int c = lane + t * lanes;
-        const bool of_costs = c < 2 * M || c == D;
+    T* const verdict = items + 2 * ITEMS;
+    constexpr int COLUMNS = (D + LANES) / LANES, ROWS = (A + WARPS - 1) / WARPS;  // of a thread, at most
+    constexpr int PARTS = (ITEMS + THREADS - 1) / THREADS;
+    int positive = 1;
+    // The costs of a step in the columns and the agents' rows of this thread are read one step ahead where registers allow.
+    constexpr bool EARLY = COLUMNS == 1;
+    Four cost[ROWS];
+    auto read_costs = [&](int k, int c) {
         const int row = c == D ? WIDE : 4 * ((c % M) / 2) + (c < M ? 0 : 2) + c % 2;
-        const T* const costs = work.data + hessian + (k * (WIDE + 1) + row) * WIDE;
+        const Four* const costs = (const Four*)(work.data + hessian) + (k * (WIDE + 1) + row) * A;
         #pragma unroll
-        for (int q = 0; q < WIDE; ++q) cost[t][q] = of_costs ? costs[q] : T(0);
+        for (int t = 0; t < ROWS; ++t) {
+            const int a = warp + t * WARPS;
+            cost[t] = a < A && (c < 2 * M || c == D) ? costs[a] : Four{T(0), T(0), T(0), T(0)};
+        }
     };
-    if (EARLY && end > 0) read_costs(end - 1, 0);
-    for (int e = lane; e < ITEMS && end > 0; e += lanes) {
+    if (EARLY && end > 0) read_costs(end - 1, lane);
+    for (int e = thread; e < ITEMS && end > 0; e += threads) {
         items[((end - 1) & 1) * ITEMS + e] = work.data[control + (end - 1) * ITEMS + e];
     }
     EPO_SYNC();
@@ -49,267 +50,256 @@
         const T* const now = items + (k & 1) * ITEMS;
         const T* const later = items + ((k + 1) & 1) * ITEMS;
         #pragma unroll
-        for (int t = 0; t < COLUMNS; ++t) {
-            const int c = lane + t * lanes;
-            if (c > D) continue;
-            const bool of_costs = c < 2 * M || c == D;
-            if (!EARLY) read_costs(k, t);
-            T column[D];
-            if (k == end - 1) {
-                #pragma unroll
-                for (int i = 0; i < D; ++i) column[i] = T(0);
-            } else {
-                T g[M];
-                #pragma unroll
-                for (int r = 0; r < M; ++r) g[r] = G[r * LD + c];
-                #pragma unroll
-                for (int i = 0; i < 2 * M; ++i) column[i] = of_costs ? P[i * LD + c] : T(0);
-                #pragma unroll
-                for (int r = 0; r < M; ++r) {
-                    const T stiffness = later[($RATE_STIFFNESS$ + r % 2) * A + r / 2];
-                    const T rate = later[($RATE$ + r % 2) * A + r / 2];
-                    column[2 * M + r] = c == 2 * M + r ? stiffness : c == D ? -rate : T(0);
-                }
-                #pragma unroll
-                for (int r = 0; r < M; ++r) {
+        for (int column = 0; column < COLUMNS; ++column) {
+            const int c = lane + column * lanes;
+            if (c > D) break;
+            if (!EARLY) read_costs(k, c);
+            T g[M];
+            #pragma unroll
+            for (int r = 0; r < M; ++r) g[r] = k == end - 1 ? T(0) : G[r * LD + c];
+            #pragma unroll
+            for (int t = 0; t < ROWS; ++t) {
+                const int a = warp + t * WARPS;
+                if (a >= A) break;
+                T value[6] = {cost[t].x, cost[t].y, cost[t].heading, cost[t].speed, T(0), T(0)};
+                if (k < end - 1) {
                     #pragma unroll
-                    for (int i = 0; i < D; ++i) column[i] -= G[r * LD + i] * g[r];
+                    for (int r = 0; r < M; ++r) {
+                        #pragma unroll
+                        for (int q = 0; q < 6; ++q) value[q] -= G[r * LD + q / 2 * M + 2 * a + q % 2] * g[r];
+                    }
+                    if (c < 2 * M || c == D) {
+                        #pragma unroll
+                        for (int q = 0; q < 4; ++q) value[q] += P[(q / 2 * M + 2 * a + q % 2) * LD + c];
+                    }
+                    #pragma unroll
+                    for (int q = 0; q < 2; ++q) {
+                        const T stiffness = later[($RATE_STIFFNESS$ + q) * A + a], rate = later[($RATE$ + q) * A + a];
+                        value[4 + q] += c == 2 * M + 2 * a + q ? stiffness : c == D ? -rate : T(0);
+                    }
                 }
-            }
-            #pragma unroll
-            for (int a = 0; a < A; ++a) {
-                column[2 * a] += cost[t][4 * a];
-                column[2 * a + 1] += cost[t][4 * a + 1];
-                column[M + 2 * a] += cost[t][4 * a + 2];
-                column[M + 2 * a + 1] += cost[t][4 * a + 3];
-            }
-            #pragma unroll
-            for (int r = 0; r < M; ++r) {
-                const T pull = now[($PULL$ + r % 2) * A + r / 2];
-                W[r * LD + c] = dt * column[M + r] + column[2 * M + r] + (c == D ? pull : T(0));
-            }
-            if (of_costs) {
                 #pragma unroll
-                for (int r = 0; r < M; ++r) {
-                    const T* const motion = now + ($MOTION$ + 2 * (r % 2)) * A + r / 2;
-                    P[r * LD + c] = column[r];
-                    P[(M + r) * LD + c] =
-                        column[M + r] + motion[0] * column[r - r % 2] + motion[A] * column[r - r % 2 + 1];
+                for (int q = 0; q < 2; ++q) {
+                    const T pull = now[($PULL$ + q) * A + a];
+                    const T* const motion = now + ($MOTION$ + 2 * q) * A + a;
+                    W[(2 * a + q) * LD + c] = dt * value[2 + q] + value[4 + q] + (c == D ? pull : T(0));
+                    P[(2 * a + q) * LD + c] = value[q];
+                    P[(M + 2 * a + q) * LD + c] = value[2 + q] + motion[0] * value[0] + motion[A] * value[1];
                 }
             }
         }
         EPO_SYNC();
-        if (EARLY && k > 0) read_costs(k - 1, 0);
-#if defined(__CUDA_ARCH__)
-        T ahead[(ITEMS + LANES - 1) / LANES];  // items of the step before, on their way while the next lines compute
+        // Numbers of the step before, on their way while the next lines compute.
+        if (EARLY && k > 0) read_costs(k - 1, lane);
+        T ahead[PARTS];
         #pragma unroll
-        for (int t = 0; t < (ITEMS + LANES - 1) / LANES; ++t) {
-            const int e = lane + t * LANES;
-            ahead[t] = k > 0 && e < ITEMS ? work.data[control + (k - 1) * ITEMS + e] : T(0);
-        }
-#endif
-        T L[M * (M + 1) / 2];  // rows, with reciprocals on the diagonal
-        #pragma unroll
-        for (int r = 0; r < M; ++r) {
-            #pragma unroll
-            for (int s = 0; s <= r; ++s) {
-                T entry = dt * W[r * LD + M + s] + W[r * LD + 2 * M + s];
-                if (r == s) entry += now[($DAMPED_STIFFNESS$ + r % 2) * A + r / 2];
-                #pragma unroll
-                for (int q = 0; q < s; ++q) entry -= L[r * (r + 1) / 2 + q] * L[s * (s + 1) / 2 + q];
-                if (r == s) {
-                    if (!(entry > T(0))) positive = 0;
-#if defined(__CUDA_ARCH__)
-                    entry = rsqrt(entry);
-#else
-                    entry = T(1) / sqrt(entry);
-#endif
-                } else {
-                    entry *= L[s * (s + 1) / 2 + s];
-                }
-                L[r * (r + 1) / 2 + s] = entry;
-            }
+        for (int t = 0; t < PARTS; ++t) {
+            const int e = thread + t * threads;
+            if (k > 0 && e < ITEMS) ahead[t] = work.data[control + (k - 1) * ITEMS + e];
         }
         T* const factor = factors.data + k * FACTOR;
-        for (int c = lane; c <= D; c += lanes) {
-            T h[M];
-            T scale = T(1);
-            if (c >= 2 * M && c < D) {
-                scale = -now[($RATE_STIFFNESS$ + c % 2) * A + (c - 2 * M) / 2];
-                factor[M * D + c - 2 * M] = -scale;
-                #pragma unroll
-                for (int r = 0; r < M; ++r) h[r] = c == 2 * M + r ? T(1) : T(0);
-            } else {
-                #pragma unroll
-                for (int r = 0; r < M; ++r) h[r] = W[r * LD + c];
-            }
-            if (c >= M && c < 2 * M) {
-                const int a = (c - M) / 2;
-                const T* const motion = now + ($MOTION$ + 2 * (c % 2)) * A + a;
-                const T z0 = motion[0], z1 = motion[A];
-                const T coupling = c % 2 ? now[$COUPLING$ * A + a] : T(0);
-                #pragma unroll
-                for (int r = 0; r < M; ++r) {
-                    h[r] += W[r * LD + 2 * a] * z0 + W[r * LD + 2 * a + 1] * z1;
-                    if (r == 2 * a) h[r] += coupling;
-                }
-                #pragma unroll
-                for (int i = 0; i < 2 * M; ++i) P[i * LD + c] += P[i * LD + 2 * a] * z0 + P[i * LD + 2 * a + 1] * z1;
-            }
-            if (c == D) {
-                #pragma unroll
-                for (int r = 0; r < M; ++r) work.data[linear + k * M + r] = h[r];
-            }
+        if (WARPS < 4 || warp < 3) {
+            T L[M][M];  // the lower triangle, with reciprocals on the diagonal
             #pragma unroll
             for (int r = 0; r < M; ++r) {
                 #pragma unroll
-                for (int s = 0; s < r; ++s) h[r] -= L[r * (r + 1) / 2 + s] * h[s];
-                h[r] *= L[r * (r + 1) / 2 + r];
-                G[r * LD + c] = scale * h[r];
+                for (int s = 0; s <= r; ++s) L[r][s] = dt * W[r * LD + M + s] + W[r * LD + 2 * M + s];
+                L[r][r] += now[($DAMPED_STIFFNESS$ + r % 2) * A + r / 2];
             }
-            if (c < D) {  // the gains, and of the columns of c the inverse of H_cc
+            #pragma unroll
+            for (int j = 0; j < M; ++j) {
+                if (!(L[j][j] > T(0))) positive = 0;
+#if defined(__CUDA_ARCH__)
+                L[j][j] = rsqrt(L[j][j]);
+#else
+                L[j][j] = T(1) / sqrt(L[j][j]);
+#endif
                 #pragma unroll
-                for (int r = M - 1; r >= 0; --r) {
+                for (int r = j + 1; r < M; ++r) L[r][j] *= L[j][j];
+                #pragma unroll
+                for (int r = j + 1; r < M; ++r) {
                     #pragma unroll
-                    for (int s = r + 1; s < M; ++s) h[r] -= L[s * (s + 1) / 2 + r] * h[s];
-                    h[r] *= L[r * (r + 1) / 2 + r];
-                    factor[r * D + c] = h[r];
+                    for (int s = j + 1; s <= r; ++s) L[r][s] -= L[r][j] * L[s][j];
                 }
             }
+            // Of four warps, each of the first three has the columns of p, z or c.
+            const int first = WARPS < 4 ? lane : lane < M ? warp * M + lane : lane == M && warp == 0 ? D : D + 1;
+            for (int c = first; c <= D; c += WARPS < 4 ? lanes : D + 1) {
+                T h[M];
+                const bool of_change = c >= 2 * M && c < D, moving = c >= M && c < 2 * M;
+                const int a = (c % M) / 2;
+                const T* const motion = now + ($MOTION$ + 2 * (c % 2)) * A + a;
+                const T z0 = moving ? motion[0] : T(0), z1 = moving ? motion[A] : T(0);
+                const T coupling = moving && c % 2 ? now[$COUPLING$ * A + a] : T(0);
+                const T scale = of_change ? -now[($RATE_STIFFNESS$ + c % 2) * A + a] : T(1);
+                #pragma unroll
+                for (int r = 0; r < M; ++r) {
+                    h[r] = W[r * LD + c] + W[r * LD + 2 * a] * z0 + W[r * LD + 2 * a + 1] * z1;
+                    h[r] += r == 2 * a ? coupling : T(0);
+                    h[r] = !of_change ? h[r] : c == 2 * M + r ? T(1) : T(0);
+                }
+                if (c == D) {
+                    #pragma unroll
+                    for (int r = 0; r < M; ++r) work.data[linear + k * M + r] = h[r];
+                }
+                #pragma unroll
+                for (int r = 0; r < M; ++r) {
+                    h[r] *= L[r][r];
+                    #pragma unroll
+                    for (int s = r + 1; s < M; ++s) h[s] -= L[s][r] * h[r];
+                    G[r * LD + c] = scale * h[r];
+                }
+                #pragma unroll
+                for (int r = M - 1; r >= 0; --r) {
+                    h[r] *= L[r][r];
+                    #pragma unroll
+                    for (int s = 0; s < r; ++s) h[s] -= L[r][s] * h[r];
+                    if (c < D) factor[r * D + c] = h[r];  // the gains, and of the columns of c the inverse of H_cc
+                }
+                if (of_change) factor[M * D + c - 2 * M] = -scale;
+            }
         }
-#if defined(__CUDA_ARCH__)
+        if (WARPS < 4 || warp >= 3) {  // H_pz and H_zz: motions act on the columns too
+            constexpr int HELPERS = WARPS < 4 ? 0 : 3 * LANES;
+            for (int e = thread - HELPERS; e < 2 * M * M; e += threads - HELPERS) {
+                const int i = e / M, s = e % M, a = s / 2;
+                const T* const motion = now + ($MOTION$ + 2 * (s % 2)) * A + a;
+                P[i * LD + M + s] += P[i * LD + 2 * a] * motion[0] + P[i * LD + 2 * a + 1] * motion[A];
+            }
+            for (int e = thread - HELPERS; e < WIDE; e += threads - HELPERS) {
+                factor[M * D + M + e] = now[$MOTION$ * A + e];
+            }
+        }
         #pragma unroll
-        for (int t = 0; t < (ITEMS + LANES - 1) / LANES; ++t) {
-            const int e = lane + t * LANES;
-            if (e < ITEMS) items[((k + 1) & 1) * ITEMS + e] = ahead[t];
+        for (int t = 0; t < PARTS; ++t) {
+            const int e = thread + t * threads;
+            if (k > 0 && e < ITEMS) items[((k + 1) & 1) * ITEMS + e] = ahead[t];
         }
-#else
-        for (int e = lane; k > 0 && e < ITEMS; e += lanes) {
-            items[((k + 1) & 1) * ITEMS + e] = work.data[control + (k - 1) * ITEMS + e];
-        }
-#endif
         EPO_SYNC();
     }
-#if defined(__CUDA_ARCH__)
-    if (lane == 0) verdict = positive;
-#endif
-    EPO_END()
-#if defined(__CUDA_ARCH__)
-    positive = verdict;
+    if (thread == 0) verdict[0] = T(positive);
     EPO_SYNC();
-#endif
+    positive = verdict[0] > T(0);
+    EPO_SYNC();
     return positive;
 
 // ---- stream
-    // What a step of the next two functions reads, in fast memory: the factor, the linear term [M] and the motions [4, A].
-    // While a step is computed, the numbers of the one after the next are on their way.
-    constexpr int STREAM = FACTOR + M + 4 * A, PARTS = (STREAM + LANES - 1) / LANES;
-    T ahead[PARTS];
-    auto request = [&](int k) {
-        #pragma unroll
-        for (int t = 0; t < PARTS; ++t) {
-            const int e = lane + t * lanes;
-            if (e < FACTOR) ahead[t] = factors.data[k * FACTOR + e];
-            else if (e < FACTOR + M) ahead[t] = work.data[linear + k * M + e - FACTOR];
-            else if (e < STREAM) ahead[t] = work.data[control + k * ITEMS + $MOTION$ * A + e - FACTOR - M];
+    // What a step of the next two functions reads, in fast memory: the factor and the linear terms [M]. While a step is
+    // computed, the numbers of the next three are on their way. The first warp of a game works, and its other ones wait.
+    constexpr int STREAM = FACTOR + M, DEPTH = 4;
+    constexpr int UNIT = 16 / sizeof(T);  // numbers that are copied at once
+    auto request = [&](T* buffers, int k) {
+        const T* const factor = factors.data + k * FACTOR;
+        const T* const others = work.data + linear + k * M - FACTOR;
+        T* const to = buffers + (k % DEPTH) * STREAM;
+        for (int e = lane * UNIT; e < STREAM && k >= 0 && k < end; e += lanes * UNIT) {
+            const T* const from = (e < FACTOR ? factor : others) + e;
+#if defined(__CUDA_ARCH__)
+            const unsigned there = __cvta_generic_to_shared(to + e);
+            asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(there), "l"(__cvta_generic_to_global(from)));
+#else
+            for (int q = 0; q < UNIT; ++q) to[e + q] = from[q];
+#endif
         }
+#if defined(__CUDA_ARCH__)
+        asm volatile("cp.async.commit_group;");
+#endif
     };
-    auto deliver = [&](T* buffers, int k) {
-        #pragma unroll
-        for (int t = 0; t < PARTS; ++t) {
-            const int e = lane + t * lanes;
-            if (e < STREAM) buffers[(k & 1) * STREAM + e] = ahead[t];
-        }
+    auto wait = [&]() {  // for the oldest of DEPTH - 1 requests
+#if defined(__CUDA_ARCH__)
+        asm volatile("cp.async.wait_group %0;" ::"n"(DEPTH - 2));
+#endif
+        EPO_SYNC_LANES();
     };
 
 // ---- pull
     // Linear terms backwards in time: h becomes the gradient by the controls of a step, for another right-hand side.
-    EPO_FAST(2 * D + M + 2 * STREAM)
+    EPO_FAST(2 * D + M + DEPTH * STREAM);
     T* const q = fast + 2 * D;
     T* const buffers = q + M;
-    if (end > 0) {
-        request(end - 1);
-        deliver(buffers, end - 1);
-    }
-    if (end > 1) request(end - 2);
-    for (int j = lane; j < 2 * D; j += lanes) fast[j] = T(0);
     EPO_SYNC();
-    for (int k = end - 1; k >= 0; --k) {
-        const T* const y = fast + (k & 1) * D;
-        T* const before = fast + ((k + 1) & 1) * D;
-        const T* const factor = buffers + (k & 1) * STREAM;
-        const T* const motions = factor + FACTOR + M;
-        for (int r = lane; r < M; r += lanes) {
-            q[r] = factor[FACTOR + r] + dt * y[M + r] + y[2 * M + r];
-            work.data[linear + k * M + r] = q[r];
-        }
-        EPO_SYNC();
-        for (int j = lane; j < D; j += lanes) {
-            T sum = T(0);
-            #pragma unroll
-            for (int r = 0; r < M; ++r) sum += factor[r * D + j] * q[r];
-            if (j < 2 * M) {
-                T moved = y[j] - sum;
-                if (j >= M) {
-                    const int a = (j - M) / 2;
-                    const T* const motion = motions + 2 * (j % 2) * A + a;
-                    moved += motion[0] * y[2 * a] + motion[A] * y[2 * a + 1];
+    if (warp == 0) {
+        for (int back = 0; back < DEPTH - 1; ++back) request(buffers, end - 1 - back);
+        for (int j = lane; j < 2 * D; j += lanes) fast[j] = T(0);
+        for (int k = end - 1; k >= 0; --k) {
+            wait();
+            const T* const y = fast + (k & 1) * D;
+            T* const before = fast + ((k + 1) & 1) * D;
+            const T* const factor = buffers + (k % DEPTH) * STREAM;
+            const T* const motions = factor + M * D + M;
+            for (int r = lane; r < M; r += lanes) {
+                q[r] = factor[FACTOR + r] + dt * y[M + r] + y[2 * M + r];
+                work.data[linear + k * M + r] = q[r];
+            }
+            EPO_SYNC_LANES();
+            request(buffers, k - DEPTH + 1);
+            for (int j = lane; j < D; j += lanes) {
+                T sum = T(0);
+                #pragma unroll
+                for (int r = 0; r < M; ++r) sum += factor[r * D + j] * q[r];
+                if (j < 2 * M) {
+                    T moved = y[j] - sum;
+                    if (j >= M) {
+                        const int a = (j - M) / 2;
+                        const T* const motion = motions + 2 * (j % 2) * A + a;
+                        moved += motion[0] * y[2 * a] + motion[A] * y[2 * a + 1];
+                    }
+                    before[j] = moved;
+                } else {
+                    before[j] = factor[M * D + j - 2 * M] * sum;
                 }
-                before[j] = moved;
-            } else {
-                before[j] = factor[M * D + j - 2 * M] * sum;
             }
         }
-        if (k > 0) deliver(buffers, k - 1);
-        if (k > 1) request(k - 2);
-        EPO_SYNC();
     }
-    EPO_END()
+    EPO_SYNC();
 
 // ---- push
     // The changes of the controls, -(K x + H_cc^-1 (h - S c)) with the controls c of the step before, forward in time. They go
     // to [agents, K, 2] from `place` on, in the rows of the agents or in their own ones, 0 to n - 1.
-    EPO_FAST(D + M + 2 * STREAM)
-    T* const x = fast;
-    T* const change = fast + D;
-    T* const buffers = change + M;
-    if (end > 0) {
-        request(0);
-        deliver(buffers, 0);
-    }
-    if (end > 1) request(1);
-    for (int j = lane; j < D; j += lanes) x[j] = T(0);
+    EPO_FAST(3 * D + M * 4 + DEPTH * STREAM);
+    T* const known = fast + 2 * D;    // [D]: p, z and h - S c, with which the gains are multiplied
+    T* const shares = known + D;      // [M, 4]: the products, by quarters of the columns
+    T* const buffers = shares + M * 4;
     EPO_SYNC();
-    for (int k = 0; k < end; ++k) {
-        const T* const factor = buffers + (k & 1) * STREAM;
-        for (int r = lane; r < M; r += lanes) {
-            T moved = T(0), steered = T(0);
-            #pragma unroll
-            for (int c = 0; c < 2 * M; ++c) moved += factor[r * D + c] * x[c];
-            #pragma unroll
-            for (int c = 0; c < M; ++c) {
-                steered += factor[r * D + 2 * M + c] * (factor[FACTOR + c] - factor[M * D + c] * x[2 * M + c]);
+    if (warp == 0) {
+        for (int ahead = 0; ahead < DEPTH - 1; ++ahead) request(buffers, ahead);
+        for (int j = lane; j < D; j += lanes) fast[j] = T(0);
+        wait();
+        for (int j = lane; j < D; j += lanes) known[j] = j < 2 * M ? T(0) : buffers[FACTOR + j - 2 * M];
+        for (int k = 0; k < end; ++k) {
+            EPO_SYNC_LANES();
+            const T* const x = fast + (k & 1) * D;
+            T* const after = fast + ((k + 1) & 1) * D;
+            const T* const factor = buffers + (k % DEPTH) * STREAM;
+            const T* const next = buffers + ((k + 1) % DEPTH) * STREAM;
+            for (int e = lane; e < 4 * M; e += lanes) {
+                const int r = e / 4, first = e % 4 * (D / 4);
+                T share = T(0);
+                #pragma unroll
+                for (int c = 0; c < D / 4; ++c) share += factor[r * D + first + c] * known[first + c];
+                shares[e] = share;
             }
-            change[r] = -(moved + steered);
-        }
-        if (k + 1 < end) deliver(buffers, k + 1);
-        if (k + 2 < end) request(k + 2);
-        EPO_SYNC();
-        for (int a = lane; a < A; a += lanes) {
-            const T* const motion = factor + FACTOR + M + a;
-            const T turned = x[M + 2 * a], faster = x[M + 2 * a + 1];
-            x[2 * a] += motion[0] * turned + motion[2 * A] * faster;
-            x[2 * a + 1] += motion[A] * turned + motion[3 * A] * faster;
-            x[M + 2 * a] = turned + dt * change[2 * a];
-            x[M + 2 * a + 1] = faster + dt * change[2 * a + 1];
-            x[2 * M + 2 * a] = change[2 * a];
-            x[2 * M + 2 * a + 1] = change[2 * a + 1];
-            if (a < count) {
-                T* const controls = to.data + place + 2 * ((own_rows ? a : rows.data[a]) * K + k);
-                controls[1] = change[2 * a];
-                controls[0] = change[2 * a + 1];
+            request(buffers, k + DEPTH - 1);
+            wait();
+            for (int j = lane; j < D; j += lanes) {
+                const int r = j % M, a = r / 2;
+                const T* const motion = factor + M * D + M + r % 2 * A + a;
+                const T* const share = shares + 4 * r;
+                const T change = -((share[0] + share[1]) + (share[2] + share[3]));
+                T moved = change, use = change;
+                if (j < M) {
+                    moved = x[j] + motion[0] * x[M + 2 * a] + motion[2 * A] * x[M + 2 * a + 1];
+                } else if (j < 2 * M) {
+                    moved = x[j] + dt * change;
+                } else if (k + 1 < end) {
+                    use = next[FACTOR + r] - next[M * D + r] * change;
+                }
+                after[j] = moved;
+                known[j] = j < 2 * M ? moved : use;
+                if (j >= 2 * M && a < count) {
+                    to.data[place + 2 * ((own_rows ? a : rows.data[a]) * K + k) + 1 - r % 2] = change;
+                }
             }
         }
-        EPO_SYNC();
     }
-    EPO_END()
+    EPO_SYNC();

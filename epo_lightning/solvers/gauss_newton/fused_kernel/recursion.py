@@ -43,12 +43,11 @@ def make(T: Any, agents: int, backwards: bool) -> SimpleNamespace:
     ) -> int: ...
 
     @wp.func_native(head + code["stream"] + code["pull"])
-    def pull(work: Array, control: int, linear: int, scratch: int, factors: Array, end: int, dt: T): ...
+    def pull(work: Array, linear: int, scratch: int, factors: Array, end: int, dt: T): ...
 
     @wp.func_native(head + code["stream"] + code["push"])
     def push(
         work: Array,
-        control: int,
         linear: int,
         scratch: int,
         factors: Array,

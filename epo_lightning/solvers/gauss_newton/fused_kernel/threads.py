@@ -1,14 +1,9 @@
-"""Threads of one game: their number, a barrier, and sums along time, which one thread computes."""
+"""Threads of one game: their number and a barrier, and two loops of one thread: sums along time, and along a line."""
 
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
 import warp as wp
-
-import os
-THREADS = int(os.environ.get("EPO_BLOCK", "32"))
-"""Threads of a game on a GPU: one warp, so that its barrier is cheap. On a CPU a game has one thread, unless Warp is set to
-run blocks of threads there (``warp.config.enable_cpu_blocks``), as tests of the barriers do."""
 
 SYNC = """
 #if defined(__CUDA_ARCH__)
@@ -69,6 +64,31 @@ _SUMS_BACK = """
         }
     }
 """
+# The line's segment that is nearest to a point; -1 if no comparison is true, because an input is NaN. What is left of the
+# point's coordinates on the segment need not be exact, and is computed again.
+_NEAREST_SEGMENT = """
+    typedef {number} T;
+    const T* from = points.data + first;
+    T from_x = from[0], from_y = from[1], least = INFINITY;
+    int nearest = -1;
+    #pragma unroll 4
+    for (int q = 0; q + 1 < count; ++q) {
+        const T to_x = from[2 * q + 2], to_y = from[2 * q + 3];
+        const T dx = to_x - from_x, dy = to_y - from_y, off_x = x - from_x, off_y = y - from_y;
+        const T length = dx * dx + dy * dy;
+        const T raw = length > T(0) ? (off_x * dx + off_y * dy) / length : T(0);
+        const T along = raw < T(0) ? T(0) : raw > T(1) ? T(1) : raw;
+        const T gap_x = off_x - along * dx, gap_y = off_y - along * dy;
+        const T square = gap_x * gap_x + gap_y * gap_y;
+        if (square < least) {
+            least = square;
+            nearest = q;
+        }
+        from_x = to_x;
+        from_y = to_y;
+    }
+    return nearest;
+"""
 
 
 @no_type_check
@@ -93,7 +113,10 @@ def make(T: Any, backwards: bool) -> SimpleNamespace:
     @wp.func_native(_SUMS_BACK.replace("{number}", number))
     def sums_back(source: Array, first: int, stride: int, count: int, target: Array, place: int): ...
 
-    return SimpleNamespace(sync=sync, lane=lane, sums=sums, sums_back=sums_back)
+    @wp.func_native(_NEAREST_SEGMENT.replace("{number}", number))
+    def nearest_segment(points: Array, first: int, count: int, x: T, y: T) -> int: ...
+
+    return SimpleNamespace(sync=sync, lane=lane, sums=sums, sums_back=sums_back, nearest_segment=nearest_segment)
 
 
 def number_type(T: Any) -> str:
