@@ -1,4 +1,4 @@
-"""Costs of all states and controls of a game with their first and second derivatives (Gauss-Newton); as in `kernel/step.hpp`.
+"""Costs of all states and controls with their first and second derivatives (Gauss-Newton); as in `kernel/step.hpp`.
 
 Threads share out pairs and agents at all times, so that the recursion of `recursion.py` finds its whole problem ready.
 """

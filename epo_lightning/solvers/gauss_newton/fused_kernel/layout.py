@@ -85,7 +85,7 @@ def fast_numbers(agents: int) -> int:
     """Numbers of the recursion's arrays: the value function, two arrays of a row per control, and controls of two steps."""
     controls = 2 * agents
     way_back = 5 * controls * (3 * controls + 4) + 2 * CONTROL_ITEMS * agents + 4
-    streamed = 13 * controls + 4 * (factor_numbers(agents) + controls)
+    streamed = 12 * controls + 4 * (factor_numbers(agents) + controls)
     return max(way_back, streamed)
 
 

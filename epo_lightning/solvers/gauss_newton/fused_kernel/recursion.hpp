@@ -256,10 +256,10 @@
 // ---- push
     // The changes of the controls, -(K x + H_cc^-1 (h - S c)) with the controls c of the step before, forward in time. They go
     // to [agents, K, 2] from `place` on, in the rows of the agents or in their own ones, 0 to n - 1.
-    EPO_FAST(3 * D + M * 4 + DEPTH * STREAM);
+    EPO_FAST(4 * D + DEPTH * STREAM);
     T* const known = fast + 2 * D;    // [D]: p, z and h - S c, with which the gains are multiplied
-    T* const shares = known + D;      // [M, 4]: the products, by quarters of the columns
-    T* const buffers = shares + M * 4;
+    T* const shares = known + D;      // [3, M]: the products with each of them
+    T* const buffers = shares + D;
     EPO_SYNC();
     if (warp == 0) {
         for (int ahead = 0; ahead < DEPTH - 1; ++ahead) request(buffers, ahead);
@@ -272,11 +272,11 @@
             T* const after = fast + ((k + 1) & 1) * D;
             const T* const factor = buffers + (k % DEPTH) * STREAM;
             const T* const next = buffers + ((k + 1) % DEPTH) * STREAM;
-            for (int e = lane; e < 4 * M; e += lanes) {
-                const int r = e / 4, first = e % 4 * (D / 4);
+            for (int e = lane; e < D; e += lanes) {
+                const int r = e % M, first = e - r;
                 T share = T(0);
                 #pragma unroll
-                for (int c = 0; c < D / 4; ++c) share += factor[r * D + first + c] * known[first + c];
+                for (int c = 0; c < M; ++c) share += factor[r * D + first + c] * known[first + c];
                 shares[e] = share;
             }
             request(buffers, k + DEPTH - 1);
@@ -284,8 +284,7 @@
             for (int j = lane; j < D; j += lanes) {
                 const int r = j % M, a = r / 2;
                 const T* const motion = factor + M * D + M + r % 2 * A + a;
-                const T* const share = shares + 4 * r;
-                const T change = -((share[0] + share[1]) + (share[2] + share[3]));
+                const T change = -(shares[r] + shares[M + r] + shares[2 * M + r]);
                 T moved = change, use = change;
                 if (j < M) {
                     moved = x[j] + motion[0] * x[M + 2 * a] + motion[2 * A] * x[M + 2 * a + 1];
