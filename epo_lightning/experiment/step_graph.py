@@ -11,6 +11,7 @@ CPU, or change from step to step except by tensors on the device.
 from __future__ import annotations
 
 import gc
+import importlib.util
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -26,8 +27,8 @@ from epo_lightning.scene import FIELDS, Scene
 
 WARM_UP = 3
 """Training steps before the capture: they compile kernels and make handles of libraries, which a capture cannot contain."""
-BACKENDS = ("pytorch", "warp")
-"""Values of ``solver.backend`` with which no work of the host is part of a step."""
+BACKENDS = ("pytorch", "warp", "auto")
+"""Values of ``solver.backend`` with which no work of the host is part of a step; ``auto`` only where Warp is installed."""
 SCHEDULES = ("relaxation", "annealing")
 """Settings of losses that change with the number of the step."""
 
@@ -184,11 +185,13 @@ def check(settings: Settings, forecaster: LightningModule) -> None:
     """
     if not settings.trainer.graph:
         return
-    backend = getattr(getattr(forecaster, "solver", None), "backend", BACKENDS[0])
-    if backend not in BACKENDS:
+    solver = getattr(forecaster, "solver", None)
+    backend = getattr(solver, "backend", BACKENDS[0])
+    on_host = backend == "auto" and (importlib.util.find_spec("warp") is None or getattr(solver, "adaptive", False))
+    if backend not in BACKENDS or on_host:
         raise ConfigError(
             f"trainer.graph=true with solver.backend={backend}: games would be solved on the host, which a CUDA graph "
-            f"cannot contain; choose solver.backend={' or '.join(reversed(BACKENDS))}"
+            "cannot contain; choose solver.backend=warp (pip install 'epo_lightning[gpu]') or pytorch"
         )
     for section in ("forecaster", "objective"):
         for name in SCHEDULES:

@@ -181,7 +181,8 @@ class LevenbergMarquardt(Stepwise):
         damping = start.new_full(start.shape[:2], self.damping) if memory is None else memory
         if start.numel() == 0:
             return descent.nothing(start), damping
-        solve = choose_backend(self.backend, energy, scene, parameters)
+        fixed = not self.adaptive and not exact
+        solve = choose_backend(self.backend, energy, scene, parameters, fixed)
         if not self.adaptive:
             return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates, exact), damping
         if solve in DESCENTS and not torch.is_grad_enabled() and not self.keep_iterates:
@@ -195,13 +196,17 @@ class LevenbergMarquardt(Stepwise):
         return adaptive.descend(step, here, steps, damping, self.keep_iterates)
 
 
-def choose_backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> Backend:
+def choose_backend(
+    name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, fixed: bool = False
+) -> Backend:
     """The function that computes the steps of a game: ``solve`` of one of the backends.
 
     Args:
-        name: the setting ``backend``. ``auto`` is ``compiled`` for tensors on a CPU and ``host`` for others, or ``pytorch``
-            where this backend cannot solve the game.
+        name: the setting ``backend``. ``auto`` is ``compiled`` for tensors on a CPU. For those on a GPU it is ``warp`` if
+            that can solve the game and the steps are ``fixed``, and else ``host``: adaptive steps of many games end at
+            different times, of which only the host makes use. Where neither can solve the game, it is ``pytorch``.
         energy, scene, parameters: the game.
+        fixed: whether all steps are Gauss-Newton steps with the same damping.
 
     Raises:
         ValueError: the backend of this name cannot solve the game.
@@ -210,6 +215,8 @@ def choose_backend(name: str, energy: FeatureEnergy, scene: Scene, parameters: G
         return structured.solve
     on_cpu = parameters.initial_controls.device.type == "cpu"
     automatic = compiled if on_cpu else hosted
+    if not on_cpu and fixed and fused.obstacle(energy, scene, parameters) is None:
+        automatic = fused
     chosen = {"compiled": compiled, "host": hosted, "warp": fused}.get(name, automatic)
     obstacle = chosen.obstacle(energy, scene, parameters)
     if obstacle is None:
