@@ -54,9 +54,10 @@
             const int c = lane + column * lanes;
             if (c > D) break;
             if (!EARLY) read_costs(k, c);
+            T *const Pc = P + c, *const Wc = W + c, *const Gc = G + c;
             T g[M];
             #pragma unroll
-            for (int r = 0; r < M; ++r) g[r] = k == end - 1 ? T(0) : G[r * LD + c];
+            for (int r = 0; r < M; ++r) g[r] = k == end - 1 ? T(0) : Gc[r * LD];
             #pragma unroll
             for (int t = 0; t < ROWS; ++t) {
                 const int a = warp + t * WARPS;
@@ -70,7 +71,7 @@
                     }
                     if (c < 2 * M || c == D) {
                         #pragma unroll
-                        for (int q = 0; q < 4; ++q) value[q] += P[(q / 2 * M + 2 * a + q % 2) * LD + c];
+                        for (int q = 0; q < 4; ++q) value[q] += Pc[(q / 2 * M + 2 * a + q % 2) * LD];
                     }
                     #pragma unroll
                     for (int q = 0; q < 2; ++q) {
@@ -82,9 +83,9 @@
                 for (int q = 0; q < 2; ++q) {
                     const T pull = now[($PULL$ + q) * A + a];
                     const T* const motion = now + ($MOTION$ + 2 * q) * A + a;
-                    W[(2 * a + q) * LD + c] = dt * value[2 + q] + value[4 + q] + (c == D ? pull : T(0));
-                    P[(2 * a + q) * LD + c] = value[q];
-                    P[(M + 2 * a + q) * LD + c] = value[2 + q] + motion[0] * value[0] + motion[A] * value[1];
+                    Wc[(2 * a + q) * LD] = dt * value[2 + q] + value[4 + q] + (c == D ? pull : T(0));
+                    Pc[(2 * a + q) * LD] = value[q];
+                    Pc[(M + 2 * a + q) * LD] = value[2 + q] + motion[0] * value[0] + motion[A] * value[1];
                 }
             }
         }
@@ -128,13 +129,14 @@
                 T h[M];
                 const bool of_change = c >= 2 * M && c < D, moving = c >= M && c < 2 * M;
                 const int a = (c % M) / 2;
-                const T* const motion = now + ($MOTION$ + 2 * (c % 2)) * A + a;
+                const T *const Wc = W + c, *const Wp = W + 2 * a, *const motion = now + ($MOTION$ + 2 * (c % 2)) * A + a;
+                T *const Gc = G + c, *const gain = factor + c;
                 const T z0 = moving ? motion[0] : T(0), z1 = moving ? motion[A] : T(0);
                 const T coupling = moving && c % 2 ? now[$COUPLING$ * A + a] : T(0);
                 const T scale = of_change ? -now[($RATE_STIFFNESS$ + c % 2) * A + a] : T(1);
                 #pragma unroll
                 for (int r = 0; r < M; ++r) {
-                    h[r] = W[r * LD + c] + W[r * LD + 2 * a] * z0 + W[r * LD + 2 * a + 1] * z1;
+                    h[r] = Wc[r * LD] + Wp[r * LD] * z0 + Wp[r * LD + 1] * z1;
                     h[r] += r == 2 * a ? coupling : T(0);
                     h[r] = !of_change ? h[r] : c == 2 * M + r ? T(1) : T(0);
                 }
@@ -147,14 +149,14 @@
                     h[r] *= L[r][r];
                     #pragma unroll
                     for (int s = r + 1; s < M; ++s) h[s] -= L[s][r] * h[r];
-                    G[r * LD + c] = scale * h[r];
+                    Gc[r * LD] = scale * h[r];
                 }
                 #pragma unroll
                 for (int r = M - 1; r >= 0; --r) {
                     h[r] *= L[r][r];
                     #pragma unroll
                     for (int s = 0; s < r; ++s) h[s] -= L[r][s] * h[r];
-                    if (c < D) factor[r * D + c] = h[r];  // the gains, and of the columns of c the inverse of H_cc
+                    if (c < D) gain[r * D] = h[r];  // the gains, and of the columns of c the inverse of H_cc
                 }
                 if (of_change) factor[M * D + c - 2 * M] = -scale;
             }
