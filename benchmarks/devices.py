@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 import statistics
@@ -221,6 +222,9 @@ def sizes(
     for batch in batches:
         game = make(setting, **{**others, "B": batch}).to(device)
         for name in list(left):
+            gc.collect()  # of the implementation before
+            if device.type == "cuda":
+                torch.cuda.empty_cache()
             try:
                 if batch == batches[0] and not (worst := disagreement(name, game)) <= TOLERANCE:
                     raise SystemExit(

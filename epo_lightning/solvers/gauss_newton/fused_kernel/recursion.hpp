@@ -9,7 +9,9 @@
     const int thread = threadIdx.x, threads = THREADS, lane = thread % LANES, lanes = LANES, warp = thread / LANES;
     #define EPO_SYNC() if (WARPS > 1) __syncthreads(); else __syncwarp()
     #define EPO_SYNC_LANES() __syncwarp()
-    #define EPO_FAST(count) __shared__ alignas(16) T fast[count]
+    // Shared memory has no room for the arrays of eight agents in double precision, which are in global memory.
+    constexpr bool SHARED = A * sizeof(T) <= 32;
+    #define EPO_FAST(count) __shared__ alignas(16) T shared[SHARED ? count : 1]; T* const fast = SHARED ? shared : work.data + scratch
 #else
     constexpr int LANES = 1, WARPS = 1, THREADS = 1;  // a CPU may have more of them, and then less work for each
     const int thread = $CPU_LANE$, threads = WP_TILE_BLOCK_DIM, lane = thread, lanes = threads, warp = 0;
@@ -197,11 +199,13 @@
         for (int e = lane * UNIT; e < STREAM && k >= 0 && k < end; e += lanes * UNIT) {
             const T* const from = (e < FACTOR ? factor : others) + e;
 #if defined(__CUDA_ARCH__)
-            const unsigned there = __cvta_generic_to_shared(to + e);
-            asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(there), "l"(__cvta_generic_to_global(from)));
-#else
-            for (int q = 0; q < UNIT; ++q) to[e + q] = from[q];
+            if (SHARED) {
+                const unsigned there = __cvta_generic_to_shared(to + e);
+                asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(there), "l"(__cvta_generic_to_global(from)));
+                continue;
+            }
 #endif
+            for (int q = 0; q < UNIT; ++q) to[e + q] = from[q];
         }
 #if defined(__CUDA_ARCH__)
         asm volatile("cp.async.commit_group;");
