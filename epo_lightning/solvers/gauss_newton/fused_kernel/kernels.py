@@ -48,10 +48,10 @@ def make(
     func = functools.partial(wp.func, inline=None if features else False)
     basics = threads.make(T, backwards)
     games = all_games.make(T, agents, features, basics, func)
-    features = pair_features.make(T, func)
-    expansion = expansions.make(T, basics, games, features, func)
+    pairs = pair_features.make(T, func)
+    expansion = expansions.make(T, basics, games, pairs, func)
     recursion = recursions.make(T, agents, backwards)
-    adjoint = adjoints.make(T, basics, games, expansion, features, func)
+    adjoint = adjoints.make(T, basics, games, expansion, pairs, func)
     sync, lane = basics.sync, basics.lane
     Game, Run, Gradients, part, set_up = games.Game, games.Run, games.Gradients, games.part, games.set_up
     pair_count = games.pair_count
