@@ -57,28 +57,33 @@ class Layout:
 def layout(agents: int, steps: int, own: int, pair: int) -> Layout:
     """The places for games of ``agents`` agents and ``steps`` steps with these numbers of features."""
     A, K, P = agents, steps, agents * (agents - 1) // 2
+    shared = {
+        "path": 6 * A * (K + 1),
+        "linear": 2 * A * K,
+        "mu": 2 * A * K,
+        "tangents": 8 * A * (K + 1),
+        "costs": 8 * A * K + A + P,
+        "control": CONTROL_ITEMS * A * K,
+        "fast": fast_numbers(A),
+    }
+    of_step = {"hessian": (4 * A + 1) * 4 * A * K, "rows": pair * K * PAIR_ROWS * P, "energy": (A + P) * K}
+    of_adjoint = {
+        "along": 8 * A * K,
+        "rates": 2 * A * (K + 1),
+        "touching": PAIR_COTANGENTS * P * K,
+        "weights": own * A * K + 2 * pair * P * K,
+    }
+    places: dict[str, int] = {}
 
-    def places(start: int, *sizes: int) -> list[int]:
-        # Four numbers are read at once, and their place must be a multiple of four.
-        found = [start]
-        for size in sizes:
-            found.append(found[-1] + -(-size // 4) * 4)
-        return found
+    def reserve(sizes: dict[str, int], start: int) -> int:
+        for name, size in sizes.items():
+            places[name] = start
+            start += -(-size // 4) * 4  # four numbers are read at once, and their place must be a multiple of four
+        return start
 
-    *shared, start = places(
-        0,
-        6 * A * (K + 1),
-        2 * A * K,
-        2 * A * K,
-        8 * A * (K + 1),
-        8 * A * K + A + P,
-        CONTROL_ITEMS * A * K,
-        fast_numbers(A),
-    )
-    *step, end = places(start, (4 * A + 1) * 4 * A * K, pair * K * PAIR_ROWS * P, (A + P) * K)
-    weights = own * A * K + 2 * pair * P * K
-    *adjoint, other = places(start, 8 * A * K, 2 * A * (K + 1), PAIR_COTANGENTS * P * K, weights)
-    return Layout(*shared, *step, *adjoint, max(end, other))
+    start = reserve(shared, 0)
+    end = max(reserve(of_step, start), reserve(of_adjoint, start))
+    return Layout(**places, numbers=end)
 
 
 def fast_numbers(agents: int) -> int:
