@@ -20,6 +20,7 @@ from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarq
 
 warp = pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install 'epo_lightning[gpu]'")
 from epo_lightning.solvers.gauss_newton.fused_kernel import ahead_of_time, kernels
+from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.fused_kernel.layout import fast_numbers
 
 
@@ -149,6 +150,23 @@ def test_machine_code_for_gpus_is_made_without_one(architecture, games, tmp_path
         assert resources.code > 10_000, name
     with pytest.raises(ValueError, match="does not begin as an ELF file"):
         ahead_of_time.resources(b"no machine code")
+
+
+def test_kernels_that_differ_in_constants_are_not_taken_for_each_other():
+    """Warp finds compiled kernels by a hash of their source; features, sizes and registers are constants of it."""
+    ours = dict(double=False, agents=2, features=Features(("goal", "acc"), ("proximity",)), count=32)
+    others = (
+        {"double": True},
+        {"agents": 4},
+        {"features": Features(("acc", "goal"), ("proximity",))},
+        {"features": Features(("goal", "turnr"), ("proximity",))},
+        {"features": Features(("goal", "acc"), ("clearance",))},
+        {"features": Features(("goal", "acc"), ("clearance",), ("clearance",))},
+        {"count": 128},
+    )
+    made = [kernels.make(**ours | change) for change in ({}, *others)]
+    hashes = {bytes(each.solve.module.get_module_hash(each.threads)) for each in made}
+    assert len(hashes) == len(made)
 
 
 def test_the_largest_games_in_double_precision_fit_into_the_memory_of_a_multiprocessor(tmp_path):

@@ -1,5 +1,7 @@
-"""Fused kernels in NVIDIA Warp: a game per warp of 32 threads, all steps in one launch, and their adjoint in another one.
+"""Fused kernels in NVIDIA Warp: one launch takes all steps of all games, and another one computes their adjoint.
 
-Every module has a function that makes its part for one type of numbers. Warp compiles the same source for CPUs, where a
-game has one thread. See :mod:`epo_lightning.solvers.gauss_newton.fused` for the backend.
+Every module has a function that makes its part for one type of numbers and one number of agents. A block of threads solves a
+game: first the costs at all times (`games`, `expansion`), then the recursion (`recursion`), and for the adjoint the same way
+back (`adjoint`). Warp compiles the same source for CPUs, where a game has one thread. See
+:mod:`epo_lightning.solvers.gauss_newton.fused` for the backend.
 """
