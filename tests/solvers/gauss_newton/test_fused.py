@@ -154,7 +154,7 @@ def test_machine_code_for_gpus_is_made_without_one(architecture, games, tmp_path
 
 def test_kernels_that_differ_in_constants_are_not_taken_for_each_other():
     """Warp finds compiled kernels by a hash of their source; features, sizes and registers are constants of it."""
-    ours = dict(double=False, agents=2, features=Features(("goal", "acc"), ("proximity",)), count=32)
+    ours = {"double": False, "agents": 2, "features": Features(("goal", "acc"), ("proximity",)), "count": 32}
     others = (
         {"double": True},
         {"agents": 4},
