@@ -106,6 +106,9 @@ class StepGraph(Callback):
             pl_module.step_graph = None
         self._end()
 
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self.teardown(trainer, pl_module, "fit")  # Lightning does not, and the forecaster may be trained again
+
     def begin(self, forecaster: Forecaster) -> None:
         """Take over the training steps of a forecaster, which is on its device already."""
         self._forecaster = forecaster

@@ -119,6 +119,19 @@ def test_replayed_steps_train_like_usual_ones_also_between_batches_of_another_si
     assert graphed.step_graph is None, "the graph's memory is free after the training"
 
 
+def test_a_training_that_fails_leaves_a_forecaster_that_trains_without_its_graph(again, monkeypatch) -> None:
+    trained, usual = forecaster(), forecaster()
+    monkeypatch.setattr(StepGraph, "_capture", lambda *_: (_ for _ in ()).throw(RuntimeError("out of memory")))
+    with pytest.raises(RuntimeError, match="out of memory"):
+        fit(trained, StepGraph())
+    assert trained.step_graph is None
+    trained.load_state_dict(usual.state_dict())
+    torch.manual_seed(3)
+    expected = fit(usual)
+    torch.manual_seed(3)
+    assert fit(trained) == expected
+
+
 def test_the_losses_of_a_step_stay_when_the_next_one_overwrites_the_graphs_tensors(again) -> None:
     trained, graph = forecaster(), StepGraph()
     graph.begin(trained)

@@ -56,6 +56,9 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
         return f"the fused kernels take bounds of all agents, not bounds of {energy.bounded_by_kind[0]!r} by kind"
     if agents > SIZES[-1]:
         return f"the fused kernels take up to {SIZES[-1]} agents, not {agents}"
+    lines = scene.references if "lane" in energy.own else None
+    if max(2 * controls.numel(), 0 if lines is None else lines.numel()) > LONGEST:
+        return "the fused kernels count states and points of lines in 32 bits, and this batch has too many: split it"
     return None
 
 
@@ -220,7 +223,7 @@ class _Call:
         self.initial_energy, self.energy, self.gradient_norm = new((3, batch, modes)).unbind(0)
         self.status = torch.empty(shape[:2], dtype=torch.int64, device=controls.device)
         self.factors = new(max(stages, 1) * slots * factor_numbers(size_for(agents)) * horizon)
-        self.nearest = new((stages + 1) * slots * 4 * agents * (horizon + 1))
+        self.nearest = new((stages + int(self.record)) * slots * 4 * agents * (horizon + 1))
         self.taken = torch.empty(max(stages, 1) * games, dtype=torch.int32, device=controls.device)
         self.start = controls.detach().contiguous()
         places = layout(size_for(agents), horizon, self.game.own_count, self.game.pair_count)
@@ -248,7 +251,6 @@ class _Call:
     def _launch(self, kernel: Any, *inputs: Any) -> None:
         """Launch a kernel on PyTorch's current stream, with memory for its blocks."""
         wp, device = warp(), self.iterates.device
-        # Kept until the kernel is enqueued only: PyTorch's allocator hands it out in the order of the stream.
         work = self.iterates.new_empty(self.blocks * self.memory)
         numbers = torch.empty(self.blocks * (2 * self.shape[2] + 2), dtype=torch.int32, device=device)
         self.arguments.work, self.arguments.numbers = _flat(work), _flat(numbers)
@@ -263,6 +265,8 @@ class _Call:
                 block_dim=self.kernels.threads,
                 device=wp.device_from_torch(device),
             )
+        # The memory is released as soon as the kernel is enqueued: PyTorch hands it out again in the order of the stream.
+        self.arguments.work = self.arguments.numbers = None
 
     def run(self) -> None:
         """Take all steps; fills the results."""
@@ -297,6 +301,6 @@ class _Call:
 def _flat(tensor: Tensor) -> Any:
     """A contiguous tensor as a flat array of Warp in the same memory; None for an empty one.
 
-    Larger arrays than Warp's are cut short: the kernels find their parts by pointers.
+    Those that may be larger than Warp's (iterates, factors, memory) are cut short: the kernels find their parts by pointers.
     """
     return warp().from_torch(tensor.view(-1)[:LONGEST], requires_grad=False) if tensor.numel() else None

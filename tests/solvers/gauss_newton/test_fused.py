@@ -128,6 +128,9 @@ def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
         choose_backend("warp", energy, scene, game)
     wide = random_scene(1, 9, history=2)
     assert "up to 8 agents, not 9" in fused.obstacle(FeatureEnergy(["acc"]), wide, random_game(wide, own=("acc",)))
+    monkeypatch.setattr(fused, "LONGEST", 2 * game.initial_controls.numel() - 1)
+    assert "this batch has too many: split it" in fused.obstacle(FeatureEnergy(["acc"]), scene, game)
+    monkeypatch.undo()
     assert "not torch.float16" in fused.obstacle(FeatureEnergy(["acc"]), scene, game.to(torch.float16))
     with pytest.raises(ValueError, match=r"no Newton steps; 'compiled', 'host' .on a GPU. and 'pytorch' have them"):
         fused.solve(FeatureEnergy(["acc"]), scene, game, 1, 1.0, torch.ones(2, 2), exact=True)

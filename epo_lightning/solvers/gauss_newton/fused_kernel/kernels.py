@@ -269,9 +269,10 @@ def make(
                         control_adjoint(g, by, game, n, agents, at, work, controls, directions, end)
                         add_products(g, by, game, n, agents, at, work, end)
                 if by.along_iterates == 1:
+                    given = part(by.iterates, wp.int64(s) * wp.int64(everything), everything)
                     for e in range(lane(), row, wp.block_dim()):
                         u = game * row + e
-                        by.controls[u] = by.controls[u] + by.iterates[s * everything + u]
+                        by.controls[u] = by.controls[u] + given[u]
                     sync()
             for e in range(lane(), row, wp.block_dim()):
                 if g.present[(game // g.M) * g.N + e // (2 * g.K)] == wp.uint8(0):

@@ -198,7 +198,7 @@
         T* const to = buffers + (k % DEPTH) * STREAM;
         for (int e = lane * UNIT; e < STREAM && k >= 0 && k < end; e += lanes * UNIT) {
             const T* const from = (e < FACTOR ? factor : others) + e;
-#if defined(__CUDA_ARCH__)
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800  // copies that nothing waits for, from Ampere on
             if (SHARED) {
                 const unsigned there = __cvta_generic_to_shared(to + e);
                 asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(there), "l"(__cvta_generic_to_global(from)));
@@ -207,12 +207,12 @@
 #endif
             for (int q = 0; q < UNIT; ++q) to[e + q] = from[q];
         }
-#if defined(__CUDA_ARCH__)
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
         asm volatile("cp.async.commit_group;");
 #endif
     };
     auto wait = [&]() {  // for the oldest of DEPTH - 1 requests
-#if defined(__CUDA_ARCH__)
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
         asm volatile("cp.async.wait_group %0;" ::"n"(DEPTH - 2));
 #endif
         EPO_SYNC_LANES();
