@@ -134,7 +134,7 @@ def test_whole_training_steps_are_compared_without_and_with_a_graph(tmp_path, mo
     assert [line.startswith("a whole step of V-LSTM") for line in lines] == [True, True, True, False]
     assert all(line.endswith(" ms from a CUDA graph") for line in lines[:3])
     assert "a step of +EPO takes" in lines[3]
-    lines = list(training_step.whole_steps(words, torch.device("cpu"), 1))
+    lines = list(training_step.whole_steps([*words, "solver.adaptive=true"], torch.device("cpu"), 1))
     assert len(lines) == 3
     assert "from a CUDA graph: trainer.graph=true with solver.backend=auto" in lines[2]
 
@@ -171,6 +171,7 @@ def test_answers_of_the_page_are_timed(capsys, tmp_path, monkeypatch):
     assert re.search(r"solver +median +[\d.]+ ms.*\nall +median +[\d.]+ ms", capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_true_games_are_measured(capsys, tmp_path):
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null"]
     assert "epo generate" in refused(true_game.main, *small)
@@ -185,6 +186,7 @@ def test_true_games_are_measured(capsys, tmp_path):
     assert "data=rpi" in refused(true_game.main, "data=drawn")
 
 
+@pytest.mark.slow
 def test_the_noise_of_recorded_futures_is_measured(capsys):
     label_noise.main(["--games", "3"])
     rows = dict(re.findall(r"^\| (\w+) \| \d+ \| (.+) \|$", capsys.readouterr().out, re.MULTILINE))

@@ -18,7 +18,7 @@ RUN = "highway_sim/hivt_m_epo"
 MODES = (0, 2, 3)
 
 
-@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_another_minimiser_finds_no_lower_energy(number: int) -> None:
     forecaster: Any = epo_lightning.load(RUN)
     scene = pretrained.examples(RUN)[number : number + 1]

@@ -14,7 +14,7 @@ import importlib.util
 from collections.abc import Mapping
 from dataclasses import asdict
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
@@ -23,9 +23,10 @@ from torch import Tensor
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import GameParameters, Scene, Solution
 from epo_lightning.solvers.gauss_newton.compiled import take_steps
-from epo_lightning.solvers.gauss_newton.fused_kernel.constants import TEAM, WARP
-from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
+
+if TYPE_CHECKING:
+    from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 
 SIZES = (2, 4, 8)
 """Numbers of agents up to which there are kernels, each with matrices of its own size in shared memory and registers."""
@@ -105,6 +106,7 @@ def warp() -> Any:
 def kernels(dtype: torch.dtype, agents: int, games: int, device: torch.device, features: Features) -> SimpleNamespace:
     """The kernels for a type of numbers and a number of agents and, on GPUs, for the features and the number of games."""
     warp()
+    from epo_lightning.solvers.gauss_newton.fused_kernel.constants import TEAM, WARP
     from epo_lightning.solvers.gauss_newton.fused_kernel.kernels import make
 
     double, size = dtype == torch.float64, size_for(agents)
@@ -131,6 +133,8 @@ class _Call:
         damping: Tensor,
         keep_iterates: bool,
     ) -> None:
+        from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
+
         controls = parameters.initial_controls
         self.steps, self.keep_iterates, self.dtype = steps, keep_iterates, controls.dtype
         self.shape = tuple(controls.shape)

@@ -142,7 +142,7 @@ def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
 
 
 @pytest.mark.parametrize("architecture", [pytest.param(80, marks=pytest.mark.slow), 90])
-@pytest.mark.parametrize("games", [fused.FEW, fused.FEW + 1])
+@pytest.mark.parametrize("games", [pytest.param(fused.FEW, marks=pytest.mark.slow), fused.FEW + 1])
 def test_machine_code_for_gpus_is_made_without_one(architecture, games, tmp_path):
     found = ahead_of_time.compile_for(architecture, False, 4, games, tmp_path)
     for name, resources in found.items():
