@@ -34,7 +34,7 @@ SCHEDULES = ("relaxation", "annealing")
 
 
 class Outcome(NamedTuple):
-    """What a step computes; a replay overwrites these tensors.
+    """Losses and gradients of a step, in tensors that a replay overwrites.
 
     Attributes:
         names: names of the loss terms.

@@ -421,7 +421,7 @@ def make(
     # ---- Sums
 
     @wp.func
-    def total(n: int, at: Layout, work: Array, K: int, end: int):
+    def total(at: Layout, work: Array, K: int, end: int):
         """The energy: the sums along time of agents, then of pairs."""
         parts = at.costs + 8 * A * K
         for e in range(lane(), A + P, wp.block_dim()):

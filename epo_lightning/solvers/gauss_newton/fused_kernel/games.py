@@ -1,10 +1,12 @@
 """The games as the kernels read them, their trajectories, and the nearest points of their reference lines."""
 
+from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
 import warp as wp
 
+from epo_lightning.solvers.gauss_newton.fused_kernel import layout
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     AHEAD_X,
     AHEAD_Y,
@@ -49,25 +51,8 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
     own_number, pair_number = len(known.own), len(known.pair)
     sync, lane, sums, nearest_segment = threads.sync, threads.lane, threads.sums, threads.nearest_segment
 
-    @wp.struct
-    class Layout:
-        """First numbers of arrays in the memory of a game: see `layout.py`."""
-
-        path: int
-        linear: int
-        mu: int
-        tangents: int
-        costs: int
-        control: int
-        fast: int
-        hessian: int
-        rows: int
-        energy: int
-        along: int
-        rates: int
-        touching: int
-        weights: int
-        numbers: int
+    # The fields of `layout.Layout`, as a structure of Warp.
+    Layout = wp.struct(type("Layout", (), {"__annotations__": {field.name: int for field in fields(layout.Layout)}}))
 
     @wp.struct
     class Game:

@@ -130,7 +130,7 @@ def make(
                 expand_controls(g, game, n, agents, at, work, controls, end)
                 expand_states(g, game, n, agents, at, work, nearest, controls, end, stepping)
                 if s == 0 or stepping == 0:
-                    energy = total(n, at, work, g.K, end)
+                    energy = total(at, work, g.K, end)
                     if lane() == 0:
                         run.energy[game] = energy
                         if s == 0:
