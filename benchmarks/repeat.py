@@ -23,7 +23,6 @@ from epo_lightning.experiment.train import train
 from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.curves import METRIC
-from epo_lightning.report.records import Records
 from epo_lightning.report.results import SavedRun, read_results, results_name
 from epo_lightning.run_folder import RunFolder, read_json
 
@@ -31,19 +30,23 @@ SPLITS = {"metrics.json": "test", "metrics-val.json": "val"}
 """Split by the name of the file of its scores."""
 
 
-def chosen(runs: Sequence[Records]) -> SavedRun:
-    """The shortest run with a game layer that was trained, or the shortest of all trained runs.
+def trained_runs(file: str) -> list[SavedRun]:
+    """The runs of a results file that were trained, and not only timed.
 
     Raises:
-        ConfigError: no run was trained.
+        ConfigError: there is none, or the file cannot be read.
     """
-    trained = [
-        run for run in runs if isinstance(run, SavedRun) and run.record.get("steps") and run.record.get("seconds")
-    ]
+    runs = [run for run in read_results(file).runs if isinstance(run, SavedRun)]
+    trained = [run for run in runs if run.record.get("steps") and run.record.get("seconds")]
     if not trained:
         raise ConfigError("no run was trained")
-    layered = [run for run in trained if run.settings["forecaster"]["name"] == "epo"]
-    return min(layered or trained, key=lambda run: run.record["seconds"])
+    return trained
+
+
+def chosen(runs: Sequence[SavedRun]) -> SavedRun:
+    """The run with the shortest training, among those with a game layer if there are any."""
+    layered = [run for run in runs if run.settings["forecaster"]["name"] == "epo"]
+    return min(layered or runs, key=lambda run: run.record["seconds"])
 
 
 def repeated(saved: SavedRun, folder: Path, overrides: Sequence[str]) -> RunFolder:
@@ -113,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("|:--|:--|:--|--:|--:|--:|")
     for file in (word for word in given.words if "=" not in word):
         try:
-            saved = chosen(read_results(file).runs)
+            saved = chosen(trained_runs(file))
             commit = str(saved.record.get("git_commit"))[:7]
             about = f"{saved.settings['title']}, seed {saved.settings['seed']} | {commit} | "
             if saved.record["seconds"] > given.longest:

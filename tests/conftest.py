@@ -28,6 +28,7 @@ install_import_hook([f"epo_lightning.{name}" for name in CHECKED], "typechecker.
 import hypothesis
 import pytest
 import torch
+import typechecker
 
 torch.set_num_threads(1)
 # No test asserts a time: on a busy machine, any example can take long.
@@ -38,3 +39,8 @@ hypothesis.settings.load_profile("epo")
 @pytest.fixture(autouse=True)
 def seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    typechecker.begin()

@@ -1,4 +1,4 @@
-"""Annotations are checked: arguments, results, and those of functions within functions at every call."""
+"""Annotations are checked: arguments, results, and those of functions within functions, in the first calls of every test."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 import jaxtyping
 import pytest
 import torch
+import typechecker
 from jaxtyping import Float, jaxtyped
 from torch import Tensor
 from typechecker import check
@@ -59,3 +60,14 @@ def test_functions_without_annotations_are_left_as_they_are() -> None:
 
     assert free("x") == "x"
     assert free(torch.zeros(2), other=3).shape == (2,)
+
+
+def test_checks_end_after_a_number_of_them_and_begin_again_with_the_next_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(typechecker, "CHECKS", 4)
+    typechecker.begin()
+    for _ in range(2):  # each checks arguments and result
+        rows(torch.zeros(3, 2))
+    rows(torch.zeros(3))
+    typechecker.begin()
+    with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):
+        rows(torch.zeros(3))

@@ -7,6 +7,8 @@ import functools
 import json
 import math
 import re
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -19,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import (
+    commits,
     dashboards,
     decentralised,
     devices,
@@ -46,7 +49,7 @@ from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import train
 from epo_lightning.experiment.config.compose import compose
-from epo_lightning.report.results import read_results
+from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import Scene
 
@@ -257,11 +260,55 @@ def test_a_run_of_a_results_file_is_trained_again(capsys, tmp_path):
     row = capsys.readouterr().out.splitlines()[-1]
     assert row.startswith("| small | V-LSTM + EPO, seed 0 | ")
     assert row.endswith(" | 0 |")
-    saved, again = repeat.chosen(read_results(file).runs), RunFolder(tmp_path / "again" / "small")
+    saved, again = repeat.chosen(repeat.trained_runs(str(file))), RunFolder(tmp_path / "again" / "small")
     saved.scores["metrics.json"]["metrics"]["minSFDE"] += 0.25
     assert repeat.distance(saved, again)[0] == pytest.approx(0.25)
     repeat.main([str(file), "data.root=nowhere", "--out", str(tmp_path / "third")])
     assert "not repeated: no RPI data at nowhere" in capsys.readouterr().out
+
+
+def test_numbers_of_two_logs_are_compared():
+    before = [
+        {"epoch": "0", "step": "5", "train/loss": "1.5"},
+        {"epoch": "0", "step": "5", "val/minSADE": "nan", "a": "1"},
+    ]
+    now = [
+        {"epoch": "1", "step": "5", "train/loss": "1.25"},
+        {"epoch": "0", "step": "5", "val/minSADE": "nan", "b": "1"},
+    ]
+    assert commits.distance(before, now) == (0.25, 2)
+    with pytest.raises(ConfigError, match="same steps"):
+        commits.distance(before, now[:1])
+    with pytest.raises(ConfigError, match="no number in common"):
+        commits.distance([{"step": "5", "a": "1"}], [{"step": "5", "b": "1"}])
+
+
+def test_one_run_of_every_commit_is_chosen():
+    runs = repeat.trained_runs(str(ROOT / "results/highway_sim_pair.json"))
+    found = commits.one_of_every_commit(runs)
+    assert len({run.record["git_commit"] for run in found}) == len(found) == 2
+    assert all(run.settings["forecaster"]["name"] == "epo" for run in found)
+    with pytest.raises(ConfigError, match="no run was trained"):
+        repeat.trained_runs(str(ROOT / "results/runtime.json"))
+
+
+@pytest.mark.slow
+def test_the_code_of_a_commit_trains_like_the_code_at_hand(capsys, tmp_path):
+    RPIData(root=str(tmp_path), games=3, placements=1, sizes=None).generate(workers=1, progress=False)
+    small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "budget=smoke"]
+    train.train(compose("train", ["experiment=rpi/v_lstm_epo", *small, "score=test", f"runs={tmp_path / 'runs'}"]))
+    file = tmp_path / "small.json"
+    cli.main(["report", f"runs={tmp_path / 'runs'}", f"save={file}", f"out={tmp_path / 'report'}"])
+    capsys.readouterr()
+    words = [str(file), f"data.root={tmp_path}", "--out", str(tmp_path / "commits")]
+    try:
+        commits.main([*words, "--steps", "2"])
+        assert capsys.readouterr().out.splitlines()[-1].endswith(" | 0 |")
+        commits.main([*words, "--steps", "4", "objective=unknown"])
+        assert "not compared: " in capsys.readouterr().out
+    finally:
+        shutil.rmtree(tmp_path / "commits")
+        subprocess.run(["git", "worktree", "prune"], cwd=ROOT, check=True)
 
 
 def test_smallest_distances_are_ranked_against_the_weight():

@@ -34,7 +34,7 @@ CHANGES = {
     ("solver", "newton"): {"steps": 4},
     ("solver", "lbfgs"): {"steps": 4},
     ("solver", "best_response"): {"rounds": 2},
-    ("solver", "augmented_lagrangian"): {"rounds": 20},
+    ("solver", "augmented_lagrangian"): {"rounds": 8},
     ("solver", "gradient_descent"): {"steps": 3, "step_size": 1e-4},
     ("solver", "langevin"): {"steps": 3, "delta": 1e-2},
 }
