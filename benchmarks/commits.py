@@ -4,17 +4,17 @@
 
 ``benchmarks.repeat`` trains a run to its end and compares it with saved scores, which may come from another kind of
 machine, where rounding differs. Here both codes run on this machine. Of every file, and of every commit in it, one run is
-trained for a few steps: by the code of its commit, which is checked out into a git worktree with a layer compiled there,
-and by the code at hand. Compared is every number in the logs of both: losses, and the scores of two validations.
+trained for a few steps: by the code of its commit, in a clone with a layer compiled there, and by the code at hand. Compared
+is every number that both logs have: losses, and the scores of two validations.
 
-Data sets are those of the folders ``cache`` and ``data`` here. Commands of the files are given to both codes as they are.
-Worktrees and runs stay in ``--out``, and finished runs are not trained again.
+Both codes get the recorded command, and the data sets in ``cache`` and ``data`` of this checkout; paths in overrides have to
+be absolute. Clones, and what they have trained, stay in ``--out`` and are used again.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
+import hashlib
 import os
 import shlex
 import shutil
@@ -22,70 +22,104 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from benchmarks.repeat import chosen, trained_runs
+from omegaconf import OmegaConf
+
+from benchmarks.repeat import chosen, difference, trained_runs
+from epo_lightning.identity import essence
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.results import SavedRun, results_name
 from epo_lightning.run_folder import RunFolder
 
 ROOT = Path(__file__).resolve().parent.parent
-LAYER = Path("epo_lightning/solvers/gauss_newton/kernel/build.py")
+LAYER = "epo_lightning/solvers/gauss_newton/kernel/build.py"
 SHARED = ("cache", "data")
-"""Folders of data sets, which the worktrees share with the code at hand."""
-ONE_RUN = ("run_dir", "runs", "score", "callbacks.progress", "trainer.max_steps", "trainer.validate_steps")
+"""Folders of data sets, which the clones share with this checkout."""
+REPLACED = ("run_dir", "runs", "score", "callbacks.progress", "trainer.max_steps", "trainer.validate_steps")
 """Settings of a recorded command that a comparison replaces or leaves out."""
 
 
 def one_of_every_commit(runs: Sequence[SavedRun]) -> list[SavedRun]:
-    """One run of every commit that trained some of the runs."""
-    commits = sorted({run.record["git_commit"] for run in runs})
-    return [chosen([run for run in runs if run.record["git_commit"] == commit]) for commit in commits]
+    """One run of every commit that trained some of the runs; of runs without a commit, one is among them."""
+    commits = sorted({str(run.record.get("git_commit")) for run in runs})
+    return [chosen([run for run in runs if str(run.record.get("git_commit")) == commit]) for commit in commits]
 
 
-def worktree(commit: str, out: Path) -> Path:
-    """The code of a commit with its layer, in a folder of its own below ``out``.
+def code_of(commit: str | None, out: Path) -> Path:
+    """The code of a commit with its layer, in a clone of its own below ``out``.
 
     Raises:
-        ConfigError: the repository does not have the commit, or the layer cannot be compiled.
+        ConfigError: the run has no commit that can be checked out, or its layer cannot be compiled.
     """
+    if not commit or commit.endswith("+"):
+        raise ConfigError(
+            f"its code is not known: its commit is {commit}, where + stands for changes that are in no commit"
+        )
     folder = (out / commit).resolve()
     if not folder.is_dir():
-        execute("git", "worktree", "prune", at=ROOT)
-        execute("git", "worktree", "add", "--detach", str(folder), commit, at=ROOT)
+        begun = folder.with_name(f"{commit}.begun")
+        shutil.rmtree(begun, ignore_errors=True)
+        execute("git", "clone", "-q", "--shared", str(ROOT), str(begun), at=ROOT)
+        execute("git", "checkout", "-q", commit, at=begun)
         for name in SHARED:
-            if Path(name).is_dir():
-                (folder / name).symlink_to(Path(name).resolve())
-    execute(sys.executable, str(LAYER), at=folder)
+            (begun / name).symlink_to(ROOT / name)
+        begun.rename(folder)
     return folder
 
 
-def trained(saved: SavedRun, code: Path, folder: Path, steps: int, overrides: Sequence[str]) -> RunFolder:
-    """The first steps of a run by the code in the folder ``code``.
+def trained(code: Path, folder: Path, words: Sequence[str]) -> RunFolder:
+    """A run by the code in the folder ``code``, in the new folder ``folder``.
 
     Raises:
         ConfigError: the command failed; the message is the end of what it printed.
     """
-    run = RunFolder(folder.resolve())
-    if not run.finished:
-        shutil.rmtree(run.path, ignore_errors=True)
-        command = shlex.split(saved.record["command"])[2:]
-        words = [word for word in command if word.lstrip("+").partition("=")[0] not in ONE_RUN]
-        limits = [f"trainer.max_steps={steps}", f"trainer.validate_steps={steps // 2}", "callbacks.progress=none"]
-        train = [sys.executable, "-m", "epo_lightning.cli", "train", *words, *limits, *overrides]
-        execute(*train, f"run_dir={run.path}", at=code)
-    return run
+    shutil.rmtree(folder, ignore_errors=True)
+    execute(sys.executable, LAYER, at=code)
+    execute(sys.executable, "-m", "epo_lightning.cli", "train", *words, f"run_dir='{folder.resolve()}'", at=code)
+    return RunFolder(folder)
+
+
+def command(saved: SavedRun, steps: int, overrides: Sequence[str]) -> list[str]:
+    """The recorded words of a run, with a smaller number of steps and with overrides."""
+    left_out = {*REPLACED, *(setting(word) for word in overrides)}
+    words = [word for word in shlex.split(saved.record["command"])[2:] if setting(word) not in left_out]
+    limits = [f"trainer.max_steps={steps}", f"trainer.validate_steps={steps // 2}", "callbacks.progress=none"]
+    return [*words, *limits, *overrides]
+
+
+def setting(word: str) -> str:
+    """The name of the setting that an override changes."""
+    return word.lstrip("+").partition("=")[0]
 
 
 def execute(*words: str, at: Path) -> None:
-    """Run a program in the folder ``at``, with the packages of that folder first.
+    """Run a program in the folder ``at``, whose package it imports.
 
     Raises:
         ConfigError: it failed.
     """
-    environment = {**os.environ, "PYTHONPATH": str(at)}
+    environment = {name: value for name, value in os.environ.items() if name != "EPO_KERNEL"} | {"PYTHONPATH": str(at)}
     done = subprocess.run(words, cwd=at, env=environment, check=False, capture_output=True, text=True)
     if done.returncode:
         raise ConfigError(f"{shlex.join(words)} failed: {(done.stderr or done.stdout).strip()[-600:]}")
+
+
+def check(saved: SavedRun, run: RunFolder) -> None:
+    """Check that a run was trained on the data of the saved one, and with its settings but for those of the trainer.
+
+    Raises:
+        ConfigError: it was not; the recorded command has another meaning now.
+    """
+    if run.record["data_digest"] != saved.record.get("data_digest"):
+        raise ConfigError(f"{run.path} has other data than the saved run")
+    config: Any = OmegaConf.to_container(OmegaConf.load(run.config_file), resolve=True)
+    ours = essence(config)
+    theirs = essence({**saved.settings, "trainer": {}})
+    for section, settings in theirs.items():
+        for name, value in settings.items() if isinstance(settings, dict) else ():
+            if ours[section].get(name) != value:
+                raise ConfigError(f"{run.path} has {section}.{name}={ours[section].get(name)}, the saved run {value}")
 
 
 def distance(before: Sequence[Mapping[str, str]], now: Sequence[Mapping[str, str]]) -> tuple[float, int]:
@@ -103,7 +137,23 @@ def distance(before: Sequence[Mapping[str, str]], now: Sequence[Mapping[str, str
     ]
     if not pairs:
         raise ConfigError("the logs have no number in common")
-    return max(0.0 if a == b or (math.isnan(a) and math.isnan(b)) else abs(a - b) for a, b in pairs), len(pairs)
+    return max(difference(*pair) for pair in pairs), len(pairs)
+
+
+def compared(saved: SavedRun, out: Path, steps: int, overrides: Sequence[str]) -> tuple[float, int]:
+    """The distance of the logs of a run by the code of its commit, and by the code at hand.
+
+    Raises:
+        ConfigError: the run cannot be trained by both, or they do not train the same.
+    """
+    words, code = command(saved, steps, overrides), code_of(saved.record.get("git_commit"), out)
+    name = hashlib.sha256(shlex.join(words).encode()).hexdigest()[:8]
+    then, now = RunFolder(out / f"{code.name[:7]}-{name}"), out / f"now-{name}"
+    if not then.finished:
+        then = trained(code, then.path, words)
+    again = trained(ROOT, now, words)
+    check(saved, again)
+    return distance(then.log(), again.log())
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -111,30 +161,36 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.commits", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("words", nargs="+", help="results files, and overrides for both codes")
-    parser.add_argument("--steps", type=int, default=200, help="training steps; the middle and the end are validated")
-    parser.add_argument("--out", type=Path, default=Path("build/commits"), help="folder of worktrees and runs")
+    parser.add_argument("words", nargs="+", help="results files (*.json), and overrides for both codes")
+    parser.add_argument("--steps", type=int, default=100, help="an even number; the middle and the end are validated")
+    parser.add_argument("--out", type=Path, default=Path("build/commits"), help="folder of clones and runs")
     given = parser.parse_args(arguments)
-    overrides = [word for word in given.words if "=" in word]
+    if given.steps < 2 or given.steps % 2:
+        parser.error(f"--steps must be an even number from 2, not {given.steps}")
+    given.out.mkdir(parents=True, exist_ok=True)
+    files = [word for word in given.words if word.endswith(".json")]
+    overrides = [word for word in given.words if word not in files]
     print("| results file | run | commit | numbers | largest difference |")
     print("|:--|:--|:--|--:|--:|")
-    for file in (word for word in given.words if "=" not in word):
+    for file in files:
         try:
             runs = one_of_every_commit(trained_runs(file))
         except ConfigError as error:
-            print(f"| {results_name(file)} | not compared: {error} | | | |", flush=True)
+            print(f"| {results_name(file)} | not compared: {one_line(error)} | | | |", flush=True)
             continue
         for saved in runs:
-            commit = saved.record["git_commit"][:7]
+            commit = str(saved.record.get("git_commit"))[:7]
             about = f"| {results_name(file)} | {saved.settings['title']}, seed {saved.settings['seed']} | {commit} |"
-            folder = given.out / f"{results_name(file)}-{commit}-{given.steps}"
             try:
-                old = trained(saved, worktree(commit, given.out), folder / "then", given.steps, overrides)
-                new = trained(saved, ROOT, folder / "now", given.steps, overrides)
-                largest, numbers = distance(old.log(), new.log())
+                largest, numbers = compared(saved, given.out, given.steps, overrides)
                 print(f"{about} {numbers} | {largest:.2g} |", flush=True)
-            except ConfigError as error:
-                print(f"{about} | not compared: {' '.join(str(error).split())} |", flush=True)
+            except (ConfigError, OSError) as error:
+                print(f"{about} | not compared: {one_line(error)} |", flush=True)
+
+
+def one_line(error: Exception) -> str:
+    """The message of an error for a cell of a table."""
+    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

@@ -94,7 +94,14 @@ def distance(saved: SavedRun, again: RunFolder) -> tuple[float, int]:
         if name in saved.scores:
             old, new = saved.scores[name]["metrics"], read_json(again.metrics_file(split))["metrics"]
             pairs += [(old[metric], new[metric]) for metric in old if metric in new]
-    return max(0.0 if a == b or (math.isnan(a) and math.isnan(b)) else abs(a - b) for a, b in pairs), len(pairs)
+    return max(difference(*pair) for pair in pairs), len(pairs)
+
+
+def difference(before: float, now: float) -> float:
+    """Distance of two scores: zero if neither is a number, and infinite if one of them is not."""
+    if math.isnan(before) or math.isnan(now):
+        return 0.0 if math.isnan(before) and math.isnan(now) else math.inf
+    return 0.0 if before == now else abs(before - now)
 
 
 def validated(run: RunFolder) -> list[dict[str, str]]:

@@ -44,3 +44,8 @@ def seed() -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
     typechecker.begin()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_call() -> None:
+    typechecker.begin()  # whatever the fixtures have called

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 
 import jaxtyping
@@ -62,12 +63,45 @@ def test_functions_without_annotations_are_left_as_they_are() -> None:
     assert free(torch.zeros(2), other=3).shape == (2,)
 
 
-def test_checks_end_after_a_number_of_them_and_begin_again_with_the_next_test(monkeypatch: pytest.MonkeyPatch) -> None:
+class Shape:
+    """Methods of all kinds."""
+
+    @property
+    @checked
+    def wide(self) -> Float[Tensor, " n"]:
+        return torch.zeros(2, 2)
+
+    @staticmethod
+    @checked
+    def of(vector: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        return vector
+
+    @classmethod
+    @checked
+    def made(cls, vector: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        return vector
+
+
+WRONG = {
+    "function": lambda: rows(torch.zeros(3)),
+    "property": lambda: Shape().wide,
+    "static method": lambda: Shape.of(torch.zeros(())),
+    "class method": lambda: Shape.made(torch.zeros(())),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG.keys())
+def test_a_function_is_checked_a_number_of_times_in_every_test(
+    monkeypatch: pytest.MonkeyPatch, wrong: Callable[[], object]
+) -> None:
     monkeypatch.setattr(typechecker, "CHECKS", 4)
-    typechecker.begin()
-    for _ in range(2):  # each checks arguments and result
-        rows(torch.zeros(3, 2))
-    rows(torch.zeros(3))
-    typechecker.begin()
-    with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):
-        rows(torch.zeros(3))
+    for _ in range(2):
+        typechecker.begin()
+        with pytest.raises(jaxtyping.TypeCheckError):
+            wrong()
+        for _ in range(4):
+            with contextlib.suppress(jaxtyping.TypeCheckError):
+                wrong()
+        wrong()
+        with pytest.raises(jaxtyping.TypeCheckError):
+            within(torch.zeros(3))(torch.zeros(2), other=torch.zeros(2))  # another function

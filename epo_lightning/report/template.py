@@ -11,7 +11,8 @@ A template gets rows by :meth:`Results.rows`, under the name ``results``, and as
     {{ table("hard split", {"+SC": sc, "+EPO": epo}, "SADE", "SFDE") }}
     {{ table("paired difference", {"+EPO - +SC": epo - sc}, "SADE", "SFDE") }}
 
-``folds("urban_folds")`` has the same rows with the test split of a cross-validation as the unit, instead of the seed.
+``folds("urban_folds")`` has the same rows with the test split of a cross-validation as the unit, instead of the seed, and
+``transfer("transfer", "us101", "dut")`` those that were trained on one data set and scored on another one.
 
 :mod:`epo_lightning.report.scores` has the names of metrics, and everything that rows can be asked for.
 """
@@ -28,7 +29,7 @@ from epo_lightning.report.costs import last_fifth
 from epo_lightning.report.curves import METRIC, validation_log
 from epo_lightning.report.results import read_results
 from epo_lightning.report.rows import Row, plain_rows
-from epo_lightning.report.runs import EvaluatedRun, read_parts
+from epo_lightning.report.runs import EvaluatedRun, read_other, read_parts
 from epo_lightning.report.scores import Differences, Scores, average, below, markdown, table
 from epo_lightning.report.tables import build_tables, over_folds
 from epo_lightning.run_folder import errors_naming, write_file
@@ -47,6 +48,7 @@ class Results:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder).expanduser()
         self.used: dict[str, list[EvaluatedRun]] = {}
+        self._elsewhere: dict[str, list[EvaluatedRun]] = {}
 
     def rows(self, name: str, data: str | None = None, digits: int = 3) -> Rows:
         """The rows of a results file by name: scores on the test split, or on the one split that the file has.
@@ -84,6 +86,29 @@ class Results:
             )
         _require_name(file, data, found)
         return Rows(file, _by_unit(found[data or next(iter(found))], digits, lambda run: run.metrics))
+
+    def transfer(self, name: str, trained: str, tested: str, digits: int = 3) -> Rows:
+        """The rows that were trained on one data set, by their scores on another one, or on the test split of their own.
+
+        Args:
+            name: name of the file without ``.json``.
+            trained, tested: names of the data sets.
+            digits: number of decimals in texts of these rows.
+
+        Raises:
+            ConfigError: no such file or data set, or a damaged file.
+        """
+        file = self.folder / f"{name}.json"
+        if name not in self._elsewhere:  # a page asks for many pairs of data sets
+            own = self._read(name)[1]
+            self._elsewhere[name] = [*own, *(one for run in read_results(file).runs for one, _ in read_other(run))]
+        runs = self._elsewhere[name]
+        _require_name(file, trained, dict.fromkeys(run.trained_data for run in runs))
+        runs = [run for run in runs if run.trained_data == trained]
+        _require_name(file, tested, dict.fromkeys(run.data for run in runs))
+        # Of the scores of one run on the same data, the ones that were written last count.
+        last = {run.path: run for run in runs if run.data == tested}
+        return Rows(file, _by_unit(plain_rows(last.values()), digits, _scores))
 
     def _read(self, name: str) -> tuple[Path, list[EvaluatedRun]]:
         """A results file and its runs, scored on the test split, or on the one split that the file has."""
@@ -176,7 +201,13 @@ def write_page(template: str | Path, results: str | Path, out: str | Path | None
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     environment.globals.update(
-        results=source.rows, folds=source.folds, sources=source.sources, average=average, below=below, table=table
+        results=source.rows,
+        folds=source.folds,
+        transfer=source.transfer,
+        sources=source.sources,
+        average=average,
+        below=below,
+        table=table,
     )
     try:
         page = environment.from_string(text).render()

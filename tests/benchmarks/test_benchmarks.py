@@ -7,8 +7,6 @@ import functools
 import json
 import math
 import re
-import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -50,7 +48,7 @@ from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import train
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder
+from epo_lightning.run_folder import RunFolder, write_json
 from epo_lightning.scene import Scene
 
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
@@ -277,6 +275,9 @@ def test_numbers_of_two_logs_are_compared():
         {"epoch": "0", "step": "5", "val/minSADE": "nan", "b": "1"},
     ]
     assert commits.distance(before, now) == (0.25, 2)
+    assert repeat.difference(math.inf, math.inf) == 0.0
+    now[1]["val/minSADE"] = "1.0"
+    assert commits.distance(before, now) == (math.inf, 2), "a number in place of none is a difference"
     with pytest.raises(ConfigError, match="same steps"):
         commits.distance(before, now[:1])
     with pytest.raises(ConfigError, match="no number in common"):
@@ -296,19 +297,23 @@ def test_one_run_of_every_commit_is_chosen():
 def test_the_code_of_a_commit_trains_like_the_code_at_hand(capsys, tmp_path):
     RPIData(root=str(tmp_path), games=3, placements=1, sizes=None).generate(workers=1, progress=False)
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "budget=smoke"]
-    train.train(compose("train", ["experiment=rpi/v_lstm_epo", *small, "score=test", f"runs={tmp_path / 'runs'}"]))
-    file = tmp_path / "small.json"
-    cli.main(["report", f"runs={tmp_path / 'runs'}", f"save={file}", f"out={tmp_path / 'report'}"])
-    capsys.readouterr()
-    words = [str(file), f"data.root={tmp_path}", "--out", str(tmp_path / "commits")]
-    try:
-        commits.main([*words, "--steps", "2"])
-        assert capsys.readouterr().out.splitlines()[-1].endswith(" | 0 |")
-        commits.main([*words, "--steps", "4", "objective=unknown"])
-        assert "not compared: " in capsys.readouterr().out
-    finally:
-        shutil.rmtree(tmp_path / "commits")
-        subprocess.run(["git", "worktree", "prune"], cwd=ROOT, check=True)
+    cli.main(["train", "experiment=rpi/v_lstm_epo", *small, "score=test", f"run_dir={tmp_path / 'run'}"])
+    run, file = RunFolder(tmp_path / "run"), tmp_path / "small.json"
+    if run.record["git_commit"] is None:
+        pytest.skip("not a checkout")
+    words = [str(file), f"data.root={tmp_path}", "--steps", "2", "--out", str(tmp_path / "commits")]
+    commit = run.record["git_commit"].rstrip("+")
+
+    def compare(commit: str, *overrides: str) -> str:
+        write_json(run.record_file, {**run.record, "git_commit": commit})
+        cli.main(["report", f"runs={run.path}", f"save={file}", f"out={tmp_path / 'report'}"])
+        capsys.readouterr()
+        commits.main([*words, *overrides])
+        return capsys.readouterr().out.splitlines()[-1]
+
+    assert compare(commit).endswith(" | 0 |")
+    assert "has solver.steps=3, the saved run 2" in compare(commit, "solver.steps=3")
+    assert "not compared: its code is not known" in compare(f"{commit}+")
 
 
 def test_smallest_distances_are_ranked_against_the_weight():

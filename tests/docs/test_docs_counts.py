@@ -90,9 +90,9 @@ def test_the_remedy_teaches_both_sides_with_two_steps():
 @pytest.mark.parametrize(
     ("pattern", "chosen"),
     [
-        (r"(\d+) of (\d+) joint runs of 3670 steps or more", squared),
-        (r"in (\d+) of (\d+) runs of \+SC and of \+EPO with two steps", two_steps_or_none),
-        (r"in (\d+) of (\d+) with other numbers of steps", other_steps),
+        (r"(\d+) of (\d+) joint runs of (?:at least )?3670", squared),
+        (r"in (\d+) of (\d+) runs of \+SC and of \+EPO with two solver steps", two_steps_or_none),
+        (r"in (\d+) of (\d+) runs with other numbers of solver steps", other_steps),
     ],
 )
 def test_counts_in_words_are_those_of_the_results_files(pattern: str, chosen: Callable[[Run], bool]):

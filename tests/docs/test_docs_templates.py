@@ -16,7 +16,17 @@ def test_the_pages_of_results_have_templates() -> None:
     pages = {template.stem for template in TEMPLATES}
     assert pages == {
         f"{page}.md"
-        for page in ("results", "claims", "rpi", "rpi_results", "highway_results", "urban", "family", "game")
+        for page in (
+            "results",
+            "claims",
+            "rpi",
+            "rpi_results",
+            "highway_results",
+            "urban",
+            "family",
+            "game",
+            "transfer",
+        )
     }
 
 

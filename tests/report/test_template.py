@@ -146,6 +146,24 @@ def test_a_results_file_without_a_cross_validation_has_no_folds() -> None:
         Results(RESULTS).folds("rpi_hard_settled")
 
 
+def test_rows_are_asked_for_by_the_data_of_their_training_and_of_their_test() -> None:
+    runs = read_results(RESULTS / "transfer.json").runs
+    found = {
+        (run.settings["title"], run.settings["seed"]): content["metrics"]["minSADE"]
+        for run in runs
+        for file, content in run.scores.items()
+        if run.path.parts[1] == "us101" and file.startswith("scores-on-dut-")
+    }
+    rows = Results(RESULTS).transfer("transfer", "us101", "dut", digits=12)
+    assert {(name, seed): row.by_seed[seed]["minSADE"] for name, row in rows.items() for seed in row.by_seed} == found
+    own = Results(RESULTS).transfer("transfer", "us101", "us101")
+    assert own["V-LSTM + EPO"].n == 3
+    with pytest.raises(ConfigError, match="found us; did you mean 'us101'"):
+        Results(RESULTS).transfer("transfer", "us", "dut")
+    with pytest.raises(ConfigError, match="found dutt; did you mean 'dut'"):
+        Results(RESULTS).transfer("transfer", "us101", "dutt")
+
+
 def test_the_sources_are_the_files_that_were_used(tmp_path: Path) -> None:
     page = write(tmp_path, '{% set rows = results("game") %}{{ sources() }}')
     lines = page.splitlines()

@@ -69,7 +69,7 @@ class LevenbergMarquardt(Stepwise):
         newton_steps: number of adaptive Newton steps, with the exact Hessian, after the S Gauss-Newton steps. Near a minimum
             they converge quadratically, and Gauss-Newton steps linearly. They have no derivative: use ``backward=implicit``.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; ``host``, the same kernel for tensors on a GPU, which are
-            copied; ``auto``, one of these two wherever it supports the game; or ``warp``, fused kernels on a GPU.
+            copied; ``warp``, fused kernels on a GPU; or ``auto``, the choice of :func:`choose_backend`.
     """
 
     needs_from_energy = frozenset({FEATURES})
