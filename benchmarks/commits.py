@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("words", nargs="+", help="results files (*.json), and overrides for both codes")
     parser.add_argument("--steps", type=int, default=100, help="an even number; the middle and the end are validated")
     parser.add_argument("--out", type=Path, default=Path("build/commits"), help="folder of clones and runs")
-    given = parser.parse_args(arguments)
+    given = parser.parse_intermixed_args(arguments)
     if given.steps < 2 or given.steps % 2:
         parser.error(f"--steps must be an even number from 2, not {given.steps}")
     given.out.mkdir(parents=True, exist_ok=True)

@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("words", nargs="+", help="results files, and overrides such as data.folder=<recordings>")
     parser.add_argument("--out", type=Path, default=Path("build/repeat"), help="folder of the new runs")
     parser.add_argument("--longest", type=float, default=math.inf, help="longest training [s] that is repeated")
-    given = parser.parse_args(arguments)
+    given = parser.parse_intermixed_args(arguments)
     overrides = ["callbacks.progress=none", *(word for word in given.words if "=" in word)]
     print("| results file | run | commit | steps | scores | largest difference |")
     print("|:--|:--|:--|--:|--:|--:|")
