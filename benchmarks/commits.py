@@ -26,7 +26,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from benchmarks.repeat import chosen, difference, trained_runs
+from benchmarks.repeat import chosen, difference, one_line, trained_runs
 from epo_lightning.identity import essence
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.results import SavedRun, results_name
@@ -35,7 +35,7 @@ from epo_lightning.run_folder import RunFolder
 ROOT = Path(__file__).resolve().parent.parent
 LAYER = "epo_lightning/solvers/gauss_newton/kernel/build.py"
 SHARED = ("cache", "data")
-"""Folders of data sets, which the clones share with this checkout."""
+"""Folders of data sets in this checkout, to which every clone has a link."""
 REPLACED = ("run_dir", "runs", "score", "callbacks.progress", "trainer.max_steps", "trainer.validate_steps")
 """Settings of a recorded command that a comparison replaces or leaves out."""
 
@@ -186,11 +186,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 print(f"{about} {numbers} | {largest:.2g} |", flush=True)
             except (ConfigError, OSError) as error:
                 print(f"{about} | not compared: {one_line(error)} |", flush=True)
-
-
-def one_line(error: Exception) -> str:
-    """The message of an error for a cell of a table."""
-    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

@@ -104,6 +104,11 @@ def difference(before: float, now: float) -> float:
     return 0.0 if before == now else abs(before - now)
 
 
+def one_line(error: Exception) -> str:
+    """The message of an error for a cell of a table."""
+    return " ".join(str(error).split())
+
+
 def validated(run: RunFolder) -> list[dict[str, str]]:
     """Rows of a run's log with a validation."""
     return [row for row in run.log() if METRIC in row]
@@ -131,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             largest, scores = distance(saved, repeated(saved, given.out / results_name(file), overrides))
             print(f"| {results_name(file)} | {about}{saved.record['steps']} | {scores} | {largest:.2g} |", flush=True)
         except ConfigError as error:
-            print(f"| {results_name(file)} | not repeated: {' '.join(str(error).split())} | | | | |", flush=True)
+            print(f"| {results_name(file)} | not repeated: {one_line(error)} | | | | |", flush=True)
 
 
 if __name__ == "__main__":

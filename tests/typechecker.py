@@ -12,8 +12,8 @@ from typing import Any
 from beartype import BeartypeConf, beartype
 
 CHECKS = 20
-"""Number of checks of a function in a test: ten calls have twenty, of arguments and of results. Loops of solvers and of
-trainings, and the examples of Hypothesis, repeat the same calls; to check all took a third of the time of the tests."""
+"""Number of checks of a function in a test: ten calls have twenty, of arguments and of results. Loops of solvers and
+trainings, and examples of Hypothesis, repeat the same calls, and to check all takes a quarter of the time of such tests."""
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))
 _CACHED: dict[tuple[Any, ...], Callable[..., Any]] = {}
 _done: Counter[tuple[str, str]] = Counter()
