@@ -7,6 +7,7 @@ import functools
 import json
 import math
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -243,6 +244,42 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     other = train.train(compose("train", ["experiment=highway/v_lstm_sc", *TINY, f"runs={tmp_path}"])).path
     assert "only RPI has known equilibria" in refused(passing_sides.main, other)
     assert "only RPI has known equilibria" in refused(distance_by_weight.main, other)
+
+
+_TOLD = """
+import sys
+import epo_lightning
+from benchmarks import hidden_weight
+from epo_lightning.data.rpi.scenes import RPIData
+
+words = sys.argv[1:]
+root = next(word for word in words if word.startswith("data.root=")).removeprefix("data.root=")
+told, plain = (kind(root=root, games=3, placements=1, sizes=None) for kind in (hidden_weight.ToldRPIData, RPIData))
+assert told.digest != plain.digest
+for split in ("train", "test"):
+    scenes, weights = told.open(split), told.records(split)["weight"].float()
+    assert (scenes.history[:, :, 0, 3] == ((weights - 55.0) / 45.0)[:, None]).all()  # w is between 10 and 100
+    assert (scenes.history[..., :3] == plain.open(split).history[..., :3]).all()
+    assert (scenes.history[:, :, 1:] == plain.open(split).history[:, :, 1:]).all()
+hidden_weight.main(words)
+run = next(word for word in words if word.startswith("run_dir=")).removeprefix("run_dir=")
+forecaster = epo_lightning.load(f"{run}/checkpoints/best.ckpt")
+scene = told.open("test")[:1]
+other = scene.history.clone()
+other[:, :, 0, 3] += 1.0
+features = [forecaster.backbone(type(scene)(**{**vars(scene), "history": history})) for history in (scene.history, other)]
+assert (features[0] != features[1]).any(-1).all()
+"""
+
+
+def test_a_network_is_told_the_weight_of_the_game(tmp_path):
+    """In a process of its own, because the program registers a data set and a backbone."""
+    RPIData(root=str(tmp_path), games=3, placements=1, sizes=None).generate(workers=1, progress=False)
+    small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "callbacks.progress=none"]
+    words = ["experiment=rpi/v_lstm_sc", *small, "budget=smoke", "score=test", f"run_dir={tmp_path / 'run'}"]
+    found = subprocess.run([sys.executable, "-c", _TOLD, *words], cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["metrics"]
 
 
 def test_a_run_of_a_results_file_is_trained_again(capsys, tmp_path):

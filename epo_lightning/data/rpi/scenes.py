@@ -13,7 +13,7 @@ from torch import Tensor
 from epo_lightning.checks import check_whole
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
-from epo_lightning.data.datamodule import SceneDataModule, SceneDataset, epoch_generator
+from epo_lightning.data.datamodule import SceneDataModule, epoch_generator
 from epo_lightning.data.rpi.game import GameConstants
 from epo_lightning.data.rpi.splits import RULES
 from epo_lightning.registry import ConfigError, nearest, register
@@ -203,7 +203,7 @@ class RPIData(SceneDataModule):
         """
         return cache.manifest(self.folder, self.command, self.config)["report"]
 
-    def open(self, split: str) -> SceneDataset:
+    def open(self, split: str) -> RPIDataset:
         """The scenes of a split.
 
         Raises:
