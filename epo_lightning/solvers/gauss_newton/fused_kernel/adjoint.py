@@ -1,6 +1,7 @@
 """The gradient of phi = -<J mu, r + J d>, with mu and d constant, by controls and parameters; as in `kernel/step.hpp`.
 
-Threads share out pairs and agents at all times; in between, cotangents are summed backwards in time.
+The costs of single agents are here, and those of pairs in `pair_adjoint.py`. Threads share out agents at all times; in
+between, cotangents are summed backwards in time.
 """
 
 from types import SimpleNamespace
@@ -44,7 +45,6 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     X,
     Y,
 )
-from epo_lightning.solvers.gauss_newton.fused_kernel.layout import PAIR_COTANGENTS
 
 
 @no_type_check
@@ -52,225 +52,27 @@ def make(
     T: Any,
     threads: SimpleNamespace,
     games: SimpleNamespace,
-    expansion: SimpleNamespace,
-    pairs: SimpleNamespace,
+    residuals: SimpleNamespace,
+    trajectories: SimpleNamespace,
+    products: SimpleNamespace,
     func: Any,
 ) -> SimpleNamespace:
     """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
-    evaluate_pair, dual = pairs.evaluate, pairs.dual
-    sync, lane, sums, sums_back = threads.sync, threads.lane, threads.sums, threads.sums_back
-    Game, Gradients, Layout, pair_index, pair_first, weight = (
+    sync, lane, sums_back = threads.sync, threads.lane, threads.sums_back
+    Game, Gradients, Layout, pair_index, weight, trace = (
         games.Game,
         games.Gradients,
         games.Layout,
         games.pair_index,
-        games.pair_first,
         games.weight,
+        games.trace,
     )
-    own_slot, own_count, pair_feature, pair_count, margin_slot = (
-        games.own_slot,
-        games.own_count,
-        games.pair_feature,
-        games.pair_count,
-        games.margin_slot,
-    )
-    trace, Array, Numbers, A = games.trace, games.Array, games.Numbers, games.agents
+    own_slot, pair_count, Array, Numbers, A = games.own_slot, games.pair_count, games.Array, games.Numbers, games.agents
     P = A * (A - 1) // 2
     six = wp.types.vector(6, T)
-    ten = wp.types.vector(PAIR_COTANGENTS, T)
-    excess, excess_slope, steering = expansion.excess, expansion.excess_slope, expansion.steering
-
-    @wp.func
-    def tangent(at: Layout, K: int, along_d: int, quantity: int, i: int):
-        """Start of one quantity of a tangent of agent i's trajectory, along mu or along the step d."""
-        return at.tangents + ((4 * along_d + quantity) * A + i) * (K + 1)
-
-    @func
-    def roll_tangents(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, directions: Array):
-        """Tangents of the trajectories along mu and along the step d: sums along time, as the trajectories are."""
-        for e in range(lane(), 4 * n, wp.block_dim()):
-            i = e // 4
-            channel = (e // 2) % 2
-            along_d = e % 2
-            to = tangent(at, g.K, along_d, wp.where(channel == TURN_RATE, TURNED, SPEED), i)
-            if along_d == 1:
-                first = (game * g.N + agents[i]) * g.K * 2 + channel
-                sums(directions, first, 2, g.K, T(0.0), g.dt, work, to)
-            else:
-                sums(work, at.mu + 2 * i * g.K + channel, 2, g.K, T(0.0), g.dt, work, to)
-        sync()
-        for e in range(lane(), 2 * n * (g.K + 1), wp.block_dim()):
-            k = e // (2 * n)
-            i = (e - k * 2 * n) // 2
-            along_d = e % 2
-            s = work[trace(at, g.K, SINE, i) + k]
-            c = work[trace(at, g.K, COSINE, i) + k]
-            across = work[trace(at, g.K, SPEED, i) + k] * work[tangent(at, g.K, along_d, TURNED, i) + k]
-            speed = work[tangent(at, g.K, along_d, SPEED, i) + k]
-            work[tangent(at, g.K, along_d, X, i) + k] = g.dt * (speed * c - across * s)
-            work[tangent(at, g.K, along_d, Y, i) + k] = g.dt * (speed * s + across * c)
-        sync()
-        for e in range(lane(), 4 * n, wp.block_dim()):
-            i = e // 4
-            to = tangent(at, g.K, e % 2, wp.where((e // 2) % 2 == 0, X, Y), i)
-            sums(work, to, 1, g.K, T(0.0), T(1.0), work, to)
-        sync()
-
-    # ---- What each cotangent is added to
-
-    @wp.func
-    def along(at: Layout, K: int, quantity: int, i: int):
-        """Start of a cotangent along time: of positions 0 and 1, of their tangents along mu 2 and 3 and along d 4 and 5, of
-        heading 6 and speed 7."""
-        return at.along + (quantity * A + i) * K
-
-    @wp.func
-    def own_product(g: Game, at: Layout, work: Array, feature: int, i: int, k: int, value: T):
-        """Keeps what an own feature at a step adds to the gradient by its weight."""
-        work[at.weights + (own_slot(g, feature) * A + i) * g.K + k] = value
-
-    @wp.func
-    def pair_product(g: Game, at: Layout, K: int, kind: int, slot: int, p: int):
-        """Start of what a pair feature (kind 0) or its margin (1) adds to its gradient along time."""
-        return at.weights + (own_count(g) * A + (kind * pair_count(g) + slot) * P + p) * K
-
-    @func
-    def forget_products(g: Game, at: Layout, work: Array):
-        for e in range(lane(), (own_count(g) * A + 2 * pair_count(g) * P) * g.K, wp.block_dim()):
-            work[at.weights + e] = T(0.0)
-        sync()
-
-    @func
-    def add_products(g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array, end: int):
-        """Adds the sums along time of the products to the gradients by weights and margins."""
-        for e in range(lane(), own_count(g) * n, wp.block_dim()):
-            slot = e // n
-            i = e - slot * n
-            value = T(0.0)
-            for k in range(end):
-                value += work[at.weights + (slot * A + i) * g.K + k]
-            to = slot * g.G * g.N + game * g.N + agents[i]
-            by.own[to] = by.own[to] + value
-        all_pairs = (g.N * (g.N - 1)) // 2
-        for p in range(lane(), (n * (n - 1)) // 2, wp.block_dim()):
-            i = pair_first(p, n)
-            j = p - pair_index(i, i + 1, n) + i + 1
-            place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
-            for slot in range(pair_count(g)):
-                product = pair_product(g, at, g.K, 0, slot, pair_index(i, j, A))
-                by_margin = pair_product(g, at, g.K, 1, slot, pair_index(i, j, A))
-                value = T(0.0)
-                slope = T(0.0)
-                for k in range(end):
-                    value += work[product + k]
-                    slope += work[by_margin + k]
-                to = slot * g.G * all_pairs + place
-                by.pair[to] = by.pair[to] + value
-                if margin_slot(g, slot) >= 0:
-                    to = margin_slot(g, slot) * g.G * all_pairs + place
-                    by.margins[to] = by.margins[to] + slope
-        sync()
-
-    @wp.func
-    def residual_adjoint(
-        g: Game,
-        at: Layout,
-        work: Array,
-        feature: int,
-        row: int,
-        i: int,
-        k: int,
-        value: T,
-        slope: T,
-        along_mu: T,
-        along_d: T,
-    ):
-        """The cotangent of a signal with a residual w c, c'' = 0; keeps the product for the gradient by the weight."""
-        w = weight(g, feature, row)
-        own_product(g, at, work, feature, i, k, T(-2.0) * w * slope * along_mu * (value + slope * along_d))
-        return -w * w * slope * slope * along_mu
-
-    # ---- Pairs
-
-    @wp.func
-    def moving(at: Layout, K: int, work: Array, quantity: int, i: int, state: int):
-        """A quantity of a trajectory with its derivatives along mu and d."""
-        return dual(
-            work[trace(at, K, quantity, i) + state],
-            work[tangent(at, K, 0, quantity, i) + state],
-            work[tangent(at, K, 1, quantity, i) + state],
-        )
-
-    @func
-    def pair_adjoint(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, end: int):
-        """The cotangents of all pairs at all states, and the products of their weights and margins."""
-        all_pairs = (g.N * (g.N - 1)) // 2
-        stride = g.G * all_pairs
-        for e in range(lane(), end * P, wp.block_dim()):
-            k = e // P
-            p = e - k * P
-            state = k + 1
-            i = pair_first(p, A)
-            j = p - pair_index(i, i + 1, A) + i + 1
-            found = ten(T(0.0))
-            if j < n and state % g.pair_stride == 0:
-                one = 2 * ((game // g.M) * g.N + agents[i])
-                other = 2 * ((game // g.M) * g.N + agents[j])
-                place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
-                c1 = work[trace(at, g.K, COSINE, i) + state]
-                s1 = work[trace(at, g.K, SINE, i) + state]
-                c2 = work[trace(at, g.K, COSINE, j) + state]
-                s2 = work[trace(at, g.K, SINE, j) + state]
-                turn1 = moving(at, g.K, work, TURNED, i, state)
-                turn2 = moving(at, g.K, work, TURNED, j, state)
-                for slot in range(pair_count(g)):
-                    w = g.pair[slot * stride + place]
-                    margin = T(0.0)
-                    if margin_slot(g, slot) >= 0:
-                        margin = g.margins[margin_slot(g, slot) * stride + place]
-                    value, x, y, h1, v1, h2, v2, by_margin = evaluate_pair(
-                        pair_feature(g, slot),
-                        moving(at, g.K, work, X, i, state),
-                        moving(at, g.K, work, Y, i, state),
-                        dual(c1, -s1 * turn1[1], -s1 * turn1[2]),
-                        dual(s1, c1 * turn1[1], c1 * turn1[2]),
-                        moving(at, g.K, work, SPEED, i, state),
-                        g.size[one],
-                        g.size[one + 1],
-                        moving(at, g.K, work, X, j, state),
-                        moving(at, g.K, work, Y, j, state),
-                        dual(c2, -s2 * turn2[1], -s2 * turn2[2]),
-                        dual(s2, c2 * turn2[1], c2 * turn2[2]),
-                        moving(at, g.K, work, SPEED, j, state),
-                        g.size[other],
-                        g.size[other + 1],
-                        dual(margin, T(0.0), T(0.0)),
-                    )
-                    # phi = -w^2 (g mu) (f + g d) with the gradient g of the feature f.
-                    square = w * w
-                    along_mu = value[1]
-                    ahead = value[0] + value[2]
-                    found += -square * ten(
-                        x[1] * ahead + along_mu * (x[0] + x[2]),
-                        y[1] * ahead + along_mu * (y[0] + y[2]),
-                        ahead * x[0],
-                        ahead * y[0],
-                        along_mu * x[0],
-                        along_mu * y[0],
-                        h1[1] * ahead + along_mu * (h1[0] + h1[2]),
-                        v1[1] * ahead + along_mu * (v1[0] + v1[2]),
-                        h2[1] * ahead + along_mu * (h2[0] + h2[2]),
-                        v2[1] * ahead + along_mu * (v2[0] + v2[2]),
-                    )
-                    work[pair_product(g, at, g.K, 0, slot, p) + k] = T(-2.0) * w * along_mu * ahead
-                    work[pair_product(g, at, g.K, 1, slot, p) + k] = -square * (
-                        by_margin[1] * ahead + along_mu * (by_margin[0] + by_margin[2])
-                    )
-            for q in range(PAIR_COTANGENTS):
-                work[at.touching + (q * P + p) * g.K + k] = found[q]
-        sync()
-
-    # ---- Agents
+    excess, excess_slope, steering = residuals.excess, residuals.excess_slope, residuals.steering
+    tangent, along = trajectories.tangent, trajectories.along
+    own_product, residual_adjoint = products.own_product, products.residual_adjoint
 
     @wp.func
     def pull_to(
@@ -573,53 +375,8 @@ def make(
                 by.controls[u] = by.controls[u] + bar
         sync()
 
-    @func
-    def pull_states(g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array):
-        """Adds the pullback of the cotangent of the states to that of the controls: sums backwards in time."""
-        for e in range(lane(), 4 * n, wp.block_dim()):
-            i = e // 4
-            q = e - 4 * i
-            first = 4 * (game * g.N + agents[i]) * g.K + q
-            if q < 2:
-                sums_back(by.states, first, 4, g.K, work, along(at, g.K, q, i))
-        sync()
-        for e in range(lane(), n * g.K, wp.block_dim()):
-            i = e // g.K
-            k = e - i * g.K
-            first = 4 * ((game * g.N + agents[i]) * g.K + k)
-            heading = by.states[first + 2]
-            speed = by.states[first + 3]
-            if k + 1 < g.K:
-                c = work[trace(at, g.K, COSINE, i) + k + 1]
-                s = work[trace(at, g.K, SINE, i) + k + 1]
-                x = work[along(at, g.K, 0, i) + k + 1]
-                y = work[along(at, g.K, 1, i) + k + 1]
-                heading += g.dt * work[trace(at, g.K, SPEED, i) + k + 1] * (c * y - s * x)
-                speed += g.dt * (c * x + s * y)
-            work[along(at, g.K, 6, i) + k] = heading
-            work[along(at, g.K, 7, i) + k] = speed
-        sync()
-        for e in range(lane(), 2 * n, wp.block_dim()):
-            i = e // 2
-            to = along(at, g.K, 6 + e - 2 * i, i)
-            sums_back(work, to, 1, g.K, work, to)
-        sync()
-        for e in range(lane(), 2 * n * g.K, wp.block_dim()):
-            k = e // (2 * n)
-            i = (e - k * 2 * n) // 2
-            channel = e % 2
-            u = 2 * ((game * g.N + agents[i]) * g.K + k) + channel
-            force = work[along(at, g.K, wp.where(channel == TURN_RATE, 6, 7), i) + k]
-            by.controls[u] = by.controls[u] + g.dt * force
-        sync()
-
     return SimpleNamespace(
-        roll_tangents=roll_tangents,
-        forget_products=forget_products,
-        add_products=add_products,
-        pair_adjoint=pair_adjoint,
         position_adjoint=position_adjoint,
         motion_adjoint=motion_adjoint,
         control_adjoint=control_adjoint,
-        pull_states=pull_states,
     )

@@ -8,7 +8,7 @@ from typing import Any, no_type_check
 
 import warp as wp
 
-from epo_lightning.game.features import SLOWEST_STEERING, WHEELBASE
+from epo_lightning.game.features import WHEELBASE
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     ACC,
     ACCB,
@@ -56,11 +56,17 @@ from epo_lightning.solvers.gauss_newton.structured import LEAST_RAISED_DAMPING
 
 @no_type_check
 def make(
-    T: Any, threads: SimpleNamespace, games: SimpleNamespace, pairs: SimpleNamespace, func: Any
+    T: Any,
+    threads: SimpleNamespace,
+    games: SimpleNamespace,
+    residuals: SimpleNamespace,
+    pairs: SimpleNamespace,
+    func: Any,
 ) -> SimpleNamespace:
     """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
     evaluate_pair = pairs.evaluate
-    sync, lane, sums_back = threads.sync, threads.lane, threads.sums_back
+    sync, lane = threads.sync, threads.lane
+    excess, excess_slope, add, steering = residuals.excess, residuals.excess_slope, residuals.add, residuals.steering
     Game, Layout, pair_index, pair_first, weight, trace = (
         games.Game,
         games.Layout,
@@ -80,42 +86,6 @@ def make(
     wide = 4 * A  # columns of the Hessian of a state's costs; its gradient is one more row
     four = wp.types.vector(4, T)
     block = wp.types.matrix((4, 4), T)
-
-    @wp.func
-    def excess(g: Game, signal: int, value: T):
-        low = g.bounds[2 * signal]
-        high = g.bounds[2 * signal + 1]
-        return wp.max(value - high, T(0.0)) + wp.max(low - value, T(0.0))
-
-    @wp.func
-    def excess_slope(g: Game, signal: int, value: T):
-        low = g.bounds[2 * signal]
-        high = g.bounds[2 * signal + 1]
-        return wp.where(value > high, T(1.0), T(0.0)) - wp.where(value < low, T(1.0), T(0.0))
-
-    @wp.func
-    def add(w: T, value: T, slope: T, energy: T, force: T, stiffness: T):
-        """Energy, first and second derivative with those of another residual of the same signal."""
-        square = w * w
-        return (
-            energy + T(0.5) * square * value * value,
-            force + square * slope * value,
-            stiffness + square * slope * slope,
-        )
-
-    @wp.func
-    def steering(wheelbase: T, turn: T, speed: T):
-        """The angle atan(q omega), q = wheelbase / max(v, slowest), its first two derivatives, by turn rate and speed."""
-        moving = speed > T(SLOWEST_STEERING)
-        inverse = T(1.0) / wp.where(moving, speed, T(SLOWEST_STEERING))
-        q = wheelbase * inverse
-        t = q * turn
-        d = T(1.0) / (T(1.0) + t * t)
-        turn_turn = T(-2.0) * q * q * t * d * d
-        by_speed = wp.where(moving, -t * d * inverse, T(0.0))
-        turn_speed = wp.where(moving, q * d * inverse * (T(2.0) * t * t * d - T(1.0)), T(0.0))
-        speed_speed = wp.where(moving, T(2.0) * t * d * d * inverse * inverse, T(0.0))
-        return wp.atan(t), q * d, by_speed, turn_turn, turn_speed, speed_speed
 
     # ---- Pairs
 
@@ -418,74 +388,10 @@ def make(
             work[at.energy + i * g.K + k] = work[at.energy + i * g.K + k] + energy
         sync()
 
-    # ---- Sums
-
-    @wp.func
-    def total(at: Layout, work: Array, K: int, end: int):
-        """The energy: the sums along time of agents, then of pairs."""
-        parts = at.costs + 8 * A * K
-        for e in range(lane(), A + P, wp.block_dim()):
-            part = T(0.0)
-            for k in range(end):
-                part += work[at.energy + e * K + k]
-            work[parts + e] = part
-        sync()
-        energy = T(0.0)
-        for e in range(A + P):
-            energy += work[parts + e]
-        return energy
-
-    @func
-    def squared_slope(g: Game, n: int, at: Layout, work: Array, end: int):
-        """The squared norm of the gradient by the controls: sums of the forces backwards in time."""
-        stride = (wide + 1) * wide
-        forces = at.hessian + wide * wide
-        for e in range(lane(), 2 * n, wp.block_dim()):
-            i = e // 2
-            axis = e - 2 * i
-            sums_back(work, forces + 4 * i + axis, stride, end, work, at.costs + e * g.K)
-        sync()
-        # By heading and speed of a state: its own, and those of later positions through its motion.
-        for e in range(lane(), 2 * n * end, wp.block_dim()):
-            r = e // end
-            k = e - r * end
-            i = r // 2
-            axis = r - 2 * i
-            force = work[forces + k * stride + 4 * i + 2 + axis]
-            if k + 1 < end:
-                moved = at.control + ((k + 1) * CONTROL_ITEMS + MOTION + 2 * axis) * A + i
-                force += work[moved] * work[at.costs + 2 * i * g.K + k + 1]
-                force += work[moved + A] * work[at.costs + (2 * i + 1) * g.K + k + 1]
-            work[at.costs + (2 * A + r) * g.K + k] = force
-        sync()
-        for r in range(lane(), 2 * n, wp.block_dim()):
-            by = at.costs + (2 * A + r) * g.K
-            sums_back(work, by, 1, end, work, by)
-            i = r // 2
-            item = at.control + wp.where(r == 2 * i, 0, A) + i
-            squared = T(0.0)
-            for k in range(end):
-                slope = work[item + (k * CONTROL_ITEMS + PULL) * A] + g.dt * work[by + k]
-                if k + 1 < end:
-                    slope -= work[item + ((k + 1) * CONTROL_ITEMS + RATE) * A]
-                squared += slope * slope
-            work[at.costs + (4 * A + r) * g.K] = squared
-        sync()
-        norm = T(0.0)
-        for r in range(2 * n):
-            norm += work[at.costs + (4 * A + r) * g.K]
-        sync()
-        return norm
-
     return SimpleNamespace(
-        excess=excess,
-        excess_slope=excess_slope,
-        steering=steering,
         set_motions=set_motions,
         expand_pairs=expand_pairs,
         expand_controls=expand_controls,
         raise_damping=raise_damping,
         expand_states=expand_states,
-        total=total,
-        squared_slope=squared_slope,
     )

@@ -9,9 +9,14 @@ import warp as wp
 from epo_lightning.solvers.gauss_newton.fused_kernel import adjoint as adjoints
 from epo_lightning.solvers.gauss_newton.fused_kernel import expansion as expansions
 from epo_lightning.solvers.gauss_newton.fused_kernel import games as all_games
+from epo_lightning.solvers.gauss_newton.fused_kernel import pair_adjoint as pair_adjoints
 from epo_lightning.solvers.gauss_newton.fused_kernel import pairs as pair_features
+from epo_lightning.solvers.gauss_newton.fused_kernel import products as all_products
 from epo_lightning.solvers.gauss_newton.fused_kernel import recursion as recursions
+from epo_lightning.solvers.gauss_newton.fused_kernel import residuals as all_residuals
 from epo_lightning.solvers.gauss_newton.fused_kernel import threads
+from epo_lightning.solvers.gauss_newton.fused_kernel import totals as all_totals
+from epo_lightning.solvers.gauss_newton.fused_kernel import trajectories as all_trajectories
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import DAMPED, SOLVED, STOPPED, TEAM, WARP
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.fused_kernel.layout import factor_numbers
@@ -49,9 +54,14 @@ def make(
     basics = threads.make(T, backwards)
     games = all_games.make(T, agents, features, basics, func)
     pairs = pair_features.make(T, func)
-    expansion = expansions.make(T, basics, games, pairs, func)
+    residuals = all_residuals.make(T, games)
+    expansion = expansions.make(T, basics, games, residuals, pairs, func)
+    totals = all_totals.make(T, basics, games, func)
     recursion = recursions.make(T, agents, backwards)
-    adjoint = adjoints.make(T, basics, games, expansion, pairs, func)
+    trajectories = all_trajectories.make(T, basics, games, func)
+    products = all_products.make(T, basics, games, func)
+    pair_adjoint = pair_adjoints.make(T, basics, games, pairs, trajectories, products, func).pair_adjoint
+    adjoint = adjoints.make(T, basics, games, residuals, trajectories, products, func)
     sync, lane = basics.sync, basics.lane
     Game, Run, Gradients, part, set_up = games.Game, games.Run, games.Gradients, games.part, games.set_up
     pair_count = games.pair_count
@@ -62,27 +72,21 @@ def make(
         games.roll,
         games.find_nearest,
     )
-    set_motions, expand_pairs, expand_controls, expand_states, raise_damping, total, squared_slope = (
+    set_motions, expand_pairs, expand_controls, expand_states, raise_damping = (
         expansion.set_motions,
         expansion.expand_pairs,
         expansion.expand_controls,
         expansion.expand_states,
         expansion.raise_damping,
-        expansion.total,
-        expansion.squared_slope,
     )
+    total, squared_slope = totals.total, totals.squared_slope
     eliminate, pull, push = recursion.eliminate, recursion.pull, recursion.push
-    roll_tangents, forget_products, add_products = (
-        adjoint.roll_tangents,
-        adjoint.forget_products,
-        adjoint.add_products,
-    )
-    pair_adjoint, position_adjoint, motion_adjoint, control_adjoint, pull_states = (
-        adjoint.pair_adjoint,
+    roll_tangents, pull_states = trajectories.roll_tangents, trajectories.pull_states
+    forget_products, add_products = products.forget_products, products.add_products
+    position_adjoint, motion_adjoint, control_adjoint = (
         adjoint.position_adjoint,
         adjoint.motion_adjoint,
         adjoint.control_adjoint,
-        adjoint.pull_states,
     )
     registers = 255 if double else REGISTERS[count]
     each_factor = factor_numbers(agents)

@@ -1,0 +1,98 @@
+"""What each residual adds to the gradients by weights and margins: kept for every step, then summed along time."""
+
+from types import SimpleNamespace
+from typing import Any, no_type_check
+
+import warp as wp
+
+
+@no_type_check
+def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) -> SimpleNamespace:
+    """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
+    sync, lane = threads.sync, threads.lane
+    Game, Gradients, Layout, pair_index, pair_first, weight = (
+        games.Game,
+        games.Gradients,
+        games.Layout,
+        games.pair_index,
+        games.pair_first,
+        games.weight,
+    )
+    own_slot, own_count, pair_count, margin_slot = games.own_slot, games.own_count, games.pair_count, games.margin_slot
+    Array, Numbers, A = games.Array, games.Numbers, games.agents
+    P = A * (A - 1) // 2
+
+    @wp.func
+    def own_product(g: Game, at: Layout, work: Array, feature: int, i: int, k: int, value: T):
+        """Keeps what an own feature at a step adds to the gradient by its weight."""
+        work[at.weights + (own_slot(g, feature) * A + i) * g.K + k] = value
+
+    @wp.func
+    def pair_product(g: Game, at: Layout, K: int, kind: int, slot: int, p: int):
+        """Start of what a pair feature (kind 0) or its margin (1) adds to its gradient along time."""
+        return at.weights + (own_count(g) * A + (kind * pair_count(g) + slot) * P + p) * K
+
+    @func
+    def forget_products(g: Game, at: Layout, work: Array):
+        """Sets all products to zero."""
+        for e in range(lane(), (own_count(g) * A + 2 * pair_count(g) * P) * g.K, wp.block_dim()):
+            work[at.weights + e] = T(0.0)
+        sync()
+
+    @func
+    def add_products(g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array, end: int):
+        """Adds the sums along time of the products to the gradients by weights and margins."""
+        for e in range(lane(), own_count(g) * n, wp.block_dim()):
+            slot = e // n
+            i = e - slot * n
+            value = T(0.0)
+            for k in range(end):
+                value += work[at.weights + (slot * A + i) * g.K + k]
+            to = slot * g.G * g.N + game * g.N + agents[i]
+            by.own[to] = by.own[to] + value
+        all_pairs = (g.N * (g.N - 1)) // 2
+        for p in range(lane(), (n * (n - 1)) // 2, wp.block_dim()):
+            i = pair_first(p, n)
+            j = p - pair_index(i, i + 1, n) + i + 1
+            place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
+            for slot in range(pair_count(g)):
+                product = pair_product(g, at, g.K, 0, slot, pair_index(i, j, A))
+                by_margin = pair_product(g, at, g.K, 1, slot, pair_index(i, j, A))
+                value = T(0.0)
+                slope = T(0.0)
+                for k in range(end):
+                    value += work[product + k]
+                    slope += work[by_margin + k]
+                to = slot * g.G * all_pairs + place
+                by.pair[to] = by.pair[to] + value
+                if margin_slot(g, slot) >= 0:
+                    to = margin_slot(g, slot) * g.G * all_pairs + place
+                    by.margins[to] = by.margins[to] + slope
+        sync()
+
+    @wp.func
+    def residual_adjoint(
+        g: Game,
+        at: Layout,
+        work: Array,
+        feature: int,
+        row: int,
+        i: int,
+        k: int,
+        value: T,
+        slope: T,
+        along_mu: T,
+        along_d: T,
+    ):
+        """The cotangent of a signal with a residual w c, c'' = 0; keeps the product for the gradient by the weight."""
+        w = weight(g, feature, row)
+        own_product(g, at, work, feature, i, k, T(-2.0) * w * slope * along_mu * (value + slope * along_d))
+        return -w * w * slope * slope * along_mu
+
+    return SimpleNamespace(
+        own_product=own_product,
+        pair_product=pair_product,
+        forget_products=forget_products,
+        add_products=add_products,
+        residual_adjoint=residual_adjoint,
+    )
