@@ -1,11 +1,13 @@
 """Training of RPI rows whose network is told the weight w of the game: how much of their errors is due to not knowing it?
 
 w says how much both agents avoid each other. It differs between games, and a history shows little of it. The arguments are
-those of ``epo train``, for an experiment of RPI with V-LSTM::
+those of ``epo train``, for an experiment of RPI with V-LSTM and without calibration, which reads speeds::
 
     python -m benchmarks.hidden_weight experiment=rpi/v_lstm_sc_relaxed data=rpi budget=reduced score=test
 
-The runs have the data set ``rpi_told`` and the backbone ``v_lstm_told``, which only this program knows.
+Training has as many values of w as main games, 16 of them by default, so a network may use w less well than it could. Its
+initial weights differ from those of the row that is not told w, also for the same seed. The runs have the data set
+``rpi_told`` and the backbone ``v_lstm_told``, which only this program knows.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from epo_lightning.backbones.v_lstm import VLSTM
 from epo_lightning.data import cache
 from epo_lightning.data.rpi.game import GameConstants
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
-from epo_lightning.registry import register
+from epo_lightning.experiment.config.compose import compose
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import SPEED, Scene
 
 NAMES = ("data.name=rpi_told", "backbone.name=v_lstm_told")
@@ -33,6 +36,9 @@ class ToldRPIData(RPIData):
     """RPI with w, scaled to -1 to 1, in the place of both agents' oldest observed speeds.
 
     No backbone of the package reads speeds, and the games begin with the newest state, so nothing else changes.
+
+    Raises:
+        ConfigError: ``games_share`` is not 1, which the lookup of w does not support.
     """
 
     @property
@@ -42,6 +48,10 @@ class ToldRPIData(RPIData):
 
     def open(self, split: str) -> RPIDataset:
         """The scenes of a split, which are all of its games."""
+        if self.games_share != 1:
+            raise ConfigError(
+                f"data.games_share is {self.games_share}, and w can be told for all games only: leave it out"
+            )
         scenes, constants = super().open(split), GameConstants()
         middle = (constants.weight_max + constants.weight_min) / 2
         told = (self.records(split)["weight"].float() - middle) / (constants.weight_max - middle)
@@ -65,7 +75,21 @@ class ToldVLSTM(VLSTM):
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    cli.main(["train", *(sys.argv[1:] if given is None else given), *NAMES])
+    words = list(sys.argv[1:] if given is None else given)
+    try:
+        config = compose("train", words)
+    except ConfigError as error:
+        raise SystemExit(f"hidden_weight: {error}") from None
+    if (
+        config["data"]["name"] != "rpi"
+        or config["backbone"]["name"] != "v_lstm"
+        or config["forecaster"].get("calibration")
+    ):
+        raise SystemExit(
+            "hidden_weight: w can be told to rows of RPI with backbone=v_lstm and without calibration, such as "
+            "experiment=rpi/v_lstm_sc_relaxed and experiment=rpi/v_lstm_epo_relaxed"
+        )
+    cli.main(["train", *words, *NAMES])
 
 
 if __name__ == "__main__":

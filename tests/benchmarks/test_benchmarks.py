@@ -247,10 +247,13 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
 
 
 _TOLD = """
+import dataclasses
 import sys
 import epo_lightning
 from benchmarks import hidden_weight
 from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.registry import ConfigError, build
+from epo_lightning.scene import SPEED
 
 words = sys.argv[1:]
 root = next(word for word in words if word.startswith("data.root=")).removeprefix("data.root=")
@@ -258,7 +261,7 @@ told, plain = (kind(root=root, games=3, placements=1, sizes=None) for kind in (h
 assert told.digest != plain.digest
 for split in ("train", "test"):
     scenes, weights = told.open(split), told.records(split)["weight"].float()
-    assert (scenes.history[:, :, 0, 3] == ((weights - 55.0) / 45.0)[:, None]).all()  # w is between 10 and 100
+    assert (scenes.history[:, :, 0, SPEED] == ((weights - 55.0) / 45.0)[:, None]).all()  # w is between 10 and 100
     assert (scenes.history[..., :3] == plain.open(split).history[..., :3]).all()
     assert (scenes.history[:, :, 1:] == plain.open(split).history[:, :, 1:]).all()
 hidden_weight.main(words)
@@ -266,9 +269,26 @@ run = next(word for word in words if word.startswith("run_dir=")).removeprefix("
 forecaster = epo_lightning.load(f"{run}/checkpoints/best.ckpt")
 scene = told.open("test")[:1]
 other = scene.history.clone()
-other[:, :, 0, 3] += 1.0
-features = [forecaster.backbone(type(scene)(**{**vars(scene), "history": history})) for history in (scene.history, other)]
-assert (features[0] != features[1]).any(-1).all()
+other[:, :, 0, SPEED] += 1.0
+scenes = [dataclasses.replace(scene, history=history) for history in (scene.history, other)]
+read = [forecaster.backbone(one) for one in scenes]
+assert (read[0] != read[1]).any(-1).all()
+for name in ("v_lstm", "vibes", "hivt_m"):  # no backbone reads speeds
+    backbone = build("backbone", {"name": name}).eval()
+    assert (backbone(scenes[0]) == backbone(scenes[1])).all()
+for row in ("rpi/v_lstm_sc backbone=vibes", "rpi/v_lstm_epo_game", "highway/v_lstm_sc"):
+    try:
+        hidden_weight.main(f"experiment={row}".split())
+    except SystemExit as error:
+        assert "backbone=v_lstm and without calibration" in str(error)
+    else:
+        raise AssertionError(row)
+try:
+    hidden_weight.ToldRPIData(root=root, games=3, placements=1, sizes=None, games_share=0.5).open("train")
+except ConfigError as error:
+    assert "games_share" in str(error)
+else:
+    raise AssertionError("a share of the games")
 """
 
 

@@ -72,7 +72,7 @@ def make(
     six = wp.types.vector(6, T)
     excess, excess_slope, steering = residuals.excess, residuals.excess_slope, residuals.steering
     tangent, along = trajectories.tangent, trajectories.along
-    own_product, residual_adjoint = products.own_product, products.residual_adjoint
+    keep_own_product, residual_adjoint = products.keep_own_product, products.residual_adjoint
 
     @wp.func
     def pull_to(
@@ -109,7 +109,7 @@ def make(
             mu_y = across_y
             off_x -= ahead * tx
             off_y -= ahead * ty
-        own_product(g, at, work, feature, i, k, T(-2.0) * w * (mu_x * off_x + mu_y * off_y))
+        keep_own_product(g, at, work, feature, i, k, T(-2.0) * w * (mu_x * off_x + mu_y * off_y))
         return -square * six(across_x, across_y, off_x, off_y, mu_x, mu_y)
 
     @func
@@ -278,7 +278,8 @@ def make(
         k: int,
         of_speed: int,
     ):
-        """The cotangent of the speed before a step, or that of its turn rate, which also keeps the product of the weight."""
+        """The cotangent of the speed before a step (``of_speed`` 1), or of the turn rate of the step (0), which also keeps
+        the product of the weight."""
         row = game * g.N + agents[i]
         wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
         angle, by_turn, by_speed, turn_turn, turn_speed, speed_speed = steering(
@@ -295,7 +296,7 @@ def make(
             moves1 = turn_speed * turn1 + speed_speed * speed1
             moves2 = turn_speed * turn2 + speed_speed * speed2
             return -w * w * (moves1 * value + s1 * (by_speed + moves2))
-        own_product(g, at, work, STEER, i, k, T(-2.0) * w * s1 * value)
+        keep_own_product(g, at, work, STEER, i, k, T(-2.0) * w * s1 * value)
         moves1 = turn_turn * turn1 + turn_speed * speed1
         moves2 = turn_turn * turn2 + turn_speed * speed2
         return -w * w * (moves1 * value + s1 * (by_turn + moves2))
@@ -313,7 +314,7 @@ def make(
         directions: Array,
         end: int,
     ):
-        """Adds to the cotangents of all controls."""
+        """Adds to the cotangents of all controls and reference controls."""
         per_dt = T(1.0) / g.dt
         for e in range(lane(), n * end, wp.block_dim()):
             k = e // n

@@ -66,7 +66,12 @@ def make(
     """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
     evaluate_pair = pairs.evaluate
     sync, lane = threads.sync, threads.lane
-    excess, excess_slope, add, steering = residuals.excess, residuals.excess_slope, residuals.add, residuals.steering
+    excess, excess_slope, add_residual, steering = (
+        residuals.excess,
+        residuals.excess_slope,
+        residuals.add_residual,
+        residuals.steering,
+    )
     Game, Layout, pair_index, pair_first, weight, trace = (
         games.Game,
         games.Layout,
@@ -185,10 +190,10 @@ def make(
             rate = wp.where(turning, TURNACC, JERK)
             rate_bounded = wp.where(turning, TURNACCB, JERKB)
             if own_slot(g, rate) >= 0:
-                energy, force, stiffness = add(weight(g, rate, row), change, T(1.0), energy, force, stiffness)
+                energy, force, stiffness = add_residual(weight(g, rate, row), change, T(1.0), energy, force, stiffness)
             if own_slot(g, rate_bounded) >= 0:
                 signal = wp.where(turning, BOUND_TURNACC, BOUND_JERK)
-                energy, force, stiffness = add(
+                energy, force, stiffness = add_residual(
                     weight(g, rate_bounded, row),
                     excess(g, signal, change),
                     excess_slope(g, signal, change),
@@ -209,13 +214,13 @@ def make(
         force = T(0.0)
         stiffness = T(0.0)
         if own_slot(g, plain) >= 0:
-            energy, force, stiffness = add(weight(g, plain, row), value, T(1.0), energy, force, stiffness)
+            energy, force, stiffness = add_residual(weight(g, plain, row), value, T(1.0), energy, force, stiffness)
         if own_slot(g, referring) >= 0:
             off = value - g.reference_controls[u]
-            energy, force, stiffness = add(weight(g, referring, row), off, T(1.0), energy, force, stiffness)
+            energy, force, stiffness = add_residual(weight(g, referring, row), off, T(1.0), energy, force, stiffness)
         if own_slot(g, bounded) >= 0:
             signal = wp.where(turning, BOUND_TURNR, BOUND_ACC)
-            energy, force, stiffness = add(
+            energy, force, stiffness = add_residual(
                 weight(g, bounded, row),
                 excess(g, signal, value),
                 excess_slope(g, signal, value),
@@ -312,14 +317,16 @@ def make(
                 push = T(0.0)
                 stiffness = T(0.0)
                 if own_slot(g, VEL) >= 0:
-                    energy, push, stiffness = add(weight(g, VEL, row), v, T(1.0), energy, push, stiffness)
+                    energy, push, stiffness = add_residual(weight(g, VEL, row), v, T(1.0), energy, push, stiffness)
                 if own_slot(g, VELREF) >= 0:
                     apart = v - g.speeds[(game // g.M) * g.N + agents[i]]
-                    energy, push, stiffness = add(weight(g, VELREF, row), apart, T(1.0), energy, push, stiffness)
+                    energy, push, stiffness = add_residual(
+                        weight(g, VELREF, row), apart, T(1.0), energy, push, stiffness
+                    )
                 if own_slot(g, VELB) >= 0:
                     over = excess(g, BOUND_VEL, v)
                     slope = excess_slope(g, BOUND_VEL, v)
-                    energy, push, stiffness = add(weight(g, VELB, row), over, slope, energy, push, stiffness)
+                    energy, push, stiffness = add_residual(weight(g, VELB, row), over, slope, energy, push, stiffness)
                 if own_slot(g, STEER) >= 0 and state < end:
                     wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
                     turn = controls[row * g.K * 2 + 2 * state + TURN_RATE]
@@ -339,8 +346,8 @@ def make(
                 if own_slot(g, LANE) >= 0 and agents[g.N + i] >= 0:
                     w = weight(g, LANE, row)
                     place = i * (g.K + 1) + state
-                    energy, fx, xx = add(w, px - nearest[NEAR_X * each + place], T(1.0), energy, fx, xx)
-                    energy, fy, yy = add(w, py - nearest[NEAR_Y * each + place], T(1.0), energy, fy, yy)
+                    energy, fx, xx = add_residual(w, px - nearest[NEAR_X * each + place], T(1.0), energy, fx, xx)
+                    energy, fy, yy = add_residual(w, py - nearest[NEAR_Y * each + place], T(1.0), energy, fy, yy)
                     if g.slides == 1:  # the nearest point of the line moves with the agent
                         tx = w * nearest[AHEAD_X * each + place]
                         ty = w * nearest[AHEAD_Y * each + place]
@@ -350,13 +357,13 @@ def make(
                 if state == end:
                     if own_slot(g, HEADING) >= 0:
                         off = work[trace(at, g.K, TURNED, i) + state] - g.headings[row]
-                        energy, heading_push, heading_stiffness = add(
+                        energy, heading_push, heading_stiffness = add_residual(
                             weight(g, HEADING, row), off, T(1.0), energy, heading_push, heading_stiffness
                         )
                     if own_slot(g, GOAL) >= 0:
                         w = weight(g, GOAL, row)
-                        energy, fx, xx = add(w, px - g.goals[2 * row], T(1.0), energy, fx, xx)
-                        energy, fy, yy = add(w, py - g.goals[2 * row + 1], T(1.0), energy, fy, yy)
+                        energy, fx, xx = add_residual(w, px - g.goals[2 * row], T(1.0), energy, fx, xx)
+                        energy, fy, yy = add_residual(w, py - g.goals[2 * row + 1], T(1.0), energy, fy, yy)
                 force = four(fx, fy, heading_push, push)
                 own[0, 0] = xx
                 own[0, 1] = xy

@@ -1,4 +1,4 @@
-"""The gradient of phi (`adjoint.py`) by the states of pairs; threads share out pairs at all times."""
+"""The gradient of phi (`adjoint.py`) by states, weights and margins of pairs; threads share out pairs at all times."""
 
 from types import SimpleNamespace
 from typing import Any, no_type_check
@@ -21,7 +21,12 @@ def make(
 ) -> SimpleNamespace:
     """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
     evaluate_pair, dual = pairs.evaluate, pairs.dual
-    sync, lane, tangent, pair_product = threads.sync, threads.lane, trajectories.tangent, products.pair_product
+    sync, lane, tangent, pair_product_place = (
+        threads.sync,
+        threads.lane,
+        trajectories.tangent,
+        products.pair_product_place,
+    )
     Game, Layout, pair_index, pair_first, trace = (
         games.Game,
         games.Layout,
@@ -104,8 +109,8 @@ def make(
                         h2[1] * ahead + along_mu * (h2[0] + h2[2]),
                         v2[1] * ahead + along_mu * (v2[0] + v2[2]),
                     )
-                    work[pair_product(g, at, g.K, 0, slot, p) + k] = T(-2.0) * w * along_mu * ahead
-                    work[pair_product(g, at, g.K, 1, slot, p) + k] = -square * (
+                    work[pair_product_place(g, at, g.K, 0, slot, p) + k] = T(-2.0) * w * along_mu * ahead
+                    work[pair_product_place(g, at, g.K, 1, slot, p) + k] = -square * (
                         by_margin[1] * ahead + along_mu * (by_margin[0] + by_margin[2])
                     )
             for q in range(PAIR_COTANGENTS):

@@ -1,4 +1,7 @@
-"""What each residual adds to the gradients by weights and margins: kept for every step, then summed along time."""
+"""What each residual adds to the gradients by weights and margins: kept for every step, then summed along time.
+
+With it the cotangent of a signal whose residual is linear in it, which keeps its product.
+"""
 
 from types import SimpleNamespace
 from typing import Any, no_type_check
@@ -23,12 +26,12 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
     P = A * (A - 1) // 2
 
     @wp.func
-    def own_product(g: Game, at: Layout, work: Array, feature: int, i: int, k: int, value: T):
+    def keep_own_product(g: Game, at: Layout, work: Array, feature: int, i: int, k: int, value: T):
         """Keeps what an own feature at a step adds to the gradient by its weight."""
         work[at.weights + (own_slot(g, feature) * A + i) * g.K + k] = value
 
     @wp.func
-    def pair_product(g: Game, at: Layout, K: int, kind: int, slot: int, p: int):
+    def pair_product_place(g: Game, at: Layout, K: int, kind: int, slot: int, p: int):
         """Start of what a pair feature (kind 0) or its margin (1) adds to its gradient along time."""
         return at.weights + (own_count(g) * A + (kind * pair_count(g) + slot) * P + p) * K
 
@@ -56,8 +59,8 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
             j = p - pair_index(i, i + 1, n) + i + 1
             place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
             for slot in range(pair_count(g)):
-                product = pair_product(g, at, g.K, 0, slot, pair_index(i, j, A))
-                by_margin = pair_product(g, at, g.K, 1, slot, pair_index(i, j, A))
+                product = pair_product_place(g, at, g.K, 0, slot, pair_index(i, j, A))
+                by_margin = pair_product_place(g, at, g.K, 1, slot, pair_index(i, j, A))
                 value = T(0.0)
                 slope = T(0.0)
                 for k in range(end):
@@ -84,14 +87,14 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
         along_mu: T,
         along_d: T,
     ):
-        """The cotangent of a signal with a residual w c, c'' = 0; keeps the product for the gradient by the weight."""
+        """The cotangent of a signal with a residual w c(signal), c'' = 0; keeps the product for the weight's gradient."""
         w = weight(g, feature, row)
-        own_product(g, at, work, feature, i, k, T(-2.0) * w * slope * along_mu * (value + slope * along_d))
+        keep_own_product(g, at, work, feature, i, k, T(-2.0) * w * slope * along_mu * (value + slope * along_d))
         return -w * w * slope * slope * along_mu
 
     return SimpleNamespace(
-        own_product=own_product,
-        pair_product=pair_product,
+        keep_own_product=keep_own_product,
+        pair_product_place=pair_product_place,
         forget_products=forget_products,
         add_products=add_products,
         residual_adjoint=residual_adjoint,

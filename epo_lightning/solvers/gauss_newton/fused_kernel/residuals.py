@@ -22,13 +22,13 @@ def make(T: Any, games: SimpleNamespace) -> SimpleNamespace:
 
     @wp.func
     def excess_slope(g: Game, signal: int, value: T):
-        """Its derivative by the signal: 1 above, -1 below, 0 between the bounds."""
+        """The derivative of the excess by the signal: 1 above, -1 below, 0 between the bounds."""
         low = g.bounds[2 * signal]
         high = g.bounds[2 * signal + 1]
         return wp.where(value > high, T(1.0), T(0.0)) - wp.where(value < low, T(1.0), T(0.0))
 
     @wp.func
-    def add(w: T, value: T, slope: T, energy: T, force: T, stiffness: T):
+    def add_residual(w: T, value: T, slope: T, energy: T, force: T, stiffness: T):
         """Energy, first and second derivative with those of another residual of the same signal."""
         square = w * w
         return (
@@ -39,7 +39,8 @@ def make(T: Any, games: SimpleNamespace) -> SimpleNamespace:
 
     @wp.func
     def steering(wheelbase: T, turn: T, speed: T):
-        """The angle atan(q omega), q = wheelbase / max(v, slowest), its first two derivatives, by turn rate and speed."""
+        """The angle atan(q omega), q = wheelbase / max(v, slowest), its two first and three second derivatives by turn rate
+        and speed."""
         moving = speed > T(SLOWEST_STEERING)
         inverse = T(1.0) / wp.where(moving, speed, T(SLOWEST_STEERING))
         q = wheelbase * inverse
@@ -54,6 +55,6 @@ def make(T: Any, games: SimpleNamespace) -> SimpleNamespace:
     return SimpleNamespace(
         excess=excess,
         excess_slope=excess_slope,
-        add=add,
+        add_residual=add_residual,
         steering=steering,
     )
