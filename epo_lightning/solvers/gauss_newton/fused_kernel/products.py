@@ -1,6 +1,6 @@
-"""What each residual adds to the gradients by weights and margins: kept for every step, then summed along time.
+"""Products that residuals add to the gradients by weights and margins: kept for every step, then summed along time.
 
-With it the cotangent of a signal whose residual is linear in it, which keeps its product.
+The cotangent of a signal with a residual that is linear in it is here too, because it keeps its product.
 """
 
 from types import SimpleNamespace
