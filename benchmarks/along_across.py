@@ -18,11 +18,12 @@ from torch import Tensor
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
+from epo_lightning.forecast import JointForecast
 from epo_lightning.metrics.functional.displacement import closest_mode
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.runs import data_name
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.scene import HEADING, JointForecast, Scene
+from epo_lightning.scene import HEADING, Scene
 
 COLUMNS = ("along", "across", "ahead")
 """Mean size of the error along and across the direction of travel, and mean error along it with its sign [m]."""

@@ -24,11 +24,12 @@ from epo_lightning import losses
 from epo_lightning.decoders.goals import choose, goal_candidates
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
+from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 COLUMNS = ("SADE", "initial", "no goals", "true goals", "goal [m]", "entropy", "uniform")
 """Scores: SADE [m] with the chosen goals, of the initial strategies, without goals, with the true ends as goals; the mean

@@ -21,11 +21,12 @@ import torch
 from benchmarks.refinement import forecasts
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.opening import open_checkpoint, settings_of
+from epo_lightning.forecast import GameParameters, JointForecast, Solution
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.energy import FEATURES
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.solvers.gauss_newton.best_response import ORDERS, BestResponse

@@ -23,8 +23,9 @@ from torch import Tensor
 from benchmarks import measure, peer, reference
 from benchmarks.games import LANE_POINTS, Game, make
 from benchmarks.implementations import Implementation, Missing
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 BATCHES = (32, 128, 512, 2048, 8192, 32768, 65536)

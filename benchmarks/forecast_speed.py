@@ -32,11 +32,12 @@ from epo_lightning.drive.world import EGO
 from epo_lightning.drive.worlds import place
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.opening import open_checkpoint, settings_of
+from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
-from epo_lightning.scene import ACCELERATION, HEADING, SPEED, GameParameters, Scene
+from epo_lightning.scene import ACCELERATION, HEADING, SPEED, Scene
 
 AHEAD = (2, 4)
 """Times [s] after which forecasts are compared with what happened."""

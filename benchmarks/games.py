@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from epo_lightning.experiment.config.compose import compose
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 SETTINGS = ("exid", "rpi", "sparse")
 HIGHWAY = ("goal", "lane", "velref", "vel", "acc", "jerk", "steer", "turnr", "turnacc")

@@ -24,12 +24,13 @@ from torch import Tensor
 from benchmarks.many_agents import intentions, largest_scenes, of_agents
 from epo_lightning import FeatureEnergy, GameParameters, LevenbergMarquardt, Scene, Solution
 from epo_lightning.experiment import assembly
+from epo_lightning.forecast import Status
 from epo_lightning.game.neighbours import closest_approach
 from epo_lightning.refinement import NOISE, track
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import Status
 from epo_lightning.solvers.base import Minimiser
-from epo_lightning.solvers.gauss_newton.augmented_lagrangian import AugmentedLagrangian, _Game
+from epo_lightning.solvers.gauss_newton.augmented_lagrangian import AugmentedLagrangian
+from epo_lightning.solvers.gauss_newton.constrained_game import ConstrainedGame
 
 WEIGHTS = (3.0, 10.0, 30.0, 100.0)
 """Weights of the soft terms."""
@@ -65,7 +66,7 @@ def parameters_of(scene: Scene, weight: float) -> GameParameters:
 
 def violation(scene: Scene, parameters: GameParameters, controls: Tensor) -> Tensor:
     """The largest violation of every scene [B]."""
-    excess = _Game(ENERGY, HARD.hard(ENERGY), scene, parameters).excess(controls)
+    excess = ConstrainedGame(ENERGY, HARD.hard(ENERGY), scene, parameters).excess(controls)
     return torch.cat([value.flatten(1) for value in excess.values()], -1).clamp_min(0.0).amax(-1)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from benchmarks import peer, reference
 from benchmarks.games import Game
-from epo_lightning.scene import GameParameters
+from epo_lightning.forecast import GameParameters
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 NAMES = ("peer", "reference", "pytorch", "compiled", "cuda")

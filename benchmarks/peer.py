@@ -15,7 +15,7 @@ from torch._C._functorch import is_functorch_wrapped_tensor  # Theseus does not 
 
 from benchmarks.games import Game
 from benchmarks.residuals import problem
-from epo_lightning.scene import GameParameters
+from epo_lightning.forecast import GameParameters
 
 LINEAR_SOLVERS = ("LUDenseSolver", "CholeskyDenseSolver")
 """Dense linear solvers, the usually faster one first."""

@@ -13,7 +13,7 @@ from torch.func import jacfwd, vmap
 
 from benchmarks.games import Game
 from benchmarks.residuals import problem
-from epo_lightning.scene import GameParameters
+from epo_lightning.forecast import GameParameters
 
 
 def prepare(game: Game) -> Callable[[GameParameters], Tensor]:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.games import Game
-from epo_lightning.scene import GameParameters
+from epo_lightning.forecast import GameParameters
 
 STEER_BASE = 0.6
 """Wheelbase as a share of a vehicle's length."""

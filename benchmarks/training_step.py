@@ -25,11 +25,12 @@ from benchmarks.measure import positive
 from epo_lightning.experiment import assembly, step_graph
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.scene import Scene
 from epo_lightning.schema import read
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import Minimiser

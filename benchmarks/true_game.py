@@ -26,11 +26,12 @@ from epo_lightning.drive.rpi import true_game
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.schema import read
 from epo_lightning.solvers.base import Minimiser
 

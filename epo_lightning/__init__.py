@@ -20,13 +20,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
     from epo_lightning.forecasters import load
     from epo_lightning.game.dynamics import Unicycle
     from epo_lightning.game.energy import Energy
     from epo_lightning.game.feature_energy import FeatureEnergy
     from epo_lightning.predictions import read_predictions, write_predictions
     from epo_lightning.refinement import refine
-    from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
+    from epo_lightning.scene import Scene
     from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 _HOMES = {
@@ -34,11 +35,11 @@ _HOMES = {
     "Unicycle": "game.dynamics",
     "Energy": "game.energy",
     "FeatureEnergy": "game.feature_energy",
-    "GameParameters": "scene",
-    "JointForecast": "scene",
+    "GameParameters": "forecast",
+    "JointForecast": "forecast",
     "Scene": "scene",
-    "Solution": "scene",
-    "Status": "scene",
+    "Solution": "forecast",
+    "Status": "forecast",
     "LevenbergMarquardt": "solvers.gauss_newton.levenberg_marquardt",
     "read_predictions": "predictions",
     "refine": "refinement",

@@ -126,8 +126,8 @@ def _help(arguments: Arguments) -> None:
     """Print the help of a verb: its configuration file, in which every line has a comment, and the options of groups."""
     from textwrap import fill
 
-    from epo_lightning.experiment.config.compose import hydra, options_of, tree
-    from epo_lightning.experiment.config.sources import HIGHWAYS
+    from epo_lightning.experiment.config.compose import hydra, tree
+    from epo_lightning.experiment.config.sources import HIGHWAYS, options_of
 
     if arguments.verb == "sweep":
         print(SWEEP_USAGE)

@@ -1,7 +1,7 @@
 """Terms of training objectives (Appendix E.4). Every loss is a mean over scenes.
 
-Cross entropies take log-probabilities (:attr:`~epo_lightning.scene.JointForecast.log_probabilities`), so that their gradient
-by the logits is softmax - one-hot even if the probability underflows.
+Cross entropies take log-probabilities (:attr:`~epo_lightning.forecast.JointForecast.log_probabilities`), so that their
+gradient by the logits is softmax - one-hot even if the probability underflows.
 """
 
 from __future__ import annotations

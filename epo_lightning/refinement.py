@@ -30,13 +30,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.checks import check_number, is_number
+from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.game.dynamics import Dynamics, Unicycle, controls_between
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.flatness import followed_controls
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import SPEED, GameParameters, JointForecast, Scene
+from epo_lightning.scene import SPEED, Scene
 from epo_lightning.solvers.backward import Backward, Implicit
 from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt

@@ -16,8 +16,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.scene import Scene
 
 STATE_PAIRS = (
     ("circles",),

@@ -11,7 +11,9 @@ from jaxtyping import install_import_hook
 
 # Everything that speaks the alphabet of shapes; compiled kernels take no decorators.
 CHECKED = (
+    "batch",
     "scene",
+    "forecast",
     "game",
     "solvers",
     "encoders",

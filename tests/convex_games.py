@@ -7,8 +7,9 @@ import dataclasses
 import torch
 from games import random_game, random_scene, widen
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.convex_energy import ConvexEnergy
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 OWN = ("goal", "lateral", "velref", "lat_vel", "acc", "lat_acc", "jerk", "lat_jerk")
 """Every own term."""

@@ -7,10 +7,11 @@ from contextlib import contextmanager
 
 import torch
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game import feature_derivatives
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.expansion import expand
 
 BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}

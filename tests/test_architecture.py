@@ -11,7 +11,9 @@ import epo_lightning
 
 ROOT = Path(epo_lightning.__file__).parent
 FLOORS = {
-    "scene": set(),
+    "batch": set(),
+    "scene": {"batch"},
+    "forecast": {"batch"},
     "registry": set(),
     "checks": {"registry"},
     "arguments": {"registry"},
@@ -24,18 +26,19 @@ FLOORS = {
     "run_folder": {"registry", "masking", "pretrained"},
     "optimizers": {"registry"},
     "losses": set(),
-    "game": {"scene", "registry", "checks", "host"},
-    "solvers": {"game", "scene", "registry", "checks", "host"},
-    "refinement": {"game", "solvers", "scene", "registry", "checks"},
+    "game": {"scene", "forecast", "registry", "checks", "host"},
+    "solvers": {"game", "scene", "forecast", "registry", "checks", "host"},
+    "refinement": {"game", "solvers", "scene", "forecast", "registry", "checks"},
     "predictions": {"scene", "registry", "run_folder", "refinement"},
     "encoders": {"scene"},
-    "metrics": {"scene", "registry"},
+    "metrics": {"scene", "forecast", "registry"},
     "decoders": {"scene", "registry", "checks", "game", "host"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
     "data": {"scene", "registry", "schema", "checks", "task", "metrics"},
-    "objectives": {"scene", "registry", "game", "solvers", "decoders", "losses"},
+    "objectives": {"scene", "forecast", "registry", "game", "solvers", "decoders", "losses"},
     "forecasters": {
         "scene",
+        "forecast",
         "task",
         "objectives",
         "registry",
@@ -50,9 +53,11 @@ FLOORS = {
         "pretrained",
         "refinement",
     },
-    "explore": {"scene", "registry", "schema", "forecasters", "game", "metrics", "solvers"},
+    "explore": {"scene", "forecast", "registry", "schema", "forecasters", "game", "metrics", "solvers"},
     "drive": {
+        "batch",
         "scene",
+        "forecast",
         "registry",
         "schema",
         "checks",
@@ -65,7 +70,7 @@ FLOORS = {
         "report",
         "run_folder",
     },
-    "report": {"scene", "registry", "metrics", "run_folder", "identity", "masking"},
+    "report": {"scene", "forecast", "registry", "metrics", "run_folder", "identity", "masking"},
 }
 """Top-level modules that each one may import besides itself; `experiment` and `cli` may import all."""
 

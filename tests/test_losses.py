@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from epo_lightning import losses
-from epo_lightning.scene import JointForecast
+from epo_lightning.forecast import JointForecast
 
 MASK = torch.ones(1, 2, 1, dtype=torch.bool)
 DISTANCE = torch.tensor([[[1.0, 5.0], [3.0, 1.0]]])  # [B=1, M=2, N=2]

@@ -9,7 +9,8 @@ import pytest
 import torch
 from games import random_scene
 
-from epo_lightning.scene import GameParameters, JointForecast, Scene
+from epo_lightning.forecast import GameParameters, JointForecast
+from epo_lightning.scene import Scene
 
 
 @pytest.fixture(autouse=True)

@@ -20,14 +20,16 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from epo_lightning.batch import Batch
 from epo_lightning.drive.world import EGO, Search
+from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.refinement import NOISE, track
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import FIELDS, HEADING, SPEED, Batch, GameParameters, JointForecast, Scene, Solution, Status
+from epo_lightning.scene import FIELDS, HEADING, SPEED, Scene
 from epo_lightning.solvers.base import TABLES
 from epo_lightning.solvers.diagnostics.equilibrium import descend_features
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt

@@ -13,8 +13,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from epo_lightning.drive.world import EGO
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import SPEED, TURN_RATE, GameParameters, Scene, wrapped
+from epo_lightning.scene import SPEED, TURN_RATE, Scene, wrapped
 
 ENERGY = FeatureEnergy(
     own=("lane", "velref", "accref", "turnrref", "jerk", "turnacc", "velb", "accb"),

@@ -25,9 +25,10 @@ from epo_lightning.data.rpi.scenes import DISC_DIAMETER
 from epo_lightning.data.rpi.solve import PotentialSettings, solve, solve_potential
 from epo_lightning.data.rpi.subgames import HISTORY, by_agent, main_starts
 from epo_lightning.drive.world import EGO, Outcome, Search
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 PEDESTRIANS = ("plays", "ignores")
 SEEDS = 1_000_000

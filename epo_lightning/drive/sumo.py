@@ -22,10 +22,11 @@ from jaxtyping import Float
 from epo_lightning.checks import check_whole
 from epo_lightning.data.recorded.formats.lanelet2 import read_map
 from epo_lightning.data.recorded.lanes import LaneGraph
+from epo_lightning.data.simulate.demand import CLASSES, STYLES
 from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.data.simulate.motion import SLOWEST, strip_at
-from epo_lightning.data.simulate.traffic import CLASSES, STYLES, simulator
+from epo_lightning.data.simulate.traffic import simulator
 from epo_lightning.drive.ride import Moment, Position
 from epo_lightning.drive.sumo_process import END, OWN, STEP, Branch, Vehicles, serve
 from epo_lightning.drive.traffic import TrafficWorld
@@ -58,7 +59,7 @@ def sumo_world(episodes: int, seed: int = 0, style: str = "dense") -> TrafficWor
     Args:
         episodes: number of episodes.
         seed: seed of their traffic; the same seed gives the same episodes.
-        style: ``dense`` or ``free`` (:data:`~epo_lightning.data.simulate.traffic.STYLES`).
+        style: ``dense`` or ``free`` (:data:`~epo_lightning.data.simulate.demand.STYLES`).
 
     Raises:
         ConfigError: a value out of its range, SUMO is not installed, or this system cannot fork.

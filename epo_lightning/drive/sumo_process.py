@@ -24,16 +24,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from epo_lightning.data.simulate.demand import STYLES, Style
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
-from epo_lightning.data.simulate.traffic import (
-    STYLES,
-    WARM_UP,
-    Simulation,
-    Style,
-    brake,
-    kind_of,
-    running,
-)
+from epo_lightning.data.simulate.traffic import WARM_UP, Simulation, brake, kind_of, running
 from epo_lightning.registry import ConfigError
 
 OWN, END = "own", "end"

@@ -21,8 +21,9 @@ from epo_lightning.drive.ride import WINDOWS, Ride, Simulation, contacts
 from epo_lightning.drive.road_game import ENERGY, road_game
 from epo_lightning.drive.road_scenes import RoadScenes, joined
 from epo_lightning.drive.world import EGO, Outcome, Search
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.scene import HEADING, SPEED, GameParameters, Scene
+from epo_lightning.scene import HEADING, SPEED, Scene
 
 NEAR = 6
 """Number of vehicles, the nearest ones to the planned one, of which measures are taken at each moment."""

@@ -9,8 +9,9 @@ from typing import Protocol
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 EGO = 0
 """Index of the planned agent in the scenes and outcomes of a world."""

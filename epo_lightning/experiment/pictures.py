@@ -13,8 +13,9 @@ from torch import Tensor
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
 from epo_lightning.experiment.config.settings import PredictSettings
 from epo_lightning.experiment.opening import split_of
+from epo_lightning.forecast import JointForecast
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import HEADING, JointForecast, Scene, X, Y
+from epo_lightning.scene import HEADING, Scene, X, Y
 
 
 def choose(data: Any, split: str, count: int | None) -> tuple[Scene, list[dict[str, Any]] | None]:

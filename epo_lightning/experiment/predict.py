@@ -15,10 +15,11 @@ from epo_lightning.experiment.config.settings import ForecastSettings, PredictSe
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
 from epo_lightning.experiment.other_data import keys_of, open_other
 from epo_lightning.experiment.pictures import choose, draw, forecast_of, pick, spread
+from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_file, write_json
-from epo_lightning.scene import KINDS, JointForecast, Scene
+from epo_lightning.scene import KINDS, Scene
 
 MEANING = {
     "states": "[B, M, N, K, 4] x, y [m], heading [rad], speed [m/s] of every joint mode",

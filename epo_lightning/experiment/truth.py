@@ -20,7 +20,8 @@ from scipy import stats
 from torch import Tensor
 
 from epo_lightning.data.rpi.game import GameConstants
-from epo_lightning.scene import GameParameters, JointForecast, Scene
+from epo_lightning.forecast import GameParameters, JointForecast
+from epo_lightning.scene import Scene
 
 OWN = {"goal": "terminal", "vel": "slowness"}
 """Own terms that are compared, with their true weight in :class:`GameConstants`."""

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 
 import torch
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import GameParameters, Scene, wrapped
+from epo_lightning.scene import Scene, wrapped
 
 FARTHEST = 1e4
 """Largest size of a coordinate, angle or speed: farther away, single precision has no digits left for the game."""

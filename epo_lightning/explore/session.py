@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from epo_lightning.explore.edit import Edit
+from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.pairs import pairs
 from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS, equilibrium_values
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import KINDS, JointForecast, Scene
+from epo_lightning.scene import KINDS, Scene
 from epo_lightning.solvers.base import TABLES
 
 DISC = 0.5

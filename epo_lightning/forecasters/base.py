@@ -10,11 +10,12 @@ import torch
 from lightning import LightningModule
 from torch import Tensor
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.metrics.forecast import COLUMNS, STOPPED, stopped
 from epo_lightning.objectives.base import Terms
 from epo_lightning.optimizers import Adam
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.task import Task
 
 

@@ -22,9 +22,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import controls_between
 from epo_lightning.game.energy import Energy
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import Minimiser
 
 _DIFFERENCE = 0.05

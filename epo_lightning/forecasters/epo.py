@@ -22,6 +22,7 @@ from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
 from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.strategies import InitialStrategies, ZeroStrategies
 from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, SharedWeights
+from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.forecasters.combination import Combination
@@ -44,7 +45,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError, build, register
-from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import SAMPLES, TABLES, Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium

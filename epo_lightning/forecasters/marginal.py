@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.trajectories import Trajectories
+from epo_lightning.forecast import JointForecast, log_probabilities
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.tracking import with_motion
 from epo_lightning.metrics.functional import marginal_to_joint
@@ -14,7 +15,7 @@ from epo_lightning.objectives.base import Terms, checked_weights
 from epo_lightning.objectives.terms import observed_future
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
-from epo_lightning.scene import JointForecast, Scene, log_probabilities
+from epo_lightning.scene import Scene
 from epo_lightning.task import Task
 
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from epo_lightning.checks import check_number
 from epo_lightning.decoders.weights import SharedWeights
+from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.forecasters.epo_settings import check_start
@@ -20,7 +21,7 @@ from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.refinement import NOISE, check_energy, refined
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import Minimiser
 from epo_lightning.task import Task

@@ -8,13 +8,14 @@ from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.strategies import InitialStrategies
+from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.objectives.base import Terms, checked_weights
 from epo_lightning.objectives.terms import imitation_terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.task import Task
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from epo_lightning.checks import check_number, check_whole
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import disc, length_of, row_extent, row_overlap, rows_may_overlap
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.limits import Bound
@@ -17,7 +18,7 @@ from epo_lightning.game.network_energy import NetworkEnergy
 from epo_lightning.game.networks import MOTION, Layers, motion, squared_distances
 from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import SPEED, GameParameters, Scene
+from epo_lightning.scene import SPEED, Scene
 
 SHAPES = ("disc", "box")
 _AT_ONCE = 100_000

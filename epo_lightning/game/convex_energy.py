@@ -28,13 +28,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.checks import check_number
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import disc
 from epo_lightning.game.double_integrator import DoubleIntegrator, rotate
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy, check_names
 from epo_lightning.game.pair_order import ALONG, DIRECTIONS, PairOrder
 from epo_lightning.game.pairs import pair_mask, pairs
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import HEADING, SPEED, GameParameters, Scene
+from epo_lightning.scene import HEADING, SPEED, Scene
 
 FLOOR = 1e-3
 """Added to the squared weight of lateral accelerations, so that the Hessian is positive definite also in float32."""

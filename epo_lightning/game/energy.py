@@ -17,11 +17,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.pair_order import PairOrder
 from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import ConfigError, nearest, parts
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 GRADIENT, RESIDUALS, FEATURES = "gradient", "residuals", "features"
 """Optional properties of an energy. GRADIENT: it can be minimised along its gradient with

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from epo_lightning.checks import is_number
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, PairFeature
 from epo_lightning.game.game_end import check_game_steps
 from epo_lightning.game.limits import check_bound
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 if TYPE_CHECKING:
     from epo_lightning.game.feature_energy import FeatureEnergy

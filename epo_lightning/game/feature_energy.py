@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.checks import check_whole
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import disc, separation
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, check_names
@@ -30,7 +31,7 @@ from epo_lightning.game.game_end import residual_mask, until
 from epo_lightning.game.limits import Bound, bounds_of_agents
 from epo_lightning.game.pairs import pair_mask, pairs
 from epo_lightning.registry import ConfigError, register
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 
 @register("energy", "features")

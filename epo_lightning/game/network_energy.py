@@ -10,13 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.limits import Bound
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 
 class NetworkEnergy(nn.Module, Energy):

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from epo_lightning.checks import check_whole
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Dynamics
 from epo_lightning.game.energy import GRADIENT
 from epo_lightning.game.limits import Bound
@@ -16,7 +17,7 @@ from epo_lightning.game.network_energy import NetworkEnergy
 from epo_lightning.game.networks import ENCOUNTER, MOTION, Layers, encounter, motion
 from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import register
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 _TABLE_ENTRIES = 50_000
 """Number of candidate pairs that are evaluated together, which bounds the memory where no gradient is recorded."""

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.forecast import GameParameters
+from epo_lightning.scene import Scene
 
 Function = Callable[[Scene, GameParameters, Tensor], tuple[Tensor, ...]]
 """(scene, parameters, controls) -> tensors [B, M, ...]."""

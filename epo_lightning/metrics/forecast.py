@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics import Metric
 
+from epo_lightning.forecast import JointForecast, Status
 from epo_lightning.metrics.functional import (
     brier_min_sade,
     closest_mode,
@@ -24,7 +25,7 @@ from epo_lightning.metrics.functional import (
 )
 from epo_lightning.metrics.functional.calibration import BINS
 from epo_lightning.metrics.functional.overlap import Shape, check_choice, overlap_rates
-from epo_lightning.scene import JointForecast, Scene, Status
+from epo_lightning.scene import Scene
 
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "overlap_authors")
 """Scores of every forecaster; displacements in m, overlaps as rates."""
@@ -38,7 +39,7 @@ EQUILIBRIUM_METRICS = (
     "nash_gap",
     "nash_gap_relative",
 )
-"""Distance of the most likely joint mode from an equilibrium of its game (:class:`~epo_lightning.scene.Equilibrium`).
+"""Distance of the most likely joint mode from an equilibrium of its game (:class:`~epo_lightning.forecast.Equilibrium`).
 ``nash_gap`` is the largest gap of an agent, ``nash_gap_relative`` the largest gap divided by the agent's J_i."""
 MODE_METRICS = tuple(f"minSADE_{k}" for k in range(1, 17))
 """The minSADE among the k most likely joint modes, k = 1 .. 16, for forecasts with several modes."""
@@ -93,7 +94,8 @@ class ForecastMetrics(Metric):
     Example:
         One scene, one mode, two agents that stand still, and a forecast that is 0.3 m off for one of them:
 
-        >>> from epo_lightning.scene import JointForecast, Scene
+        >>> from epo_lightning.forecast import JointForecast
+        >>> from epo_lightning.scene import Scene
         >>> states = torch.tensor([[0.0, 0.0, 0.0, 0.0], [5.0, 0.0, 0.0, 0.0]]).view(1, 2, 1, 4)
         >>> scene = Scene(history=states, dt=0.1, future=states, size=torch.ones(1, 2, 2))
         >>> predicted = states[:, None].clone()

@@ -10,9 +10,10 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 Terms = dict[str, tuple[float, Tensor]]
 """Weight lambda and value of every named term of a training loss; their weighted sum is minimised, and all are logged."""

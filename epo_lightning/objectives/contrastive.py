@@ -17,13 +17,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning import losses
+from epo_lightning.forecast import JointForecast
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.selection import games
 from epo_lightning.game.tracking import demonstrated, observed_controls
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term, observed_future
 from epo_lightning.registry import register
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
 
 

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from epo_lightning import losses
 from epo_lightning.decoders.orders import order_loss
+from epo_lightning.forecast import JointForecast
 from epo_lightning.game.energy import Energy
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term, imitation_terms
 from epo_lightning.registry import register
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 
 @register("objective", "imitation")

@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning import losses
+from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.game.energy import RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.selection import evaluated
@@ -32,7 +33,7 @@ from epo_lightning.game.tracking import demonstrated, observed_controls
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term, observed_future
 from epo_lightning.registry import register
-from epo_lightning.scene import GameParameters, JointForecast, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
 from epo_lightning.solvers.gauss_newton.normal_equations import by_channel, normal_equations
 from epo_lightning.solvers.general import dense

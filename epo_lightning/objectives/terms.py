@@ -9,8 +9,9 @@ from torch import Tensor
 
 from epo_lightning import losses
 from epo_lightning.decoders.goals import goal_candidates
+from epo_lightning.forecast import JointForecast
 from epo_lightning.objectives.base import Terms
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 
 def observed_future(scene: Scene) -> tuple[Float[Tensor, "B N K 4"], Bool[Tensor, "B N K"]]:

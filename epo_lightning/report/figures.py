@@ -17,8 +17,9 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 from torch import Tensor
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.report.style import AGENTS, HISTORY, MODES, OTHER, TRUTH, save, style
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 Color = str | tuple[float, float, float]
 

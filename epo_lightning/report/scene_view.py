@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from epo_lightning.scene import HEADING, KINDS, SPEED, JointForecast, Scene
+from epo_lightning.forecast import JointForecast
+from epo_lightning.scene import HEADING, KINDS, SPEED, Scene
 
 LONGEST = 250.0
 """Largest length of road in a picture [m], as in the paper."""

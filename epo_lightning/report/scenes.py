@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.report.scene_panels import draw_forecast, draw_known, draw_road, layout
 from epo_lightning.report.scene_view import JointMode, SceneView, by_probability, joint_mode
 from epo_lightning.report.style import save, style
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 MOST_MODES = 6
 """Largest number of panels of a picture of one forecaster."""

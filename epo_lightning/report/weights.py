@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from torch import Tensor
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.report.style import AGENT_COLORS, AGENTS, save, style
-from epo_lightning.scene import JointForecast
 
 SMALLEST = 1e-6
 """Smallest squared weight on the logarithmic axis; smaller ones are drawn there."""

@@ -21,10 +21,11 @@ from typing import ClassVar
 import torch
 
 from epo_lightning.checks import check_whole
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, TABLES, Minimiser, Stepwise
 from epo_lightning.solvers.gauss_newton import implicit
 from epo_lightning.solvers.general import dense

@@ -13,8 +13,9 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.energy import Energy
-from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.scene import Scene
 
 PATH, STEPS, STATIONARY, SAMPLES, TABLES = "path", "steps", "stationary", "samples", "tables"
 """Properties that a minimiser can provide. PATH: its steps can be differentiated. STEPS: they can be interrupted and

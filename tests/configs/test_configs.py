@@ -19,8 +19,9 @@ from suites import untrained
 
 from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.compose import compose, hydra, jobs, options_of, tree
+from epo_lightning.experiment.config.compose import compose, hydra, jobs, tree
 from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.experiment.config.sources import options_of
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.schema import read

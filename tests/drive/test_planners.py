@@ -10,9 +10,10 @@ import torch
 import epo_lightning
 from epo_lightning.drive.planners import BRAKING, ForecastPlanner, GamePlanner, Plan, ResponsePlanner, shifted
 from epo_lightning.drive.rpi import RPIWorld
+from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import SPEED, JointForecast, Scene
+from epo_lightning.scene import SPEED, Scene
 
 
 @pytest.fixture(scope="module")

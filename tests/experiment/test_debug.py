@@ -20,10 +20,11 @@ from epo_lightning.experiment.config.compose import compose, tree
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.debugging import PROFILED, FewBatches, NonFinite
 from epo_lightning.experiment.train import folder_for
+from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters import Forecaster, build_forecaster
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.schema import read
 
 WAYS = sorted(file.stem for file in (tree() / "conf" / "debug").glob("*.yaml"))

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from experiment.conftest import Epo
 
-from epo_lightning.experiment.config.compose import compose, hydra, jobs, options_of, tree
+from epo_lightning.experiment.config.compose import compose, hydra, jobs, tree
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.config.sources import HIGHWAYS
+from epo_lightning.experiment.config.sources import HIGHWAYS, options_of
 from epo_lightning.experiment.train import folder_for
 from epo_lightning.identity import differences
 from epo_lightning.schema import read

@@ -16,8 +16,9 @@ from torch import Tensor
 from epo_lightning.data.datamodule import SceneDataModule
 from epo_lightning.experiment.pictures import choose, even, eventful
 from epo_lightning.experiment.predict import MEANING
+from epo_lightning.forecast import JointForecast
 from epo_lightning.registry import register
-from epo_lightning.scene import KINDS, JointForecast, Scene
+from epo_lightning.scene import KINDS, Scene
 from epo_lightning.task import Task
 
 Epo = Callable[..., int]

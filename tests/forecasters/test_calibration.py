@@ -10,10 +10,11 @@ import torch
 
 from epo_lightning.drive.rpi import ENERGY as RPI
 from epo_lightning.drive.rpi import RPIWorld
+from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import HEADING, GameParameters, Scene, wrapped
+from epo_lightning.scene import HEADING, Scene, wrapped
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 ENERGY = FeatureEnergy(own=["goal", "vel", "acc", "turnr"], pair=["proximity"])

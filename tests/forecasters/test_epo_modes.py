@@ -10,12 +10,13 @@ from games import highway_scene, random_scene
 from suites import highway_model, model
 
 from epo_lightning.experiment.config.compose import compose
+from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.convex_energy import ConvexEnergy
 from epo_lightning.metrics.functional.displacement import min_sade_of_likely
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 SECTIONS = ("forecaster", "dynamics", "energy", "solver", "backward", "objective")
 

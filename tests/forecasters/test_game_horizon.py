@@ -11,9 +11,10 @@ import torch
 from games import random_scene
 from suites import ForecasterSuite, model
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 BOUNDS = {"vel": [-0.05, 2.0], "acc": [-9.81, 9.81], "turnr": [-0.2, 0.2]}
 ENERGY = {

@@ -10,9 +10,9 @@ import torch
 from games import random_scene
 from suites import model
 
+from epo_lightning.forecast import Status
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.metrics import ForecastMetrics
-from epo_lightning.scene import Status
 
 
 @pytest.fixture(scope="module")

@@ -19,12 +19,13 @@ import torch
 from scipy.optimize import minimize
 
 from epo_lightning.experiment.config.compose import compose
+from epo_lightning.forecast import Equilibrium, GameParameters, JointForecast, Solution
 from epo_lightning.game.convex_energy import FLOOR
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import build
-from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scene, Solution
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 
 STEPS, DT, KEPT = 6, 0.4, 6.0

@@ -11,10 +11,11 @@ import torch
 from suites import models
 
 from epo_lightning.data.drawn import DrawnData
+from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.metrics.forecast import pair_effect
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 
 def scenes() -> Scene:

@@ -14,11 +14,11 @@ from shapely import LineString, MultiPoint, Point, Polygon
 from shapely.affinity import rotate, translate
 
 from epo_lightning.experiment.config.compose import compose
+from epo_lightning.forecast import Status
 from epo_lightning.game.circles import places, row_extent, row_overlap, rows_may_overlap
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import PAIR_FEATURES, Source, pair_feature
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import Status
 from epo_lightning.solvers.backward import Implicit, Unrolled
 from epo_lightning.solvers.gauss_newton import structured
 from epo_lightning.solvers.gauss_newton.expansion import expand

@@ -12,11 +12,11 @@ from games import highway_scene, random_game, random_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.collision_energy import CollisionEnergy
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.metrics.functional.overlap import overlapping_pairs
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters
 
 WIDTH, HORIZON = 3, 4
 SIZES = ((1.6, 0.7), (0.5, 0.5), (3.6, 1.9), (4.0, 1.8), (4.7, 1.9), (8.0, 2.3), (11.0, 2.5))

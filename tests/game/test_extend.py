@@ -11,11 +11,11 @@ import torch
 from games import leaves_of, random_game, random_scene
 from suites import FeatureSuite
 
+from epo_lightning.forecast import Status
 from epo_lightning.game import features
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.neural_energy import NeuralEnergy
-from epo_lightning.scene import Status
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.solvers.general.gradient_descent import GradientDescent
 

@@ -9,10 +9,11 @@ import pytest
 import torch
 from games import leaves_of, random_game, random_scene
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.limits import DEFAULT, bounds_of_agents
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import KINDS, GameParameters, Scene
+from epo_lightning.scene import KINDS, Scene
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 OWN = ("vel", "acc", "turnr", "jerk", "velb", "accb", "turnrb", "jerkb")

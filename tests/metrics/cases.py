@@ -8,7 +8,8 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.forecast import JointForecast
+from epo_lightning.scene import Scene
 
 
 @dataclass

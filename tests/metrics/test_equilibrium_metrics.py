@@ -8,9 +8,9 @@ import math
 import pytest
 import torch
 
+from epo_lightning.forecast import Equilibrium
 from epo_lightning.metrics import METRICS, ForecastMetrics
 from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS
-from epo_lightning.scene import Equilibrium
 
 from .cases import make_case
 

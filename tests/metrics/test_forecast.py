@@ -11,9 +11,10 @@ import torch
 import torch.distributed
 from torch import Tensor
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.metrics import METRICS, ForecastMetrics
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 from . import reference
 from .cases import Case, make_case

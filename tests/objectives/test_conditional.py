@@ -14,10 +14,11 @@ from games import random_scene
 from torch import Tensor
 
 from epo_lightning import registry
+from epo_lightning.forecast import JointForecast, Solution, Tables
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.objectives.conditional import Conditional
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import JointForecast, Scene, Solution, Tables
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.discrete import assignments
 
 NAN, INF = float("nan"), float("inf")

@@ -11,10 +11,10 @@ import yaml
 from games import ALL, BOUNDS, leaves_of, pad, random_game, random_scene, widen
 from torch.testing import assert_close
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.selection import games
 from epo_lightning.objectives.contrastive import Contrastive
-from epo_lightning.scene import JointForecast
 from epo_lightning.solvers.general.gradient_descent import GradientDescent
 from epo_lightning.solvers.general.langevin import Langevin
 

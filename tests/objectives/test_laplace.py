@@ -13,11 +13,11 @@ from games import ALL, BOUNDS, EXID, leaves_of, pad, random_game, random_scene, 
 from torch.distributions import MultivariateNormal
 from torch.testing import assert_close
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.objectives.laplace import Laplace, log_densities
-from epo_lightning.scene import JointForecast
 from epo_lightning.solvers.general import dense
 
 CONF = Path(__file__).parents[2] / "conf" / "objective" / "laplace.yaml"

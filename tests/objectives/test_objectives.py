@@ -13,9 +13,9 @@ from suites.games import build_energy
 from suites.objective import ENERGY
 
 from epo_lightning import losses
+from epo_lightning.forecast import JointForecast
 from epo_lightning.objectives.terms import imitation_terms
 from epo_lightning.registry import build, parts
-from epo_lightning.scene import JointForecast
 
 
 class TestImitation(ObjectiveSuite):

@@ -14,11 +14,12 @@ import torch
 from matplotlib.axes import Axes
 from PIL import Image
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import animation
 from epo_lightning.report.animation import animate
 from epo_lightning.report.style import TRUTH, VEHICLES
-from epo_lightning.scene import JointForecast, Scene
+from epo_lightning.scene import Scene
 
 from .traffic_scenes import DT, STEPS, boxes, forecast, short, traffic
 

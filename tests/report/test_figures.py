@@ -12,11 +12,12 @@ import pytest
 import torch
 from matplotlib.image import imread
 
+from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.report import weights
 from epo_lightning.report.figures import joint_predictions
 from epo_lightning.report.style import save
 from epo_lightning.report.weights import learned_weights
-from epo_lightning.scene import GameParameters, JointForecast, Scene
+from epo_lightning.scene import Scene
 
 HISTORY, FUTURE, MODES, AGENTS = 5, 8, 2, 2
 

@@ -15,11 +15,12 @@ from matplotlib.patches import PathPatch, Polygon
 from PIL import Image
 from torch import Tensor
 
+from epo_lightning.forecast import JointForecast
 from epo_lightning.report import scenes as pictures
 from epo_lightning.report.scene_view import LONGEST
 from epo_lightning.report.scenes import highway_comparison, highway_scene
 from epo_lightning.report.style import TRUTH, VEHICLES
-from epo_lightning.scene import KINDS, JointForecast, Scene
+from epo_lightning.scene import KINDS, Scene
 
 from .traffic_scenes import DT, HISTORY, LANE, SIZES, STEPS, boxes, forecast, road, states, traffic
 

@@ -11,7 +11,8 @@ from matplotlib.colors import to_hex
 from matplotlib.patches import Polygon
 from torch import Tensor
 
-from epo_lightning.scene import KINDS, GameParameters, JointForecast, Scene
+from epo_lightning.forecast import GameParameters, JointForecast
+from epo_lightning.scene import KINDS, Scene
 
 HISTORY, FUTURE, DT, LANE = 10, 20, 0.2, 3.6
 STEPS = HISTORY + FUTURE

@@ -9,9 +9,10 @@ import pytest
 import torch
 from games import leaves_of, random_game, random_scene
 
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Implicit, Truncated
 from epo_lightning.solvers.base import Stepwise
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt

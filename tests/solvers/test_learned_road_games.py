@@ -11,8 +11,8 @@ import torch
 
 import epo_lightning
 from epo_lightning import GameParameters, LevenbergMarquardt, Scene, pretrained
+from epo_lightning.forecast import Status
 from epo_lightning.game.energy import Energy
-from epo_lightning.scene import Status
 
 RUN = "highway_sim/hivt_m_epo"
 MODES = (0, 2, 3)

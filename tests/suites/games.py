@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from games import pad, random_scene, reordered
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import build
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 WIDTH, HORIZON, MODES = 8, 6, 2
 

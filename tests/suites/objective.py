@@ -8,10 +8,11 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
+from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.registry import ConfigError, build
-from epo_lightning.scene import GameParameters, JointForecast, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, STEPS, TABLES
 
 from .games import MODES, build_energy, game_of, in_order, padded

@@ -7,9 +7,10 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy
 from epo_lightning.registry import build
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, STEPS, TABLES, Minimiser, Stepwise
 
 from .games import HORIZON, MODES, build_energy, game_of, in_order, padded, poisoned

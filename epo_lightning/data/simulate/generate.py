@@ -16,10 +16,11 @@ from typing import Any
 
 from epo_lightning.data import cache
 from epo_lightning.data.simulate import recording
+from epo_lightning.data.simulate.demand import STYLES, Style
 from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.data.simulate.motion import move
-from epo_lightning.data.simulate.traffic import RATE, STYLES, WARM_UP, Style, simulate, simulator
+from epo_lightning.data.simulate.traffic import RATE, WARM_UP, simulate, simulator
 from epo_lightning.data.workers import Report, finished
 from epo_lightning.registry import ConfigError, nearest
 
@@ -44,7 +45,7 @@ def config(
         minutes: duration of each recording.
         layouts: ids of the layouts; None for all.
         traffic: style of the traffic, ``free`` or ``dense``
-            (:data:`~epo_lightning.data.simulate.traffic.STYLES`). Free traffic is not named in the configuration, as it was
+            (:data:`~epo_lightning.data.simulate.demand.STYLES`). Free traffic is not named in the configuration, as it was
             the only one once: recordings of older versions stay valid.
 
     Raises:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from epo_lightning.data.simulate.demand import CLASSES
 from epo_lightning.data.simulate.layout import Layout
-from epo_lightning.data.simulate.traffic import CLASSES, Traffic
+from epo_lightning.data.simulate.traffic import Traffic
 
 WINDOW = 1.0
 """Length [s] of the Savitzky-Golay filter."""

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult
 from omegaconf import OmegaConf
+
+if TYPE_CHECKING:
+    from hydra._internal.hydra import Hydra
 
 GROUP = "sweeps"
 HIGHWAYS = ("exid", "us101", "highway_sim", "highd", "ind", "round", "unid", "interaction", "argoverse2", "waymo")
@@ -129,3 +133,8 @@ class SweepsSource(ParsedOnce):
 
 def _ours(config_path: str) -> bool:
     return config_path == GROUP or config_path.startswith(f"{GROUP}/")
+
+
+def options_of(instance: Hydra, group: str) -> list[str]:
+    """The options of a group, also those in folders within it: ``rpi/v_lstm`` for ``experiment``."""
+    return sorted(set(instance.config_loader.get_group_options(group, ObjectType.CONFIG)))

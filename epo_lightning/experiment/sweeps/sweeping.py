@@ -14,6 +14,7 @@ from epo_lightning.data.cache import CacheError
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config import compose
+from epo_lightning.experiment.config.sources import options_of
 from epo_lightning.experiment.config.settings import Settings, TrainerSettings
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
 from epo_lightning.experiment.sweeps.watch import news, status, summary
@@ -203,7 +204,7 @@ def _with_choices(listed: Sequence[list[str]], choices: Choices, extra: Sequence
     """
     file = f"choices={choices.file}"
     with compose.hydra(extra) as instance:
-        experiments = compose.options_of(instance, "experiment")
+        experiments = options_of(instance, "experiment")
     for experiment in choices.overrides:
         if experiment not in experiments:
             raise ConfigError(f"{file}: unknown experiment {experiment!r}: {nearest(experiment, experiments)}")
@@ -289,7 +290,7 @@ def known(extra: Sequence[str] = ()) -> dict[str, str]:
     """The names of all sweeps, and the description with which each file begins."""
     says = {}
     with compose.hydra(extra) as instance:
-        for option in compose.options_of(instance, "sweeps"):
+        for option in options_of(instance, "sweeps"):
             files = (folder / "sweeps" / f"{option}.yaml" for folder in [*map(Path, extra), compose.tree()])
             lines = next((file.read_text(encoding="utf-8").splitlines() for file in files if file.is_file()), [])
             says[option] = _description([line for line in lines if line.startswith("#") and "@package" not in line])

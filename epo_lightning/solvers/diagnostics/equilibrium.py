@@ -28,10 +28,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from epo_lightning.forecast import Equilibrium, GameParameters, JointForecast, Solution, Tables
 from epo_lightning.game.energy import FEATURES, GRADIENT, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.pairs import pairs
-from epo_lightning.scene import Equilibrium, GameParameters, JointForecast, Scene, Solution, Tables
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.diagnostics import quasi_newton
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 

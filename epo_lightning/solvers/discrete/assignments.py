@@ -2,7 +2,7 @@
 
     E(k) = sum_i unary_i(k_i) + sum_{i<j} pair_ij(k_i, k_j)
 
-These are functions of energy tables alone (:class:`~epo_lightning.scene.Tables`), differentiable with respect to them. An
+These are functions of energy tables alone (:class:`~epo_lightning.forecast.Tables`), differentiable with respect to them. An
 energy of plus infinity marks an impossible candidate or pair of candidates: its probability and its gradient are zero.
 Absent agents take their first candidate at no cost, whatever their entries are.
 """

@@ -18,10 +18,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole, is_number
+from epo_lightning.forecast import GameParameters, Solution, Status, Tables
 from epo_lightning.game.energy import Energy
 from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError, register
-from epo_lightning.scene import GameParameters, Scene, Solution, Status, Tables
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.discrete import assignments
 

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from epo_lightning.forecast import Solution, Status
 from epo_lightning.host import readable
-from epo_lightning.scene import Solution, Status
 from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, MOST_DAMPING
 from epo_lightning.solvers.general.descent import wide
 

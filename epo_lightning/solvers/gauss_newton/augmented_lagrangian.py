@@ -27,23 +27,21 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole
-from epo_lightning.game.circles import separation
+from epo_lightning.forecast import Constraints, GameParameters, Solution, Status
 from epo_lightning.game.energy import FEATURES, Energy
-from epo_lightning.game.feature_derivatives import Bounds, signal_and_change
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.game.game_end import free_controls
-from epo_lightning.game.pairs import pairs
 from epo_lightning.host import readable
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import Constraints, GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
+from epo_lightning.solvers.gauss_newton.constrained_game import ConstrainedGame
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.solvers.general import dense, descent
 
@@ -168,7 +166,7 @@ class AugmentedLagrangian(Minimiser):
         scene, controls = descent.begin(energy, scene, parameters)
         if controls.numel() == 0:
             return descent.nothing(controls)
-        game = _Game(energy, names, scene, parameters.for_every_mode(controls.shape[1]))
+        game = ConstrainedGame(energy, names, scene, parameters.for_every_mode(controls.shape[1]))
         initial = energy(scene, game.parameters, controls)
         rounds = _Rounds.begin(self, game, controls, initial)
         for _ in range(self.rounds):
@@ -204,7 +202,7 @@ class AugmentedLagrangian(Minimiser):
         assert solution.constraints is not None
         names, met = self.hard(energy), solution.status != Status.STOPPED
         state = solution.constraints.to(torch.float64)
-        game = _Game(energy, names, scene.to(torch.float64), parameters.to(torch.float64))
+        game = ConstrainedGame(energy, names, scene.to(torch.float64), parameters.to(torch.float64))
         controls = torch.where(descent.wide(met), solution.controls, 0.0).detach().double()
         multipliers = torch.cat([value.flatten(2) for value in state.multipliers.values()], -1)
         with torch.no_grad():
@@ -244,110 +242,6 @@ class AugmentedLagrangian(Minimiser):
         return attached, torch.where(definite, int(Status.SOLVED), int(Status.STOPPED))
 
 
-@dataclass(frozen=True)
-class _Game:
-    """The games of a batch with their constraints."""
-
-    energy: FeatureEnergy
-    names: Sequence[str]
-    scene: Scene
-    parameters: GameParameters
-
-    def of(self, rows: Tensor) -> _Game:
-        """The games of some scenes."""
-        return dataclasses.replace(self, scene=self.scene[rows], parameters=self.parameters[rows])
-
-    @property
-    def objective(self) -> FeatureEnergy:
-        """The energy without the features that are constraints."""
-        own, pair = ([name for name in part if name not in self.names] for part in (self.energy.own, self.energy.pair))
-        return dataclasses.replace(self.energy, own=own, pair=pair)
-
-    def excess(self, controls: Tensor) -> dict[str, Float[Tensor, "B M R S"]]:
-        """h by constraint, positive where it is violated, and -inf where there is none; a bound has two entries."""
-        return {name: value for name, value, _ in self._signals(controls, controls.new_zeros(0, *controls.shape))}
-
-    def jacobian(self, controls: Tensor) -> Float[Tensor, "B M C n"]:
-        """dh/du of all constraints, in the order of :meth:`excess`; zero where there is none."""
-        count = controls.shape[2:].numel()
-        units = torch.eye(count, dtype=controls.dtype, device=controls.device).view(count, 1, 1, *controls.shape[2:])
-        signals = self._signals(controls, units.expand(-1, *controls.shape[:2], -1, -1, -1))
-        return torch.cat([change.flatten(3) for *_, change in signals], -1).permute(1, 2, 3, 0)
-
-    def _signals(self, controls: Tensor, directions: Tensor) -> list[tuple[str, Tensor, Tensor]]:
-        """Name, h, and its changes along directions of controls, of every constraint."""
-        energy, scene, parameters = self.energy, self.scene, self.parameters
-        states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
-        change = energy.dynamics.tangent(states, directions, scene.dt)
-        around, found = energy.surroundings(scene, parameters), []
-        for name in self.names:
-            if name in energy.own:
-                feature = energy.own_features[name]
-                signal, along = signal_and_change(feature, states, controls, change, directions, around)
-                exists = (energy.own_weight(scene, parameters, name) != 0)[..., None]
-                mask = energy.residual_mask(scene, feature, controls.shape[3])
-                exists = exists if mask is None else exists & mask
-                lower, upper = around.bounds[feature.signal]
-                found.append((f"{name}, lower", *_where(exists, lower - signal, -along)))
-                found.append((f"{name}, upper", *_where(exists, signal - upper, along)))
-            else:
-                first, second = pairs(controls.shape[2], controls.device)
-                at, moving = energy.at_pair_steps(states[..., :2]), energy.at_pair_steps(change[..., :2])
-                distance, normal = separation(at[:, :, first], at[:, :, second])
-                closing = (normal * (moving[:, :, :, first] - moving[:, :, :, second])).sum(-1)
-                exists = (energy.pair_weight(scene, parameters, name) != 0)[..., None]
-                exists = exists & energy.pair_exists(scene, energy.pair_features[name], distance.shape[-1])
-                reach = energy.reach(scene, parameters, name)[..., None]
-                found.append((name, *_where(exists, reach - distance, -closing)))
-        return found
-
-    def slope(self, multipliers: Tensor, controls: Tensor) -> Float[Tensor, "B M N K 2"]:
-        """The gradient by the controls of E + sum of lambda h, differentiable."""
-        with torch.enable_grad():
-            leaf = controls if controls.requires_grad else controls.detach().requires_grad_()
-            excess = torch.cat([value.flatten(2) for value in self.excess(leaf).values()], -1)
-            pushing = (multipliers * torch.where(multipliers > 0, excess, 0.0)).sum()
-            value = self.objective(self.scene, self.parameters, leaf).sum() + pushing
-            return torch.autograd.grad(value, leaf, create_graph=True)[0]
-
-    def hessian(self, multipliers: Tensor, controls: Tensor) -> Float[Tensor, "B M n n"]:
-        """The Hessian of E + sum of lambda h, with ones on the diagonal for controls on which nothing depends."""
-        leaf, count = controls.detach().requires_grad_(), controls.shape[2:].numel()
-        slope = self.slope(multipliers, leaf)
-        units = (
-            torch.eye(count, dtype=controls.dtype, device=controls.device)
-            .view(count, 1, 1, *controls.shape[2:])
-            .expand(count, *controls.shape)
-        )
-        rows = torch.autograd.grad(slope, leaf, units, is_grads_batched=True, materialize_grads=True)[0]
-        idle = ~free_controls(self.scene, controls.shape[3]).repeat_interleave(2, -1).flatten(1)[:, None]
-        return rows.flatten(3).movedim(0, 2) + torch.diag_embed(idle.to(controls.dtype))
-
-    def augmented(
-        self, multipliers: Mapping[str, Tensor], penalty: Tensor, controls: Tensor
-    ) -> tuple[FeatureEnergy, Scene, GameParameters]:
-        """The game of a round: its energy is the augmented Lagrangian, but for a constant."""
-        weight = penalty.sqrt()[..., None]
-
-        def weights(given: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            return {
-                name: torch.where(value != 0, weight, 0.0) if name in self.names else value
-                for name, value in given.items()
-            }
-
-        shifts = {name: value / _wide(penalty) for name, value in multipliers.items()}
-        energy = _Shifted(
-            **{one.name: getattr(self.energy, one.name) for one in dataclasses.fields(self.energy)}, shifts=shifts
-        )
-        parameters = dataclasses.replace(
-            self.parameters,
-            own_weights=weights(self.parameters.own_weights),
-            pair_weights=weights(self.parameters.pair_weights),
-            initial_controls=controls,
-        )
-        return energy, self.scene, parameters
-
-
 @dataclass
 class _Rounds:
     """The state of the rounds of a batch, which :meth:`advance` changes.
@@ -365,7 +259,7 @@ class _Rounds:
     """
 
     solver: AugmentedLagrangian
-    game: _Game
+    game: ConstrainedGame
     controls: Tensor
     damping: Tensor
     multipliers: dict[str, Tensor]
@@ -378,7 +272,7 @@ class _Rounds:
     count: Tensor
 
     @classmethod
-    def begin(cls, solver: AugmentedLagrangian, game: _Game, controls: Tensor, initial: Tensor) -> _Rounds:
+    def begin(cls, solver: AugmentedLagrangian, game: ConstrainedGame, controls: Tensor, initial: Tensor) -> _Rounds:
         """The state after the Gauss-Newton steps of the first round; ``initial`` is E [B, M] at the start."""
         multipliers = {name: torch.zeros_like(value) for name, value in game.excess(controls).items()}
         penalty, finite = torch.full_like(initial, solver.penalty), initial.isfinite()
@@ -428,53 +322,6 @@ class _Rounds:
         self.count[rows] += was_open.long()
         self.solved[rows] |= settled & met
         self.open[rows] = was_open & ~(settled & met) & ~hopeless
-
-
-@dataclass(frozen=True)
-class _Shifted(FeatureEnergy):
-    """A feature energy whose limits are moved inwards, for every pair, agent and step.
-
-    Attributes:
-        shifts: by constraint, how far.
-    """
-
-    shifts: Mapping[str, Tensor] = field(default_factory=dict)
-
-    def validate(self, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
-        """Nothing: the game was checked before its limits were moved."""
-
-    def of_scenes(self, rows: Tensor | slice) -> FeatureEnergy:
-        """The energy with the limits of some scenes."""
-        return dataclasses.replace(self, shifts={name: shift[rows] for name, shift in self.shifts.items()})
-
-    @property
-    def bounded_by_kind(self) -> Sequence[str]:
-        return [name.partition("b, ")[0] for name in self.shifts if name.endswith("lower")]
-
-    def _bounds_of(self, scene: Scene) -> Bounds:
-        found = dict(super()._bounds_of(scene))
-        for name in self.bounded_by_kind:
-            lower, upper = found[name]
-            down, up = self.shifts[f"{name}b, lower"], self.shifts[f"{name}b, upper"]
-            upper = upper - up
-            # Of limits that have passed each other, the one with a multiplier counts.
-            lower = torch.where(up > 0, (lower + down).minimum(upper), lower + down)
-            found[name] = lower, upper.maximum(lower)
-        return found
-
-    def reach(self, scene: Scene, parameters: GameParameters, name: str) -> Tensor:
-        reach = super().reach(scene, parameters, name)
-        return reach[..., None] + self.shifts[name] if name in self.shifts else reach
-
-    def extent(self, scene: Scene) -> Tensor | None:
-        extent = super().extent(scene)
-        moved = [self.shifts[name].amax() for name in self.pair if name in self.shifts and self.shifts[name].numel()]
-        return extent if extent is None or not moved else extent + torch.stack(moved).amax() / 2
-
-
-def _where(exists: Tensor, value: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
-    """h and its changes, with -inf and zero where there is no constraint."""
-    return torch.where(exists, value, -torch.inf), torch.where(exists, change, 0.0)
 
 
 def _wide(samples: Shaped[Tensor, "B M"]) -> Shaped[Tensor, "B M 1 1"]:

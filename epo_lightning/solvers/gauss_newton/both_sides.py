@@ -22,9 +22,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from epo_lightning.checks import check_number
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError, register
-from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 

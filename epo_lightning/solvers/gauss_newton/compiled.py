@@ -24,8 +24,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.kernel.interface import (
     MOST_AGENTS,

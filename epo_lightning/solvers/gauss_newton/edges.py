@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.pairs import pairs
-from epo_lightning.scene import GameParameters, Scene
+from epo_lightning.scene import Scene
 
 
 @dataclass(frozen=True)

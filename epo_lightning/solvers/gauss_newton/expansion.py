@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_derivatives import (
     Bounds,
     add_linear_gradient,
@@ -26,7 +27,7 @@ from epo_lightning.game.feature_derivatives import (
 )
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OwnFeature, PairFeature, Source
-from epo_lightning.scene import HEADING, TURN_RATE, GameParameters, Scene
+from epo_lightning.scene import HEADING, TURN_RATE, Scene
 from epo_lightning.solvers.gauss_newton.edges import Edges
 from epo_lightning.solvers.gauss_newton.iterate import Iterate, suffix_sums
 from epo_lightning.solvers.gauss_newton.quadratic_model import (

@@ -20,8 +20,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.compiled import take_steps
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
 

@@ -20,8 +20,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton import compiled
 
 

@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.host import readable
-from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton import compiled, hosted
 from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import choose_backend
@@ -41,8 +42,8 @@ def attach(
         backend: the solver's backend, which computes the derivative as well.
 
     Returns:
-        controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H is not positive definite, so that the controls
-        are no minimum; such a problem has a gradient of zero.
+        controls, and a :class:`~epo_lightning.forecast.Status`: STOPPED where H is not positive definite, so that the
+        controls are no minimum; such a problem has a gradient of zero.
     """
     solve = choose_backend(backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls))
     for compiling in (compiled, hosted):

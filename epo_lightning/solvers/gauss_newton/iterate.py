@@ -20,9 +20,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_derivatives import Surroundings
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import HEADING, SPEED, TURN_RATE, GameParameters, Scene
+from epo_lightning.scene import HEADING, SPEED, TURN_RATE, Scene
 
 
 def suffix_sums(values: Float[Tensor, "*rest K"]) -> Float[Tensor, "*rest K"]:

@@ -20,10 +20,11 @@ import torch
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole, is_number
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
 from epo_lightning.solvers.gauss_newton import adaptive, compiled, fused, hosted, structured
 from epo_lightning.solvers.general import descent

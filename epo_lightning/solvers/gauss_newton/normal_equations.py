@@ -17,6 +17,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import separation
 from epo_lightning.game.feature_derivatives import (
     linear_signal,
@@ -29,7 +30,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OwnFeature, Source
 from epo_lightning.game.game_end import free_controls
 from epo_lightning.game.pairs import pairs
-from epo_lightning.scene import ACCELERATION, GameParameters, Scene
+from epo_lightning.scene import ACCELERATION, Scene
 
 
 def by_channel(values: Shaped[Tensor, "B M N K 2"]) -> Shaped[Tensor, "B M n"]:

@@ -32,9 +32,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.host import readable
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton import blocks
 from epo_lightning.solvers.gauss_newton.edges import Group
 from epo_lightning.solvers.gauss_newton.expansion import expand

@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.energy import RESIDUALS, Energy
 from epo_lightning.game.game_end import free_controls
 from epo_lightning.host import readable
-from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.general import descent
 
 _PRODUCTS = 64
@@ -128,8 +129,8 @@ def attach(
         exact: whether H is the Hessian or its Gauss-Newton approximation.
 
     Returns:
-        controls, and a :class:`~epo_lightning.scene.Status`: STOPPED where H is not positive definite, so that the controls
-        are no minimum; such a sample has a gradient of zero.
+        controls, and a :class:`~epo_lightning.forecast.Status`: STOPPED where H is not positive definite, so that the
+        controls are no minimum; such a sample has a gradient of zero.
     """
     controls = controls.detach()
     if scene.history.dtype != controls.dtype:

@@ -12,9 +12,10 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import Energy
 from epo_lightning.host import readable
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 
 _FAR, _TINY = 1e-3, 1e-6
 """Largest Newton decrement of a minimum: relative to the energy, and absolute."""

@@ -24,10 +24,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole, is_number
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.selection import evaluated
 from epo_lightning.registry import ConfigError, register
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
 from epo_lightning.solvers.general.dense import gradient
 

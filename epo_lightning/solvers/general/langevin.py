@@ -23,9 +23,10 @@ from dataclasses import dataclass
 import torch
 
 from epo_lightning.checks import check_number
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.registry import register
-from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import SAMPLES, Minimiser
 from epo_lightning.solvers.general.gradient_descent import GradientDescent, check_steps, descend
 

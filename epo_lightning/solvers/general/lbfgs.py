@@ -13,9 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.registry import register
-from epo_lightning.scene import GameParameters, Scene, Solution
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.general import descent
 from epo_lightning.solvers.general.dense import gradient

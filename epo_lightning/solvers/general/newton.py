@@ -9,10 +9,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.host import readable
 from epo_lightning.registry import register
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.general import descent
 from epo_lightning.solvers.general.dense import factorise, gradient, hessian

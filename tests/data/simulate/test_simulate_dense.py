@@ -13,11 +13,12 @@ import torch
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.data.simulate import recording, traffic
+from epo_lightning.data.simulate.demand import STYLES, Style
 from epo_lightning.data.simulate.generate import map_path
 from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS
 from epo_lightning.data.simulate.motion import Motion, move
-from epo_lightning.data.simulate.traffic import STYLES, Style, simulate
+from epo_lightning.data.simulate.traffic import simulate
 from epo_lightning.registry import lookup
 
 SEED, RATE = [5, 0], 10

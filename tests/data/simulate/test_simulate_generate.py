@@ -19,8 +19,9 @@ import pytest
 
 from epo_lightning.data import cache
 from epo_lightning.data.simulate import config, generate, make_recordings
+from epo_lightning.data.simulate.demand import STYLES, Style
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
-from epo_lightning.data.simulate.traffic import STYLES, Style, Traffic
+from epo_lightning.data.simulate.traffic import Traffic
 from epo_lightning.registry import ConfigError, lookup
 
 FREE = "8bbdc1b0f23c"

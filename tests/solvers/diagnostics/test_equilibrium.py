@@ -14,12 +14,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
+from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status, Tables
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.pairs import pairs
 from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS, equilibrium_values
-from epo_lightning.scene import GameParameters, JointForecast, Scene, Solution, Status, Tables
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.diagnostics import quasi_newton
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.solvers.gauss_newton import compiled, structured

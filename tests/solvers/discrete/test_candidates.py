@@ -15,10 +15,11 @@ from games import leaves_of, pad, random_game, random_scene, widen
 from torch import Tensor
 
 from epo_lightning import registry
+from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.discrete import assignments, candidates
 from epo_lightning.solvers.discrete.candidates import Enumeration, SumProduct
 

@@ -10,13 +10,15 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
+from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.objectives.imitation import Imitation
 from epo_lightning.registry import ConfigError, build
-from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Implicit
-from epo_lightning.solvers.gauss_newton.augmented_lagrangian import AugmentedLagrangian, _Game
+from epo_lightning.solvers.gauss_newton.augmented_lagrangian import AugmentedLagrangian
+from epo_lightning.solvers.gauss_newton.constrained_game import ConstrainedGame
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 OWN = {"goal": 3.0, "vel": 0.5, "acc": 1.0, "turnr": 1.0, "accb": 5.0}
@@ -71,7 +73,7 @@ def test_the_solution_is_the_one_of_scipy(agents):
     scene, parameters = meeting(agents)
     found = EXACT(ENERGY, scene, parameters)
     assert (found.status == Status.SOLVED).all()
-    game, shape = _Game(ENERGY, EXACT.hard(ENERGY), scene, parameters), parameters.initial_controls.shape
+    game, shape = ConstrainedGame(ENERGY, EXACT.hard(ENERGY), scene, parameters), parameters.initial_controls.shape
 
     def objective(flat):
         leaf = torch.tensor(flat).view(shape).requires_grad_()
@@ -102,7 +104,7 @@ def test_the_solution_is_the_one_of_scipy(agents):
 def test_the_optimality_conditions_hold():
     scene, parameters = meeting(3, steps=10)
     found = EXACT(ENERGY, scene, parameters)
-    game = _Game(ENERGY, EXACT.hard(ENERGY), scene, parameters)
+    game = ConstrainedGame(ENERGY, EXACT.hard(ENERGY), scene, parameters)
     excess = torch.cat([h.flatten(2) for h in game.excess(found.controls).values()], -1)
     multipliers = torch.cat([value.flatten(2) for value in found.constraints.multipliers.values()], -1)
     assert excess.max() <= 1e-8
@@ -122,7 +124,7 @@ def test_the_jacobian_of_the_constraints_is_that_of_automatic_differentiation():
     )
     more = {name: torch.ones(1, 1, 3, dtype=torch.double) for name in ("jerkb", "velb")}
     parameters = dataclasses.replace(parameters, own_weights={**parameters.own_weights, **more})
-    game = _Game(energy, AugmentedLagrangian().hard(energy), scene, parameters)
+    game = ConstrainedGame(energy, AugmentedLagrangian().hard(energy), scene, parameters)
     controls = 0.3 * torch.randn(1, 1, 3, 5, 2, dtype=torch.double, generator=torch.Generator().manual_seed(0))
 
     def values(given):

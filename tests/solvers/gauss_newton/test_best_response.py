@@ -11,9 +11,10 @@ import pytest
 import torch
 from games import random_scene
 
+from epo_lightning.forecast import GameParameters, JointForecast, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, JointForecast, Scene, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.solvers.gauss_newton.best_response import BestResponse
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt

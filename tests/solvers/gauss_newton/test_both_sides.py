@@ -9,9 +9,10 @@ import pytest
 import torch
 from games import leaves_of
 
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Scene, Solution, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.gauss_newton.both_sides import BothSides, _chosen
 

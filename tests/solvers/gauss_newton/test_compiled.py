@@ -19,9 +19,9 @@ import torch
 from backends import BackendSuite, gradients, stacked
 from games import ALL, BOUNDS, leaves_of, nearest_points_held, random_game, random_scene
 
+from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import Status
 from epo_lightning.solvers.gauss_newton import compiled, structured
 from epo_lightning.solvers.gauss_newton.kernel import build, interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt

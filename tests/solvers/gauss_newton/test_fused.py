@@ -10,11 +10,11 @@ import torch
 from backends import STATE_PAIRS, BackendSuite, HostMustNotWait, gradients
 from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 
+from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import PAIR_FEATURES
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import Status
 from epo_lightning.solvers.gauss_newton import fused, structured
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt, choose_backend
 

@@ -11,9 +11,10 @@ from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
-from epo_lightning.scene import GameParameters, JointForecast, Scene
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Implicit, Truncated, Unrolled
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt

@@ -11,9 +11,9 @@ from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_map
 
+from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import Status
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.gauss_newton import compiled, hosted, structured
 from epo_lightning.solvers.gauss_newton.kernel import interface

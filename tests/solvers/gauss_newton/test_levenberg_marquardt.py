@@ -10,9 +10,9 @@ import pytest
 import torch
 from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 
+from epo_lightning.forecast import Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import Status
 from epo_lightning.solvers.backward import Detached, Implicit, Truncated, Unrolled
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 

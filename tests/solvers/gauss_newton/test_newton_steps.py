@@ -11,9 +11,10 @@ from games import ALL, BOUNDS, leaves_of, random_game, random_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Implicit, Unrolled
 from epo_lightning.solvers.gauss_newton import adaptive, compiled, structured
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt

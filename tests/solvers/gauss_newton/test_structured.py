@@ -12,10 +12,11 @@ from games import ALL, BOUNDS, leaves_of, pad, random_game, random_scene, widen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
-from epo_lightning.scene import SPEED, TURN_RATE, Status
+from epo_lightning.scene import SPEED, TURN_RATE
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.gauss_newton import structured
 from epo_lightning.solvers.gauss_newton.expansion import expand

@@ -11,11 +11,11 @@ from convex_games import convex_energy, convex_game, unaware, widen_convex
 from games import leaves_of, normal_equations, pad, random_game, random_scene, widen
 from torch import nn
 
+from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.pairs import pair_mask
-from epo_lightning.scene import Status
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.gauss_newton import implicit
 from epo_lightning.solvers.general import descent

@@ -11,9 +11,9 @@ import yaml
 from games import ALL, BOUNDS, leaves_of, pad, random_game, random_scene, widen
 from torch.testing import assert_close
 
+from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Status
 from epo_lightning.solvers.backward import Truncated
 from epo_lightning.solvers.general.dense import gradient
 from epo_lightning.solvers.general.gradient_descent import GradientDescent

@@ -7,8 +7,8 @@ import dataclasses
 import torch
 from games import ALL, BOUNDS, leaves_of, pad, random_game, random_scene, widen
 
+from epo_lightning.forecast import Status
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.scene import Status
 from epo_lightning.solvers.general.dense import gauss_newton, gradient
 from epo_lightning.solvers.general.gradient_descent import GradientDescent
 from epo_lightning.solvers.general.langevin import Langevin

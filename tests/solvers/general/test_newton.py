@@ -17,10 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from epo_lightning.experiment.config.compose import tree
+from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.convex_energy import FLOOR, ConvexEnergy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import GameParameters, Scene, Status
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.solvers.general.dense import gradient, hessian
 from epo_lightning.solvers.general.lbfgs import LBFGS

@@ -1,7 +1,7 @@
 """Constants of the fused kernels: indices of features and signals in the order of `kernel/interface.py`, and of arrays."""
 
+from epo_lightning.forecast import Status
 from epo_lightning.scene import TURN_RATE as TURN_RATE
-from epo_lightning.scene import Status
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
 
 GOAL, LANE, VELREF, VEL, HEADING, STEER, VELB = (

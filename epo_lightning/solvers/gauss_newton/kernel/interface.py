@@ -9,9 +9,9 @@ from __future__ import annotations
 import ctypes
 import functools
 
+from epo_lightning.forecast import Status
 from epo_lightning.game import circles, vehicles
 from epo_lightning.game.features import SLOWEST_STEERING, WHEELBASE
-from epo_lightning.scene import Status
 from epo_lightning.solvers.gauss_newton.kernel.build import load
 from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, LEAST_RAISED_DAMPING, MOST_DAMPING, RETRIES
 

@@ -1,0 +1,45 @@
+"""Base of the data classes: batches whose tensors are moved and indexed together."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+Some = TypeVar("Some", bound="Batch")
+
+
+class Batch:
+    """A data class of tensors that share their leading dimension B; they are moved and indexed together."""
+
+    def map(self: Some, function: Callable[[Tensor], Tensor]) -> Some:
+        """A copy with ``function`` applied to every tensor, also inside nested mappings, tuples and batches."""
+
+        def visit(value: Any) -> Any:
+            if isinstance(value, Tensor):
+                return function(value)
+            if isinstance(value, Batch):
+                return value.map(function)
+            if isinstance(value, Mapping):
+                return {key: visit(entry) for key, entry in value.items()}
+            if isinstance(value, tuple):
+                return tuple(visit(entry) for entry in value)
+            return value
+
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        return type(self)(**{field.name: visit(getattr(self, field.name)) for field in fields})
+
+    def to(self: Some, target: torch.device | torch.dtype | str) -> Some:
+        """A copy on another device, or with its floating-point tensors in another precision."""
+        if isinstance(target, torch.dtype):
+            return self.map(lambda tensor: tensor.to(target) if tensor.is_floating_point() else tensor)
+        return self.map(lambda tensor: tensor.to(target))
+
+    def __getitem__(self: Some, index: Any) -> Some:
+        """The chosen scenes of the batch; an integer keeps the batch dimension."""
+        if isinstance(index, int):
+            index = [index]
+        return self.map(lambda tensor: tensor[index])

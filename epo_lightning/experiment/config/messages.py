@@ -1,0 +1,136 @@
+"""Hydra's and OmegaConf's errors as one sentence each, with the nearest valid word."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from epo_lightning.experiment.config.sources import options_of
+from epo_lightning.registry import ConfigError, nearest, parts
+
+if TYPE_CHECKING:
+    from hydra._internal.hydra import Hydra
+    from omegaconf import DictConfig
+
+PLUGINS = {
+    "hydra/launcher/joblib": "local",
+    "hydra/launcher/submitit_slurm": "slurm",
+    "hydra/launcher/submitit_local": "slurm",
+    "hydra/launcher/ray": "ray",
+    "hydra/sweeper/optuna": "search",
+}
+"""Options that come with another package, and the extra that installs it."""
+
+
+@contextmanager
+def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterator[None]:
+    """Turn Hydra's and OmegaConf's exceptions into a :class:`ConfigError` that names the nearest valid word."""
+    from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        yield
+    except OverrideParseException as error:
+        raise ConfigError(
+            f"cannot read the override {error.override!r}: write key=value, for example seed=1; "
+            "a value with other than plain letters, digits and ._-/ needs quotes, \"key='value'\""
+        ) from error
+    except MissingConfigException as error:
+        raise ConfigError(_missing_option(instance, error.missing_cfg_file or "", str(error))) from error
+    except (HydraException, OmegaConfBaseException) as error:
+        unknown = re.search(r"Could not (?:override|delete from config\.) +'([\w./@]+)'", str(error))
+        if unknown and "Multiple values" not in str(error):
+            raise ConfigError(_unknown_key(instance, name, unknown.group(1), overrides)) from error
+        raise ConfigError(sentence(error)) from error
+    except ValueError as error:  # Hydra's own, for example debug=null
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(sentence(error)) from error
+
+
+def _missing_option(instance: Hydra, missing: str, message: str) -> str:
+    """The error message for an option without a file, such as ``experiment/rpi/v_lst``; names the options that exist."""
+    if missing.removesuffix(".yaml") in PLUGINS:
+        package = PLUGINS[missing.removesuffix(".yaml")]
+        return (
+            f"{missing.removesuffix('.yaml')} is a plugin that is not installed: pip install 'epo_lightning[{package}]'"
+        )
+    group, _, option = missing.removesuffix(".yaml").partition("/")
+    options = options_of(instance, group) if option else []
+    if not options:
+        return f"unknown configuration {missing!r}: " + " ".join(message.split())
+    return f"unknown option {group}={option}: {_known(option, options)}"
+
+
+def _known(option: str, options: Sequence[str]) -> str:
+    """A hint for an option that does not exist: the nearest one, then the options of its folder or, failing that, all.
+
+    Where options lie in folders, as the rows of all data sets do, the folders stand for them.
+    """
+    folder = option.rpartition("/")[0] + "/"
+    if beside := [name for name in options if name.startswith(folder)]:
+        return nearest(option, beside)
+    shown = {name.partition("/")[0] + "/..." if "/" in name else name for name in options}
+    hint, known, _ = nearest(option, options).partition("known: ")
+    return hint + known + ", ".join(sorted(shown))
+
+
+def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str]) -> str:
+    """The error message for an unknown key: names its first unknown part, the section, and the keys of that section."""
+    from hydra.types import RunMode
+    from omegaconf import DictConfig
+
+    config: Any = None
+    for kept in (_groups(instance, overrides), []):
+        try:
+            config = instance.compose_config(
+                config_name=name, overrides=kept, run_mode=RunMode.RUN, with_log_configuration=False
+            )
+            break
+        except Exception:  # other overrides are wrong as well: try again without any, which is enough to list the keys
+            continue
+    walked: list[str] = []
+    for word in key.replace("/", ".").split("."):
+        names = [str(known) for known in config if known != "hydra"] if isinstance(config, DictConfig) else []
+        if word == "gate" and not walked and "." in key:  # the group's settings are those of the forecaster
+            return f"unknown key {key!r}: with gate=<one of {', '.join(options_of(instance, word))}> it is forecaster.{key}"
+        if walked == ["forecaster"] and word == "gate" and word not in names:
+            choice = f"gate=<one of {', '.join(options_of(instance, word))}>"
+            return f"{key} is a setting of a gate, but no gate is chosen: add {choice}, or leave it out"
+        if word not in names and not walked and (options := options_of(instance, word)):
+            defaults = instance.config_loader.compute_defaults_list(name, overrides=[], run_mode=RunMode.RUN)
+            if word not in defaults.overrides.known_choices:
+                return f"unknown key {key!r} of epo {name}: {word} is a choice of epo train, and a run keeps it"
+            return f"{key} needs a choice of {word}: add {word}=<one of {', '.join(options)}>"
+        if word not in names and len(walked) == 1 and names and word in _arguments(walked[0], config):
+            return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
+        if word not in names:
+            level = f" in {'.'.join(walked)}" if walked else ""
+            return f"unknown key {key!r}{level}: {nearest(word, names)}"
+        walked.append(word)
+        config = config[word]
+    return f"unknown key {key!r}"
+
+
+def _arguments(group: str, section: DictConfig) -> Collection[str]:
+    """Names of the arguments of the part that a section chooses, which its file need not list; empty for other sections."""
+    chosen = parts(group).get(str(section.get("name")))
+    return inspect.signature(chosen).parameters if chosen else ()
+
+
+def _groups(instance: Hydra, overrides: Iterable[str]) -> list[str]:
+    """Only those overrides that choose an option of a group."""
+    groups = set(instance.config_loader.list_groups(""))
+    return [text for text in overrides if text.split("=", 1)[0].split("@")[0].split("/")[0] in groups]
+
+
+def sentence(error: BaseException) -> str:
+    """An exception's message in one line, without OmegaConf's notes for programmers."""
+    texts = [str(error)] + ([str(error.__cause__)] if error.__cause__ else [])
+    lines = [line.strip() for text in texts for line in text.splitlines()]
+    notes = ("object_type=", "reference_type=")
+    kept = [line.replace("full_key:", "key:") for line in lines if line and not line.startswith(notes)]
+    return "; ".join(dict.fromkeys(kept))
