@@ -77,17 +77,26 @@ OF_EXTRAS = [
     "uvicorn",
     "warp",
 ]
-LOOK_UPS = [f"from epo_lightning.registry import parts; assert parts({group!r})" for group in registry._HOMES]
+LOOK_UPS = f"""
+from epo_lightning.registry import parts
+
+for group in {list(registry._HOMES)}:
+    assert parts(group), group
+"""
+LOAD = "import epo_lightning; assert epo_lightning.load('rpi/v_lstm_epo')"
 
 
-@pytest.mark.parametrize(
-    "work", [*LOOK_UPS, "import epo_lightning; assert epo_lightning.load('rpi/v_lstm_epo')", "import warp"]
-)
+def run_without_extras(work: str) -> subprocess.CompletedProcess[str]:
+    program = WITHOUT_EXTRAS.format(packages=OF_EXTRAS, work=work)
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("work", [LOOK_UPS, LOAD], ids=["look-ups", "load"])
 def test_parts_are_found_and_loaded_without_extras(work: str) -> None:
     """Look-ups import whole folders, so no module in them may need a package of an extra at once."""
-    program = WITHOUT_EXTRAS.format(packages=OF_EXTRAS, work=work)
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    if work == "import warp":
-        assert "ModuleNotFoundError: import of warp halted" in done.stderr, "the packages are really missing"
-    else:
-        assert done.returncode == 0, done.stderr
+    done = run_without_extras(work)
+    assert done.returncode == 0, done.stderr
+
+
+def test_extras_are_really_missing_there() -> None:
+    assert "ModuleNotFoundError: import of warp halted" in run_without_extras("import warp").stderr

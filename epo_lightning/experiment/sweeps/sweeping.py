@@ -14,8 +14,8 @@ from epo_lightning.data.cache import CacheError
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config import compose
-from epo_lightning.experiment.config.sources import options_of
 from epo_lightning.experiment.config.settings import Settings, TrainerSettings
+from epo_lightning.experiment.config.sources import options_of
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
 from epo_lightning.experiment.sweeps.watch import news, status, summary
 from epo_lightning.experiment.verbs import check_settings, make_data
