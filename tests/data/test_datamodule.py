@@ -261,7 +261,14 @@ def test_invalid_settings_are_refused(settings, message):
 def test_the_digest_follows_what_a_run_depends_on(tmp_path):
     base = RPIData(root=str(tmp_path)).digest
     assert RPIData(batch_size=64).digest == base
-    for change in ({"seed": 1}, {"games": 5}, {"split": "hard"}, {"targets": "executed"}, {"sizes": None}):
+    for change in (
+        {"seed": 1},
+        {"games": 5},
+        {"split": "hard"},
+        {"targets": "executed"},
+        {"sizes": None},
+        {"recipe": 2},
+    ):
         assert RPIData(**change).digest != base
     folders = {RPIData(targets=targets).folder for targets in ("executed", "sampled", "both")}
     assert len(folders) == 1

@@ -22,7 +22,7 @@ from epo_lightning.data.rpi.report import markdown
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.splits import PAPER_SIZES, assign, games_of
 
-SMALL = {"games": 3, "placements": 2, "seed": 1}
+SMALL = {"games": 3, "placements": 2, "seed": 1, "recipe": 2}
 
 
 @pytest.fixture(scope="module")

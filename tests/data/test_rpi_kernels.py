@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -128,3 +130,18 @@ def test_main_games_place_the_agents_as_documented():
         assert np.radians(30) <= abs(game.phi) <= np.pi
         assert 10 <= game.weight <= 100
         assert game.weight == main_game(0, 3, 0, 38, CONSTANTS).weight
+
+
+@pytest.mark.parametrize("placement", [0, 1, 4])
+def test_the_angle_says_nothing_about_the_weight(placement):
+    games = [main_game(0, number, placement, 5, CONSTANTS) for number in range(400)]
+    weights, angles = ([getattr(game, name) for game in games] for name in ("weight", "phi"))
+    assert abs(np.corrcoef(weights, angles)[0, 1]) < 4 / math.sqrt(len(games))
+    # Angles are uniform within the arc, and those of the first recipe differ in the first placement alone.
+    assert np.ptp(angles) == pytest.approx(np.radians(60), rel=0.02)
+    first = [main_game(0, number, placement, 5, CONSTANTS, recipe=1) for number in range(400)]
+    assert [game.weight for game in first] == weights
+    if placement:
+        assert [game.phi for game in first] == angles
+    else:
+        assert np.corrcoef(weights, [game.phi for game in first])[0, 1] == pytest.approx(1)

@@ -45,7 +45,7 @@ def _rotation(states):
 
 @pytest.fixture(scope="module")
 def records(tmp_path_factory):
-    made = RPIData(root=str(tmp_path_factory.mktemp("rpi")), games=3, placements=2, seed=1)
+    made = RPIData(root=str(tmp_path_factory.mktemp("rpi")), games=3, placements=2, seed=1, recipe=2)
     made.generate(workers=1, progress=False)
     return {split: load_file(made.folder / f"{split}.safetensors") for split in ("train", "val", "test")}
 

@@ -28,6 +28,10 @@ AGENTS = 2
 ROBOT, PEDESTRIAN = range(AGENTS)
 DISC_RADIUS = 0.25
 """Radius of an agent's body [m] (App. "Energy Features")."""
+RECIPE = 2
+"""Version of the method: raised whenever the same configuration would give other records. Version 1 can still be made."""
+FIRST_ANGLE = 1_000_004
+"""Purpose of a random generator: the angle of the first placement."""
 
 
 @dataclass(frozen=True)
@@ -92,19 +96,26 @@ class MainGame:
 
 
 def generator(*key: int) -> np.random.Generator:
-    """Random generator for a purpose, given by a key (seed, game, placement, ...), independent of the order of draws."""
+    """Random generator for a purpose, given by a key (seed, game, placement, ...), independent of the order of draws.
+
+    NumPy ignores zeros at the end of a key, so two purposes must not differ in these alone.
+    """
     return np.random.default_rng(np.random.SeedSequence(list(key)))
 
 
-def main_game(seed: int, game: int, placement: int, placements: int, constants: GameConstants) -> MainGame:
+def main_game(
+    seed: int, game: int, placement: int, placements: int, constants: GameConstants, recipe: int = RECIPE
+) -> MainGame:
     """A main game with both agents at rest: w is drawn once per game, the pedestrian's angle once per placement.
 
     The circle without the sector around the robot is cut into ``placements`` equal arcs; the angle is uniform within the arc
-    of the placement.
+    of the placement. In recipe 1 the angle of the first placement is a function of w.
     """
     weight = float(generator(seed, game).uniform(constants.weight_min, constants.weight_max))
     arc = (2 * math.pi - 2 * constants.sector) / placements
-    jitter = float(generator(seed, game, placement, 0).uniform())
+    # The key of the first placement would be that of w: both end with zeros.
+    purpose = 0 if placement or recipe == 1 else FIRST_ANGLE
+    jitter = float(generator(seed, game, placement, purpose).uniform())
     phi = constants.sector + arc * (placement + jitter)
     phi = math.remainder(phi, 2 * math.pi)
     start, goals = [], []

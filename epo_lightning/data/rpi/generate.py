@@ -27,18 +27,16 @@ from epo_lightning.data.rpi.splits import assign
 from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, MAIN_STARTS, RANDOM_STARTS, Records, play
 from epo_lightning.data.workers import Report, finished
 
-RECIPE = 1
-"""Version of the numerical method: raised whenever the same configuration would give other records."""
 WHOLE = ("modes", "converged", "game", "placement", "executed", "step")
 """Integer fields of a record."""
 DOUBLE = ("cost", "agent_cost", "weight", "phi")
 """Fields in double precision; all others are in single precision."""
 
 
-def pool_config(seed: int, games: int, placements: int, solver: str) -> dict[str, Any]:
+def pool_config(seed: int, games: int, placements: int, solver: str, recipe: int) -> dict[str, Any]:
     """Configuration of a pool: all values that its records depend on."""
     return {
-        "recipe": RECIPE,
+        "recipe": recipe,
         "seed": seed,
         "games": games,
         "placements": placements,
@@ -51,10 +49,12 @@ def pool_config(seed: int, games: int, placements: int, solver: str) -> dict[str
     }
 
 
-def _play(seed: int, game: int, placement: int, placements: int, solver: str) -> tuple[Records, dict[str, int]]:
+def _play(
+    seed: int, game: int, placement: int, placements: int, solver: str, recipe: int
+) -> tuple[Records, dict[str, int]]:
     """Records of one placement of one main game, and the solver's counts."""
     constants = GameConstants()
-    records, counts = play(seed, main_game(seed, game, placement, placements, constants), constants, solver)
+    records, counts = play(seed, main_game(seed, game, placement, placements, constants, recipe), constants, solver)
     return {name: values.astype(_dtype(name)) for name, values in records.items()}, counts
 
 
@@ -131,7 +131,8 @@ def _solve_missing(paths: Sequence[Path], config: Mapping[str, Any], workers: in
     """Solve the main games whose files are missing or broken, and write each when its last placement is solved."""
     name, placements = cache.digest(config), config["placements"]
     missing = [game for game, path in enumerate(paths) if _read_game(path, name) is None]
-    tasks = [(config["seed"], game, p, placements, config["solver"]) for game in missing for p in range(placements)]
+    of_all = (placements, config["solver"], config["recipe"])
+    tasks = [(config["seed"], game, placement, *of_all) for game in missing for placement in range(placements)]
     report = Report(tasks, lambda task: task[1], "game", "solving", "solved", len(paths) - len(missing), progress)
     solved: dict[int, dict[int, tuple[Records, dict[str, int]]]] = {game: {} for game in missing}
     kept = f"finished main games are kept in {paths[0].parent}"

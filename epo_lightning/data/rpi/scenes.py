@@ -14,7 +14,7 @@ from epo_lightning.checks import check_whole
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, epoch_generator
-from epo_lightning.data.rpi.game import GameConstants
+from epo_lightning.data.rpi.game import RECIPE, GameConstants
 from epo_lightning.data.rpi.splits import RULES
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import Scene
@@ -106,6 +106,8 @@ class RPIData(SceneDataModule):
         share: share of the scenes of every split that is used, drawn once.
         games_share: share of the training split's games that is used, drawn once; a game is a start of the pedestrian in a
             main game. Smaller shares are contained in larger ones; validation and test stay whole.
+        recipe: version of the method, 2; or 1, in which the angle of the first placement is a function of w. The default is
+            that of runs that were trained before this was a setting; ``conf/data/rpi.yaml`` has 2.
     """
 
     task = Task(horizon=40, dt=0.1, subsets=SUBSETS)
@@ -124,8 +126,12 @@ class RPIData(SceneDataModule):
         batch_size: int = 32,
         share: float = 1.0,
         games_share: float = 1.0,
+        recipe: int = 1,
     ) -> None:
         super().__init__(batch_size, seed, share)
+        if recipe not in range(1, RECIPE + 1):
+            raise ConfigError(f"data.recipe is {recipe!r}, expected {RECIPE}, or 1 for data of earlier versions")
+        self.recipe = recipe
         if not 0 < games_share <= 1:
             raise ConfigError(
                 f"data.games_share is {games_share}, expected a number in (0, 1]: the share of the training games"
@@ -151,7 +157,7 @@ class RPIData(SceneDataModule):
         """Configuration of the data set: all values that its files depend on."""
         from epo_lightning.data.rpi.generate import pool_config
 
-        pool = pool_config(self.seed, self.games, self.placements, self.solver)
+        pool = pool_config(self.seed, self.games, self.placements, self.solver, self.recipe)
         return {"pool": pool, "split": self.split, "sizes": self.sizes}
 
     @property
@@ -168,7 +174,14 @@ class RPIData(SceneDataModule):
     @property
     def command(self) -> str:
         """The command that makes this data set, for error messages."""
-        defaults = {"seed": 0, "games": 20, "placements": 39, "solver": "potential", "split": "paper"}
+        defaults = {
+            "recipe": RECIPE,
+            "seed": 0,
+            "games": 20,
+            "placements": 39,
+            "solver": "potential",
+            "split": "paper",
+        }
         words = [
             f"data.{name}={getattr(self, name)}" for name, value in defaults.items() if getattr(self, name) != value
         ]
