@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.data.rpi.scenes import RPIData
@@ -28,6 +28,7 @@ class Forecasts:
         both: whether a record has both futures.
         start: positions at t0.
         weight: true weight w of the interaction in the record's game.
+        placement: index of the pedestrian's placement in the record's game.
     """
 
     modes: Float[Tensor, "B M N K 2"]
@@ -35,6 +36,7 @@ class Forecasts:
     both: Bool[Tensor, " B"]
     start: Float[Tensor, "B N 2"]
     weight: Float[Tensor, " B"]
+    placement: Int[Tensor, " B"]
 
 
 @torch.no_grad()
@@ -67,4 +69,5 @@ def forecasts(folder: str) -> Forecasts:
         both=records["modes"][scene.id] == 2,
         start=scene.current[..., :2],
         weight=records["weight"][scene.id],
+        placement=records["placement"][scene.id],
     )

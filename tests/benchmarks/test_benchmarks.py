@@ -35,6 +35,7 @@ from benchmarks import (
     label_noise,
     many_agents,
     passing_sides,
+    placements,
     reading,
     refinement,
     repeat,
@@ -177,7 +178,7 @@ def test_answers_of_the_page_are_timed(capsys, tmp_path, monkeypatch):
 def test_true_games_are_measured(capsys, tmp_path):
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null"]
     assert "epo generate" in refused(true_game.main, *small)
-    generate = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None)
+    generate = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2)
     generate.generate(workers=1, progress=False)
     true_game.main(["--records", "2", *small])
     lines = capsys.readouterr().out.splitlines()[-9:]
@@ -222,7 +223,7 @@ def test_the_side_of_a_future_is_the_turn_of_the_line_of_sight():
 
 def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "callbacks.progress=none"]
-    data = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None)
+    data = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2)
     data.generate(workers=1, progress=False)
     run = train.train(compose("train", ["experiment=rpi/v_lstm_sc", *small, "budget=smoke", f"runs={tmp_path}"])).path
     capsys.readouterr()
@@ -234,6 +235,11 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     true, forecast = (line.removeprefix(str(run)).split() for line in capsys.readouterr().out.splitlines()[1:])
     assert (true[0], forecast[0]) == ("true", "forecast")
     assert float(true[2]) > 0.5, "discs do not touch"
+    placements.main([str(run)])
+    executed, alternative = (line.removeprefix(str(run)).split() for line in capsys.readouterr().out.splitlines()[1:])
+    assert (executed[0], alternative[0]) == ("executed", "alternative")
+    assert float(executed[1]) > 0
+    assert executed[2:] == ["nan", "nan"], "there is one placement"
     assert "no run folder" in refused(passing_sides.main, tmp_path / "nowhere")
     record = run / "run.json"
     record.write_text(record.read_text().replace('"finished"', '"training"'))
@@ -257,7 +263,7 @@ from epo_lightning.scene import SPEED
 
 words = sys.argv[1:]
 root = next(word for word in words if word.startswith("data.root=")).removeprefix("data.root=")
-told, plain = (kind(root=root, games=3, placements=1, sizes=None) for kind in (hidden_weight.ToldRPIData, RPIData))
+told, plain = (kind(root=root, games=3, placements=1, sizes=None, recipe=2) for kind in (hidden_weight.ToldRPIData, RPIData))
 assert told.digest != plain.digest
 for split in ("train", "test"):
     scenes, weights = told.open(split), told.records(split)["weight"].float()
@@ -284,7 +290,7 @@ for row in ("rpi/v_lstm_sc backbone=vibes", "rpi/v_lstm_epo_game", "highway/v_ls
     else:
         raise AssertionError(row)
 try:
-    hidden_weight.ToldRPIData(root=root, games=3, placements=1, sizes=None, games_share=0.5).open("train")
+    hidden_weight.ToldRPIData(root=root, games=3, placements=1, sizes=None, recipe=2, games_share=0.5).open("train")
 except ConfigError as error:
     assert "games_share" in str(error)
 else:
@@ -294,7 +300,7 @@ else:
 
 def test_a_network_is_told_the_weight_of_the_game(tmp_path):
     """In a process of its own, because the program registers a data set and a backbone."""
-    RPIData(root=str(tmp_path), games=3, placements=1, sizes=None).generate(workers=1, progress=False)
+    RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2).generate(workers=1, progress=False)
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "callbacks.progress=none"]
     words = ["experiment=rpi/v_lstm_sc", *small, "budget=smoke", "score=test", f"run_dir={tmp_path / 'run'}"]
     found = subprocess.run([sys.executable, "-c", _TOLD, *words], cwd=ROOT, capture_output=True, text=True)
@@ -304,7 +310,7 @@ def test_a_network_is_told_the_weight_of_the_game(tmp_path):
 
 def test_a_run_of_a_results_file_is_trained_again(capsys, tmp_path):
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "callbacks.progress=none"]
-    RPIData(root=str(tmp_path), games=3, placements=1, sizes=None).generate(workers=1, progress=False)
+    RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2).generate(workers=1, progress=False)
     for row in ("v_lstm", "v_lstm_epo"):
         words = [f"experiment=rpi/{row}", *small, "budget=smoke", "score=test", f"runs={tmp_path / 'runs'}"]
         train.train(compose("train", words))
@@ -352,7 +358,7 @@ def test_one_run_of_every_commit_is_chosen():
 
 @pytest.mark.slow
 def test_the_code_of_a_commit_trains_like_the_code_at_hand(capsys, tmp_path):
-    RPIData(root=str(tmp_path), games=3, placements=1, sizes=None).generate(workers=1, progress=False)
+    RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2).generate(workers=1, progress=False)
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "budget=smoke"]
     cli.main(["train", "experiment=rpi/v_lstm_epo", *small, "score=test", f"run_dir={tmp_path / 'run'}"])
     run, file = RunFolder(tmp_path / "run"), tmp_path / "small.json"
@@ -389,7 +395,7 @@ def test_smallest_distances_are_ranked_against_the_weight():
 
 @pytest.mark.slow
 def test_modes_of_records_are_drawn_with_their_energies(capsys, tmp_path):
-    data = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None)
+    data = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2)
     data.generate(workers=1, progress=False)
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "budget=smoke"]
     run = train.train(compose("train", ["experiment=rpi/v_lstm_epo", *small, f"runs={tmp_path}"])).path

@@ -237,11 +237,11 @@ class RPIData(SceneDataModule):
         return RPIDataset(records, self.targets, self.seed)
 
     def records(self, split: str) -> dict[str, Tensor]:
-        """The records of a split [R, ...] with their modes and the weight w of their game.
+        """The records of a split [R, ...] with their modes, and the weight w and the placement of their game.
 
         ``Scene.id`` holds indices of records.
 
         Raises:
             cache.CacheError: as :meth:`open`.
         """
-        return cache.load(self.folder, split, ("states", "modes", "weight"), self.command, self.config)
+        return cache.load(self.folder, split, ("states", "modes", "weight", "placement"), self.command, self.config)
