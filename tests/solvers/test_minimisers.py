@@ -35,7 +35,7 @@ class TestAugmentedLagrangian(SolverSuite):
     """At its solutions the gradient of the Lagrangian vanishes, and not that of the energy, which may rise where a
     constraint is met (`gauss_newton/test_augmented_lagrangian.py`)."""
 
-    config = {"name": "augmented_lagrangian"}
+    config = {"name": "augmented_lagrangian", "rounds": 12}
     test_a_solution_is_consistent_and_has_less_energy_than_its_start = None
     test_the_gradient_vanishes_at_converged_solutions = None
 
