@@ -88,6 +88,12 @@ def command(saved: SavedRun, steps: int, overrides: Sequence[str]) -> list[str]:
     return [*words, *limits, *overrides]
 
 
+def settings_since(saved: SavedRun) -> list[str]:
+    """Settings that did not exist when a run was trained, with the values that stand for the code of then."""
+    data = saved.settings["data"]
+    return ["data.recipe=1"] if data["name"] == "rpi" and "recipe" not in data else []
+
+
 def setting(word: str) -> str:
     """The name of the setting that an override changes."""
     return word.lstrip("+").partition("=")[0]
@@ -151,7 +157,7 @@ def compared(saved: SavedRun, out: Path, steps: int, overrides: Sequence[str]) -
     then, now = RunFolder(out / f"{code.name[:7]}-{name}"), out / f"now-{name}"
     if not then.finished:
         then = trained(code, then.path, words)
-    again = trained(ROOT, now, words)
+    again = trained(ROOT, now, [*words, *settings_since(saved)])
     check(saved, again)
     return distance(then.log(), again.log())
 

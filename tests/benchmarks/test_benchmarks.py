@@ -352,6 +352,9 @@ def test_one_run_of_every_commit_is_chosen():
     found = commits.one_of_every_commit(runs)
     assert len({run.record["git_commit"] for run in found}) == len(found) == 2
     assert all(run.settings["forecaster"]["name"] == "epo" for run in found)
+    assert all(commits.settings_since(run) == [] for run in found)
+    on_rpi = repeat.trained_runs(str(ROOT / "results/rpi_equilibrium.json"))
+    assert all(commits.settings_since(run) == ["data.recipe=1"] for run in on_rpi)
     with pytest.raises(ConfigError, match="no run was trained"):
         repeat.trained_runs(str(ROOT / "results/runtime.json"))
 
