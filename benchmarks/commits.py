@@ -89,7 +89,7 @@ def command(saved: SavedRun, steps: int, overrides: Sequence[str]) -> list[str]:
 
 
 def settings_since(saved: SavedRun) -> list[str]:
-    """Settings that did not exist when a run was trained, with the values that stand for the code of then."""
+    """Settings that did not exist when a run was trained, with the values that make today's code do the same."""
     data = saved.settings["data"]
     return ["data.recipe=1"] if data["name"] == "rpi" and "recipe" not in data else []
 

@@ -1,11 +1,12 @@
 """Errors on RPI by the placement of the pedestrian: does a forecaster do better where the placement tells w?
 
     python -m benchmarks.placements runs/rpi/v_lstm_sc_relaxed/reduced-s0 runs/rpi/v_lstm_epo_relaxed/reduced-s0
+    python -m benchmarks.placements --split train runs/rpi/v_lstm_sc_relaxed/reduced-s0
 
 In data of recipe 1 (docs/rpi.md) the angle of the first placement is a function of the weight w of the interaction. The last
-placement is the mirror image of the first one, so without such knowledge both are equally difficult. Printed are SFDEs [m]
-on the test split, for executed and alternative futures: distances of the last positions to those of the closest joint mode,
-as means over agents and records. Nothing is written.
+placement is the mirror image of the first one: its angles are drawn from the mirrored arc, so without such knowledge both
+are about equally difficult. Printed are SFDEs [m] of a split, for executed and alternative futures: distances of the last
+positions to those of the closest joint mode, as means over agents and records. Nothing is written.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from collections.abc import Sequence
 
 import torch
 
-from benchmarks.rpi_runs import forecasts
+from benchmarks.rpi_runs import Forecasts, forecasts
+from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.rpi.scenes import SUBSETS
 from epo_lightning.experiment import assembly
 from epo_lightning.registry import ConfigError
@@ -23,14 +25,9 @@ from epo_lightning.registry import ConfigError
 PLACES = ("first", "mirrored", "others")
 
 
-def errors(folder: str) -> dict[str, list[float]]:
-    """SFDE [m] of a run by side, in the first placement, its mirror image and the others; NaN where there is no record.
-
-    Raises:
-        ConfigError: no finished run on RPI, or its data is missing or has changed.
-    """
-    found = forecasts(folder)
-    first, last = found.placement == 0, found.placement == found.placement.max()
+def errors(found: Forecasts) -> dict[str, list[float]]:
+    """SFDE [m] by side, in the first placement, its mirror image and the others; NaN where there is no record."""
+    first, last = found.placement == 0, found.placement == found.placements - 1
     result = {}
     for side, name in enumerate(SUBSETS):
         missed = (found.modes[:, :, :, -1] - found.futures[:, None, side, :, -1]).norm(dim=-1).mean(2).amin(1)
@@ -47,6 +44,7 @@ def main(given: Sequence[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("runs", nargs="+", help="folders of finished runs on RPI")
+    parser.add_argument("--split", choices=SPLITS, default="test", help="which records")
     arguments = parser.parse_args(given)
     torch.set_num_threads(1)
     assembly.quiet()
@@ -54,7 +52,7 @@ def main(given: Sequence[str] | None = None) -> None:
     print(f"{'run':<{width}}{'futures':<13}" + "".join(f"{place:>10}" for place in PLACES))
     try:
         for folder in arguments.runs:
-            for name, row in errors(folder).items():
+            for name, row in errors(forecasts(folder, arguments.split)).items():
                 print(f"{folder:<{width}}{name:<13}" + "".join(f"{value:>10.4f}" for value in row))
     except ConfigError as error:
         raise SystemExit(f"placements: {error}") from None

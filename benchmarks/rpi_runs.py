@@ -1,4 +1,4 @@
-"""Forecasts of trained runs for the test records of RPI, whose equilibria and true weights are known."""
+"""Forecasts of trained runs for the records of RPI, whose equilibria and true weights are known."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BATCH = 1024
 
 @dataclass(frozen=True)
 class Forecasts:
-    """Forecasts of one run for all records of the test split, as positions [m].
+    """Forecasts of one run for all records of a split, as positions [m].
 
     Attributes:
         modes: joint modes of the forecast.
@@ -29,6 +29,7 @@ class Forecasts:
         start: positions at t0.
         weight: true weight w of the interaction in the record's game.
         placement: index of the pedestrian's placement in the record's game.
+        placements: number of placements of every game.
     """
 
     modes: Float[Tensor, "B M N K 2"]
@@ -37,11 +38,12 @@ class Forecasts:
     start: Float[Tensor, "B N 2"]
     weight: Float[Tensor, " B"]
     placement: Int[Tensor, " B"]
+    placements: int
 
 
 @torch.no_grad()
-def forecasts(folder: str) -> Forecasts:
-    """The forecasts of a finished run.
+def forecasts(folder: str, split: str = "test") -> Forecasts:
+    """The forecasts of a finished run for a split of its data.
 
     Raises:
         ConfigError: no finished run on RPI, one whose targets are sampled, or its data is missing or has changed.
@@ -60,7 +62,7 @@ def forecasts(folder: str) -> Forecasts:
     forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
     data = open_data(run, settings)
     assert isinstance(data, RPIData)
-    scenes, records = data.open("test"), data.records("test")
+    scenes, records = data.open(split), data.records(split)
     scene = scenes[(scenes.mode == 0).nonzero().flatten()]  # type: ignore[attr-defined]
     chunks = torch.arange(len(scene.history)).split(BATCH)
     return Forecasts(
@@ -70,4 +72,5 @@ def forecasts(folder: str) -> Forecasts:
         start=scene.current[..., :2],
         weight=records["weight"][scene.id],
         placement=records["placement"][scene.id],
+        placements=data.placements,
     )

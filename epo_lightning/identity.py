@@ -42,7 +42,8 @@ ELSEWHERE = (
 )
 """Keys of those sections that do not decide on the result: folders of data, the machine, logging and progress."""
 
-
+LATER = {"data.recipe": 1}
+"""Settings that did not exist when the first runs were recorded, with the value that has the meaning of their absence."""
 SHARES = ("trainer.limit_train_batches", "trainer.limit_val_batches")
 """Keys for which 1 and 1.0 differ: 1 is a number of batches, and 1.0 is a share of all batches."""
 
@@ -55,12 +56,16 @@ def essence(config: Mapping[str, Any]) -> dict[str, Any]:
 def _plain(value: Any, where: str) -> Any:
     if isinstance(value, Mapping):
         entries = {str(key): (f"{where}.{key}", entry) for key, entry in value.items()}
-        return {key: _plain(entry, place) for key, (place, entry) in entries.items() if place not in ELSEWHERE}
+        return {key: _plain(entry, place) for key, (place, entry) in entries.items() if _decides(place, entry)}
     if isinstance(value, list | tuple):
         return [_plain(entry, where) for entry in value]
     if isinstance(value, float) and where in SHARES:
         return f"{value!r} of all"
     return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _decides(place: str, entry: Any) -> bool:
+    return place not in ELSEWHERE and (place not in LATER or entry != LATER[place])
 
 
 def identity(config: Mapping[str, Any], data_digest: str) -> str:

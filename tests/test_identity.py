@@ -73,6 +73,13 @@ def test_rows_are_runs_without_their_seed() -> None:
     assert row_identity(other, "d") == row_identity(CONFIG, "d")
 
 
+def test_a_setting_that_runs_did_not_have_yet_leaves_their_identity() -> None:
+    before = copy.deepcopy(CONFIG)
+    del before["data"]["recipe"]
+    assert identity(before, "d") == identity(changed("data.recipe", 1), "d") != identity(CONFIG, "d")
+    assert differences(before, changed("data.recipe", 1)) == []
+
+
 def test_data_enters_the_identity_by_its_digest() -> None:
     assert identity(CONFIG, "one") != identity(CONFIG, "other")
     assert len(identity(CONFIG, "one")) == 16

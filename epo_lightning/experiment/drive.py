@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from epo_lightning.data.cache import digest, file_digest
+from epo_lightning.data.rpi.game import RECIPE
 from epo_lightning.drive.driven import Driven
 from epo_lightning.drive.episodes import play, times
 from epo_lightning.drive.film import film
@@ -79,9 +80,10 @@ def folder_of(settings: DriveSettings) -> Path:
 
 
 def _deciding(settings: DriveSettings) -> dict[str, Any]:
-    """The settings that decide on the episodes, as plain values."""
+    """The settings that decide on the episodes, as plain values, with the version of the method that draws games of RPI."""
     plain = json.loads(json.dumps(dataclasses.asdict(settings)))
-    return {name: value for name, value in plain.items() if name not in ("out", "timed", "film")}
+    drawn = {"recipe": RECIPE} if settings.world == "rpi" else {}
+    return {name: value for name, value in plain.items() if name not in ("out", "timed", "film")} | drawn
 
 
 def _compare(

@@ -149,7 +149,7 @@ def keys_of(overrides: Sequence[str]) -> set[str]:
 def follow(
     section: Mapping[str, Any], of_run: Settings, task: Task, given: Collection[str] = ()
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Settings of other data with the windows of a run, and statements about what was changed.
+    """Settings of other data with the windows of a run, or RPI's recipe, and statements about what was changed.
 
     The time between two windows stays that of the data, and so the moments of its windows lie on its own clock where the
     run's time step divides it.
@@ -158,6 +158,10 @@ def follow(
         ConfigError: a key that the user has set contradicts the run.
     """
     section = {**section}
+    if section["name"] == of_run.data["name"] == "rpi" and "data.recipe" not in given:
+        own, theirs = (part.get("recipe", 1) for part in (of_run.data, section))
+        notes = () if own == theirs else (f"data.recipe={own} instead of {theirs}, as the run",)
+        return {**section, "recipe": own}, notes
     if "windows" not in section:
         return section, ()
     own = assembly.build_data(of_run.data)

@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, NullLoc
 
 from epo_lightning.identity import essence
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.paper import STEPS, is_papers, without_players
+from epo_lightning.report.paper import STEPS, is_papers, papers_name
 from epo_lightning.report.records import Records
 from epo_lightning.report.rows import Row
 from epo_lightning.report.style import MODES, VEHICLES, style
@@ -195,7 +195,7 @@ def steps_curves(rows: Iterable[Row]) -> list[StepsCurve]:
                 optimised=Curve.over_seeds(first.name, solved),
                 initial=Curve.over_seeds(first.name, initial) if initial else None,
                 seeds=tuple(len(group) for group in runs.values()),
-                paper=(without_players(first.runs[0].data), first.runs[0].backbone) == ("rpi", "v_lstm")
+                paper=(papers_name(first.runs[0].data), first.runs[0].backbone) == ("rpi", "v_lstm")
                 and is_papers("epo", first.runs[0].config),
             )
         )

@@ -90,9 +90,9 @@ def interacts(config: Mapping[str, Any]) -> bool:
     return (config.get("energy") or {}).get("pair") != []
 
 
-def without_players(data: str) -> str:
-    """A data set's name without the kind of RPI's players, since the paper has one."""
-    return re.sub(r", \S+ players$", "", data)
+def papers_name(data: str) -> str:
+    """A data set's name without the recipe and the kind of RPI's players, since the paper has one of each."""
+    return re.sub(r"(, recipe \d+)?(, \S+ players)?$", "", data)
 
 
 def paper_values(
@@ -107,13 +107,13 @@ def paper_values(
     """The paper's values of a row by metric; empty where the paper has none, as it gives known goals to the energy only.
 
     Args:
-        data: name of the data set (:func:`.runs.data_name`); the paper's values are shown beside any kind of RPI's players.
+        data: name of the data set (:func:`.runs.data_name`); the paper's values are shown beside any recipe and players.
         split: ``test`` for the tables, ``val`` for the figure over S.
         steps: the solver's steps S; None for a forecaster without a solver.
     """
     if goal != "energy":
         return {}
-    data = without_players(data)
+    data = papers_name(data)
     if split == "val":
         return STEPS.get(steps or 0, {}) if (data, backbone, forecaster) == ("rpi", "v_lstm", "epo") else {}
     if split != "test" or (forecaster == "epo" and steps not in (None, TABLE_STEPS)):

@@ -43,6 +43,7 @@ from benchmarks import (
     training_step,
     true_game,
 )
+from benchmarks.rpi_runs import Forecasts
 from epo_lightning import cli
 from epo_lightning.data.recorded.formats.argoverse2 import argoverse2
 from epo_lightning.data.recorded.windows import WindowConfig, extract
@@ -221,6 +222,23 @@ def test_the_side_of_a_future_is_the_turn_of_the_line_of_sight():
     assert passing_sides.turns_left(pairs).tolist() == [True, False]
 
 
+def test_errors_are_split_by_placement_and_side():
+    """One agent and step, three placements: errors are 1, 2 and 4 m on the executed side, ten times as much on the other."""
+    at = torch.tensor([1.0, 2.0, 4.0, 100.0])
+    futures = torch.stack((at, 10.0 * at), 1)[:, :, None, None, None] * torch.tensor([1.0, 0.0])
+    modes = torch.stack((torch.zeros(4), torch.full((4,), 1e6)), 1)[:, :, None, None, None] * torch.ones(2)
+    found = Forecasts(
+        modes=modes,
+        futures=futures,
+        both=torch.tensor([True, True, True, False]),
+        start=torch.zeros(4, 1, 2),
+        weight=torch.ones(4),
+        placement=torch.tensor([0, 1, 2, 1]),
+        placements=3,
+    )
+    assert placements.errors(found) == {"executed": [1.0, 4.0, 51.0], "alternative": [10.0, 40.0, 20.0]}
+
+
 def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "callbacks.progress=none"]
     data = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2)
@@ -235,7 +253,7 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     true, forecast = (line.removeprefix(str(run)).split() for line in capsys.readouterr().out.splitlines()[1:])
     assert (true[0], forecast[0]) == ("true", "forecast")
     assert float(true[2]) > 0.5, "discs do not touch"
-    placements.main([str(run)])
+    placements.main([str(run), "--split", "train"])
     executed, alternative = (line.removeprefix(str(run)).split() for line in capsys.readouterr().out.splitlines()[1:])
     assert (executed[0], alternative[0]) == ("executed", "alternative")
     assert float(executed[1]) > 0

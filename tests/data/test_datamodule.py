@@ -251,11 +251,22 @@ def test_a_batch_that_ranks_cannot_share_evenly_is_refused(monkeypatch):
         ({"targets": "sample"}, "did you mean 'sampled'"),
         ({"solver": "potentail"}, "did you mean 'potential'"),
         ({"plcements": 3}, r"unknown key data\.plcements"),
+        ({"recipe": 3}, r"data\.recipe is 3, expected 2, or 1 for data of earlier versions"),
+        ({"recipe": 2.0}, r"data\.recipe must be a whole number, 1 or more, not 2\.0"),
+        ({"recipe": True}, r"data\.recipe must be a whole number, 1 or more, not True"),
     ],
 )
 def test_invalid_settings_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         build("data", {"name": "rpi", **settings})
+
+
+def test_data_of_earlier_versions_keep_their_digest_and_command():
+    earlier = RPIData(split="hard", placements=8)
+    assert earlier.digest == "a90b8d2bfafc6f96"
+    assert earlier.command == "epo generate data=rpi data.recipe=1 data.placements=8 data.split=hard"
+    today = RPIData(split="hard", placements=8, recipe=2)
+    assert today.command == "epo generate data=rpi data.placements=8 data.split=hard"
 
 
 def test_the_digest_follows_what_a_run_depends_on(tmp_path):

@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -193,6 +194,17 @@ def test_recordings_of_another_rate_are_read_at_the_runs(trained: Path) -> None:
     assert "data.windows.agents=8, unlike the run's 4" in notes
     assert (given["agents"], given["least_agents"], given["every"]) == (8, 6, 2)
     assert follow({"name": "drawn"}, settings, task) == ({"name": "drawn"}, ())
+
+
+def test_games_of_a_run_of_before_have_its_recipe():
+    settings = read(Settings, compose("train", ["experiment=rpi/v_lstm_epo"]))
+    section, task = dict(settings.data), build_data(settings.data).task
+    earlier = replace(settings, data={name: value for name, value in settings.data.items() if name != "recipe"})
+    assert follow(section, settings, task) == (section, ())
+    followed, notes = follow(section, earlier, task)
+    assert followed == {**section, "recipe": 1}
+    assert notes == ("data.recipe=1 instead of 2, as the run",)
+    assert follow(section, earlier, task, {"data.recipe"}) == (section, ())
 
 
 def test_what_does_not_fit_is_refused_with_a_reason(

@@ -19,6 +19,7 @@ from rich.console import Console
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, write_report
+from epo_lightning.report.paper import papers_name
 from epo_lightning.report.render import legend
 from epo_lightning.report.rows import Cell, Row
 from epo_lightning.report.runs import collect, data_name, find_runs
@@ -62,6 +63,10 @@ def test_players_of_another_kind_are_another_data_set_beside_the_same_values_of_
     assert set(tables) == {"rpi", "rpi, feedback players"}
     assert [table.rows[0].cells["overlap_jfp"].paper for table in tables.values()] == [0.006, 0.006]
     assert data_name({"name": "rpi", "solver": None, "split": "hard"}) == "rpi_hard"
+    second = data_name({"name": "rpi", "solver": "feedback", "recipe": 2})
+    assert second == "rpi, recipe 2, feedback players"
+    assert papers_name(second) == papers_name("rpi, recipe 2") == papers_name("rpi, feedback players") == "rpi"
+    assert data_name({"name": "rpi", "recipe": 1}) == papers_name("rpi") == "rpi"
 
 
 def test_rows_that_the_paper_does_not_have_follow_in_the_order_of_the_runs(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ DISC_RADIUS = 0.25
 RECIPE = 2
 """Version of the method: raised whenever the same configuration would give other records. Version 1 can still be made."""
 FIRST_ANGLE = 1_000_004
-"""Purpose of a random generator: the angle of the first placement."""
+"""Last number of the generator's key for the angle of the first placement."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class MainGame:
 def generator(*key: int) -> np.random.Generator:
     """Random generator for a purpose, given by a key (seed, game, placement, ...), independent of the order of draws.
 
-    NumPy ignores zeros at the end of a key, so two purposes must not differ in these alone.
+    NumPy ignores zeros at the end of a key, so the keys of two purposes must not differ only in such zeros.
     """
     return np.random.default_rng(np.random.SeedSequence(list(key)))
 

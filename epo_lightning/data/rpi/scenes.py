@@ -129,8 +129,9 @@ class RPIData(SceneDataModule):
         recipe: int = 1,
     ) -> None:
         super().__init__(batch_size, seed, share)
-        if recipe not in range(1, RECIPE + 1):
-            raise ConfigError(f"data.recipe is {recipe!r}, expected {RECIPE}, or 1 for data of earlier versions")
+        check_whole("data.recipe", recipe)
+        if recipe > RECIPE:
+            raise ConfigError(f"data.recipe is {recipe}, expected {RECIPE}, or 1 for data of earlier versions")
         self.recipe = recipe
         if not 0 < games_share <= 1:
             raise ConfigError(

@@ -54,7 +54,13 @@ def _xml(path: Path, tag: str, children: Iterable[tuple[str, dict[str, Any]]]) -
 
 
 def write_network(layout: Layout, edges: list[Edge], programs: Path, folder: Path) -> Path:
-    """Path of SUMO's network of a layout. Edges are straight; vehicles pass from the end of one to the start of the next."""
+    """Write SUMO's network of a layout, and return its path.
+
+    Edges are straight; vehicles pass from the end of one to the start of the next.
+
+    Raises:
+        ConfigError: SUMO refuses it.
+    """
     height = {road: -50.0 * row for row, road in enumerate(dict.fromkeys(edge.road for edge in edges))}
     height["main"] = 0.0
 

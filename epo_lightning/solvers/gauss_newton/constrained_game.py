@@ -27,9 +27,9 @@ class ConstrainedGame:
     """The games of a batch with hard constraints h(u) <= 0.
 
     Attributes:
-        energy: with the features that are constraints.
-        names: those features.
-        scene, parameters: the games.
+        energy: features of E, and those that are constraints.
+        names: names of the latter.
+        scene, parameters: the games. A constraint holds where the weight of its feature is not zero.
     """
 
     energy: FeatureEnergy
