@@ -159,9 +159,7 @@ def follow(
     """
     section = {**section}
     if section["name"] == of_run.data["name"] == "rpi" and "data.recipe" not in given:
-        own, theirs = (part.get("recipe", 1) for part in (of_run.data, section))
-        notes = () if own == theirs else (f"data.recipe={own} instead of {theirs}, as the run",)
-        return {**section, "recipe": own}, notes
+        return _with_recipe(section, of_run.data.get("recipe", 1))
     if "windows" not in section:
         return section, ()
     own = assembly.build_data(of_run.data)
@@ -198,6 +196,13 @@ def follow(
     if "frame" in section and "frame" in of_run.data and "data.frame" not in given:
         section["frame"] = of_run.data["frame"]
     return section, tuple(notes)
+
+
+def _with_recipe(section: Mapping[str, Any], recipe: int) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """RPI's data by the recipe of a run, and a statement if that of the section is another one."""
+    theirs = section.get("recipe", 1)
+    notes = (f"data.recipe={recipe} instead of {theirs}, as the run",) if recipe != theirs else ()
+    return {**section, "recipe": recipe}, notes
 
 
 def check_fits(forecaster: Forecaster, data: Any, name: str) -> None:
