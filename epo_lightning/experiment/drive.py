@@ -80,7 +80,7 @@ def folder_of(settings: DriveSettings) -> Path:
 
 
 def _deciding(settings: DriveSettings) -> dict[str, Any]:
-    """The settings that decide on the episodes, as plain values, with the version of the method that draws games of RPI."""
+    """The settings that decide on the episodes, as plain values; for RPI also the version by which its games are drawn."""
     plain = json.loads(json.dumps(dataclasses.asdict(settings)))
     drawn = {"recipe": RECIPE} if settings.world == "rpi" else {}
     return {name: value for name, value in plain.items() if name not in ("out", "timed", "film")} | drawn

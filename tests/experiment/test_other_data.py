@@ -196,7 +196,7 @@ def test_recordings_of_another_rate_are_read_at_the_runs(trained: Path) -> None:
     assert follow({"name": "drawn"}, settings, task) == ({"name": "drawn"}, ())
 
 
-def test_games_of_a_run_of_before_have_its_recipe():
+def test_games_for_an_earlier_run_are_of_its_recipe():
     settings = read(Settings, compose("train", ["experiment=rpi/v_lstm_epo"]))
     section, task = dict(settings.data), build_data(settings.data).task
     earlier = replace(settings, data={name: value for name, value in settings.data.items() if name != "recipe"})

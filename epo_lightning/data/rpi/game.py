@@ -113,7 +113,7 @@ def main_game(
     """
     weight = float(generator(seed, game).uniform(constants.weight_min, constants.weight_max))
     arc = (2 * math.pi - 2 * constants.sector) / placements
-    # The key of the first placement would be that of w: both end with zeros.
+    # With zero, the key of the first placement would be that of w, as in recipe 1.
     purpose = 0 if placement or recipe == 1 else FIRST_ANGLE
     jitter = float(generator(seed, game, placement, purpose).uniform())
     phi = constants.sector + arc * (placement + jitter)
