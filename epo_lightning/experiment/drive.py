@@ -18,7 +18,7 @@ from epo_lightning.data.rpi.game import RECIPE
 from epo_lightning.drive.driven import Driven
 from epo_lightning.drive.episodes import play, times
 from epo_lightning.drive.film import film
-from epo_lightning.drive.measures import UNITS, Estimate, differences, estimate, estimates, measure
+from epo_lightning.drive.measures import UNITS, Estimate, differences, estimates, measure
 from epo_lightning.drive.planners import ForecastPlanner, GamePlanner, Planner, ResponsePlanner
 from epo_lightning.drive.progress import Progress
 from epo_lightning.drive.world import World
@@ -29,6 +29,7 @@ from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.experiment.provenance import commit
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.report.closed_loop import SHARE, measures_table, times_table
 from epo_lightning.run_folder import RunFolder, write_file, write_json
 
 ROUNDS = 3
@@ -108,11 +109,11 @@ def _compare(
             made = {name: make(world) for name, make in planners.items()}
             _drive(world, kind, made, driven, tell)
             measured, rates = driven.measured(kind, planners), driven.rates(kind)
-            results["worlds"][kind] = _results(measured, rates)
-            tables.append(_table(kind, measured, rates))
+            results["worlds"][kind] = world_results = _results(measured, rates)
+            tables.append(f"### others: {kind}\n\n{_table(world_results)}\n")
             if settings.timed and (milliseconds := _milliseconds(world, kind, made, settings.timed, tell)):
                 results["milliseconds"][kind] = milliseconds
-                tables.append(_times_table(milliseconds))
+                tables.append(f"### milliseconds of a plan, one scene and one thread\n\n{times_table(milliseconds)}\n")
             if settings.film is not None:
                 tell(f"{kind:8} draws a film of episode {settings.film}")
                 played = {
@@ -244,12 +245,20 @@ def _baseline(name: str) -> Make:
 
 
 def _results(measured: Mapping[str, Mapping[str, Tensor]], rates: Collection[str]) -> dict[str, Any]:
-    """Estimates of all planners, and paired differences of the first from the others."""
+    """Estimates of all planners, paired differences of the first from the others, and units."""
     first, *others = measured
+    units = {**dict.fromkeys(rates, SHARE), **UNITS}
     return {
         "planners": {name: _plain(estimates(values, rates)) for name, values in measured.items()},
         "differences": {f"{first} - {name}": _plain(differences(measured[first], measured[name])) for name in others},
+        "units": {name: units[name] for name in measured[first] if name in units},
     }
+
+
+def _table(results: Mapping[str, Any]) -> str:
+    """Table of all planners and measures."""
+    measures = list(next(iter(results["planners"].values())))
+    return measures_table(results["planners"], results["units"], measures)
 
 
 def _plain(values: Mapping[str, Estimate]) -> dict[str, dict[str, float]]:
@@ -260,24 +269,6 @@ def _heading(settings: DriveSettings, code: str | None) -> str:
     """Heading of the tables: the world, the runs, the number of episodes and their seed, and the code."""
     of = f"{settings.episodes} episodes of seed {settings.seed}, runs {', '.join(settings.run)}"
     return f"world={settings.world}, {of}, checkpoint {settings.checkpoint}, commit {code or 'unknown'}\n"
-
-
-def _table(kind: str, measured: Mapping[str, Mapping[str, Tensor]], rates: Collection[str]) -> str:
-    names = list(next(iter(measured.values())))
-    units = {**dict.fromkeys(rates, "%"), **UNITS}
-    heads = [f"{name.replace('_', ' ')}{f' [{units[name]}]' if name in units else ''}" for name in names]
-    lines = [f"### others: {kind}", "", "| planner | " + " | ".join(heads) + " |", "|:--|" + "--:|" * len(names)]
-    for planner, values in measured.items():
-        cells = [_cell(estimate(values[name], name in rates), name in rates) for name in names]
-        lines.append(f"| {planner} | " + " | ".join(cells) + " |")
-    return "\n".join([*lines, ""])
-
-
-def _cell(value: Estimate, rate: bool) -> str:
-    if rate:
-        return f"{100 * value.mean:.1f} ({100 * value.low:.1f} to {100 * value.high:.1f})"
-    digits = 0 if abs(value.mean) >= 100 else 2 if abs(value.mean) >= 0.2 else 3
-    return f"{value.mean:.{digits}f} ({value.low:.{digits}f} to {value.high:.{digits}f})"
 
 
 def _milliseconds(
@@ -299,13 +290,3 @@ def _milliseconds(
             for label, share in (("median", 0.5), ("99 %", 0.99))
         } | {"plans": len(wall)}
     return found
-
-
-def _times_table(times: Mapping[str, Mapping[str, float]]) -> str:
-    names = list(next(iter(times.values())))
-    lines = ["### milliseconds of a plan, one scene and one thread", ""]
-    lines += ["| planner | " + " | ".join(names) + " |", "|:--|" + "--:|" * len(names)]
-    for planner, values in times.items():
-        cells = [f"{value:.1f}" if name != "plans" else str(value) for name, value in values.items()]
-        lines.append(f"| {planner} | " + " | ".join(cells) + " |")
-    return "\n".join([*lines, ""])

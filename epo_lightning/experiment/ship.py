@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -38,16 +38,23 @@ PLACES = {"runs": "runs", "run_dir": None, "sweep": None, "resume": None}
 """Entries of a configuration that name folders of the machine on which the run was made."""
 
 
-def make(name: str) -> Path:
-    """Generate the data of a shipped forecaster, train it as its recipe says, and replace it in the package.
+def make(names: Sequence[str]) -> list[Path]:
+    """Train shipped forecasters as their recipes say, and replace them in the package.
 
-    A run that was interrupted is continued, and a finished one in ``runs/pretrained/<name>`` is not trained again.
+    All are trained before the first one is replaced: a run records whether the working tree has changed since the commit.
+
+    Returns:
+        the folders that were written.
     """
-    recipe = recipe_of(name)
+    runs = [train_by(recipe_of(name), Path("runs/pretrained") / name) for name in names]
+    return [ship(run, name, recipe_of(name), pretrained.HOME / name) for run, name in zip(runs, names, strict=True)]
+
+
+def train_by(recipe: Recipe, folder: Path) -> RunFolder:
+    """Generate the data of a recipe and train its run; an interrupted run is continued, and a finished one kept."""
     generate_and_print(compose.compose("generate", recipe.data_words), recipe.data_words)
-    words = [*recipe.words, f"run_dir=runs/pretrained/{name}", "existing=continue"]
-    run = train(compose.compose("train", words), words)
-    return ship(run, name, recipe, pretrained.HOME / name)
+    words = [*recipe.words, f"run_dir={folder}", "existing=continue"]
+    return train(compose.compose("train", words), words)
 
 
 def ship(run: RunFolder, name: str, recipe: Recipe, folder: Path) -> Path:
@@ -116,5 +123,5 @@ def score_examples(run: str | Path) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    for chosen in sys.argv[1:] or recipes():
-        print(f"wrote {make(chosen)}")
+    for written in make(sys.argv[1:] or list(recipes())):
+        print(f"wrote {written}")

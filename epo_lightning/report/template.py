@@ -13,8 +13,10 @@ A template gets rows by :meth:`Results.rows`, under the name ``results``, and as
 
 ``folds("urban_folds")`` has the same rows with the test split of a cross-validation as the unit, instead of the seed, and
 ``transfer("transfer", "us101", "dut")`` those that were trained on one data set and scored on another one.
-
 :mod:`epo_lightning.report.scores` has the names of metrics, and everything that rows can be asked for.
+
+``driven("rpi", "plays")`` has what planners did in closed loop (:mod:`epo_lightning.report.closed_loop`), from
+``drive/rpi.json`` in the folder of the results files, a ``results.json`` of ``epo drive``.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.report.closed_loop import ClosedLoop, read_closed_loop
 from epo_lightning.report.columns import MISSING
 from epo_lightning.report.costs import last_fifth
 from epo_lightning.report.curves import METRIC, validation_log
@@ -110,13 +113,21 @@ class Results:
         last = {run.path: run for run in runs if run.data == tested}
         return Rows(file, _by_unit(plain_rows(last.values()), digits, _scores))
 
+    def driven(self, name: str, others: str) -> ClosedLoop:
+        """What planners did in closed loop.
+
+        Args:
+            name: name of the file in the folder ``drive``, without ``.json``.
+            others: kind of the others.
+
+        Raises:
+            ConfigError: no such file or kind of others, or a damaged file.
+        """
+        return read_closed_loop(_existing(self.folder / "drive", name), others)
+
     def _read(self, name: str) -> tuple[Path, list[EvaluatedRun]]:
         """A results file and its runs, scored on the test split, or on the one split that the file has."""
-        file = self.folder / f"{name}.json"
-        if not file.exists():
-            raise ConfigError(
-                f"no results file {file}; {nearest(name, (path.stem for path in self.folder.glob('*.json')))}"
-            )
+        file = _existing(self.folder, name)
         report = read_results(file)
         runs = [*report.evaluated, *(part for run in report.runs for part in read_parts(run))]
         self.used[name] = [run for run in runs if run.split == "test"] or runs
@@ -204,6 +215,7 @@ def write_page(template: str | Path, results: str | Path, out: str | Path | None
         results=source.rows,
         folds=source.folds,
         transfer=source.transfer,
+        driven=source.driven,
         sources=source.sources,
         average=average,
         below=below,
@@ -217,6 +229,14 @@ def write_page(template: str | Path, results: str | Path, out: str | Path | None
         raise ConfigError(f"{template}, line {_line(error)}: {error}") from error
     file = Path(template.parent if out is None else out).expanduser() / template.stem
     write_file(file, page)
+    return file
+
+
+def _existing(folder: Path, name: str) -> Path:
+    """The file of a name in a folder of results."""
+    file = folder / f"{name}.json"
+    if not file.exists():
+        raise ConfigError(f"no results file {file}; {nearest(name, (path.stem for path in folder.glob('*.json')))}")
     return file
 
 

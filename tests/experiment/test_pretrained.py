@@ -191,13 +191,17 @@ def test_make_generates_trains_and_replaces(monkeypatch: pytest.MonkeyPatch, tmp
     monkeypatch.setattr(pretrained, "HOME", tmp_path / "package")
     monkeypatch.setattr(shipping, "recipe_of", lambda name: recipe)
     monkeypatch.setattr(shipping, "generate_and_print", lambda config, words: generated.append(words))
-    (tmp_path / "package" / "rpi" / "mine" / "old").mkdir(parents=True)
-    folder = shipping.make("rpi/mine")
-    assert generated == [["data=drawn", "data.like=rpi", "data.scenes=64"]]
-    assert pretrained.names() == ["rpi/mine"]
-    assert not (folder / "old").exists()
+    old = tmp_path / "package" / "rpi" / "mine" / "old"
+    old.mkdir(parents=True)
+    train, replaced = shipping.train, []
+    monkeypatch.setattr(shipping, "train", lambda *values: (replaced.append(not old.exists()), train(*values))[1])
+    folder, second = shipping.make(["rpi/mine", "rpi/second"])
+    assert generated == 2 * [["data=drawn", "data.like=rpi", "data.scenes=64"]]
+    assert replaced == [False, False], "the second run must find the working tree as the first one did"
+    assert pretrained.names() == ["rpi/mine", "rpi/second"]
+    assert not old.exists()
     assert score_examples("rpi/mine") == pytest.approx(read_json(folder / "metrics.json")["examples"], rel=1e-3)
     # The finished run is packed again, not trained again.
     trained = RunFolder.open("runs/pretrained/rpi/mine").checkpoint("last").stat().st_mtime_ns
-    assert shipping.make("rpi/mine") == folder
+    assert shipping.make(["rpi/mine", "rpi/second"]) == [folder, second]
     assert RunFolder.open("runs/pretrained/rpi/mine").checkpoint("last").stat().st_mtime_ns == trained
