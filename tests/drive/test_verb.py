@@ -14,6 +14,7 @@ from experiment.conftest import epo  # noqa: F401 - a fixture
 
 from epo_lightning.experiment.config.settings import DriveSettings
 from epo_lightning.experiment.drive import _titles, folder_of
+from epo_lightning.report.closed_loop import read_closed_loop
 from epo_lightning.run_folder import RunFolder, read_json
 
 SMALL = ["episodes=2", "timed=1", "others=[ignores]"]
@@ -46,7 +47,10 @@ def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -
         "world=rpi, 2 episodes of seed 0, runs rpi/v_lstm_epo, rpi/v_lstm_sc, checkpoint best, commit "
     )
     assert table.count(f"| {baseline} |") == 2
-    assert json.dumps(results)
+    ignores = read_closed_loop(tmp_path / "driven" / "results.json", "ignores")
+    line = next(line for line in table.splitlines() if line.startswith(f"| {row} |"))
+    assert sorted(line.strip("| ").split(" | ")[1:]) == sorted(ignores.text(row, name) for name in planners[row])
+    assert ignores.units["collision"] == "%"
 
 
 @pytest.mark.parametrize(
