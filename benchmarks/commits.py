@@ -27,7 +27,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from benchmarks.repeat import chosen, difference, one_line, trained_runs
-from epo_lightning.identity import essence
+from epo_lightning.identity import data_recipe, essence
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.results import SavedRun, results_name
 from epo_lightning.run_folder import RunFolder
@@ -91,7 +91,7 @@ def command(saved: SavedRun, steps: int, overrides: Sequence[str]) -> list[str]:
 def settings_since(saved: SavedRun) -> list[str]:
     """Settings that did not exist when a run was trained, with the values that make today's code do the same."""
     data = saved.settings["data"]
-    return ["data.recipe=1"] if data["name"] == "rpi" and "recipe" not in data else []
+    return [f"data.recipe={data_recipe(data)}"] if data["name"] == "rpi" and "recipe" not in data else []
 
 
 def setting(word: str) -> str:

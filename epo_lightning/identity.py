@@ -48,6 +48,11 @@ SHARES = ("trainer.limit_train_batches", "trainer.limit_val_batches")
 """Keys for which 1 and 1.0 differ: 1 is a number of batches, and 1.0 is a share of all batches."""
 
 
+def data_recipe(section: Mapping[str, Any]) -> int:
+    """Version of the method that made data of RPI; the first one where the ``data`` section is older than the setting."""
+    return section.get("recipe", LATER["data.recipe"])
+
+
 def essence(config: Mapping[str, Any]) -> dict[str, Any]:
     """The part of a resolved configuration that decides on the result, as plain JSON values; 2.0 and 2 are the same."""
     return {section: _plain(config.get(section), section) for section in SECTIONS}

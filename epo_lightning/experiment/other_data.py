@@ -25,6 +25,7 @@ from epo_lightning.data.recorded.windows import WindowConfig
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import Forecaster
+from epo_lightning.identity import data_recipe
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import KINDS
@@ -159,7 +160,7 @@ def follow(
     """
     section = {**section}
     if section["name"] == of_run.data["name"] == "rpi" and "data.recipe" not in given:
-        return _with_recipe(section, of_run.data.get("recipe", 1))
+        return _with_recipe(section, data_recipe(of_run.data))
     if "windows" not in section:
         return section, ()
     own = assembly.build_data(of_run.data)
@@ -200,7 +201,7 @@ def follow(
 
 def _with_recipe(section: Mapping[str, Any], recipe: int) -> tuple[dict[str, Any], tuple[str, ...]]:
     """RPI's data by the recipe of a run, and a statement if that of the section is another one."""
-    theirs = section.get("recipe", 1)
+    theirs = data_recipe(section)
     notes = (f"data.recipe={recipe} instead of {theirs}, as the run",) if recipe != theirs else ()
     return {**section, "recipe": recipe}, notes
 

@@ -8,7 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from epo_lightning.identity import check_unchanged, identity, row_identity
+from epo_lightning.identity import check_unchanged, data_recipe, identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
@@ -300,7 +300,7 @@ def data_name(section: Mapping[str, Any]) -> str:
     name = str(section.get("dataset") or section["name"])
     if section.get("split") == "hard":
         name = f"{name}_hard"
-    if (recipe := section.get("recipe", 1)) != 1:
+    if (recipe := data_recipe(section)) != 1:
         name = f"{name}, recipe {recipe}"
     if (players := section.get("solver")) not in (None, "potential"):
         name = f"{name}, {players} players"
