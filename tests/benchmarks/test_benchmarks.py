@@ -40,6 +40,7 @@ from benchmarks import (
     refinement,
     repeat,
     scaling,
+    shared_errors,
     training_step,
     true_game,
 )
@@ -239,6 +240,29 @@ def test_errors_are_split_by_placement_and_side():
     assert placements.errors(found) == {"executed": [1.0, 4.0, 51.0], "alternative": [10.0, 40.0, 20.0]}
 
 
+def test_errors_of_runs_are_shared_where_they_point_the_same_way():
+    """Two records and one agent: the closest mode misses by (1, 0) and (0, 2), or in other directions."""
+    off = torch.tensor([[1.0, 0.0], [0.0, 2.0]])[:, None, None, None]
+    far = torch.full_like(off, 1e3)
+    found = [
+        Forecasts(
+            modes=torch.cat((far, error), 1),
+            futures=torch.zeros(2, 2, 1, 1, 2),
+            both=torch.tensor([True, False]),
+            start=torch.zeros(2, 1, 2),
+            weight=torch.ones(2),
+            placement=torch.zeros(2, dtype=torch.long),
+            placements=1,
+        )
+        for error in (off, -3 * off, off.flip(0), off * torch.tensor([1.0, 0.0]))
+    ]
+    executed, alternative = ([shared_errors.displacements(of_run, side) for of_run in found] for side in (0, 1))
+    assert executed[0].tolist() == [[[1.0, 0.0]], [[0.0, 2.0]]]
+    assert [len(error) for error in alternative] == [1, 1, 1, 1]
+    expected = [1.0, -1.0, 0.0, 1 / math.sqrt(5)]
+    assert shared_errors.correlations(executed)[0].tolist() == pytest.approx(expected)
+
+
 def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "callbacks.progress=none"]
     data = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2)
@@ -258,6 +282,10 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     assert (executed[0], alternative[0]) == ("executed", "alternative")
     assert float(executed[1]) > 0
     assert executed[2:] == ["nan", "nan"], "there is one placement"
+    shared_errors.main([str(run), str(run)])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:2] == [f"run 0: {run}", f"run 1: {run}"]
+    assert [line.split()[3:] for line in lines if line.startswith("  run")] == 4 * [["1.00", "1.00"]]
     assert "no run folder" in refused(passing_sides.main, tmp_path / "nowhere")
     record = run / "run.json"
     record.write_text(record.read_text().replace('"finished"', '"training"'))
