@@ -49,7 +49,7 @@ def measure(episodes: Episodes, world: World) -> dict[str, Float[Tensor, " B"]]:
     - ``collision``: whether the bodies of the planned agent and another one overlap at any step.
     - ``distance``: smallest distance [m] between the centres of the planned agent and another one.
     - ``time_to_collision``: smallest time [s] until bodies would overlap if all agents kept their velocities, at most
-      :data:`SOON`.
+      :data:`SOON`; zero if they do overlap.
     - ``progress``: how far the planned agent comes [m].
     - ``jerk``, ``lateral``: mean absolute change of acceleration per second, and mean absolute lateral acceleration, the
       speed times the turn rate.
@@ -64,7 +64,7 @@ def measure(episodes: Episodes, world: World) -> dict[str, Float[Tensor, " B"]]:
     controls, dt, happened = episodes.controls, episodes.dt, episodes.outcome
     speed = happened.states[:, EGO, :, SPEED]
     still = (speed.abs() < STILL) & (happened.progress < world.arrived) & happened.agent_mask[:, EGO]
-    window = round(world.patience / dt)
+    window = round(world.patience / dt) + 1  # states at both ends
     stood = still.unfold(1, window, 1).all(-1).any(1) if window <= still.shape[1] else torch.zeros_like(still[:, 0])
     with_ego = happened.agent_mask & happened.agent_mask[:, EGO, None]
     offset = (happened.states[:, 1:, :, :2] - happened.states[:, :1, :, :2]).norm(dim=-1)
@@ -105,9 +105,10 @@ def _time_to_collision(happened: Outcome, shape: str) -> Float[Tensor, " B"]:
     standing = torch.zeros(round(SOON / _STEP), 2, dtype=states.dtype)
     for some in torch.arange(len(episode)).split(_MANY):
         ahead = Unicycle().rollout(now[some], standing.expand(len(some), 2, -1, -1), _STEP)
+        ahead = torch.cat((now[some][:, :, None], ahead), 2)
         there = torch.ones(len(some), 2, dtype=torch.bool)
         touch = overlaps_with(EGO, ahead, size[some], there, shape)[:, 0]
-        first = torch.where(touch.any(1), (touch.to(torch.int8).argmax(1) + 1) * _STEP, SOON)
+        first = torch.where(touch.any(1), touch.to(torch.int8).argmax(1) * _STEP, SOON)
         least = least.scatter_reduce(0, episode[some], first.to(least), "amin")
     return least
 

@@ -25,7 +25,7 @@ from epo_lightning.checks import check_number, check_whole
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import controls_between
 from epo_lightning.game.energy import Energy
-from epo_lightning.scene import Scene
+from epo_lightning.scene import HEADING, Scene, wrapped
 from epo_lightning.solvers.base import Minimiser
 
 _DIFFERENCE = 0.05
@@ -130,14 +130,20 @@ class Calibration:
 
 
 def _at_first_step(scene: Scene) -> Scene:
-    """The scene at its first observed step: the rest of the history is its future, and its game ends as much later."""
+    """The scene at its first observed step: the rest of the history is its future, and its game ends as much later.
+
+    Headings lead continuously to those at t0, from which the headings wanted at the goals are counted.
+    """
     before = scene.history.shape[2] - 1
     steps = None if scene.game_steps is None else scene.game_steps + before
+    history = scene.history.clone()
+    turns = wrapped(history[..., HEADING].diff(dim=-1))
+    history[..., :-1, HEADING] = history[..., -1:, HEADING] - turns.flip(-1).cumsum(-1).flip(-1)
     return dataclasses.replace(
         scene,
-        history=scene.history[:, :, :1],
+        history=history[:, :, :1],
         history_mask=scene.history_mask[:, :, :1],
-        future=scene.history[:, :, 1:],
+        future=history[:, :, 1:],
         future_mask=scene.history_mask[:, :, 1:],
         game_steps=steps,
     )

@@ -75,4 +75,5 @@ def _difference_ahead(scene: Scene, forecast: JointForecast) -> Tensor | float:
     if initial.shape[3] == 0:
         return 0.0
     difference = (initial - forecast.solution.controls[..., first:, :].detach()).abs().mean((1, 3, 4))
-    return torch.where(scene.agent_mask, difference, 0.0).sum() / scene.agent_mask.sum().clamp_min(1)
+    of_scenes = torch.where(scene.agent_mask, difference, 0.0).sum(-1) / scene.agent_mask.sum(-1).clamp_min(1)
+    return of_scenes.mean()

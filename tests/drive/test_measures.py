@@ -68,6 +68,9 @@ def test_time_to_collision_is_the_smallest_over_the_way() -> None:
     # After 0.5 s the robot is 1.5 m away, and discs of 0.25 m touch after 1 s.
     assert values(early)["time_to_collision"] == pytest.approx(1.1, abs=0.11)
     assert values(meeting(0.6))["time_to_collision"] == SOON
+    assert values(begun)["time_to_collision"] == 0.0, "they overlap later"
+    begun.outcome.states[:, 0] = torch.tensor([1.6, 0.0, torch.pi, 10.0])
+    assert values(begun)["time_to_collision"] == 0.0, "they overlap, and would be apart after 0.1 s"
 
 
 def test_comfort_progress_and_deadlocks() -> None:
@@ -85,6 +88,10 @@ def test_comfort_progress_and_deadlocks() -> None:
     assert values(standing, arrived=0.0)["deadlock"] == 0.0, "it has arrived"
     standing.outcome.states[:, 0, ::15, 3] = 1.0
     assert values(standing)["deadlock"] == 0.0, "it never stands for two seconds"
+    for steps, expected in ((20, 0.0), (21, 1.0)):  # states of 1.9 s, and of 2 s
+        standing.outcome.states[:, 0, :, 3] = 1.0
+        standing.outcome.states[:, 0, :steps, 3] = 0.0
+        assert values(standing)["deadlock"] == expected
 
 
 def test_one_step_without_a_plan_counts() -> None:

@@ -81,6 +81,22 @@ def test_headings_that_wrap_give_the_same_weights() -> None:
     torch.testing.assert_close(found.pair_weights["proximity"].flatten(), true, rtol=1e-3, atol=0)
 
 
+def test_headings_that_wrap_do_not_move_the_heading_that_is_wanted_at_a_goal() -> None:
+    """The headings wanted at goals are counted from that at t0; earlier ones may be written a whole turn below it."""
+    world = RPIWorld(3)
+    scene, solver = world.observe(), LevenbergMarquardt(steps=20, step_size=1.0, damping=10.0, adaptive=True)
+    game = world.game(scene)
+    inferred = dataclasses.replace(game, pair_weights={name: 2 * weight for name, weight in game.pair_weights.items()})
+    history = scene.history.clone()
+    history[:, 1, :-1, HEADING] -= 2 * torch.pi
+    expected, found = (
+        Calibration()(solver, RPI, dataclasses.replace(scene, history=of), inferred).pair_weights["clearance"]
+        for of in (scene.history, history)
+    )
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(found, game.pair_weights["clearance"], rtol=1e-2, atol=0)
+
+
 def test_few_steps_of_the_forecast_do_not_make_the_calibration_less_accurate() -> None:
     """Twenty Gauss-Newton steps do not arrive at the minima of these games; the weights are those of the minima anyway."""
     world = RPIWorld(3)
