@@ -27,11 +27,12 @@ from epo_lightning.experiment.config.compose import compose
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import SPEED, Scene
 
-NAMES = ("data.name=rpi_told", "backbone.name=v_lstm_told")
+TOLD = "rpi_told"
+NAMES = (f"data.name={TOLD}", "backbone.name=v_lstm_told")
 """The settings that replace data set and backbone of an experiment by those that are told w."""
 
 
-@register("data", "rpi_told")
+@register("data", TOLD)
 class ToldRPIData(RPIData):
     """RPI with w, scaled to -1 to 1, in the place of both agents' oldest observed speeds.
 

@@ -1,4 +1,7 @@
-"""Forecasts of trained runs for the records of RPI, whose equilibria and true weights are known."""
+"""Forecasts of trained runs for the records of RPI, whose equilibria and true weights are known.
+
+Runs whose network was told the weight (:mod:`benchmarks.hidden_weight`) are read as well.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from benchmarks.hidden_weight import TOLD
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.subgames import FUTURE
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
@@ -52,7 +56,7 @@ def forecasts(folder: str, split: str = "test") -> Forecasts:
     if not run.finished:
         raise ConfigError(f"{folder} is not finished: continue it by epo train resume={folder}")
     settings = settings_of(run)
-    if settings.data["name"] != "rpi":
+    if settings.data["name"] not in ("rpi", TOLD):
         raise ConfigError(f"{folder} was trained on data={settings.data['name']}, but only RPI has known equilibria")
     if settings.data.get("targets") == "sampled":
         raise ConfigError(

@@ -74,7 +74,9 @@ def _find(place: Place, run: RunFolder | None) -> dist.TCPStore | None:
         except (dist.DistNetworkError, dist.DistStoreError) as error:
             if run is not None and run.finished:
                 return None
-            if time.monotonic() > deadline:
+            if run is not None and run.locked:  # the leader waits as well, until another job has trained the run
+                deadline = time.monotonic() + PATIENCE
+            elif time.monotonic() > deadline:
                 raise ConfigError(f"process {place.rank} of {place.world} finds no leader: {error}") from error
 
 

@@ -7,6 +7,7 @@ that it uses; the system releases the lock when the process ends.
 from __future__ import annotations
 
 import getpass
+import os
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -50,7 +51,7 @@ def place(names: Sequence[str], share: int, folder: Path | None = None) -> Itera
     """
     from filelock import FileLock, Timeout
 
-    folder = folder or Path(tempfile.gettempdir()) / f"epo-gpus-{getpass.getuser()}"
+    folder = folder or Path(tempfile.gettempdir()) / f"epo-gpus-{_user()}"
     folder.mkdir(parents=True, exist_ok=True)
     told = False
     while True:
@@ -73,3 +74,8 @@ def place(names: Sequence[str], share: int, folder: Path | None = None) -> Itera
             )
             told = True
         time.sleep(0.5)
+
+
+def _user() -> str:
+    """This user's number, which a container may run under without a name; the name where the system has no numbers."""
+    return str(os.getuid()) if hasattr(os, "getuid") else getpass.getuser()

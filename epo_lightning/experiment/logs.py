@@ -104,11 +104,11 @@ def _facts(settings: Settings, config: Mapping[str, Any], run: RunFolder) -> Fac
     key = record.get("identity") or identity(config, str(record.get("data_digest")))
     # The second in which the run began is part of the id. A run that begins anew (with corrected code) is then a new curve.
     began = "".join(filter(str.isdigit, str(record.get("began", ""))))
-    sweep = Path(settings.sweep).name if settings.sweep else None
+    sweep = run.config().get("sweep")  # of the command that began the run; another sweep may continue it
     return Facts(
         id=f"{key}-{began}",
         name=mask(f"{settings.title} (seed {settings.seed})"),
-        group=sweep,
+        group=Path(sweep).name if sweep else None,
         config=mask({name: config.get(name) for name in ("title", "experiment", "budget", *SECTIONS)}),
         tags={
             "identity": key,

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from experiment.conftest import Epo
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from epo_lightning import cli
-from epo_lightning.experiment import distributed
+from epo_lightning.experiment import distributed, follower
 from epo_lightning.experiment.callbacks import RandomStates
 from epo_lightning.experiment.distributed import DDP, Place
 from epo_lightning.registry import ConfigError
@@ -256,6 +257,27 @@ def test_the_tasks_of_a_slurm_step_are_the_processes(monkeypatch: pytest.MonkeyP
     assert distributed.here(1) == Place(0, 1)
     with pytest.raises(ConfigError, match=r"trainer\.devices is 4, but Slurm has started 2 tasks"):
         distributed.here(4)
+
+
+def test_a_follower_waits_as_long_as_another_job_trains_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The leader waits for the lock of the run before it can be found."""
+    locked = [True, True, True]
+
+    def nobody(*_: object, **__: object) -> None:
+        raise dist.DistNetworkError("refused")
+
+    class Run:
+        finished = False
+
+        @property
+        def locked(self) -> bool:
+            return locked.pop() if locked else False
+
+    monkeypatch.setattr(follower, "PATIENCE", 0.0)
+    monkeypatch.setattr(follower.dist, "TCPStore", nobody)
+    with pytest.raises(ConfigError, match="process 1 of 2 finds no leader"):
+        follower._find(Place(1, 2, 1234), cast(RunFolder, Run()))
+    assert not locked
 
 
 def normalise_one_of_three(rank: int, meeting: str, given: str) -> None:

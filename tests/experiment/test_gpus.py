@@ -6,6 +6,8 @@ import threading
 from contextlib import ExitStack
 from pathlib import Path
 
+import pytest
+
 from epo_lightning.experiment.config.settings import TrainerSettings
 from epo_lightning.experiment.gpus import place, placed
 
@@ -31,6 +33,19 @@ def test_a_run_waits_for_a_free_gpu(tmp_path: Path) -> None:
         assert not got.wait(1.0)
     assert got.wait(5.0)
     waiting.join()
+
+
+def test_a_user_without_a_name_takes_a_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container may run under a number that its /etc/passwd does not have."""
+
+    def nameless() -> str:
+        raise KeyError("getpwuid(): uid not found: 12345")
+
+    monkeypatch.setattr("getpass.getuser", nameless)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with place(["a"], 1) as number:
+        assert number == 0
+    assert list(tmp_path.glob("epo-gpus-*/a-0.lock"))
 
 
 def test_runs_on_cpu_take_no_gpu() -> None:

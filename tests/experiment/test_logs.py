@@ -11,7 +11,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -22,11 +23,13 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from epo_lightning.experiment import logs
 from epo_lightning.experiment.callbacks import RandomStates
-from epo_lightning.experiment.config.settings import Settings, TensorBoardSettings
+from epo_lightning.experiment.config.settings import MLflowSettings, Settings, TensorBoardSettings
 from epo_lightning.experiment.dashboards import aside
 from epo_lightning.experiment.dashboards.aside import Aside
 from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
+from epo_lightning.experiment.dashboards.mlflow import MLflow
 from epo_lightning.experiment.dashboards.tensorboard import TensorBoard
+from epo_lightning.experiment.dashboards.wandb import has_key
 from epo_lightning.run_folder import RunFolder, discover
 from epo_lightning.schema import read
 
@@ -225,6 +228,18 @@ def test_pictures_and_the_checkpoint_can_be_uploaded(epo: Epo) -> None:
     assert str(Path("run/checkpoints/best.ckpt").resolve()).encode() in file.read_bytes()
 
 
+@pytest.mark.parametrize("server", ["https://wandb.local", "http://wandb.local:8080"])
+def test_the_key_that_wandb_login_writes_is_found(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_BASE_URL", server)
+    assert not has_key()
+    (tmp_path / "netrc").write_text(f"machine {server.partition('//')[2]}\n  login user\n  password {40 * 'a'}\n")
+    assert has_key()
+    monkeypatch.setenv("WANDB_BASE_URL", "http://wandb.local:9090")
+    assert not has_key()
+    monkeypatch.setenv("WANDB_IDENTITY_TOKEN_FILE", str(tmp_path / "token"))
+    assert has_key()
+
+
 # MLflow
 
 
@@ -254,6 +269,22 @@ def test_mlflow_keeps_name_parameters_tags_and_scores_through_a_stop(epo: Epo, s
     assert run.data.metrics["best/minSADE"] == pytest.approx(best_in_file("runs/one"))
     measured = json.loads(Path("runs/one/metrics.json").read_text())["metrics"]["minSADE"]
     assert run.data.metrics["test/minSADE"] == pytest.approx(measured)
+
+
+def test_an_experiment_that_another_job_makes_at_the_same_moment_is_used(tmp_path: Path) -> None:
+    exceptions = pytest.importorskip("mlflow.exceptions")
+    made: list[SimpleNamespace] = []
+
+    def create(name: str, *_: object) -> str:
+        made.append(SimpleNamespace(experiment_id="7"))
+        raise exceptions.MlflowException(f"Experiment(name={name}) already exists.")
+
+    board = MLflow(facts(tmp_path), MLflowSettings(), tmp_path)
+    there = SimpleNamespace(get_experiment_by_name=lambda name: made[-1] if made else None, create_experiment=create)
+    board._client = cast(Any, there)
+    assert board._experiment("rpi_main") == "7"
+    assert board._experiment("rpi_main") == "7"
+    assert len(made) == 1
 
 
 def test_a_missing_mlflow_is_named_before_the_run(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -358,9 +389,12 @@ def test_the_runs_of_a_sweep_are_a_group(epo: Epo, bad: type[Bad]) -> None:
     assert epo("train", ROW, *TINY, "run_dir=run", "logger=[tensorboard]") == 0
     run = RunFolder.open("run")
     config = run.config() | {"sweep": "runs/sweeps/ours"}
-    with logs.open_logs(read(Settings, config), config, run) as (_, logger):
-        told = logger.dashboard.facts
-    assert (told.group, told.name) == ("ours", "V-LSTM + SC (seed 0)")
+    run.begin(config, run.record)
+    for sweep in ("ours", "another that continues it"):
+        now = config | {"sweep": f"runs/sweeps/{sweep}"}
+        with logs.open_logs(read(Settings, now), now, run) as (_, logger):
+            told = logger.dashboard.facts
+        assert (told.group, told.name) == ("ours", "V-LSTM + SC (seed 0)")
     assert told.parameters()["optimizer.lr"] == 1e-3
 
 

@@ -94,7 +94,9 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             continue
     walked: list[str] = []
     for word in key.replace("/", ".").split("."):
-        names = [str(known) for known in config if known != "hydra"] if isinstance(config, DictConfig) else []
+        names = [str(known) for known in config] if isinstance(config, DictConfig) else []
+        if not walked and word != "hydra":
+            names = [known for known in names if known != "hydra"]
         if word == "gate" and not walked and "." in key:  # the group's settings are those of the forecaster
             return f"unknown key {key!r}: with gate=<one of {', '.join(options_of(instance, word))}> it is forecaster.{key}"
         if walked == ["forecaster"] and word == "gate" and word not in names:

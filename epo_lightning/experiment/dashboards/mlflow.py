@@ -84,10 +84,7 @@ class MLflow(Dashboard):
         self._uri = tracking_uri(self._settings, default=self._uri)
         with self._alone():
             self._client = MlflowClient(self._uri)
-            place = None if not self._uri.startswith(SQLITE) else self._artifacts()
-            name = self.facts.group or self._settings.experiment
-            experiment = self._client.get_experiment_by_name(name)
-            key = experiment.experiment_id if experiment else self._client.create_experiment(name, place, KIND)
+            key = self._experiment(self.facts.group or self._settings.experiment)
             found = self._client.search_runs([key], f"tags.run = '{self.facts.id}'", max_results=1)
             if found:
                 self._run = found[0].info.run_id
@@ -98,6 +95,20 @@ class MLflow(Dashboard):
                 tags = {"run": self.facts.id, "folder": str(self.facts.folder), **self.facts.tags}
                 self._run = self._client.create_run(key, tags=tags, run_name=self.facts.name).info.run_id
                 self._parameters()
+
+    def _experiment(self, name: str) -> str:
+        """The experiment with this name, which is made if there is none. Another job may make it at the same moment."""
+        from mlflow.exceptions import MlflowException
+
+        if experiment := self._client.get_experiment_by_name(name):
+            return str(experiment.experiment_id)
+        place = self._artifacts() if self._uri.startswith(SQLITE) else None
+        try:
+            return str(self._client.create_experiment(name, place, KIND))
+        except MlflowException:
+            if (experiment := self._client.get_experiment_by_name(name)) is None:
+                raise
+            return str(experiment.experiment_id)
 
     def _artifacts(self) -> str:
         """Folder of the artifacts, beside the database; MLflow's default would be the current folder of the process."""

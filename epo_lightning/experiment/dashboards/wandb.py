@@ -146,11 +146,14 @@ def server() -> str:
 
 
 def has_key() -> bool:
-    """Whether there is an API key in the environment or in the file that ``wandb login`` writes."""
-    if os.environ.get("WANDB_API_KEY"):
+    """Whether there is an API key or a token in the environment, or a key in the file that ``wandb login`` writes.
+
+    W&B writes the server's address with its port there.
+    """
+    if os.environ.get("WANDB_API_KEY") or os.environ.get("WANDB_IDENTITY_TOKEN_FILE"):
         return True
     try:
-        return netrc.netrc(os.environ.get("NETRC")).authenticators(urlsplit(server()).hostname or "") is not None
+        return netrc.netrc(os.environ.get("NETRC")).authenticators(urlsplit(server()).netloc) is not None
     except (OSError, netrc.NetrcParseError):
         return False
 

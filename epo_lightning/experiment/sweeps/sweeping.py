@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -31,6 +32,8 @@ CHOICES = "choices="
 """Beginning of the override that names a choices file (:mod:`epo_lightning.report.choices`)."""
 ATTEMPTS = 3
 """Number of times that the launcher of a sweep is started, if it breaks down."""
+PAUSE = 5.0
+"""Seconds between two looks at runs that still run after their launcher broke down."""
 
 
 def run(
@@ -82,12 +85,13 @@ def run(
             if jobs:
                 missing = [job for job, state in zip(jobs, states, strict=True) if state != "done"]
                 _launch(sweep, missing, words, task, extra)
+                all_chosen = True
             else:
-                _search(sweep, words, task, extra)
+                all_chosen = _search(sweep, words, task, extra)
         counts = status(sweep)
     if counts["failed"]:
         print(f"tracebacks: {os.path.relpath(sweep.folder / 'failures')}")
-    done = counts["done"] == counts.total()
+    done = all_chosen and counts["done"] == counts.total()
     if done:
         print(f"next: epo report {sweep.label}" + (f" {word('runs', runs)}" if runs != "runs" else ""))
     return done
@@ -254,7 +258,10 @@ def _set_aside(run: RunFolder, settings: TrainerSettings) -> None:
 def _launch(
     sweep: Sweep, jobs: Sequence[Job], words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]
 ) -> None:
-    """Run jobs by the launcher. If it breaks down (a worker was killed), it is started again for the remaining jobs."""
+    """Run jobs by the launcher. If it breaks down (a worker was killed), it is started again for the remaining jobs.
+
+    On a cluster the other jobs may go on without it, so the runs that are still in work are waited for.
+    """
     left = list(jobs)
     for _ in range(ATTEMPTS):
         if not left:
@@ -265,25 +272,43 @@ def _launch(
         except ConfigError:
             raise
         except Exception as error:
+            print(f"the launcher broke down ({_said(error)})", flush=True)
+            while running := sum(sweep.state(job) == "running" for job in left):
+                print(f"waiting for {running} runs that go on", flush=True)
+                while sum(sweep.state(job) == "running" for job in left) == running:
+                    time.sleep(PAUSE)
             left = [job for job in left if sweep.state(job) not in ("done", "failed")]
-            said = " ".join(str(error).split())
-            print(
-                f"the launcher broke down ({type(error).__name__}: {said[:200]}): {len(left)} runs are left", flush=True
-            )
+            print(f"{len(left)} runs are left", flush=True)
     for job in left:
         if sweep.state(job) == "interrupted":
             sweep.lost(job)
 
 
-def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]) -> None:
-    """Continue a searching sweep: finish the runs that it has chosen already, then let the sweeper choose further runs."""
+def _said(error: Exception) -> str:
+    """Kind and beginning of the message of an error, in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+
+
+def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]) -> bool:
+    """Continue a searching sweep: finish the runs that it has chosen already, then let the sweeper choose further runs.
+
+    Returns:
+        whether the sweeper has chosen all runs that it was asked for.
+    """
     found = sweep.jobs
     _launch(sweep, [job for job in found if sweep.state(job) != "done"], words, task, extra)
     trials = compose.trials("train", words, extra)
-    if trials is None:
-        compose.multirun("train", words, task, extra)
-    elif trials > len(found):
-        compose.multirun("train", [*words, f"hydra.sweeper.n_trials={trials - len(found)}"], task, extra)
+    if trials is not None and trials <= len(found):
+        return True
+    more = [] if trials is None else [f"hydra.sweeper.n_trials={trials - len(found)}"]
+    try:
+        compose.multirun("train", [*words, *more], task, extra)
+    except Exception as error:  # no run gave a result, for example
+        if isinstance(error, ConfigError) and len(sweep.jobs) == len(found):
+            raise
+        print(f"the search ended early ({_said(error)})", flush=True)
+        return False
+    return True
 
 
 def known(extra: Sequence[str] = ()) -> dict[str, str]:

@@ -10,9 +10,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import yaml
@@ -20,6 +23,7 @@ from experiment import tiny
 from experiment.conftest import TINY, Epo
 
 from epo_lightning.experiment.config.compose import compose, jobs
+from epo_lightning.experiment.sweeps import sweeping
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
 from epo_lightning.experiment.sweeps.watch import names_of, result
 from epo_lightning.identity import identity
@@ -340,6 +344,64 @@ def test_globs_find_experiments_in_folders() -> None:
     assert len(listed) == 3 * len(list((SRC / "conf" / "experiment" / "rpi").glob("*.yaml")))
 
 
+@pytest.mark.parametrize(
+    ("launcher", "word", "message"),
+    [
+        ("slurm", "hydra.launcher.time=3", "unknown key 'hydra.launcher.time' in hydra.launcher: did you mean"),
+        (
+            "local",
+            "hydra.launcher.n_job=2",
+            "unknown key 'hydra.launcher.n_job' in hydra.launcher: did you mean 'n_jobs'",
+        ),
+    ],
+)
+def test_an_unknown_key_of_a_launcher_is_named(
+    refused: Callable[..., str], launcher: str, word: str, message: str
+) -> None:
+    pytest.importorskip(f"hydra_plugins.hydra_{'submitit' if launcher == 'slurm' else 'joblib'}_launcher")
+    assert message in refused("sweep", "rpi_main", *TINY, f"hydra/launcher={launcher}", word)
+
+
+def test_runs_that_go_on_without_their_launcher_are_waited_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a cluster one job is lost, and another one goes on until the third look; a third one has not begun."""
+    lost, on, late = (cast(Job, SimpleNamespace(overrides=[name])) for name in ("lost", "on", "late"))
+    looks, launched = Counter[str](), []
+
+    class Watched:
+        def state(self, job: Job) -> str:
+            name = job.overrides[0]
+            looks[name] += 1
+            return {"lost": "interrupted", "on": "running" if looks["on"] < 3 else "done", "late": "waiting"}[name]
+
+    def launch(name: str, words: object, jobs: list[list[str]], *_: object) -> None:
+        launched.append([job[0] for job in jobs])
+        if len(launched) == 1:
+            raise RuntimeError("one job has no result")
+
+    monkeypatch.setattr(sweeping.compose, "launch", launch)
+    monkeypatch.setattr(sweeping, "PAUSE", 0.0)
+    sweeping._launch(cast(Sweep, Watched()), [lost, on, late], [], print, [])
+    assert launched == [["lost", "on", "late"], ["lost", "late"]]
+    said = capsys.readouterr().out
+    assert "the launcher broke down (RuntimeError: one job has no result)\nwaiting for 1 runs that go on\n" in said
+    assert "2 runs are left" in said
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    find_spec("hydra_plugins.hydra_optuna_sweeper") is None, reason="the extra `search` is not installed"
+)
+def test_a_search_goes_on_when_a_run_fails(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("sweep", "rpi_search", *TINY, "hydra.sweeper.n_trials=2")
+    assert epo(*words, "optimizer.lr=1e30") == 1
+    said = capsys.readouterr()
+    assert "2 runs: 2 failed" in said.out
+    assert "the search ended early" in said.out, "no run gave a result"
+    assert "Traceback" not in said.out + said.err
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(
     find_spec("hydra_plugins.hydra_optuna_sweeper") is None, reason="the extra `search` is not installed"
@@ -384,7 +446,7 @@ def test_a_stopped_sweep_prints_a_note_and_leaves_no_process(
     if not (launcher and how == signal.SIGTERM):  # joblib's parent has no handler of SIGTERM
         assert process.returncode == status
     if how == signal.SIGINT:
-        assert "epo: interrupted; the same command goes on" in said
+        assert "epo: interrupted; no incomplete file was left; the same command continues" in said
     assert "Traceback" not in said
 
 
