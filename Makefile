@@ -126,7 +126,7 @@ docs: $(DOCUMENTABLE)
 
 tables: $(patsubst results/%.json,docs/tables/%/results.md,$(wildcard results/*.json)) $(patsubst %.j2,%,$(wildcard docs/*.md.j2))
 
-docs/%.md: docs/%.md.j2 $(wildcard results/*.json) $(INSTALLED)
+docs/%.md: docs/%.md.j2 $(wildcard results/*.json results/drive/*.json) $(INSTALLED)
 	$(EPO) report template=$<
 
 docs/tables/%/results.md: results/%.json $(INSTALLED)

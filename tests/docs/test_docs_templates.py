@@ -19,6 +19,7 @@ def test_the_pages_of_results_have_templates() -> None:
         for page in (
             "results",
             "claims",
+            "drive",
             "rpi",
             "rpi_results",
             "highway_results",
