@@ -27,10 +27,9 @@ CHEAPER = {
 }
 """Words that make a command cheap; later words win. The sweep has its own folder, as the first run has other settings."""
 COLUMNS = (
+    "epo generate data=rpi data.placements=8 data.solver=feedback_converged",
     "epo generate data=rpi_hard data.placements=8 data.solver=feedback_converged",
-    "epo sweep rpi_relaxed data=rpi_hard data.placements=8 data.solver=feedback_converged budget=reduced seed=0,1,2,3,4",
-    "epo generate data=rpi data.solver=feedback data.recipe=1",
-    "epo sweep rpi_squared budget=reduced trainer.max_epochs=3 data.recipe=1",
+    "epo sweep rpi_relaxed data=rpi,rpi_hard data.placements=8 data.solver=feedback_converged budget=reduced seed=0,1,2,3,4",
 )
 NOT_RUN = {
     "make run": "installs, and takes minutes",
