@@ -93,8 +93,8 @@ class EPO(Forecaster):
             Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
         pair_weights: the same for pairs; shared ones are positive.
-        calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which, outside
-            training, corrects the inferred pair weights so that the game explains the history; None for no correction.
+        calibration: settings of a :class:`~epo_lightning.forecasters.calibration.Calibration`, which corrects the
+            inferred pair weights so that the game explains the history; None for no correction.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
             (:mod:`~epo_lightning.decoders.probabilities`).
         margin: ``largest`` margin [m] of pair features with a decoded margin, and the margin before training, ``start``;
@@ -207,7 +207,7 @@ class EPO(Forecaster):
         solved_scene = self._with_game_end(scene)
         orders = self._decode_orders(z, scene)
         parameters = self._infer_game(z, scene, goals, orders)
-        if self.calibration is not None and not self.training:
+        if self.calibration is not None and (self.calibration.training or not self.training):
             parameters = self.calibration(self.solver, self.energy, solved_scene, parameters)
         if TABLES not in self.solver.provides:
             parameters = parameters.for_every_mode(self.modes)
