@@ -80,6 +80,17 @@ def test_a_setting_that_runs_did_not_have_yet_leaves_their_identity() -> None:
     assert differences(before, changed("data.recipe", 1)) == []
 
 
+def test_rows_from_before_calibration_in_training_leave_their_identity() -> None:
+    now = compose("train", ["experiment=rpi/v_lstm_epo_game", "forecaster.calibration.training=false"])
+    before = copy.deepcopy(now)
+    del before["forecaster"]["calibration"]["training"]
+    assert (
+        identity(before, "d")
+        == identity(now, "d")
+        != identity(compose("train", ["experiment=rpi/v_lstm_epo_game"]), "d")
+    )
+
+
 def test_data_enters_the_identity_by_its_digest() -> None:
     assert identity(CONFIG, "one") != identity(CONFIG, "other")
     assert len(identity(CONFIG, "one")) == 16

@@ -141,16 +141,31 @@ def test_the_modes_of_one_game_have_the_same_positive_weights_and_different_star
     assert not torch.equal(game.initial_controls[:, 0], game.initial_controls[:, 1])
 
 
-def test_calibration_runs_outside_of_training_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    forecaster, scene = built(), scenes()
+@pytest.mark.parametrize("training", [False, True])
+def test_calibration_runs_in_training_if_it_is_asked_for(training: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    forecaster, scene = built(calibration={"steps": 2, "training": training}), scenes()
     seen = []
     monkeypatch.setattr(
         type(forecaster.calibration), "__call__", lambda self, *arguments: seen.append(1) or arguments[-1]
     )
     forecaster.train()(scene)
-    assert seen == []
+    assert seen == training * [1]
     forecaster.predict(scene)
-    assert seen == [1]
+    assert seen == (training + 1) * [1]
+
+
+def test_weights_learn_from_calibrated_games() -> None:
+    """In training the solution is that of the calibrated game, and the calibration is a constant factor for gradients."""
+    forecaster, scene = built(calibration={"steps": 2, "training": True}).train(), scenes()
+    forecast = forecaster(scene)
+    calibrated = forecaster.predict(scene)
+    torch.testing.assert_close(forecast.states, calibrated.states, rtol=0, atol=1e-3)  # the derivative asks for a better minimum
+    for name, (weight, value) in forecaster.losses(scene, forecast).items():
+        assert weight == 0 or value.isfinite(), name
+    (gradient,) = torch.autograd.grad(forecast.states.sum(), forecast.parameters.own_weights["goal"], retain_graph=True)
+    assert gradient.abs().sum() > 0
+    again = forecaster.solver(forecaster.energy, scene, forecast.parameters)
+    torch.testing.assert_close(again.states[..., : forecast.states.shape[3], :], forecast.states)
 
 
 def test_calibration_solves_its_games_as_training_does(monkeypatch: pytest.MonkeyPatch) -> None:
