@@ -81,14 +81,11 @@ def test_a_setting_that_runs_did_not_have_yet_leaves_their_identity() -> None:
 
 
 def test_rows_from_before_calibration_in_training_leave_their_identity() -> None:
-    now = compose("train", ["experiment=rpi/v_lstm_epo_game", "forecaster.calibration.training=false"])
+    now = compose("train", ["experiment=rpi/v_lstm_epo_game"])
+    training = compose("train", ["experiment=rpi/v_lstm_epo_game", "forecaster.calibration.training=true"])
     before = copy.deepcopy(now)
     del before["forecaster"]["calibration"]["training"]
-    assert (
-        identity(before, "d")
-        == identity(now, "d")
-        != identity(compose("train", ["experiment=rpi/v_lstm_epo_game"]), "d")
-    )
+    assert identity(before, "d") == identity(now, "d") != identity(training, "d")
 
 
 def test_data_enters_the_identity_by_its_digest() -> None:
