@@ -30,8 +30,7 @@ def errors(found: Forecasts) -> dict[str, list[float]]:
     first, last = found.placement == 0, found.placement == found.placements - 1
     result = {}
     for side, name in enumerate(SUBSETS):
-        missed = (found.modes[:, :, :, -1] - found.futures[:, None, side, :, -1]).norm(dim=-1).mean(2).amin(1)
-        there = found.both if side else torch.ones_like(found.both)
+        missed, there = found.missed(side).norm(dim=-1).mean(1), found.having(side)
         result[name] = [float(missed[there & of].mean()) for of in (first, last & ~first, ~first & ~last)]
     return result
 

@@ -44,6 +44,19 @@ class Forecasts:
     placement: Int[Tensor, " B"]
     placements: int
 
+    def missed(self, side: int) -> Float[Tensor, "B N 2"]:
+        """Displacements [m] of the last positions of the closest joint mode from the executed (0) or alternative (1) future.
+
+        The closest mode is that of SFDE. Rows of records without an alternative mean nothing for side 1.
+        """
+        of_modes = self.modes[:, :, :, -1] - self.futures[:, None, side, :, -1]
+        closest = of_modes.norm(dim=-1).mean(2).argmin(1)
+        return of_modes[torch.arange(len(closest)), closest]
+
+    def having(self, side: int) -> Bool[Tensor, " B"]:
+        """Mask of the records that have the executed (0) or alternative (1) future."""
+        return self.both if side else torch.ones_like(self.both)
+
 
 @torch.no_grad()
 def forecasts(folder: str, split: str = "test") -> Forecasts:

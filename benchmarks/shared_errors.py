@@ -9,8 +9,8 @@ correlations of the errors of every two runs,
 
     mean(e_i e_j) / sqrt(mean(e_i^2) mean(e_j^2)),
 
-where e_i e_j is the inner product of displacements: of the last positions of the closest joint mode from the future. Means
-are over agents and records. Nothing is written.
+where e is the displacement of an agent's last position in the closest joint mode from the future, and e_i e_j an inner
+product. Means are over agents and records. Nothing is written.
 """
 
 from __future__ import annotations
@@ -22,25 +22,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.rpi_runs import Forecasts, forecasts
+from benchmarks.rpi_runs import forecasts
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.rpi.scenes import SUBSETS
 from epo_lightning.experiment import assembly
 from epo_lightning.registry import ConfigError
 
 
-def displacements(found: Forecasts, side: int) -> Float[Tensor, "B N 2"]:
-    """Displacements [m] of the last positions of the closest joint mode from a future, of the records that have it."""
-    of_modes = found.modes[:, :, :, -1] - found.futures[:, None, side, :, -1]
-    closest = of_modes.norm(dim=-1).mean(2).argmin(1)
-    there = found.both if side else torch.ones_like(found.both)
-    return of_modes[torch.arange(len(closest)), closest][there]
-
-
 def correlations(errors: Sequence[Float[Tensor, "B N 2"]]) -> Float[Tensor, "R R"]:
-    """Correlations, about zero, of the errors of every two runs."""
-    flat = torch.stack([error.double().flatten() for error in errors])
-    return torch.nn.functional.normalize(flat, dim=1) @ torch.nn.functional.normalize(flat, dim=1).T
+    """Correlations, about zero, of the errors [m] of every two runs."""
+    units = torch.nn.functional.normalize(torch.stack([error.double().flatten() for error in errors]), dim=1)
+    return units @ units.T
 
 
 def main(given: Sequence[str] | None = None) -> None:
@@ -67,7 +59,7 @@ def main(given: Sequence[str] | None = None) -> None:
     for number, folder in enumerate(arguments.runs):
         print(f"run {number}: {folder}")
     for side, name in enumerate(SUBSETS):
-        errors = [displacements(of_run, side) for of_run in found]
+        errors = [of_run.missed(side)[of_run.having(side)] for of_run in found]
         print(f"{name} futures: rms [m], and correlations with runs 0 to {len(found) - 1}")
         for number, (error, row) in enumerate(zip(errors, correlations(errors), strict=True)):
             rms = float(error.double().square().sum(-1).mean().sqrt())

@@ -1,4 +1,4 @@
-"""What planners did in closed loop, as ``epo drive`` stores it in ``results.json``: Markdown tables, and single values.
+"""Results of closed loops, as ``epo drive`` stores them in ``results.json``: Markdown tables, and single values.
 
 An estimate is a mean over episodes with its 95 % interval, ``{"mean", "low", "high"}``.
 """
@@ -49,7 +49,7 @@ def times_table(planners: Mapping[str, Mapping[str, float]]) -> str:
 
 @dataclass(frozen=True)
 class ClosedLoop:
-    """What planners did with one kind of others.
+    """Measures of all planners with one kind of others.
 
     Attributes:
         file: the file that it was read from, for error messages.

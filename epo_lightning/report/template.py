@@ -114,7 +114,7 @@ class Results:
         return Rows(file, _by_unit(plain_rows(last.values()), digits, _scores))
 
     def driven(self, name: str, others: str) -> ClosedLoop:
-        """What planners did in closed loop.
+        """Measures of planners in closed loop.
 
         Args:
             name: name of the file in the folder ``drive``, without ``.json``.

@@ -256,7 +256,7 @@ def test_errors_of_runs_are_shared_where_they_point_the_same_way():
         )
         for error in (off, -3 * off, off.flip(0), off * torch.tensor([1.0, 0.0]))
     ]
-    executed, alternative = ([shared_errors.displacements(of_run, side) for of_run in found] for side in (0, 1))
+    executed, alternative = ([of_run.missed(side)[of_run.having(side)] for of_run in found] for side in (0, 1))
     assert executed[0].tolist() == [[[1.0, 0.0]], [[0.0, 2.0]]]
     assert [len(error) for error in alternative] == [1, 1, 1, 1]
     expected = [1.0, -1.0, 0.0, 1 / math.sqrt(5)]
