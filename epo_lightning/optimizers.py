@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import nn
 
+from epo_lightning.checks import check_number
 from epo_lightning.registry import ConfigError, nearest, register
 
 _SCHEDULES: dict[str, Callable[[float], float]] = {
@@ -25,25 +26,47 @@ class Adam:
 
     Attributes:
         lr: learning rate.
+        shared_factor: the learning rate of weights that all scenes share is ``lr`` times this factor
+            (:class:`~epo_lightning.decoders.weights.SharedWeights`). A step of Adam changes every number by about the
+            learning rate, whatever its gradient is; a few numbers that all scenes determine can take longer steps.
         schedule: ``constant`` or ``cosine``.
         clip: largest norm of the gradient; longer gradients are scaled down to it (gradient clipping); None for no limit.
     """
 
     lr: float = 5e-5
+    shared_factor: float = 1.0
     schedule: str = "constant"
     clip: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.lr < float("inf"):
             raise ConfigError(f"optimizer.lr must be positive and finite, not {self.lr}")
+        check_number("optimizer.shared_factor", self.shared_factor)
         if self.clip is not None and not self.clip > 0:
             raise ConfigError(f"optimizer.clip must be positive or null, not {self.clip}")
         if self.schedule not in _SCHEDULES:
             raise ConfigError(f"unknown optimizer.schedule {self.schedule!r}: {nearest(self.schedule, _SCHEDULES)}")
 
-    def configure(self, parameters: Iterable[nn.Parameter], total_steps: float) -> dict[str, Any]:
-        """Optimizer and schedule for Lightning's ``configure_optimizers``; the schedule lasts ``total_steps`` steps."""
-        adam = torch.optim.Adam(parameters, lr=self.lr, fused=True)  # one call for all parameters, not a dozen for each
+    def configure(
+        self, parameters: Sequence[nn.Parameter], total_steps: float, shared: Sequence[nn.Parameter] = ()
+    ) -> dict[str, Any]:
+        """Optimizer and schedule for Lightning's ``configure_optimizers``.
+
+        Args:
+            parameters: the parameters to learn.
+            total_steps: number of steps that the schedule lasts.
+            shared: those of them that learn faster, by ``shared_factor``.
+        """
+        # fused: one call for all parameters, not a dozen for each
+        adam = torch.optim.Adam(self._groups(parameters, shared), lr=self.lr, fused=True)
         shape = _SCHEDULES[self.schedule]
         schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: shape(step / total_steps))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _groups(self, parameters: Sequence[nn.Parameter], shared: Sequence[nn.Parameter]) -> list[dict[str, Any]]:
+        if self.shared_factor == 1 or not shared:
+            return [{"params": parameters}]
+        faster = {id(parameter) for parameter in shared}
+        others = [parameter for parameter in parameters if id(parameter) not in faster]
+        groups = [{"params": others}, {"params": shared, "lr": self.lr * self.shared_factor}]
+        return [group for group in groups if group["params"]]

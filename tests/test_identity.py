@@ -78,14 +78,9 @@ def test_a_setting_that_runs_did_not_have_yet_leaves_their_identity() -> None:
     del before["data"]["recipe"]
     assert identity(before, "d") == identity(changed("data.recipe", 1), "d") != identity(CONFIG, "d")
     assert differences(before, changed("data.recipe", 1)) == []
-
-
-def test_rows_from_before_calibration_in_training_leave_their_identity() -> None:
-    now = compose("train", ["experiment=rpi/v_lstm_epo_game"])
-    training = compose("train", ["experiment=rpi/v_lstm_epo_game", "forecaster.calibration.training=true"])
-    before = copy.deepcopy(now)
-    del before["forecaster"]["calibration"]["training"]
-    assert identity(before, "d") == identity(now, "d") != identity(training, "d")
+    before = copy.deepcopy(CONFIG)
+    del before["optimizer"]["shared_factor"]
+    assert identity(before, "d") == identity(CONFIG, "d") != identity(changed("optimizer.shared_factor", 10), "d")
 
 
 def test_data_enters_the_identity_by_its_digest() -> None:

@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 from lightning import LightningModule
-from torch import Tensor
+from torch import Tensor, nn
 
+from epo_lightning.decoders.weights import SharedWeights
 from epo_lightning.forecast import JointForecast
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.metrics.forecast import COLUMNS, STOPPED, stopped
@@ -140,7 +141,18 @@ class Forecaster(LightningModule):
         parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
         if not parameters:
             return None
-        return self.optimizer.configure(parameters, self.trainer.estimated_stepping_batches)
+        return self.optimizer.configure(parameters, self.trainer.estimated_stepping_batches, self.shared_weights)
+
+    @property
+    def shared_weights(self) -> list[nn.Parameter]:
+        """Parameters that are weights of all scenes, which may learn faster than a network."""
+        return [
+            parameter
+            for module in self.modules()
+            if isinstance(module, SharedWeights)
+            for parameter in module.parameters()
+            if parameter.requires_grad
+        ]
 
     def configure_gradient_clipping(self, *_: Any, **__: Any) -> None:
         """Clip by the limit of the optimizer's configuration instead of the Trainer's."""

@@ -49,15 +49,11 @@ class Calibration:
             improvement and changed its weights by 5 % or more takes up to 20 further ones.
         noise: standard deviation [m] of the observed positions.
         spread: standard deviation of s before the history is seen.
-        training: whether games are calibrated in training too, as a constant factor of the decoded pair weights. Otherwise
-            the other weights learn from solutions with the pair weights of the network, which reads them badly from a
-            history.
     """
 
     steps: int = 6
     noise: float = 0.001
     spread: float = 1.0
-    training: bool = False
 
     def __post_init__(self) -> None:
         check_whole("calibration.steps", self.steps, least=0)

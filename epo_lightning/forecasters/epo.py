@@ -123,7 +123,7 @@ class EPO(Forecaster):
         control_scale: float = 0.3,
         motions: Mapping[str, float] | None = None,
         game_horizon: int | None = None,
-        calibration: Mapping[str, float | bool] | None = None,
+        calibration: Mapping[str, float] | None = None,
         own_weights: str = "decoded",
         pair_weights: str = "decoded",
         one_game: bool = False,
@@ -207,7 +207,7 @@ class EPO(Forecaster):
         solved_scene = self._with_game_end(scene)
         orders = self._decode_orders(z, scene)
         parameters = self._infer_game(z, scene, goals, orders)
-        if self.calibration is not None and (self.calibration.training or not self.training):
+        if self.calibration is not None and not self.training:
             parameters = self.calibration(self.solver, self.energy, solved_scene, parameters)
         if TABLES not in self.solver.provides:
             parameters = parameters.for_every_mode(self.modes)

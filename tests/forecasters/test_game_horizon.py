@@ -141,35 +141,22 @@ def test_the_modes_of_one_game_have_the_same_positive_weights_and_different_star
     assert not torch.equal(game.initial_controls[:, 0], game.initial_controls[:, 1])
 
 
-@pytest.mark.parametrize("training", [False, True])
-def test_calibration_runs_in_training_if_it_is_asked_for(training: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    forecaster, scene = built(calibration={"steps": 2, "training": training}), scenes()
+def test_weights_of_all_scenes_are_named_for_the_optimizer() -> None:
+    forecaster = built()
+    assert [id(parameter) for parameter in forecaster.shared_weights] == [id(forecaster.own_weights.logarithms)]
+    assert built(own_weights="decoded").shared_weights == []
+
+
+def test_calibration_runs_outside_of_training_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    forecaster, scene = built(), scenes()
     seen = []
     monkeypatch.setattr(
         type(forecaster.calibration), "__call__", lambda self, *arguments: seen.append(1) or arguments[-1]
     )
     forecaster.train()(scene)
-    assert seen == training * [1]
+    assert seen == []
     forecaster.predict(scene)
-    assert seen == (training + 1) * [1]
-
-
-def test_weights_learn_from_calibrated_games(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The game that is solved in training has the corrected pair weights, and own weights have a gradient through it."""
-    plain, calibrated, scene = built(calibration=None), built(calibration={"training": True}), scenes()
-    decoded = plain.train()(scene).parameters.pair_weights
-
-    def doubled(self: object, *arguments: Any) -> Any:
-        weights = {name: 2 * weight for name, weight in arguments[-1].pair_weights.items()}
-        return dataclasses.replace(arguments[-1], pair_weights=weights)
-
-    monkeypatch.setattr(type(calibrated.calibration), "__call__", doubled)
-    forecast = calibrated.train()(scene)
-    solved = forecast.parameters
-    for name, weight in solved.pair_weights.items():
-        torch.testing.assert_close(weight, 2 * decoded[name])
-    (gradient,) = torch.autograd.grad(forecast.states.square().sum(), solved.own_weights["goal"])
-    assert gradient.abs().sum() > 0
+    assert seen == [1]
 
 
 def test_calibration_solves_its_games_as_training_does(monkeypatch: pytest.MonkeyPatch) -> None:
