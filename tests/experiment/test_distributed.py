@@ -138,7 +138,8 @@ def test_two_processes_give_the_scores_of_one(epo: Epo, row: str, precision: str
         same("one", "two", 1e-9)
     for split in ("test", "val"):
         one, two = (read_json(RunFolder(Path(name)).metrics_file(split))["metrics"] for name in ("one", "two"))
-        assert two == pytest.approx(one, rel=1e-5, abs=1e-5, nan_ok=True)
+        tolerance = 1e-3 if precision == "32-true" else 1e-5  # probabilities amplify rounding errors of the trainings
+        assert two == pytest.approx(one, rel=tolerance, abs=tolerance, nan_ok=True)
 
 
 def sweep(epo: Epo, *more: str) -> None:

