@@ -168,8 +168,8 @@ def test_the_sources_are_the_files_that_were_used(tmp_path: Path) -> None:
     page = write(tmp_path, '{% set rows = results("game") %}{{ sources() }}')
     lines = page.splitlines()
     assert len(lines) == 3
-    assert lines[2].startswith("| [game](tables/game/results.md) | rpi_hard (")
-    assert lines[2].endswith("| ba411c2 | 0 to 2 | 12 | 3670 | -3.4 to 0.0 % |")
+    assert lines[2].startswith("| [game](tables/game/results.md) | rpi_hard, recipe 2 (")
+    assert lines[2].endswith("| 81b9ee8, a951099 | 0 to 4 | 16 | 3670 | -4.9 to 0.0 % |")
 
 
 def test_the_validation_score_is_the_lowest_of_the_log(tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_the_validation_score_is_the_lowest_of_the_log(tmp_path: Path) -> None:
         ('a\n\n{{ results("game")["V-LSTM + SC"] }}', "line 3: .*has no row 'V-LSTM \\+ SC'; did you mean"),
         ('{{ results("game")["V-LSTM + SC, relaxed"].text("SAED") }}', "line 1: .*no metric 'SAED'"),
         ('{{ results("rpi_games_share") }}', "line 1: .*data must name one of its data sets, found None"),
-        ('{{ results("game", data="rpi") }}', "line 1: .*found rpi; did you mean 'rpi_hard'"),
+        ('{{ results("rpi_goal", data="rpi") }}', "line 1: .*found rpi; did you mean 'rpi_hard'"),
         (
             '\n{% set rows = results("rpi_hard") %}{{ rows["V-LSTM"].over(rows["V-LSTM"] - rows["V-LSTM"], "SADE") }}',
             "line 2: float division by zero",
