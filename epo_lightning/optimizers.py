@@ -68,5 +68,5 @@ class Adam:
             return [{"params": parameters}]
         faster = {id(parameter) for parameter in shared}
         others = [parameter for parameter in parameters if id(parameter) not in faster]
-        groups = [{"params": others}, {"params": shared, "lr": self.lr * self.shared_factor}]
-        return [group for group in groups if group["params"]]
+        fast: dict[str, Any] = {"params": shared, "lr": self.lr * self.shared_factor}
+        return [{"params": others}, fast] if others else [fast]
