@@ -26,9 +26,10 @@ class Adam:
 
     Attributes:
         lr: learning rate.
-        shared_factor: the learning rate of weights that all scenes share is ``lr`` times this factor
-            (:class:`~epo_lightning.decoders.weights.SharedWeights`). A step of Adam changes every number by about the
-            learning rate, whatever its gradient is; a few numbers that all scenes determine can take longer steps.
+        shared_factor: the learning rate of cost weights that all scenes share is ``lr`` times this factor
+            (:class:`~epo_lightning.decoders.weights.SharedWeights`). Other numbers, such as a temperature, keep ``lr``.
+            A step of Adam changes every number by about its learning rate, whatever the gradient is; a few numbers that
+            all scenes determine can take longer steps than a network.
         schedule: ``constant`` or ``cosine``.
         clip: largest norm of the gradient; longer gradients are scaled down to it (gradient clipping); None for no limit.
     """
@@ -55,7 +56,7 @@ class Adam:
         Args:
             parameters: the parameters to learn.
             total_steps: number of steps that the schedule lasts.
-            shared: those of them that learn faster, by ``shared_factor``.
+            shared: those of ``parameters`` whose learning rate is multiplied by ``shared_factor``.
         """
         # fused: one call for all parameters, not a dozen for each
         adam = torch.optim.Adam(self._groups(parameters, shared), lr=self.lr, fused=True)

@@ -145,7 +145,7 @@ class Forecaster(LightningModule):
 
     @property
     def shared_weights(self) -> list[nn.Parameter]:
-        """Parameters that are weights of all scenes, which may learn faster than a network."""
+        """Cost weights that all scenes share; the optimizer may give them another learning rate than the network."""
         return [
             parameter
             for module in self.modules()

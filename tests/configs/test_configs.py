@@ -208,7 +208,7 @@ def test_searches_learn_from_scores_and_keep_what_they_learned() -> None:
 def test_a_budget_in_the_command_line_wins_over_the_experiment() -> None:
     config = compose("train", ["experiment=rpi/v_lstm", "budget=reduced", "optimizer.lr=0.5"])
     assert config["budget"]["name"] == "reduced"
-    assert config["optimizer"] == {"name": "adam", "lr": 0.5, "schedule": "cosine", "clip": None}
+    assert (config["optimizer"]["lr"], config["optimizer"]["schedule"]) == (0.5, "cosine")
 
 
 MISTAKES = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import random
 import re
@@ -29,10 +30,16 @@ def generate(words: tuple[str, ...], root: Path, *prefix: str, workers: int = 1)
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """Files of the data sets of a cache, without its hidden files, the pool, and the summary, which has measured times."""
+    """Files of the data sets of a cache, without its hidden files, the pool, and the measured times of the summary."""
     folders = [path for path in root.glob("[!.]*-*") if "pool" not in path.name]
-    files = [file for folder in folders for file in folder.iterdir() if file.name != "recordings.csv"]
-    return {str(file.relative_to(root)): file.read_bytes() for file in files}
+    return {str(file.relative_to(root)): _content(file) for folder in folders for file in folder.iterdir()}
+
+
+def _content(file: Path) -> bytes:
+    if file.name != "recordings.csv":
+        return file.read_bytes()
+    rows = list(csv.DictReader(file.open(newline="")))
+    return repr([{key: value for key, value in row.items() if key != "seconds"} for row in rows]).encode()
 
 
 @pytest.mark.parametrize(("words", "workers"), [(RPI, 1), (EXID, 2)])

@@ -86,9 +86,10 @@ def test_a_program_gives_the_forecasts_of_its_forecaster_in_another_process(
         wanted, precise = forecaster.predict(scene), exact.predict(scene)
         # Where an agent is exactly at a bound, a Gauss-Newton step depends on the side to which numbers are rounded.
         smooth = torch.isclose(wanted.states, precise.states.float(), atol=1e-4, rtol=1e-5).flatten(1).all(1)
-        assert smooth.float().mean() > 0.8
+        assert (~smooth).sum() <= (0 if name == "rpi/v_lstm_sc" else 1)
+        torch.testing.assert_close(outputs["states"], wanted.states, atol=1e-2, rtol=1e-5)
         torch.testing.assert_close(outputs["states"][smooth], wanted.states[smooth], atol=1e-5, rtol=1e-5)
-        torch.testing.assert_close(outputs["probabilities"], wanted.probabilities, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(outputs["probabilities"], wanted.probabilities, atol=1e-5, rtol=1e-5)
     assert about["dt"] == scenes.dt
     agents = "N" if free else scenes.history.shape[1]
     assert about["inputs"]["history"]["shape"] == ["B", agents, *scenes.history.shape[2:]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,8 +12,10 @@ import torch
 from games import random_scene
 from suites import ForecasterSuite, model
 
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters import build_forecaster
+from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
@@ -145,6 +148,17 @@ def test_weights_of_all_scenes_are_named_for_the_optimizer() -> None:
     forecaster = built()
     assert [id(parameter) for parameter in forecaster.shared_weights] == [id(forecaster.own_weights.logarithms)]
     assert built(own_weights="decoded").shared_weights == []
+
+
+def test_the_row_of_the_inferred_game_gives_its_shared_weights_ten_times_the_learning_rate() -> None:
+    config = compose("train", ["experiment=rpi/v_lstm_epo_game", "budget=reduced"])
+    forecaster = built()
+    forecaster.optimizer = Adam(**{key: value for key, value in config["optimizer"].items() if key != "name"})
+    forecaster._trainer = SimpleNamespace(estimated_stepping_batches=10)
+    network, shared = forecaster.configure_optimizers()["optimizer"].param_groups
+    assert [id(parameter) for parameter in shared["params"]] == [id(forecaster.own_weights.logarithms)]
+    assert (network["lr"], shared["lr"]) == pytest.approx((1e-3, 1e-2))
+    assert len(network["params"]) + 1 == sum(parameter.requires_grad for parameter in forecaster.parameters())
 
 
 def test_calibration_runs_outside_of_training_only(monkeypatch: pytest.MonkeyPatch) -> None:
