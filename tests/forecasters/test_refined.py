@@ -81,7 +81,7 @@ class TestRefinedOnHighways(Refinements, HighwaySuite):
     tolerance = {"rtol": 1e-5, "atol": 1e-2}  # a game of fast vehicles amplifies rounding errors to 5 mm
 
     def crowded(self) -> Scene:
-        """Vehicles of 4.5 m: the refinement converges. Those of the suite are 20 times as large, and 20 steps are too few."""
+        """Vehicles of 4.5 m, with which 20 steps converge; those of the suite are 20 times as large."""
         return self.scene(16)
 
     def model(self, **changes: Any) -> dict[str, Any]:
