@@ -168,7 +168,7 @@ def prepare(experiment: str, overrides: Sequence[str], device: torch.device) -> 
         batches = _random_scenes(data.batch_size, data.task.horizon, data.task.dt)
     if device.type == "cuda":  # batches that are on the device already, as a data set that fits into its memory
         batches = itertools.cycle([next(batches).to(device) for _ in range(RESIDENT)])
-    optimizer = model.optimizer.configure(model.parameters(), 1000)["optimizer"]
+    optimizer = model.optimizer.configure(model.parameters(), 1000, model.shared_weights)["optimizer"]
     return Prepared(settings.title, model, optimizer, batches, made_up)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,7 +49,7 @@ class Adam:
             raise ConfigError(f"unknown optimizer.schedule {self.schedule!r}: {nearest(self.schedule, _SCHEDULES)}")
 
     def configure(
-        self, parameters: Sequence[nn.Parameter], total_steps: float, shared: Sequence[nn.Parameter] = ()
+        self, parameters: Iterable[nn.Parameter], total_steps: float, shared: Sequence[nn.Parameter] = ()
     ) -> dict[str, Any]:
         """Optimizer and schedule for Lightning's ``configure_optimizers``.
 
@@ -64,7 +64,7 @@ class Adam:
         schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: shape(step / total_steps))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def _groups(self, parameters: Sequence[nn.Parameter], shared: Sequence[nn.Parameter]) -> list[dict[str, Any]]:
+    def _groups(self, parameters: Iterable[nn.Parameter], shared: Sequence[nn.Parameter]) -> list[dict[str, Any]]:
         if self.shared_factor == 1 or not shared:
             return [{"params": parameters}]
         faster = {id(parameter) for parameter in shared}

@@ -24,7 +24,7 @@ FLOORS = {
     "host": set(),
     "pretrained": {"scene"},
     "run_folder": {"registry", "masking", "pretrained"},
-    "optimizers": {"registry"},
+    "optimizers": {"registry", "checks"},
     "losses": set(),
     "game": {"scene", "forecast", "registry", "checks", "host"},
     "solvers": {"game", "scene", "forecast", "registry", "checks", "host"},
