@@ -81,10 +81,15 @@ def test_a_setting_that_runs_did_not_have_yet_leaves_their_identity() -> None:
     before = copy.deepcopy(CONFIG)
     del before["optimizer"]["shared_factor"]
     assert identity(before, "d") == identity(CONFIG, "d") != identity(changed("optimizer.shared_factor", 10), "d")
+
+
+def test_a_setting_that_is_gone_leaves_the_identity_of_runs_that_have_it_off() -> None:
     now = compose("train", ["experiment=rpi/v_lstm_epo_game"])
     before = copy.deepcopy(now)
     before["forecaster"]["calibration"]["training"] = False
     assert identity(before, "d") == identity(now, "d")
+    before["forecaster"]["calibration"]["training"] = True
+    assert identity(before, "d") != identity(now, "d")
 
 
 def test_data_enters_the_identity_by_its_digest() -> None:

@@ -36,11 +36,10 @@ def test_weights_of_all_scenes_learn_by_their_own_factor():
 
 def test_one_group_of_parameters_is_enough_without_a_factor():
     """Runs of versions without the factor can be continued."""
-    shared = [torch.nn.Parameter(torch.zeros(1))]
-    for adam, given in ((Adam(shared_factor=1.0), shared), (Adam(shared_factor=10), [])):
-        assert (
-            len(adam.configure([torch.nn.Parameter(torch.zeros(1)), *shared], 5, given)["optimizer"].param_groups) == 1
-        )
+    network, shared = (torch.nn.Parameter(torch.zeros(1)) for _ in range(2))
+    for adam, given in ((Adam(shared_factor=1.0), [shared]), (Adam(shared_factor=10), [])):
+        (group,) = adam.configure([network, shared], 5, given)["optimizer"].param_groups
+        assert len(group["params"]) == 2
 
 
 def test_all_parameters_may_be_shared():
