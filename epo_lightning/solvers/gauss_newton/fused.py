@@ -28,13 +28,14 @@ from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNA
 
 if TYPE_CHECKING:
     from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
+    from epo_lightning.solvers.gauss_newton.fused_kernel.layout import Fast
 
 SIZES = (2, 4, 8)
 """Numbers of agents up to which there are kernels, each with matrices of its own size in shared memory and registers."""
 FEW = 2 * 132
 """Games of a launch up to which each has four warps: two for a multiprocessor of an H100 or H200."""
-RESIDENT = 16 * 132
-"""Blocks of a launch: as many as an H100 or H200 holds at a time. Each solves several games in turn, in the same memory."""
+MULTIPROCESSORS = 132
+"""Of an H100 or H200."""
 LONGEST = 2**31 - 1
 """Largest number of entries of an array of Warp."""
 
@@ -104,8 +105,10 @@ def warp() -> Any:
     return wp
 
 
-def kernels(dtype: torch.dtype, agents: int, games: int, device: torch.device, features: Features) -> SimpleNamespace:
-    """The kernels for a type of numbers and a number of agents and, on GPUs, for the features and the number of games."""
+def kernels(
+    dtype: torch.dtype, agents: int, steps: int, games: int, device: torch.device, features: Features
+) -> SimpleNamespace:
+    """The kernels for a type of numbers and a number of agents and, on GPUs, for features, steps and the number of games."""
     warp()
     from epo_lightning.solvers.gauss_newton.fused_kernel.constants import TEAM, WARP
     from epo_lightning.solvers.gauss_newton.fused_kernel.kernels import make
@@ -113,7 +116,13 @@ def kernels(dtype: torch.dtype, agents: int, games: int, device: torch.device, f
     double, size = dtype == torch.float64, size_for(agents)
     if device.type != "cuda":
         return make(double, size)
-    return make(double, size, features, TEAM if games <= FEW else WARP)
+    return make(double, size, features, steps, TEAM if games <= FEW else WARP)
+
+
+def resident(fast: Fast, dtype: torch.dtype) -> int:
+    """Blocks of a launch: as many as an H100 or H200 holds at a time. Each solves several games in turn, in the same memory."""
+    shared = 1024 + fast.numbers * dtype.itemsize * int(fast.shared)  # a block takes 1 kB more than it asks for
+    return MULTIPROCESSORS * min(16, 228 * 1024 // shared)
 
 
 def size_for(agents: int) -> int:
@@ -152,7 +161,7 @@ class _Call:
         fixed = [name for name in coupled if name in energy.margins]
         self.features = Features(tuple(energy.own), tuple(coupled), (*energy.decoded_margins, *fixed))
         games = self.shape[0] * self.shape[1]
-        self.kernels = kernels(self.dtype, self.shape[2], games, controls.device, self.features)
+        self.kernels = kernels(self.dtype, self.shape[2], self.shape[3], games, controls.device, self.features)
         with torch.no_grad():
             self.kept: list[Tensor] = []
             self._describe(energy, scene, parameters, step_size, damping)
@@ -183,17 +192,17 @@ class _Call:
                 bounds[2 * index : 2 * index + 2] = bound
         game.bounds = type(game.bounds)(*bounds)
         game.initial = self._array(scene.current)
-        game.present = self._array(scene.agent_mask, torch.uint8)
+        game.present = self._array(scene.agent_mask.view(torch.uint8), torch.uint8)
         size = scene.current.new_zeros(batch, agents, 2) if scene.size is None else scene.size
         game.size = self._array(size)
-        game.own = self._array(torch.stack(self.own)) if self.own else self._array(size)
+        game.own = self._array(_stacked(self.own)) if self.own else self._array(size)
         if self.features.pair:
-            game.pair = self._array(torch.stack(self.pair))
+            game.pair = self._array(_stacked(self.pair))
             pairs = (batch, modes, agents * (agents - 1) // 2)
             fixed = self.features.margins[len(self.margins) :]
             margins = [*self.margins, *(energy.margin(scene, parameters, name).expand(pairs) for name in fixed)]
             if margins:
-                game.margins = self._array(torch.stack([margin.to(self.dtype) for margin in margins]))
+                game.margins = self._array(_stacked([margin.to(self.dtype) for margin in margins]))
         for name, tensor in self.others.items():
             if tensor is not None:
                 setattr(game, name, self._array(tensor))
@@ -204,14 +213,14 @@ class _Call:
             assert scene.reference_mask is not None
             assert parameters.reference is not None
             game.references = self._array(scene.references)
-            game.exists = self._array(scene.reference_mask, torch.uint8)
+            game.exists = self._array(scene.reference_mask.view(torch.uint8), torch.uint8)
             game.reference = self._array(parameters.reference, torch.int64)
             game.lines, game.points = scene.references.shape[2:4]
         if "velref" in energy.own:
             assert scene.reference_speed is not None
             game.speeds = self._array(scene.reference_speed)
-        each = damping if damping.dim() == 3 else damping[..., None]
-        game.damping = self._array(each.expand(-1, -1, agents))
+        game.damping = self._array(damping)
+        game.damping_of_game, game.damping_of_agent = (agents, 1) if damping.dim() == 3 else (1, 0)
 
     def _reserve(self, controls: Tensor) -> None:
         """Allocate what the kernels write: results, and what the adjoint reads of all steps if they are recorded."""
@@ -220,7 +229,7 @@ class _Call:
         batch, modes, agents, horizon, _ = shape = self.shape
         games, new = batch * modes, controls.new_empty
         stacked = self.record or self.keep_iterates
-        self.blocks = min(games, RESIDENT) if controls.device.type == "cuda" else 1
+        self.blocks = min(games, resident(self.kernels.fast, self.dtype)) if controls.device.type == "cuda" else 1
         stages, slots = (self.steps, games) if self.record else (1, self.blocks)
         self.iterates = new((self.steps + 1 if stacked else 1, *shape))
         self.directions = new((max(self.steps, 1) if self.record else 1, *shape))
@@ -228,10 +237,11 @@ class _Call:
         self.initial_energy, self.energy, self.gradient_norm = new((3, batch, modes)).unbind(0)
         self.status = torch.empty(shape[:2], dtype=torch.int64, device=controls.device)
         self.factors = new(max(stages, 1) * slots * factor_numbers(size_for(agents)) * horizon)
-        self.nearest = new((stages + int(self.record)) * slots * 4 * agents * (horizon + 1))
+        self.nearest = new(int(self.record) * stages * slots * 4 * agents * (horizon + 1))
         self.taken = torch.empty(max(stages, 1) * games, dtype=torch.int32, device=controls.device)
         self.start = controls.detach().contiguous()
-        places = layout(size_for(agents), horizon, self.game.own_count, self.game.pair_count)
+        fast = self.kernels.fast
+        places = layout(size_for(agents), horizon, self.game.own_count, self.game.pair_count, fast)
         self.memory = places.numbers
         run = self.arguments = self.kernels.Run()
         run.steps, run.record, run.blocks, run.slots = self.steps, int(self.record), self.blocks, slots
@@ -301,6 +311,11 @@ class _Call:
         count = len(self.own)
         found = [*own[:count].unbind(0), *pair.unbind(0), *margins[: len(self.margins)].unbind(0)]
         return [*found, *(gradient for gradient in others.values() if gradient is not None)]
+
+
+def _stacked(tensors: list[Tensor]) -> Tensor:
+    """The tensors one after the other; a single one is not copied."""
+    return torch.stack(tensors) if len(tensors) > 1 else tensors[0]
 
 
 def _flat(tensor: Tensor) -> Any:

@@ -67,7 +67,8 @@ def make(
         games.weight,
         games.trace,
     )
-    own_slot, pair_count, Array, Numbers, A = games.own_slot, games.pair_count, games.Array, games.Numbers, games.agents
+    own_slot, pair_count, horizon = games.own_slot, games.pair_count, games.horizon
+    Array, Numbers, A = games.Array, games.Numbers, games.agents
     P = A * (A - 1) // 2
     six = wp.types.vector(6, T)
     excess, excess_slope, steering = residuals.excess, residuals.excess_slope, residuals.steering
@@ -114,24 +115,25 @@ def make(
 
     @func
     def position_adjoint(
-        g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array, nearest: Array, end: int
+        g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array, path: Array, nearest: Array, end: int
     ):
         """The cotangents of positions and of their tangents at all states, summed over the states from each on."""
-        each = n * (g.K + 1)
+        K = horizon(g)
+        each = n * (K + 1)
         for e in range(lane(), end * n, wp.block_dim()):
             i = e // end
             k = e - i * end
             state = k + 1
             row = game * g.N + agents[i]
-            x1 = work[tangent(at, g.K, 0, X, i) + state]
-            y1 = work[tangent(at, g.K, 0, Y, i) + state]
-            x2 = work[tangent(at, g.K, 1, X, i) + state]
-            y2 = work[tangent(at, g.K, 1, Y, i) + state]
-            px = work[trace(at, g.K, X, i) + state]
-            py = work[trace(at, g.K, Y, i) + state]
+            x1 = work[tangent(at, K, 0, X, i) + state]
+            y1 = work[tangent(at, K, 0, Y, i) + state]
+            x2 = work[tangent(at, K, 1, X, i) + state]
+            y2 = work[tangent(at, K, 1, Y, i) + state]
+            px = path[trace(at, K, X, i) + state]
+            py = path[trace(at, K, Y, i) + state]
             found = six(T(0.0))
             if own_slot(g, LANE) >= 0 and agents[g.N + i] >= 0:
-                place = i * (g.K + 1) + state
+                place = i * (K + 1) + state
                 found += pull_to(
                     g,
                     at,
@@ -177,13 +179,13 @@ def make(
                     p = pair_index(wp.min(i, other), wp.max(i, other), A)
                     sign = wp.where(other < i, T(-1.0), T(1.0))
                     for q in range(6):
-                        found[q] += sign * work[at.touching + (q * P + p) * g.K + k]
+                        found[q] += sign * work[at.touching + (q * P + p) * K + k]
             for q in range(6):
-                work[along(at, g.K, q, i) + k] = found[q]
+                work[along(at, K, q, i) + k] = found[q]
         sync()
         for e in range(lane(), 6 * n, wp.block_dim()):
             i = e // 6
-            to = along(at, g.K, e - 6 * i, i)
+            to = along(at, K, e - 6 * i, i)
             sums_back(work, to, 1, end, work, to)
         sync()
 
@@ -196,32 +198,34 @@ def make(
         agents: Numbers,
         at: Layout,
         work: Array,
+        path: Array,
         controls: Array,
         directions: Array,
         end: int,
     ):
         """The cotangents of headings and speeds, with those of later positions, summed over the states from each on."""
+        K = horizon(g)
         for e in range(lane(), end * n, wp.block_dim()):
             i = e // end
             k = e - i * end
             state = k + 1
             row = game * g.N + agents[i]
-            heading1 = work[tangent(at, g.K, 0, TURNED, i) + state]
-            speed1 = work[tangent(at, g.K, 0, SPEED, i) + state]
-            heading2 = work[tangent(at, g.K, 1, TURNED, i) + state]
-            speed2 = work[tangent(at, g.K, 1, SPEED, i) + state]
-            v = work[trace(at, g.K, SPEED, i) + state]
+            heading1 = work[tangent(at, K, 0, TURNED, i) + state]
+            speed1 = work[tangent(at, K, 0, SPEED, i) + state]
+            heading2 = work[tangent(at, K, 1, TURNED, i) + state]
+            speed2 = work[tangent(at, K, 1, SPEED, i) + state]
+            v = path[trace(at, K, SPEED, i) + state]
             by_heading = T(0.0)
             by_speed_of = T(0.0)
             if state < end:
-                c = work[trace(at, g.K, COSINE, i) + state]
-                s = work[trace(at, g.K, SINE, i) + state]
-                x0 = work[along(at, g.K, 0, i) + state]
-                y0 = work[along(at, g.K, 1, i) + state]
-                x_mu = work[along(at, g.K, 2, i) + state]
-                y_mu = work[along(at, g.K, 3, i) + state]
-                x_d = work[along(at, g.K, 4, i) + state]
-                y_d = work[along(at, g.K, 5, i) + state]
+                c = path[trace(at, K, COSINE, i) + state]
+                s = path[trace(at, K, SINE, i) + state]
+                x0 = work[along(at, K, 0, i) + state]
+                y0 = work[along(at, K, 1, i) + state]
+                x_mu = work[along(at, K, 2, i) + state]
+                y_mu = work[along(at, K, 3, i) + state]
+                x_d = work[along(at, K, 4, i) + state]
+                y_d = work[along(at, K, 5, i) + state]
                 along0 = c * x0 + s * y0
                 across0 = c * y0 - s * x0
                 along1 = c * x_mu + s * y_mu
@@ -233,8 +237,8 @@ def make(
                 )
                 by_speed_of = g.dt * (along0 + across1 * heading1 + across2 * heading2)
                 if own_slot(g, STEER) >= 0:
-                    u = row * g.K * 2 + 2 * state + TURN_RATE
-                    by_speed_of += steering_adjoint(g, game, agents, at, work, controls, directions, i, u, state, 1)
+                    u = row * K * 2 + 2 * state + TURN_RATE
+                    by_speed_of += steering_adjoint(g, game, agents, at, work, path, controls, directions, i, u, state, 1)
             if own_slot(g, VEL) >= 0:
                 by_speed_of += residual_adjoint(g, at, work, VEL, row, i, k, v, T(1.0), speed1, speed2)
             if own_slot(g, VELREF) >= 0:
@@ -245,7 +249,7 @@ def make(
                 slope = excess_slope(g, BOUND_VEL, v)
                 by_speed_of += residual_adjoint(g, at, work, VELB, row, i, k, over, slope, speed1, speed2)
             if own_slot(g, HEADING) >= 0 and state == end:
-                off = work[trace(at, g.K, TURNED, i) + state] - g.headings[row]
+                off = path[trace(at, K, TURNED, i) + state] - g.headings[row]
                 force = residual_adjoint(g, at, work, HEADING, row, i, k, off, T(1.0), heading1, heading2)
                 by_heading += force
                 by.headings[row] = by.headings[row] - force
@@ -253,14 +257,14 @@ def make(
                 if other != i and pair_count(g) > 0:
                     p = pair_index(wp.min(i, other), wp.max(i, other), A)
                     first = wp.where(other < i, 8, 6)
-                    by_heading += work[at.touching + (first * P + p) * g.K + k]
-                    by_speed_of += work[at.touching + ((first + 1) * P + p) * g.K + k]
-            work[along(at, g.K, 6, i) + k] = by_heading
-            work[along(at, g.K, 7, i) + k] = by_speed_of
+                    by_heading += work[at.touching + (first * P + p) * K + k]
+                    by_speed_of += work[at.touching + ((first + 1) * P + p) * K + k]
+            work[along(at, K, 6, i) + k] = by_heading
+            work[along(at, K, 7, i) + k] = by_speed_of
         sync()
         for e in range(lane(), 2 * n, wp.block_dim()):
             i = e // 2
-            to = along(at, g.K, 6 + e - 2 * i, i)
+            to = along(at, K, 6 + e - 2 * i, i)
             sums_back(work, to, 1, end, work, to)
         sync()
 
@@ -271,6 +275,7 @@ def make(
         agents: Numbers,
         at: Layout,
         work: Array,
+        path: Array,
         controls: Array,
         directions: Array,
         i: int,
@@ -280,16 +285,17 @@ def make(
     ):
         """The cotangent of the speed before a step (``of_speed`` 1), or of the turn rate of the step (0), which also keeps
         the product of the weight."""
+        K = horizon(g)
         row = game * g.N + agents[i]
         wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
         angle, by_turn, by_speed, turn_turn, turn_speed, speed_speed = steering(
-            wheelbase, controls[u], work[trace(at, g.K, SPEED, i) + k]
+            wheelbase, controls[u], path[trace(at, K, SPEED, i) + k]
         )
         w = weight(g, STEER, row)
-        turn1 = work[at.mu + 2 * (i * g.K + k) + TURN_RATE]
+        turn1 = work[at.mu + 2 * (i * K + k) + TURN_RATE]
         turn2 = directions[u]
-        speed1 = work[tangent(at, g.K, 0, SPEED, i) + k]
-        speed2 = work[tangent(at, g.K, 1, SPEED, i) + k]
+        speed1 = work[tangent(at, K, 0, SPEED, i) + k]
+        speed2 = work[tangent(at, K, 1, SPEED, i) + k]
         s1 = by_turn * turn1 + by_speed * speed1
         value = angle + by_turn * turn2 + by_speed * speed2
         if of_speed == 1:
@@ -310,19 +316,21 @@ def make(
         agents: Numbers,
         at: Layout,
         work: Array,
+        path: Array,
         controls: Array,
         directions: Array,
         end: int,
     ):
         """Adds to the cotangents of all controls and reference controls."""
+        K = horizon(g)
         per_dt = T(1.0) / g.dt
         for e in range(lane(), n * end, wp.block_dim()):
             k = e // n
             i = e - k * n
             row = game * g.N + agents[i]
             for channel in range(2):
-                u = row * g.K * 2 + 2 * k + channel
-                mine = at.mu + 2 * (i * g.K + k) + channel
+                u = row * K * 2 + 2 * k + channel
+                mine = at.mu + 2 * (i * K + k) + channel
                 turning = channel == TURN_RATE
                 force = T(0.0)
                 if k > 0:
@@ -340,20 +348,20 @@ def make(
                         force += residual_adjoint(
                             g, at, work, rate_bounded, row, i, k, over, slope, mu_change, d_change
                         )
-                work[at.rates + (channel * A + i) * (g.K + 1) + k] = per_dt * force
+                work[at.rates + (channel * A + i) * (K + 1) + k] = per_dt * force
         sync()
         for e in range(lane(), n * end, wp.block_dim()):
             k = e // n
             i = e - k * n
             row = game * g.N + agents[i]
             for channel in range(2):
-                u = row * g.K * 2 + 2 * k + channel
+                u = row * K * 2 + 2 * k + channel
                 turning = channel == TURN_RATE
                 value = controls[u]
-                mu = work[at.mu + 2 * (i * g.K + k) + channel]
+                mu = work[at.mu + 2 * (i * K + k) + channel]
                 d = directions[u]
-                rate = at.rates + (channel * A + i) * (g.K + 1) + k
-                bar = g.dt * work[along(at, g.K, wp.where(turning, 6, 7), i) + k] + work[rate]
+                rate = at.rates + (channel * A + i) * (K + 1) + k
+                bar = g.dt * work[along(at, K, wp.where(turning, 6, 7), i) + k] + work[rate]
                 if k + 1 < end:
                     bar -= work[rate + 1]
                 plain = wp.where(turning, TURNR, ACC)
@@ -372,7 +380,7 @@ def make(
                     slope = excess_slope(g, signal, value)
                     bar += residual_adjoint(g, at, work, bounded, row, i, k, over, slope, mu, d)
                 if turning and own_slot(g, STEER) >= 0:
-                    bar += steering_adjoint(g, game, agents, at, work, controls, directions, i, u, k, 0)
+                    bar += steering_adjoint(g, game, agents, at, work, path, controls, directions, i, u, k, 0)
                 by.controls[u] = by.controls[u] + bar
         sync()
 

@@ -45,7 +45,13 @@ class Resources:
 
 
 def compile_for(
-    architecture: int, double: bool, agents: int, games: int, folder: Path, features: Features = HIGHWAY
+    architecture: int,
+    double: bool,
+    agents: int,
+    games: int,
+    folder: Path,
+    features: Features = HIGHWAY,
+    steps: int = 20,
 ) -> dict[str, Resources]:
     """The resources of both kernels.
 
@@ -56,10 +62,11 @@ def compile_for(
         games: number of games of a launch.
         folder: where Warp writes source and machine code.
         features: the features of the games.
+        steps: number of steps of a game.
     """
     wp = fused.warp()
     dtype, device = torch.float64 if double else torch.float32, torch.device("cuda")
-    kernels = fused.kernels(dtype, agents, games, device, features)
+    kernels = fused.kernels(dtype, agents, steps, games, device, features)
     found = {}
     for name in ("solve", "differentiate"):
         module = getattr(kernels, name).module

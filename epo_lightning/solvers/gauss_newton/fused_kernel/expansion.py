@@ -1,6 +1,7 @@
-"""Costs of all states and controls with their first and second derivatives (Gauss-Newton); as in `kernel/step.hpp`.
+"""Costs of states and controls with their first and second derivatives (Gauss-Newton); as in `kernel/step.hpp`.
 
-Threads share out pairs and agents at all times, so that the recursion of `recursion.py` finds its whole problem ready.
+Threads share out the pairs and the agents of some steps, those from ``first`` on to ``last`` - 1, whose derivatives are then
+in fast memory for the recursion of `recursion.py`.
 """
 
 from types import SimpleNamespace
@@ -50,7 +51,7 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     X,
     Y,
 )
-from epo_lightning.solvers.gauss_newton.fused_kernel.layout import CONTROL_ITEMS, PAIR_ROWS
+from epo_lightning.solvers.gauss_newton.fused_kernel.layout import CONTROL_ITEMS, PAIR_ROWS, Fast
 from epo_lightning.solvers.gauss_newton.structured import LEAST_RAISED_DAMPING
 
 
@@ -61,54 +62,84 @@ def make(
     games: SimpleNamespace,
     residuals: SimpleNamespace,
     pairs: SimpleNamespace,
+    fast: Fast,
     func: Any,
 ) -> SimpleNamespace:
-    """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
+    """The functions for numbers of type ``T``, with fast memory for ``fast``; ``func`` decorates the longer ones."""
     evaluate_pair = pairs.evaluate
-    sync, lane = threads.sync, threads.lane
+    sync, lane, put = threads.sync, threads.lane, threads.put
     excess, excess_slope, add_residual, steering = (
         residuals.excess,
         residuals.excess_slope,
         residuals.add_residual,
         residuals.steering,
     )
-    Game, Layout, pair_index, pair_first, weight, trace = (
+    Game, Layout, pair_index, first_agent, weight, trace, nearest_point = (
         games.Game,
         games.Layout,
         games.pair_index,
-        games.pair_first,
+        games.first_agent,
         games.weight,
         games.trace,
+        games.nearest_point,
     )
-    own_slot, pair_feature, pair_count, margin_slot = (
+    own_slot, pair_feature, pair_count, margin_slot, horizon = (
         games.own_slot,
         games.pair_feature,
         games.pair_count,
         games.margin_slot,
+        games.horizon,
     )
+    steps, control_place, hessian_place, rows_place = fast.steps, fast.control, fast.hessian, fast.rows
     Array, Numbers, A = games.Array, games.Numbers, games.agents
     P = A * (A - 1) // 2
     wide = 4 * A  # columns of the Hessian of a state's costs; its gradient is one more row
     four = wp.types.vector(4, T)
     block = wp.types.matrix((4, 4), T)
 
+    # ---- Places in fast memory, of numbers of a step
+
+    @wp.func
+    def control_items(k: int):
+        """Derivatives by the controls of a step [13, A]."""
+        return control_place + (k % (steps + 1)) * (CONTROL_ITEMS * A)
+
+    @wp.func
+    def force_place(k: int, first: int, i: int):
+        """The gradient of the costs of a state by agent i's position, heading and speed."""
+        return hessian_place + (k - first) * (wide + 1) * wide + wide * wide + 4 * i
+
     # ---- Pairs
 
     @func
-    def expand_pairs(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, end: int, curved: int):
+    def expand_pairs(
+        g: Game,
+        game: int,
+        n: int,
+        agents: Numbers,
+        at: Layout,
+        work: Array,
+        path: Array,
+        costs: Array,
+        first: int,
+        last: int,
+        curved: int,
+    ):
         """The rows and energies of all pairs and, if ``curved``, their blocks of the Hessians."""
+        K = horizon(g)
         all_pairs = (g.N * (g.N - 1)) // 2
-        for e in range(lane(), end * P, wp.block_dim()):
-            k = e // P
-            p = e - k * P
+        for e in range(lane(), (last - first) * P, wp.block_dim()):
+            step = e // P
+            k = first + step
+            p = e - step * P
             state = k + 1
-            i = pair_first(p, A)
+            i = first_agent(p)
             j = p - pair_index(i, i + 1, A) + i + 1
             energy = T(0.0)
             cross = block(T(0.0))
             for slot in range(pair_count(g)):
-                first = four(T(0.0))
-                second = four(T(0.0))
+                of_one = four(T(0.0))
+                of_other = four(T(0.0))
                 pushed = T(0.0)
                 if j < n and state % g.pair_stride == 0:
                     one = 2 * ((game // g.M) * g.N + agents[i])
@@ -120,63 +151,63 @@ def make(
                         margin = g.margins[margin_slot(g, slot) * g.G * all_pairs + place]
                     value, x, y, turn1, faster1, turn2, faster2, by_margin = evaluate_pair(
                         pair_feature(g, slot),
-                        work[trace(at, g.K, X, i) + state],
-                        work[trace(at, g.K, Y, i) + state],
-                        work[trace(at, g.K, COSINE, i) + state],
-                        work[trace(at, g.K, SINE, i) + state],
-                        work[trace(at, g.K, SPEED, i) + state],
+                        path[trace(at, K, X, i) + state],
+                        path[trace(at, K, Y, i) + state],
+                        path[trace(at, K, COSINE, i) + state],
+                        path[trace(at, K, SINE, i) + state],
+                        path[trace(at, K, SPEED, i) + state],
                         g.size[one],
                         g.size[one + 1],
-                        work[trace(at, g.K, X, j) + state],
-                        work[trace(at, g.K, Y, j) + state],
-                        work[trace(at, g.K, COSINE, j) + state],
-                        work[trace(at, g.K, SINE, j) + state],
-                        work[trace(at, g.K, SPEED, j) + state],
+                        path[trace(at, K, X, j) + state],
+                        path[trace(at, K, Y, j) + state],
+                        path[trace(at, K, COSINE, j) + state],
+                        path[trace(at, K, SINE, j) + state],
+                        path[trace(at, K, SPEED, j) + state],
                         g.size[other],
                         g.size[other + 1],
                         margin,
                     )
-                    first = w * four(x, y, turn1, faster1)
-                    second = w * four(-x, -y, turn2, faster2)
+                    of_one = w * four(x, y, turn1, faster1)
+                    of_other = w * four(-x, -y, turn2, faster2)
                     pushed = w * value
                 energy += T(0.5) * pushed * pushed
-                cross += wp.outer(first, second)
-                row = at.rows + (slot * g.K + k) * PAIR_ROWS * P + p
+                cross += wp.outer(of_one, of_other)
+                row = rows_place + (slot * steps + step) * PAIR_ROWS * P + p
                 for q in range(4):
-                    work[row + q * P] = first[q]
-                    work[row + (4 + q) * P] = second[q]
-                work[row + 8 * P] = pushed
-            work[at.energy + (A + p) * g.K + k] = energy
+                    costs[row + q * P] = of_one[q]
+                    costs[row + (4 + q) * P] = of_other[q]
+                costs[row + 8 * P] = pushed
+            work[at.energy + (A + p) * K + k] = energy
             if curved == 1:
-                whole = at.hessian + k * (wide + 1) * wide
+                whole = hessian_place + step * (wide + 1) * wide
                 for q in range(4):
-                    for r in range(4):
-                        work[whole + (4 * i + q) * wide + 4 * j + r] = cross[q, r]
-                        work[whole + (4 * j + r) * wide + 4 * i + q] = cross[q, r]
-        sync()
+                    put(
+                        costs,
+                        whole + (4 * i + q) * wide + 4 * j,
+                        cross[q, 0],
+                        cross[q, 1],
+                        cross[q, 2],
+                        cross[q, 3],
+                    )
+                    put(
+                        costs,
+                        whole + (4 * j + q) * wide + 4 * i,
+                        cross[0, q],
+                        cross[1, q],
+                        cross[2, q],
+                        cross[3, q],
+                    )
 
     # ---- Agents
 
     @wp.func
-    def motion(g: Game, at: Layout, work: Array, i: int, k: int):
+    def motion(g: Game, at: Layout, path: Array, i: int, k: int):
         """Derivatives of the position after a step by heading (x, y) and by speed (x, y)."""
-        s = work[trace(at, g.K, SINE, i) + k]
-        c = work[trace(at, g.K, COSINE, i) + k]
-        along = g.dt * work[trace(at, g.K, SPEED, i) + k]
+        K = horizon(g)
+        s = path[trace(at, K, SINE, i) + k]
+        c = path[trace(at, K, COSINE, i) + k]
+        along = g.dt * path[trace(at, K, SPEED, i) + k]
         return four(-along * s, along * c, g.dt * c, g.dt * s)
-
-    @func
-    def set_motions(g: Game, n: int, at: Layout, work: Array, end: int):
-        """The motions of the positions of all agents at all steps."""
-        for e in range(lane(), end * A, wp.block_dim()):
-            k = e // A
-            i = e - k * A
-            moved = four(T(0.0))
-            if i < n:
-                moved = motion(g, at, work, i, k)
-            for q in range(4):
-                work[at.control + (k * CONTROL_ITEMS + MOTION + q) * A + i] = moved[q]
-        sync()
 
     @wp.func
     def rate_costs(g: Game, channel: int, row: int, u: int, k: int, value: T, controls: Array):
@@ -232,20 +263,41 @@ def make(
 
     @func
     def expand_controls(
-        g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, controls: Array, end: int
+        g: Game,
+        game: int,
+        n: int,
+        agents: Numbers,
+        at: Layout,
+        work: Array,
+        path: Array,
+        costs: Array,
+        controls: Array,
+        first: int,
+        last: int,
+        raised: T,
     ):
-        """Derivatives by the controls of all steps; those of absent agents are inert."""
-        for e in range(lane(), end * A, wp.block_dim()):
-            k = e // A
-            i = e - k * A
-            item = at.control + k * CONTROL_ITEMS * A + i
+        """Derivatives by controls, and the motions of positions; those of absent agents are inert.
+
+        The damping is added to the second derivatives, with ``raised`` times more of it.
+        """
+        K = horizon(g)
+        for e in range(lane(), (last - first) * A, wp.block_dim()):
+            step = e // A
+            k = first + step
+            i = e - step * A
+            item = control_items(k) + i
             energy = T(0.0)
             coupling = T(0.0)
+            moved = four(T(0.0))
             if i < n:
                 row = game * g.N + agents[i]
-                speed = work[trace(at, g.K, SPEED, i) + k]
+                moved = motion(g, at, path, i, k)
+                damping = g.damping[game * g.damping_of_game + agents[i] * g.damping_of_agent]
+                if raised > T(0.0):
+                    damping += raised * wp.max(damping, T(LEAST_RAISED_DAMPING))
+                speed = path[trace(at, K, SPEED, i) + k]
                 for channel in range(2):
-                    u = row * g.K * 2 + 2 * k + channel
+                    u = row * K * 2 + 2 * k + channel
                     value = controls[u]
                     turning = channel == TURN_RATE
                     each, force, stiffness = control_costs(g, channel, row, u, value)
@@ -260,30 +312,19 @@ def make(
                         stiffness += w * w * by_turn * by_turn
                         coupling = w * w * by_turn * by_speed
                     at_channel = item + wp.where(turning, 0, A)
-                    work[at_channel + PULL * A] = force + rate_force
-                    work[at_channel + RATE * A] = rate_force
-                    work[at_channel + DAMPED_STIFFNESS * A] = stiffness + rate_stiffness + g.damping[row]
-                    work[at_channel + RATE_STIFFNESS * A] = rate_stiffness
+                    costs[at_channel + PULL * A] = force + rate_force
+                    costs[at_channel + RATE * A] = rate_force
+                    costs[at_channel + DAMPED_STIFFNESS * A] = stiffness + rate_stiffness + damping
+                    costs[at_channel + RATE_STIFFNESS * A] = rate_stiffness
             else:
                 for q in range(COUPLING):
-                    work[item + q * A] = T(0.0)
-                work[item + DAMPED_STIFFNESS * A] = T(1.0)
-                work[item + (DAMPED_STIFFNESS + 1) * A] = T(1.0)
-            work[item + COUPLING * A] = coupling
-            work[at.energy + i * g.K + k] = energy
-        sync()
-
-    @wp.func
-    def raise_damping(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, end: int, more: T):
-        """Adds a multiple of the damping, for another factorisation."""
-        for e in range(lane(), end * n, wp.block_dim()):
-            k = e // n
-            i = e - k * n
-            item = at.control + k * CONTROL_ITEMS * A + i + DAMPED_STIFFNESS * A
-            extra = more * wp.max(g.damping[game * g.N + agents[i]], T(LEAST_RAISED_DAMPING))
-            work[item] = work[item] + extra
-            work[item + A] = work[item + A] + extra
-        sync()
+                    costs[item + q * A] = T(0.0)
+                costs[item + DAMPED_STIFFNESS * A] = T(1.0)
+                costs[item + (DAMPED_STIFFNESS + 1) * A] = T(1.0)
+            costs[item + COUPLING * A] = coupling
+            for q in range(4):
+                costs[item + (MOTION + q) * A] = moved[q]
+            work[at.energy + i * K + k] = energy
 
     @func
     def expand_states(
@@ -293,27 +334,36 @@ def make(
         agents: Numbers,
         at: Layout,
         work: Array,
+        path: Array,
+        costs: Array,
         nearest: Array,
         controls: Array,
+        first: int,
+        last: int,
         end: int,
         curved: int,
+        keep: int,
     ):
         """Gradients and, if ``curved``, the agents' own blocks of the Hessians; reads the rows of the pairs.
+
+        The nearest points of the lines [4, n, K + 1] and the tangents there go to ``nearest`` if ``keep``.
 
         The steering angle of a step depends on the speed of the state before it, and counts there for the derivatives by
         that speed.
         """
-        each = n * (g.K + 1)
-        for e in range(lane(), end * A, wp.block_dim()):
-            k = e // A
-            i = e - k * A
+        K = horizon(g)
+        each = n * (K + 1)
+        for e in range(lane(), (last - first) * A, wp.block_dim()):
+            step = e // A
+            k = first + step
+            i = e - step * A
             state = k + 1
             force = four(T(0.0))
             own = block(T(0.0))
             energy = T(0.0)
             if i < n:
                 row = game * g.N + agents[i]
-                v = work[trace(at, g.K, SPEED, i) + state]
+                v = path[trace(at, K, SPEED, i) + state]
                 push = T(0.0)
                 stiffness = T(0.0)
                 if own_slot(g, VEL) >= 0:
@@ -329,34 +379,41 @@ def make(
                     energy, push, stiffness = add_residual(weight(g, VELB, row), over, slope, energy, push, stiffness)
                 if own_slot(g, STEER) >= 0 and state < end:
                     wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
-                    turn = controls[row * g.K * 2 + 2 * state + TURN_RATE]
+                    turn = controls[row * K * 2 + 2 * state + TURN_RATE]
                     angle, by_turn, by_speed, turn_turn, turn_speed, speed_speed = steering(wheelbase, turn, v)
                     w = weight(g, STEER, row)
                     push += w * w * angle * by_speed
                     stiffness += w * w * by_speed * by_speed
                 heading_push = T(0.0)
                 heading_stiffness = T(0.0)
-                px = work[trace(at, g.K, X, i) + state]
-                py = work[trace(at, g.K, Y, i) + state]
+                px = path[trace(at, K, X, i) + state]
+                py = path[trace(at, K, Y, i) + state]
                 fx = T(0.0)
                 fy = T(0.0)
                 xx = T(0.0)
                 xy = T(0.0)
                 yy = T(0.0)
-                if own_slot(g, LANE) >= 0 and agents[g.N + i] >= 0:
-                    w = weight(g, LANE, row)
-                    place = i * (g.K + 1) + state
-                    energy, fx, xx = add_residual(w, px - nearest[NEAR_X * each + place], T(1.0), energy, fx, xx)
-                    energy, fy, yy = add_residual(w, py - nearest[NEAR_Y * each + place], T(1.0), energy, fy, yy)
-                    if g.slides == 1:  # the nearest point of the line moves with the agent
-                        tx = w * nearest[AHEAD_X * each + place]
-                        ty = w * nearest[AHEAD_Y * each + place]
-                        xx -= tx * tx
-                        xy -= tx * ty
-                        yy -= ty * ty
+                if own_slot(g, LANE) >= 0:
+                    near_x, near_y, ahead_x, ahead_y = nearest_point(g, agents[g.N + i], px, py)
+                    if agents[g.N + i] >= 0:
+                        w = weight(g, LANE, row)
+                        energy, fx, xx = add_residual(w, px - near_x, T(1.0), energy, fx, xx)
+                        energy, fy, yy = add_residual(w, py - near_y, T(1.0), energy, fy, yy)
+                        if g.slides == 1:  # the nearest point of the line moves with the agent
+                            tx = w * ahead_x
+                            ty = w * ahead_y
+                            xx -= tx * tx
+                            xy -= tx * ty
+                            yy -= ty * ty
+                    if keep == 1:
+                        place = i * (K + 1) + state
+                        nearest[NEAR_X * each + place] = near_x
+                        nearest[NEAR_Y * each + place] = near_y
+                        nearest[AHEAD_X * each + place] = ahead_x
+                        nearest[AHEAD_Y * each + place] = ahead_y
                 if state == end:
                     if own_slot(g, HEADING) >= 0:
-                        off = work[trace(at, g.K, TURNED, i) + state] - g.headings[row]
+                        off = path[trace(at, K, TURNED, i) + state] - g.headings[row]
                         energy, heading_push, heading_stiffness = add_residual(
                             weight(g, HEADING, row), off, T(1.0), energy, heading_push, heading_stiffness
                         )
@@ -375,30 +432,30 @@ def make(
                     for other in range(n):
                         if other != i:
                             pair = pair_index(wp.min(i, other), wp.max(i, other), A)
-                            at_pair = at.rows + (f * g.K + k) * PAIR_ROWS * P + pair
+                            at_pair = rows_place + (f * steps + step) * PAIR_ROWS * P + pair
                             side = wp.where(other < i, 4 * P, 0)
                             here = four(
-                                work[at_pair + side],
-                                work[at_pair + side + P],
-                                work[at_pair + side + 2 * P],
-                                work[at_pair + side + 3 * P],
+                                costs[at_pair + side],
+                                costs[at_pair + side + P],
+                                costs[at_pair + side + 2 * P],
+                                costs[at_pair + side + 3 * P],
                             )
-                            force += work[at_pair + 8 * P] * here
+                            force += costs[at_pair + 8 * P] * here
                             if curved == 1:
                                 own += wp.outer(here, here)
-            whole = at.hessian + k * (wide + 1) * wide + 4 * i
-            for q in range(4):
-                work[whole + wide * wide + q] = force[q]
-                if curved == 1:
-                    for r in range(4):
-                        work[whole + (4 * i + q) * wide + r] = own[q, r]
-            work[at.energy + i * g.K + k] = work[at.energy + i * g.K + k] + energy
+            to = force_place(k, first, i)
+            put(costs, to, force[0], force[1], force[2], force[3])
+            if curved == 1:
+                for q in range(4):
+                    to = hessian_place + step * (wide + 1) * wide + (4 * i + q) * wide + 4 * i
+                    put(costs, to, own[q, 0], own[q, 1], own[q, 2], own[q, 3])
+            work[at.energy + i * K + k] = work[at.energy + i * K + k] + energy
         sync()
 
     return SimpleNamespace(
-        set_motions=set_motions,
+        control_items=control_items,
+        force_place=force_place,
         expand_pairs=expand_pairs,
         expand_controls=expand_controls,
-        raise_damping=raise_damping,
         expand_states=expand_states,
     )

@@ -8,12 +8,8 @@ import warp as wp
 
 from epo_lightning.solvers.gauss_newton.fused_kernel import layout
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
-    AHEAD_X,
-    AHEAD_Y,
     COSINE,
     LANE,
-    NEAR_X,
-    NEAR_Y,
     PAIRS,
     SINE,
     SPEED,
@@ -28,12 +24,22 @@ from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, SIGNALS
 
 
 @no_type_check
-def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespace, func: Any) -> SimpleNamespace:
+def make(
+    T: Any,
+    agents: int,
+    features: Features | None,
+    steps: int | None,
+    fast: layout.Fast,
+    threads: SimpleNamespace,
+    func: Any,
+) -> SimpleNamespace:
     """Structures and functions for numbers of type ``T``; ``func`` decorates the longer functions.
 
     Args:
         agents: number of agents for which memory is laid out; a game has that many or fewer.
         features: the only features that the games have, so that the compiler leaves out all others; None for any.
+        steps: the only number of steps K that the games have; None for any.
+        fast: places in the fast memory of a game.
     """
     A = agents
     bytes_each = 8 if T is wp.float64 else 4
@@ -50,6 +56,7 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
     )
     own_number, pair_number = len(known.own), len(known.pair)
     sync, lane, sums, nearest_segment = threads.sync, threads.lane, threads.sums, threads.nearest_segment
+    in_fast_memory = fast.path
 
     # The fields of `layout.Layout`, as a structure of Warp.
     Layout = wp.struct(type("Layout", (), {"__annotations__": {field.name: int for field in fields(layout.Layout)}}))
@@ -86,6 +93,8 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
         speeds: Array
         reference_controls: Array
         damping: Array
+        damping_of_game: int
+        damping_of_agent: int
         present: wp.array(dtype=wp.uint8)
         exists: wp.array(dtype=wp.uint8)
         reference: wp.array(dtype=wp.int64)
@@ -150,7 +159,15 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
             i += 1
         return i
 
-    # ---- Features: constants if the kernels are compiled for them
+    @wp.func
+    def first_agent(pair: int):
+        """The first agent of a pair of A agents."""
+        i = int(0)
+        for r in range(1, A - 1):
+            i += wp.where(pair >= r * A - (r * (r + 1)) // 2, 1, 0)
+        return i
+
+    # ---- Features and the number of steps: constants if the kernels are compiled for them
 
     if features is None:
 
@@ -174,6 +191,10 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
         def pair_count(g: Game):
             return g.pair_count
 
+        @wp.func
+        def horizon(g: Game):
+            return g.K
+
     else:
 
         @wp.func
@@ -195,6 +216,10 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
         @wp.func
         def pair_count(g: Game):
             return pair_number
+
+        @wp.func
+        def horizon(g: Game):
+            return steps
 
     # ---- A game: its agents, their lines and whether its inputs are finite
 
@@ -220,9 +245,10 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
 
     @wp.func
     def end_of(g: Game, game: int):
+        K = horizon(g)
         if g.cut == 0:
-            return g.K
-        return wp.clamp(int(g.ends[game // g.M]), 0, g.K)
+            return K
+        return wp.clamp(int(g.ends[game // g.M]), 0, K)
 
     @func
     def valid(g: Game, game: int, n: int, agents: Numbers):
@@ -279,89 +305,94 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
 
     # ---- Trajectories
 
-    @wp.func
-    def trace(at: Layout, K: int, quantity: int, i: int):
-        """Start of one quantity of agent i's trajectory."""
-        return at.path + (quantity * A + i) * (K + 1)
+    if fast.path < 0:
+
+        @wp.func
+        def path_of(work: Array, fast: Array):
+            return work
+
+        @wp.func
+        def trace(at: Layout, K: int, quantity: int, i: int):
+            return at.path + (quantity * A + i) * (K + 1)
+
+    else:
+
+        @wp.func
+        def path_of(work: Array, fast: Array):
+            """The memory that holds the trajectories."""
+            return fast
+
+        @wp.func
+        def trace(at: Layout, K: int, quantity: int, i: int):
+            """Start of one quantity of agent i's trajectory in it."""
+            return in_fast_memory + (quantity * A + i) * (K + 1)
 
     @func
-    def roll(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, controls: Array):
+    def roll(g: Game, game: int, n: int, agents: Numbers, at: Layout, path: Array, controls: Array):
         """Headings and speeds are sums of the controls along time, and positions are sums of the motions that follow.
 
         The changes are summed on their own: added to a large coordinate, small ones would lose most of their digits.
         """
+        K = horizon(g)
         for e in range(lane(), 2 * n, wp.block_dim()):
             i = e // 2
             channel = e - 2 * i
             row = (game // g.M) * g.N + agents[i]
             turning = channel == TURN_RATE
             start = g.initial[4 * row + wp.where(turning, 2, 3)]
-            to = trace(at, g.K, wp.where(turning, TURNED, SPEED), i)
-            sums(controls, (game * g.N + agents[i]) * g.K * 2 + channel, 2, g.K, start, g.dt, work, to)
+            to = trace(at, K, wp.where(turning, TURNED, SPEED), i)
+            sums(controls, (game * g.N + agents[i]) * K * 2 + channel, 2, K, start, g.dt, path, to)
         sync()
-        for e in range(lane(), n * (g.K + 1), wp.block_dim()):
-            i = e // (g.K + 1)
-            k = e - i * (g.K + 1)
-            heading = work[trace(at, g.K, TURNED, i) + k]
+        for e in range(lane(), n * (K + 1), wp.block_dim()):
+            i = e // (K + 1)
+            k = e - i * (K + 1)
+            heading = path[trace(at, K, TURNED, i) + k]
             s = wp.sin(heading)
             c = wp.cos(heading)
-            along = g.dt * work[trace(at, g.K, SPEED, i) + k]
-            work[trace(at, g.K, SINE, i) + k] = s
-            work[trace(at, g.K, COSINE, i) + k] = c
-            work[trace(at, g.K, X, i) + k] = along * c
-            work[trace(at, g.K, Y, i) + k] = along * s
+            along = g.dt * path[trace(at, K, SPEED, i) + k]
+            path[trace(at, K, SINE, i) + k] = s
+            path[trace(at, K, COSINE, i) + k] = c
+            path[trace(at, K, X, i) + k] = along * c
+            path[trace(at, K, Y, i) + k] = along * s
         sync()
         for e in range(lane(), 2 * n, wp.block_dim()):
             i = e // 2
             axis = e - 2 * i
             start = g.initial[4 * ((game // g.M) * g.N + agents[i]) + axis]
-            to = trace(at, g.K, wp.where(axis == 0, X, Y), i)
-            sums(work, to, 1, g.K, start, T(1.0), work, to)
+            to = trace(at, K, wp.where(axis == 0, X, Y), i)
+            sums(path, to, 1, K, start, T(1.0), path, to)
         sync()
 
     @func
-    def find_nearest(g: Game, n: int, agents: Numbers, at: Layout, work: Array, nearest: Array):
-        """The nearest points of the lines [4, n, K + 1], with the tangents there where the nearest point moves along."""
-        if own_slot(g, LANE) >= 0:
-            for e in range(lane(), n * g.K, wp.block_dim()):
-                i = e // g.K
-                k = e - i * g.K + 1
-                line = agents[g.N + i]
-                x = work[trace(at, g.K, X, i) + k]
-                y = work[trace(at, g.K, Y, i) + k]
-                # Without a nearest segment an input is NaN, and the nearest point stays NaN.
-                near_x = T(wp.nan)
-                near_y = T(wp.nan)
-                ahead_x = T(0.0)
-                ahead_y = T(0.0)
-                inside = T(0.0)
-                if line < 0:
-                    near_x = x
-                    near_y = y
-                else:
-                    segment = nearest_segment(g.references, line, g.points, x, y)
-                    if segment >= 0:
-                        from_x = g.references[line + 2 * segment]
-                        from_y = g.references[line + 2 * segment + 1]
-                        ahead_x = g.references[line + 2 * segment + 2] - from_x
-                        ahead_y = g.references[line + 2 * segment + 3] - from_y
-                        length = ahead_x * ahead_x + ahead_y * ahead_y
-                        inverse = T(0.0)
-                        if length > T(0.0):
-                            inverse = T(1.0) / length
-                        raw = ((x - from_x) * ahead_x + (y - from_y) * ahead_y) * inverse
-                        along = wp.min(wp.max(raw, T(0.0)), T(1.0))
-                        near_x = from_x + along * ahead_x
-                        near_y = from_y + along * ahead_y
-                        inside = wp.where(along == raw, inverse, T(0.0))
-                scale = wp.sqrt(inside)
-                place = i * (g.K + 1) + k
-                each = n * (g.K + 1)
-                nearest[NEAR_X * each + place] = near_x
-                nearest[NEAR_Y * each + place] = near_y
-                nearest[AHEAD_X * each + place] = ahead_x * scale
-                nearest[AHEAD_Y * each + place] = ahead_y * scale
-            sync()
+    def nearest_point(g: Game, line: int, x: T, y: T):
+        """The nearest point of a line, and the tangent there where the point moves along; the point itself without a line."""
+        # Without a nearest segment an input is NaN, and the nearest point stays NaN.
+        near_x = T(wp.nan)
+        near_y = T(wp.nan)
+        ahead_x = T(0.0)
+        ahead_y = T(0.0)
+        inside = T(0.0)
+        if line < 0:
+            near_x = x
+            near_y = y
+        else:
+            segment = nearest_segment(g.references, line, g.points, x, y)
+            if segment >= 0:
+                from_x = g.references[line + 2 * segment]
+                from_y = g.references[line + 2 * segment + 1]
+                ahead_x = g.references[line + 2 * segment + 2] - from_x
+                ahead_y = g.references[line + 2 * segment + 3] - from_y
+                length = ahead_x * ahead_x + ahead_y * ahead_y
+                inverse = T(0.0)
+                if length > T(0.0):
+                    inverse = T(1.0) / length
+                raw = ((x - from_x) * ahead_x + (y - from_y) * ahead_y) * inverse
+                along = wp.min(wp.max(raw, T(0.0)), T(1.0))
+                near_x = from_x + along * ahead_x
+                near_y = from_y + along * ahead_y
+                inside = wp.where(along == raw, inverse, T(0.0))
+        scale = wp.sqrt(inside)
+        return near_x, near_y, ahead_x * scale, ahead_y * scale
 
     return SimpleNamespace(
         Game=Game,
@@ -381,9 +412,12 @@ def make(T: Any, agents: int, features: Features | None, threads: SimpleNamespac
         end_of=end_of,
         valid=valid,
         weight=weight,
+        horizon=horizon,
+        first_agent=first_agent,
+        path_of=path_of,
         trace=trace,
         roll=roll,
-        find_nearest=find_nearest,
+        nearest_point=nearest_point,
         Array=Array,
         Numbers=Numbers,
     )

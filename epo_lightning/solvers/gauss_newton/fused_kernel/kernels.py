@@ -9,6 +9,7 @@ import warp as wp
 from epo_lightning.solvers.gauss_newton.fused_kernel import adjoint as adjoints
 from epo_lightning.solvers.gauss_newton.fused_kernel import expansion as expansions
 from epo_lightning.solvers.gauss_newton.fused_kernel import games as all_games
+from epo_lightning.solvers.gauss_newton.fused_kernel import layout
 from epo_lightning.solvers.gauss_newton.fused_kernel import pair_adjoint as pair_adjoints
 from epo_lightning.solvers.gauss_newton.fused_kernel import pairs as pair_features
 from epo_lightning.solvers.gauss_newton.fused_kernel import products as all_products
@@ -17,9 +18,8 @@ from epo_lightning.solvers.gauss_newton.fused_kernel import residuals as all_res
 from epo_lightning.solvers.gauss_newton.fused_kernel import threads
 from epo_lightning.solvers.gauss_newton.fused_kernel import totals as all_totals
 from epo_lightning.solvers.gauss_newton.fused_kernel import trajectories as all_trajectories
-from epo_lightning.solvers.gauss_newton.fused_kernel.constants import DAMPED, SOLVED, STOPPED, TEAM, WARP
+from epo_lightning.solvers.gauss_newton.fused_kernel.constants import DAMPED, PAIRS, SOLVED, STOPPED, TEAM, WARP
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
-from epo_lightning.solvers.gauss_newton.fused_kernel.layout import factor_numbers
 from epo_lightning.solvers.gauss_newton.structured import RETRIES
 
 REGISTERS = {WARP: 128, TEAM: 255}
@@ -35,6 +35,7 @@ def make(
     double: bool,
     agents: int,
     features: Features | None = None,
+    steps: int | None = None,
     count: int = WARP,
     backwards: bool = False,
 ) -> SimpleNamespace:
@@ -45,41 +46,47 @@ def make(
         agents: number of agents that a game has at most.
         features: the features of the games, for kernels that are compiled for them and have all functions inlined, as GPUs
             need it; None for kernels that solve games with any features and take a few seconds to compile, for CPUs.
+        steps: the games' number of steps K, with ``features``.
         count: number of threads of a game on a GPU. On a CPU a game has one, unless Warp is set to run blocks of threads
             there (``warp.config.enable_cpu_blocks``), as tests of the barriers do.
         backwards: whether a CPU runs the threads of a game in the opposite order, for tests.
     """
     T = wp.float64 if double else wp.float32
     func = functools.partial(wp.func, inline=None if features else False)
-    basics = threads.make(T, backwards)
-    games = all_games.make(T, agents, features, basics, func)
+    fast = layout.fast(agents, len(features.pair) if features else PAIRS, steps, double, count)
+    basics = threads.make(T, fast, backwards)
+    games = all_games.make(T, agents, features, steps, fast, basics, func)
     pairs = pair_features.make(T, func)
     residuals = all_residuals.make(T, games)
-    expansion = expansions.make(T, basics, games, residuals, pairs, func)
-    totals = all_totals.make(T, basics, games, func)
-    recursion = recursions.make(T, agents, backwards)
+    expansion = expansions.make(T, basics, games, residuals, pairs, fast, func)
+    totals = all_totals.make(T, basics, games, expansion, func)
+    recursion = recursions.make(T, agents, fast, backwards)
     trajectories = all_trajectories.make(T, basics, games, func)
     products = all_products.make(T, basics, games, func)
     pair_adjoint = pair_adjoints.make(T, basics, games, pairs, trajectories, products, func).pair_adjoint
     adjoint = adjoints.make(T, basics, games, residuals, trajectories, products, func)
-    sync, lane = basics.sync, basics.lane
+    sync, lane, fast_memory = basics.sync, basics.lane, basics.fast_memory
     Game, Run, Gradients, part, set_up = games.Game, games.Run, games.Gradients, games.part, games.set_up
     pair_count = games.pair_count
-    end_of, valid, trace, roll, find_nearest = (
+    end_of, valid, trace, roll, path_of, horizon = (
         games.end_of,
         games.valid,
         games.trace,
         games.roll,
-        games.find_nearest,
+        games.path_of,
+        games.horizon,
     )
-    set_motions, expand_pairs, expand_controls, expand_states, raise_damping = (
-        expansion.set_motions,
+    expand_pairs, expand_controls, expand_states = (
         expansion.expand_pairs,
         expansion.expand_controls,
         expansion.expand_states,
-        expansion.raise_damping,
     )
-    total, squared_slope = totals.total, totals.squared_slope
+    total, forget_slopes, add_slopes, squared_slope = (
+        totals.total,
+        totals.forget_slopes,
+        totals.add_slopes,
+        totals.squared_slope,
+    )
     eliminate, pull, push = recursion.eliminate, recursion.pull, recursion.push
     roll_tangents, pull_states = trajectories.roll_tangents, trajectories.pull_states
     forget_products, add_products = products.forget_products, products.add_products
@@ -89,8 +96,9 @@ def make(
         adjoint.control_adjoint,
     )
     registers = 255 if double else REGISTERS[count]
-    each_factor = factor_numbers(agents)
+    each_factor = layout.factor_numbers(agents)
     rows = 2 * agents
+    together = fast.steps
 
     @wp.kernel(
         enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False, cuda_max_registers=registers
@@ -98,11 +106,14 @@ def make(
     def solve(g: Game, run: Run):
         block, _ = wp.tid()
         at = run.at
-        row = g.N * g.K * 2
+        K = horizon(g)
+        row = g.N * K * 2
         everything = g.G * row
-        factors_of_step = each_factor * g.K
-        each_nearest = 4 * g.N * (g.K + 1)
+        factors_of_step = each_factor * K
+        each_nearest = 4 * g.N * (K + 1)
         work = part(run.work, wp.int64(block) * wp.int64(at.numbers), at.numbers)
+        costs = fast_memory(work, at.fast)
+        path = path_of(work, costs)
         agents = wp.array(
             ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
         )
@@ -113,10 +124,10 @@ def make(
             status = SOLVED
             if sound == 0:
                 status = STOPPED
-            first = part(run.iterates, wp.int64(0), everything)
+            initial = part(run.iterates, wp.int64(0), everything)
             for e in range(lane(), row, wp.block_dim()):
-                there = g.present[(game // g.M) * g.N + e // (2 * g.K)] != wp.uint8(0)
-                first[game * row + e] = wp.where(there, run.start[game * row + e], T(0.0))
+                there = g.present[(game // g.M) * g.N + e // (2 * K)] != wp.uint8(0)
+                initial[game * row + e] = wp.where(there, run.start[game * row + e], T(0.0))
             sync()
             slot = wp.where(run.record == 1, game, block)
             flag = 2 * g.N
@@ -124,17 +135,53 @@ def make(
             for s in range(run.steps + 1):
                 stepping = wp.where(s < run.steps, 1, 0)
                 controls = part(run.iterates, wp.int64(s) * run.iterate_stride, everything)
-                # Nearest points of the last iterate have a place of their own: those of the steps are needed again.
                 tape = wp.int64(wp.where(run.record == 1, s, 0)) * wp.int64(run.slots) + wp.int64(slot)
-                nearest = part(run.nearest, tape * wp.int64(each_nearest), each_nearest)
-                roll(g, game, n, agents, at, work, controls)
-                find_nearest(g, n, agents, at, work, nearest)
-                set_motions(g, n, at, work, end)
-                expand_pairs(g, game, n, agents, at, work, end, stepping)
-                expand_controls(g, game, n, agents, at, work, controls, end)
-                expand_states(g, game, n, agents, at, work, nearest, controls, end, stepping)
+                keep = stepping * run.record
+                nearest = part(run.nearest, tape * wp.int64(each_nearest * keep), each_nearest)
+                factors = part(run.factors, tape * wp.int64(factors_of_step * stepping), factors_of_step)
+                roll(g, game, n, agents, at, path, controls)
+                positive = int(0)
+                attempt = int(0)
+                raised = T(0.0)
+                while positive == 0 and attempt <= RETRIES:
+                    positive = int(1)
+                    if stepping == 0:
+                        forget_slopes(costs)
+                    # Backwards in time: the costs of a few steps, then the recursion over them.
+                    for back in range((end + together - 1) // together):
+                        last = end - back * together
+                        first = wp.max(last - together, 0)
+                        expand_pairs(g, game, n, agents, at, work, path, costs, first, last, stepping)
+                        expand_controls(g, game, n, agents, at, work, path, costs, controls, first, last, raised)
+                        sync()
+                        expand_states(
+                            g,
+                            game,
+                            n,
+                            agents,
+                            at,
+                            work,
+                            path,
+                            costs,
+                            nearest,
+                            controls,
+                            first,
+                            last,
+                            end,
+                            stepping,
+                            keep,
+                        )
+                        if stepping == 1:
+                            solved = eliminate(work, at.linear, costs, factors, first, last, end, g.dt)
+                            positive = wp.min(positive, solved)
+                        else:
+                            add_slopes(g, n, costs, first, last, end)
+                    if positive == 0:
+                        status = wp.max(status, DAMPED)
+                        raised = wp.where(attempt == 0, T(10.0), T(10.0) * raised)
+                    attempt += 1
                 if s == 0 or stepping == 0:
-                    energy = total(at, work, g.K, end)
+                    energy = total(at, work, K, end)
                     if lane() == 0:
                         run.energy[game] = energy
                         if s == 0:
@@ -142,25 +189,13 @@ def make(
                 if stepping == 1:
                     onward = part(run.iterates, wp.int64(s + 1) * run.iterate_stride, everything)
                     directions = part(run.directions, wp.int64(s) * run.direction_stride, everything)
-                    factors = part(run.factors, tape * wp.int64(factors_of_step), factors_of_step)
                     for e in range(lane(), row, wp.block_dim()):
                         directions[game * row + e] = T(0.0)
                     sync()
-                    positive = int(0)
-                    attempt = int(0)
-                    raised = T(0.0)
-                    while positive == 0 and attempt <= RETRIES:
-                        positive = eliminate(work, at.control, at.hessian, at.linear, at.fast, factors, end, g.dt)
-                        if positive == 0:
-                            status = wp.max(status, DAMPED)
-                            more = wp.where(attempt == 0, T(10.0), T(9.0) * raised)
-                            raised += more
-                            raise_damping(g, game, n, agents, at, work, end, more)
-                        attempt += 1
                     push(
                         work,
                         at.linear,
-                        at.fast,
+                        costs,
                         factors,
                         end,
                         g.dt,
@@ -169,7 +204,7 @@ def make(
                         0,
                         agents,
                         n,
-                        g.K,
+                        K,
                     )
                     if lane() == 0:
                         agents[flag] = sound * positive
@@ -190,19 +225,19 @@ def make(
                     if run.record == 1 and lane() == 0:
                         run.taken[s * g.G + game] = taken
                     sync()
-            squared = squared_slope(g, n, at, work, end)
+            squared = squared_slope(n, costs)
             if lane() == 0:
                 run.gradient_norm[game] = wp.sqrt(squared)
                 run.status[game] = wp.int64(status)
             for e in range(lane(), 2 * row, wp.block_dim()):
                 run.states[game * 2 * row + e] = T(0.0)
             sync()
-            for e in range(lane(), n * g.K * 4, wp.block_dim()):
+            for e in range(lane(), n * K * 4, wp.block_dim()):
                 q = e % 4
-                k = (e // 4) % g.K
-                i = e // (4 * g.K)
-                to = ((game * g.N + agents[i]) * g.K + k) * 4 + q
-                run.states[to] = work[trace(at, g.K, q, i) + k + 1]
+                k = (e // 4) % K
+                i = e // (4 * K)
+                to = ((game * g.N + agents[i]) * K + k) * 4 + q
+                run.states[to] = path[trace(at, K, q, i) + k + 1]
             sync()
 
     @wp.kernel(
@@ -211,11 +246,14 @@ def make(
     def differentiate(g: Game, run: Run, by: Gradients):
         block, _ = wp.tid()
         at = run.at
-        row = g.N * g.K * 2
+        K = horizon(g)
+        row = g.N * K * 2
         everything = g.G * row
-        factors_of_step = each_factor * g.K
-        each_nearest = 4 * g.N * (g.K + 1)
+        factors_of_step = each_factor * K
+        each_nearest = 4 * g.N * (K + 1)
         work = part(run.work, wp.int64(block) * wp.int64(at.numbers), at.numbers)
+        costs = fast_memory(work, at.fast)
+        path = path_of(work, costs)
         agents = wp.array(
             ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
         )
@@ -224,8 +262,8 @@ def make(
             end = end_of(g, game)
             if by.along_states == 1:
                 last = part(run.iterates, wp.int64(run.steps) * run.iterate_stride, everything)
-                roll(g, game, n, agents, at, work, last)
-                pull_states(g, by, game, n, agents, at, work)
+                roll(g, game, n, agents, at, path, last)
+                pull_states(g, by, game, n, agents, at, work, path)
             for turn in range(run.steps + 1):
                 s = run.steps - turn
                 if s < run.steps:
@@ -235,25 +273,25 @@ def make(
                         tape = wp.int64(s) * wp.int64(run.slots) + wp.int64(game)
                         factors = part(run.factors, tape * wp.int64(factors_of_step), factors_of_step)
                         nearest = part(run.nearest, tape * wp.int64(each_nearest), each_nearest)
-                        roll(g, game, n, agents, at, work, controls)
+                        roll(g, game, n, agents, at, path, controls)
                         # mu = alpha H^-1 times the cotangent; zero after the end of the game.
                         m = 2 * n
-                        for e in range(lane(), m * g.K, wp.block_dim()):
+                        for e in range(lane(), m * K, wp.block_dim()):
                             work[at.mu + e] = T(0.0)
                         for e in range(lane(), rows * end, wp.block_dim()):
                             k = e // rows
                             r = e - k * rows  # turn rate and acceleration of each agent
                             value = T(0.0)
                             if r < m:
-                                u = 2 * ((game * g.N + agents[r // 2]) * g.K + k) + 1 - r % 2
+                                u = 2 * ((game * g.N + agents[r // 2]) * K + k) + 1 - r % 2
                                 value = -g.step_size * by.controls[u]
                             work[at.linear + e] = value
                         sync()
-                        pull(work, at.linear, at.fast, factors, end, g.dt)
+                        pull(work, at.linear, costs, factors, end, g.dt)
                         push(
                             work,
                             at.linear,
-                            at.fast,
+                            costs,
                             factors,
                             end,
                             g.dt,
@@ -262,15 +300,15 @@ def make(
                             1,
                             agents,
                             n,
-                            g.K,
+                            K,
                         )
-                        roll_tangents(g, game, n, agents, at, work, directions)
+                        roll_tangents(g, game, n, agents, at, work, path, directions)
                         forget_products(g, at, work)
                         if pair_count(g) > 0:
-                            pair_adjoint(g, game, n, agents, at, work, end)
-                        position_adjoint(g, by, game, n, agents, at, work, nearest, end)
-                        motion_adjoint(g, by, game, n, agents, at, work, controls, directions, end)
-                        control_adjoint(g, by, game, n, agents, at, work, controls, directions, end)
+                            pair_adjoint(g, game, n, agents, at, work, path, end)
+                        position_adjoint(g, by, game, n, agents, at, work, path, nearest, end)
+                        motion_adjoint(g, by, game, n, agents, at, work, path, controls, directions, end)
+                        control_adjoint(g, by, game, n, agents, at, work, path, controls, directions, end)
                         add_products(g, by, game, n, agents, at, work, end)
                 if by.along_iterates == 1:
                     given = part(by.iterates, wp.int64(s) * wp.int64(everything), everything)
@@ -279,10 +317,16 @@ def make(
                         by.controls[u] = by.controls[u] + given[u]
                     sync()
             for e in range(lane(), row, wp.block_dim()):
-                if g.present[(game // g.M) * g.N + e // (2 * g.K)] == wp.uint8(0):
+                if g.present[(game // g.M) * g.N + e // (2 * K)] == wp.uint8(0):
                     by.controls[game * row + e] = T(0.0)
             sync()
 
     return SimpleNamespace(
-        solve=solve, differentiate=differentiate, Game=Game, Run=Run, Gradients=Gradients, threads=count
+        solve=solve,
+        differentiate=differentiate,
+        Game=Game,
+        Run=Run,
+        Gradients=Gradients,
+        threads=count,
+        fast=fast,
     )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from epo_lightning.solvers.gauss_newton.fused_kernel.constants import WARP
+
 CONTROL_ITEMS = 13
 """Numbers of an agent and a control: see ``PULL`` and the others in `constants.py`."""
 PAIR_ROWS = 9
@@ -16,20 +18,16 @@ PAIR_COTANGENTS = 10
 class Layout:
     """First numbers of the arrays; the shape of each, with A agents, P pairs, K steps, F pair features, O own features.
 
-    The arrays from ``hessian`` on are those of a step, and those from ``along`` on those of its adjoint, in the same place.
-    ``fast`` is used on CPUs only: GPUs have shared memory in its place.
+    The array ``energy`` is that of a step, and those from ``mu`` on are those of its adjoint, in the same place. ``fast`` is
+    used where a game has no shared memory, and ``path`` where :class:`Fast` has no place for it.
 
     Attributes:
         path: trajectories and their sines and cosines [6, A, K + 1].
         linear: gradient by the controls, as the recursion leaves it [K, 2 A].
+        fast: see :class:`Fast`.
+        energy: by agent and by pair [A + P, K], and sums along time of each [A + P].
         mu: product of the inverse Hessian and a cotangent [A, K, 2].
         tangents: of the trajectories along mu and along the step [2, 4, A, K + 1].
-        costs: sums along time of gradients [8, A, K], and single sums [A + P].
-        control: derivatives by controls [K, 13, A].
-        fast: what the recursion works on.
-        hessian: of the costs of a state by positions, headings and speeds, and their gradient [K, 4 A + 1, 4 A].
-        rows: pair features [F, K, 9, P].
-        energy: by agent and by pair [A + P, K].
         along: cotangents of positions (6), heading and speed [8, A, K].
         rates: cotangents of the changes of controls [2, A, K + 1].
         touching: cotangents of pairs [10, P, K].
@@ -39,14 +37,10 @@ class Layout:
 
     path: int
     linear: int
+    fast: int
+    energy: int
     mu: int
     tangents: int
-    costs: int
-    control: int
-    fast: int
-    hessian: int
-    rows: int
-    energy: int
     along: int
     rates: int
     touching: int
@@ -54,20 +48,18 @@ class Layout:
     numbers: int
 
 
-def layout(agents: int, steps: int, own: int, pair: int) -> Layout:
+def layout(agents: int, steps: int, own: int, pair: int, fast: Fast) -> Layout:
     """The places for games of ``agents`` agents and ``steps`` steps with these numbers of features."""
     A, K, P = agents, steps, agents * (agents - 1) // 2
     shared = {
-        "path": 6 * A * (K + 1),
+        "path": 0 if fast.path >= 0 else 6 * A * (K + 1),
         "linear": 2 * A * K,
+        "fast": 0 if fast.shared else fast.numbers,
+    }
+    of_step = {"energy": (A + P) * (K + 1)}
+    of_adjoint = {
         "mu": 2 * A * K,
         "tangents": 8 * A * (K + 1),
-        "costs": 8 * A * K + A + P,
-        "control": CONTROL_ITEMS * A * K,
-        "fast": fast_numbers(A),
-    }
-    of_step = {"hessian": (4 * A + 1) * 4 * A * K, "rows": pair * K * PAIR_ROWS * P, "energy": (A + P) * K}
-    of_adjoint = {
         "along": 8 * A * K,
         "rates": 2 * A * (K + 1),
         "touching": PAIR_COTANGENTS * P * K,
@@ -86,12 +78,65 @@ def layout(agents: int, steps: int, own: int, pair: int) -> Layout:
     return Layout(**places, numbers=end)
 
 
-def fast_numbers(agents: int) -> int:
-    """Numbers of the recursion's arrays: the value function, two arrays of a row per control, and controls of two steps."""
-    controls = 2 * agents
-    way_back = 5 * controls * (3 * controls + 4) + 2 * CONTROL_ITEMS * agents + 4
-    streamed = 12 * controls + 4 * (factor_numbers(agents) + controls)
-    return max(way_back, streamed)
+@dataclass(frozen=True)
+class Fast:
+    """Places in the fast memory of a game: shared memory on a GPU.
+
+    The costs of ``steps`` steps are in it at a time, just before the recursion needs them.
+
+    Attributes:
+        steps: C, the number of those steps.
+        control: derivatives by controls [C + 1, 13, A], at k modulo C + 1: the recursion needs those of the next step too.
+        hessian: of the costs of a state by positions, headings and speeds, and their gradient [C, 4 A + 1, 4 A].
+        path: trajectories and their sines and cosines [6, A, K + 1]; -1 where they are in the other memory.
+        rows: pair features [F, C, 9, P].
+        numbers: of all together. The first ones, up to ``control``, are the arrays of the recursion.
+        shared: whether this is shared memory.
+    """
+
+    steps: int
+    control: int
+    hessian: int
+    path: int
+    rows: int
+    numbers: int
+    shared: bool
+
+
+STEPS_ON_CPUS = 4
+"""Steps whose costs are in fast memory at a time on a CPU."""
+MOST_SHARED = 46_000
+"""Bytes of shared memory that a game may have, below the 48 kB that a compiler reserves without being asked."""
+SHARED_OF_MANY = 13_200
+"""Bytes with which 16 games are in the shared memory of a multiprocessor of an H100 or H200 at a time."""
+
+
+def fast(agents: int, pair: int, horizon: int | None, double: bool, threads: int) -> Fast:
+    """Places for games of ``agents`` agents with ``pair`` pair features.
+
+    Args:
+        agents: A.
+        pair: F.
+        horizon: K on a GPU; None on a CPU.
+        double: whether numbers have double precision.
+        threads: of a game: of few games, one has the memory of a multiprocessor nearly for itself.
+    """
+    A, P = agents, agents * (agents - 1) // 2
+    sizes = {"control": CONTROL_ITEMS * A, "hessian": (4 * A + 1) * 4 * A, "rows": pair * PAIR_ROWS * P}
+    recursion = 5 * 2 * A * (6 * A + 4)  # the value function and two arrays of a row per control
+    steps, path, most = STEPS_ON_CPUS, 0, 0
+    if horizon is not None:
+        most = (SHARED_OF_MANY if threads == WARP else MOST_SHARED) // (8 if double else 4)
+        path = 6 * A * (horizon + 1)
+        path = path if path <= most // 3 else 0
+        left = most - recursion - sizes["control"] - path
+        steps = max(1, min(left // sum(sizes.values()), horizon))
+    places = [recursion]
+    for count in ((steps + 1) * sizes["control"], steps * sizes["hessian"], path, steps * sizes["rows"]):
+        places.append(places[-1] + -(-count // 4) * 4)
+    control, hessian, at_path, rows, numbers = places
+    shared = horizon is not None and numbers * (8 if double else 4) <= MOST_SHARED
+    return Fast(steps, control, hessian, at_path if path else -1, rows, numbers, shared)
 
 
 def factor_numbers(agents: int) -> int:

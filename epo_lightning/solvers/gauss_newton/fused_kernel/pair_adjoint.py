@@ -27,49 +27,45 @@ def make(
         trajectories.tangent,
         products.pair_product_place,
     )
-    Game, Layout, pair_index, pair_first, trace = (
-        games.Game,
-        games.Layout,
-        games.pair_index,
-        games.pair_first,
-        games.trace,
-    )
+    Game, Layout, pair_index, trace = games.Game, games.Layout, games.pair_index, games.trace
     pair_feature, pair_count, margin_slot = games.pair_feature, games.pair_count, games.margin_slot
+    horizon, first_agent = games.horizon, games.first_agent
     Array, Numbers, A = games.Array, games.Numbers, games.agents
     P = A * (A - 1) // 2
     ten = wp.types.vector(PAIR_COTANGENTS, T)
 
     @wp.func
-    def moving(at: Layout, K: int, work: Array, quantity: int, i: int, state: int):
+    def moving(at: Layout, K: int, work: Array, path: Array, quantity: int, i: int, state: int):
         """A quantity of a trajectory with its derivatives along mu and d."""
         return dual(
-            work[trace(at, K, quantity, i) + state],
+            path[trace(at, K, quantity, i) + state],
             work[tangent(at, K, 0, quantity, i) + state],
             work[tangent(at, K, 1, quantity, i) + state],
         )
 
     @func
-    def pair_adjoint(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, end: int):
+    def pair_adjoint(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, path: Array, end: int):
         """The cotangents of all pairs at all states, and the products of their weights and margins."""
+        K = horizon(g)
         all_pairs = (g.N * (g.N - 1)) // 2
         stride = g.G * all_pairs
         for e in range(lane(), end * P, wp.block_dim()):
             k = e // P
             p = e - k * P
             state = k + 1
-            i = pair_first(p, A)
+            i = first_agent(p)
             j = p - pair_index(i, i + 1, A) + i + 1
             found = ten(T(0.0))
             if j < n and state % g.pair_stride == 0:
                 one = 2 * ((game // g.M) * g.N + agents[i])
                 other = 2 * ((game // g.M) * g.N + agents[j])
                 place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
-                c1 = work[trace(at, g.K, COSINE, i) + state]
-                s1 = work[trace(at, g.K, SINE, i) + state]
-                c2 = work[trace(at, g.K, COSINE, j) + state]
-                s2 = work[trace(at, g.K, SINE, j) + state]
-                turn1 = moving(at, g.K, work, TURNED, i, state)
-                turn2 = moving(at, g.K, work, TURNED, j, state)
+                c1 = path[trace(at, K, COSINE, i) + state]
+                s1 = path[trace(at, K, SINE, i) + state]
+                c2 = path[trace(at, K, COSINE, j) + state]
+                s2 = path[trace(at, K, SINE, j) + state]
+                turn1 = moving(at, K, work, path, TURNED, i, state)
+                turn2 = moving(at, K, work, path, TURNED, j, state)
                 for slot in range(pair_count(g)):
                     w = g.pair[slot * stride + place]
                     margin = T(0.0)
@@ -77,18 +73,18 @@ def make(
                         margin = g.margins[margin_slot(g, slot) * stride + place]
                     value, x, y, h1, v1, h2, v2, by_margin = evaluate_pair(
                         pair_feature(g, slot),
-                        moving(at, g.K, work, X, i, state),
-                        moving(at, g.K, work, Y, i, state),
+                        moving(at, K, work, path, X, i, state),
+                        moving(at, K, work, path, Y, i, state),
                         dual(c1, -s1 * turn1[1], -s1 * turn1[2]),
                         dual(s1, c1 * turn1[1], c1 * turn1[2]),
-                        moving(at, g.K, work, SPEED, i, state),
+                        moving(at, K, work, path, SPEED, i, state),
                         g.size[one],
                         g.size[one + 1],
-                        moving(at, g.K, work, X, j, state),
-                        moving(at, g.K, work, Y, j, state),
+                        moving(at, K, work, path, X, j, state),
+                        moving(at, K, work, path, Y, j, state),
                         dual(c2, -s2 * turn2[1], -s2 * turn2[2]),
                         dual(s2, c2 * turn2[1], c2 * turn2[2]),
-                        moving(at, g.K, work, SPEED, j, state),
+                        moving(at, K, work, path, SPEED, j, state),
                         g.size[other],
                         g.size[other + 1],
                         dual(margin, T(0.0), T(0.0)),
@@ -109,12 +105,12 @@ def make(
                         h2[1] * ahead + along_mu * (h2[0] + h2[2]),
                         v2[1] * ahead + along_mu * (v2[0] + v2[2]),
                     )
-                    work[pair_product_place(g, at, g.K, 0, slot, p) + k] = T(-2.0) * w * along_mu * ahead
-                    work[pair_product_place(g, at, g.K, 1, slot, p) + k] = -square * (
+                    work[pair_product_place(g, at, K, 0, slot, p) + k] = T(-2.0) * w * along_mu * ahead
+                    work[pair_product_place(g, at, K, 1, slot, p) + k] = -square * (
                         by_margin[1] * ahead + along_mu * (by_margin[0] + by_margin[2])
                     )
             for q in range(PAIR_COTANGENTS):
-                work[at.touching + (q * P + p) * g.K + k] = found[q]
+                work[at.touching + (q * P + p) * K + k] = found[q]
         sync()
 
     return SimpleNamespace(

@@ -24,11 +24,13 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
     own_slot, own_count, pair_count, margin_slot = games.own_slot, games.own_count, games.pair_count, games.margin_slot
     Array, Numbers, A = games.Array, games.Numbers, games.agents
     P = A * (A - 1) // 2
+    horizon = games.horizon
 
     @wp.func
     def keep_own_product(g: Game, at: Layout, work: Array, feature: int, i: int, k: int, value: T):
         """Keeps what an own feature at a step adds to the gradient by its weight."""
-        work[at.weights + (own_slot(g, feature) * A + i) * g.K + k] = value
+        K = horizon(g)
+        work[at.weights + (own_slot(g, feature) * A + i) * K + k] = value
 
     @wp.func
     def pair_product_place(g: Game, at: Layout, K: int, kind: int, slot: int, p: int):
@@ -38,19 +40,21 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
     @func
     def forget_products(g: Game, at: Layout, work: Array):
         """Sets all products to zero."""
-        for e in range(lane(), (own_count(g) * A + 2 * pair_count(g) * P) * g.K, wp.block_dim()):
+        K = horizon(g)
+        for e in range(lane(), (own_count(g) * A + 2 * pair_count(g) * P) * K, wp.block_dim()):
             work[at.weights + e] = T(0.0)
         sync()
 
     @func
     def add_products(g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array, end: int):
         """Adds the sums along time of the products to the gradients by weights and margins."""
+        K = horizon(g)
         for e in range(lane(), own_count(g) * n, wp.block_dim()):
             slot = e // n
             i = e - slot * n
             value = T(0.0)
             for k in range(end):
-                value += work[at.weights + (slot * A + i) * g.K + k]
+                value += work[at.weights + (slot * A + i) * K + k]
             to = slot * g.G * g.N + game * g.N + agents[i]
             by.own[to] = by.own[to] + value
         all_pairs = (g.N * (g.N - 1)) // 2
@@ -59,8 +63,8 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
             j = p - pair_index(i, i + 1, n) + i + 1
             place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
             for slot in range(pair_count(g)):
-                product = pair_product_place(g, at, g.K, 0, slot, pair_index(i, j, A))
-                by_margin = pair_product_place(g, at, g.K, 1, slot, pair_index(i, j, A))
+                product = pair_product_place(g, at, K, 0, slot, pair_index(i, j, A))
+                by_margin = pair_product_place(g, at, K, 1, slot, pair_index(i, j, A))
                 value = T(0.0)
                 slope = T(0.0)
                 for k in range(end):

@@ -1,7 +1,8 @@
 // The bodies of three functions, after what they share. `recursion.py` explains them, joins them and fills in the values
 // between dollar signs. Arrays in fast memory have rows of LD numbers.
     typedef $T$ T;
-    struct alignas(4 * sizeof(T)) Four { T x, y, heading, speed; };
+    struct alignas(2 * sizeof(T)) Two { T at[2]; };
+    struct alignas(4 * sizeof(T)) Four { T at[4]; };
     constexpr int A = $A$, M = 2 * A, D = 3 * M, LD = D + 4, WIDE = 4 * A, ITEMS = $ITEMS$ * A;
     constexpr int FACTOR = M * D + M + WIDE;  // gains [M, D], second derivatives by changes of controls [M], motions [4, A]
 #if defined(__CUDA_ARCH__)
@@ -9,53 +10,35 @@
     const int thread = threadIdx.x, threads = THREADS, lane = thread % LANES, lanes = LANES, warp = thread / LANES;
     #define EPO_SYNC() if (WARPS > 1) __syncthreads(); else __syncwarp()
     #define EPO_SYNC_LANES() __syncwarp()
-    // Shared memory has no room for the arrays of eight agents in double precision, which are in global memory.
-    constexpr bool SHARED = A * sizeof(T) <= 32;
-    #define EPO_FAST(count) __shared__ alignas(16) T shared[SHARED ? count : 1]; T* const fast = SHARED ? shared : work.data + scratch
+    constexpr bool SHARED = $SHARED$;
 #else
     constexpr int LANES = 1, WARPS = 1, THREADS = 1;  // a CPU may have more of them, and then less work for each
     const int thread = $CPU_LANE$, threads = WP_TILE_BLOCK_DIM, lane = thread, lanes = threads, warp = 0;
     #define EPO_SYNC() WP_TILE_SYNC()
     #define EPO_SYNC_LANES() WP_TILE_SYNC()
-    #define EPO_FAST(count) T* const fast = work.data + scratch
 #endif
     (void)A, (void)LD, (void)WIDE, (void)ITEMS, (void)FACTOR, (void)M, (void)D, (void)lanes, (void)lane, (void)warp;
 
 // ---- eliminate
-    EPO_FAST(5 * M * LD + 2 * ITEMS + 4);
-    T* const P = fast;           // [D, LD]: the value function of the next state, and in column D its gradient
+    // The value function of the state after the last step is in fast memory if that step is not the last one of the game.
+    T* const P = fast.data;      // [D, LD]: the value function of the next state, and in column D its gradient
     T* const W = P + D * LD;     // [M, LD]: H_cp, H_cz before the motion, and H_cc = dt W_cz + W_cc
     T* const G = W + M * LD;     // [M, LD]
-    T* const items = G + M * LD; // [2, ITEMS]: of this step, and of the one after it or before it
-    T* const verdict = items + 2 * ITEMS;
+    T* const verdict = P + D + 1; // behind the columns of the first row
+    constexpr int RING = $STEPS$ + 1;
+    const T* const controls = fast.data + $CONTROL$;  // [RING, ITEMS]
+    const Four* const costs = (const Four*)(fast.data + $HESSIAN$);  // [STEPS, WIDE + 1, A]
     constexpr int COLUMNS = (D + LANES) / LANES, ROWS = (A + WARPS - 1) / WARPS;  // of a thread, at most
-    constexpr int PARTS = (ITEMS + THREADS - 1) / THREADS;
     int positive = 1;
-    // The costs of a step in the columns and the agents' rows of this thread are read one step ahead where registers allow.
-    constexpr bool EARLY = COLUMNS == 1;
-    Four cost[ROWS];
-    auto read_costs = [&](int k, int c) {
-        const int row = c == D ? WIDE : 4 * ((c % M) / 2) + (c < M ? 0 : 2) + c % 2;
-        const Four* const costs = (const Four*)(work.data + hessian) + (k * (WIDE + 1) + row) * A;
-        #pragma unroll
-        for (int t = 0; t < ROWS; ++t) {
-            const int a = warp + t * WARPS;
-            cost[t] = a < A && (c < 2 * M || c == D) ? costs[a] : Four{T(0), T(0), T(0), T(0)};
-        }
-    };
-    if (EARLY && end > 0) read_costs(end - 1, lane);
-    for (int e = thread; e < ITEMS && end > 0; e += threads) {
-        items[((end - 1) & 1) * ITEMS + e] = work.data[control + (end - 1) * ITEMS + e];
-    }
-    EPO_SYNC();
-    for (int k = end - 1; k >= 0; --k) {
-        const T* const now = items + (k & 1) * ITEMS;
-        const T* const later = items + ((k + 1) & 1) * ITEMS;
+    for (int k = last - 1; k >= first; --k) {
+        const T* const now = controls + k % RING * ITEMS;
+        const T* const later = controls + (k + 1) % RING * ITEMS;
         #pragma unroll
         for (int column = 0; column < COLUMNS; ++column) {
             const int c = lane + column * lanes;
             if (c > D) break;
-            if (!EARLY) read_costs(k, c);
+            const int row = c == D ? WIDE : 4 * ((c % M) / 2) + (c < M ? 0 : 2) + c % 2;
+            const Four* const cost = costs + ((k - first) * (WIDE + 1) + row) * A;
             T *const Pc = P + c, *const Wc = W + c, *const Gc = G + c;
             T g[M];
             #pragma unroll
@@ -64,12 +47,21 @@
             for (int t = 0; t < ROWS; ++t) {
                 const int a = warp + t * WARPS;
                 if (a >= A) break;
-                T value[6] = {cost[t].x, cost[t].y, cost[t].heading, cost[t].speed, T(0), T(0)};
+                T value[6] = {T(0), T(0), T(0), T(0), T(0), T(0)};
+                if (c < 2 * M || c == D) {
+                    const Four own = cost[a];
+                    #pragma unroll
+                    for (int q = 0; q < 4; ++q) value[q] = own.at[q];
+                }
                 if (k < end - 1) {
                     #pragma unroll
                     for (int r = 0; r < M; ++r) {
                         #pragma unroll
-                        for (int q = 0; q < 6; ++q) value[q] -= G[r * LD + q / 2 * M + 2 * a + q % 2] * g[r];
+                        for (int part = 0; part < 3; ++part) {
+                            const Two here = *(const Two*)(G + r * LD + part * M + 2 * a);
+                            value[2 * part] -= here.at[0] * g[r];
+                            value[2 * part + 1] -= here.at[1] * g[r];
+                        }
                     }
                     if (c < 2 * M || c == D) {
                         #pragma unroll
@@ -92,21 +84,17 @@
             }
         }
         EPO_SYNC();
-        // Numbers of the step before, on their way while the next lines compute.
-        if (EARLY && k > 0) read_costs(k - 1, lane);
-        T ahead[PARTS];
-        #pragma unroll
-        for (int t = 0; t < PARTS; ++t) {
-            const int e = thread + t * threads;
-            if (k > 0 && e < ITEMS) ahead[t] = work.data[control + (k - 1) * ITEMS + e];
-        }
         T* const factor = factors.data + k * FACTOR;
         if (WARPS < 4 || warp < 3) {
             T L[M][M];  // the lower triangle, with reciprocals on the diagonal
             #pragma unroll
             for (int r = 0; r < M; ++r) {
                 #pragma unroll
-                for (int s = 0; s <= r; ++s) L[r][s] = dt * W[r * LD + M + s] + W[r * LD + 2 * M + s];
+                for (int s = 0; s <= r; s += 2) {
+                    const Two by_state = *(const Two*)(W + r * LD + M + s), by_change = *(const Two*)(W + r * LD + 2 * M + s);
+                    L[r][s] = dt * by_state.at[0] + by_change.at[0];
+                    if (s < r) L[r][s + 1] = dt * by_state.at[1] + by_change.at[1];
+                }
                 L[r][r] += now[($DAMPED_STIFFNESS$ + r % 2) * A + r / 2];
             }
             #pragma unroll
@@ -138,7 +126,8 @@
                 const T scale = of_change ? -now[($RATE_STIFFNESS$ + c % 2) * A + a] : T(1);
                 #pragma unroll
                 for (int r = 0; r < M; ++r) {
-                    h[r] = Wc[r * LD] + Wp[r * LD] * z0 + Wp[r * LD + 1] * z1;
+                    const Two of_position = *(const Two*)(Wp + r * LD);
+                    h[r] = Wc[r * LD] + of_position.at[0] * z0 + of_position.at[1] * z1;
                     h[r] += r == 2 * a ? coupling : T(0);
                     h[r] = !of_change ? h[r] : c == 2 * M + r ? T(1) : T(0);
                 }
@@ -174,13 +163,10 @@
                 factor[M * D + M + e] = now[$MOTION$ * A + e];
             }
         }
-        #pragma unroll
-        for (int t = 0; t < PARTS; ++t) {
-            const int e = thread + t * threads;
-            if (k > 0 && e < ITEMS) items[((k + 1) & 1) * ITEMS + e] = ahead[t];
-        }
         EPO_SYNC();
     }
+    if (WARPS < 4) return positive;
+    // The fourth warp has not seen the factors.
     if (thread == 0) verdict[0] = T(positive);
     EPO_SYNC();
     positive = verdict[0] > T(0);
@@ -220,17 +206,17 @@
 
 // ---- pull
     // Linear terms backwards in time: h becomes the gradient by the controls of a step, for another right-hand side.
-    EPO_FAST(2 * D + M + DEPTH * STREAM);
-    T* const q = fast + 2 * D;
+    T* const states = fast.data;  // [2, D]: of a step and the one before it
+    T* const q = states + 2 * D;
     T* const buffers = q + M;
     EPO_SYNC();
     if (warp == 0) {
         for (int back = 0; back < DEPTH - 1; ++back) request(buffers, end - 1 - back);
-        for (int j = lane; j < 2 * D; j += lanes) fast[j] = T(0);
+        for (int j = lane; j < 2 * D; j += lanes) states[j] = T(0);
         for (int k = end - 1; k >= 0; --k) {
             wait();
-            const T* const y = fast + (k & 1) * D;
-            T* const before = fast + ((k + 1) & 1) * D;
+            const T* const y = states + (k & 1) * D;
+            T* const before = states + ((k + 1) & 1) * D;
             const T* const factor = buffers + (k % DEPTH) * STREAM;
             const T* const motions = factor + M * D + M;
             for (int r = lane; r < M; r += lanes) {
@@ -262,20 +248,20 @@
 // ---- push
     // The changes of the controls, -(K x + H_cc^-1 (h - S c)) with the controls c of the step before, forward in time. They go
     // to [agents, K, 2] from `place` on, in the rows of the agents or in their own ones, 0 to n - 1.
-    EPO_FAST(4 * D + DEPTH * STREAM);
-    T* const known = fast + 2 * D;    // [D]: p, z and h - S c, with which the gains are multiplied
+    T* const states = fast.data;      // [2, D]: of a step and the one after it
+    T* const known = states + 2 * D;  // [D]: p, z and h - S c, with which the gains are multiplied
     T* const shares = known + D;      // [3, M]: the products with each of them
     T* const buffers = shares + D;
     EPO_SYNC();
     if (warp == 0) {
         for (int ahead = 0; ahead < DEPTH - 1; ++ahead) request(buffers, ahead);
-        for (int j = lane; j < D; j += lanes) fast[j] = T(0);
+        for (int j = lane; j < D; j += lanes) states[j] = T(0);
         wait();
         for (int j = lane; j < D; j += lanes) known[j] = j < 2 * M ? T(0) : buffers[FACTOR + j - 2 * M];
         for (int k = 0; k < end; ++k) {
             EPO_SYNC_LANES();
-            const T* const x = fast + (k & 1) * D;
-            T* const after = fast + ((k + 1) & 1) * D;
+            const T* const x = states + (k & 1) * D;
+            T* const after = states + ((k + 1) & 1) * D;
             const T* const factor = buffers + (k % DEPTH) * STREAM;
             const T* const next = buffers + ((k + 1) % DEPTH) * STREAM;
             for (int e = lane; e < D; e += lanes) {

@@ -20,8 +20,8 @@ from epo_lightning.solvers.gauss_newton.fused_kernel import constants, layout, t
 
 
 @no_type_check
-def make(T: Any, agents: int, backwards: bool) -> SimpleNamespace:
-    """The recursions for numbers of type ``T``."""
+def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNamespace:
+    """The recursions for numbers of type ``T``, with fast memory for ``fast``."""
     Array = wp.array(dtype=T)
     source = Path(__file__).with_name("recursion.hpp").read_text()
     values = {
@@ -29,6 +29,10 @@ def make(T: Any, agents: int, backwards: bool) -> SimpleNamespace:
         "A": agents,
         "CPU_LANE": threads.cpu_lane(backwards),
         "ITEMS": layout.CONTROL_ITEMS,
+        "SHARED": int(fast.shared),
+        "STEPS": fast.steps,
+        "CONTROL": fast.control,
+        "HESSIAN": fast.hessian,
         **{name: getattr(constants, name) for name in ("PULL", "RATE", "DAMPED_STIFFNESS", "RATE_STIFFNESS")},
         **{name: getattr(constants, name) for name in ("COUPLING", "MOTION")},
     }
@@ -39,17 +43,17 @@ def make(T: Any, agents: int, backwards: bool) -> SimpleNamespace:
 
     @wp.func_native(head + code["eliminate"])
     def eliminate(
-        work: Array, control: int, hessian: int, linear: int, scratch: int, factors: Array, end: int, dt: T
+        work: Array, linear: int, fast: Array, factors: Array, first: int, last: int, end: int, dt: T
     ) -> int: ...
 
     @wp.func_native(head + code["stream"] + code["pull"])
-    def pull(work: Array, linear: int, scratch: int, factors: Array, end: int, dt: T): ...
+    def pull(work: Array, linear: int, fast: Array, factors: Array, end: int, dt: T): ...
 
     @wp.func_native(head + code["stream"] + code["push"])
     def push(
         work: Array,
         linear: int,
-        scratch: int,
+        fast: Array,
         factors: Array,
         end: int,
         dt: T,

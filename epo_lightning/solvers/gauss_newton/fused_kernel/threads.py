@@ -1,9 +1,12 @@
-"""Threads of one game: their number and a barrier, and two loops of one thread: sums along time, and along a line."""
+"""Threads of one game: their number, a barrier and the memory that they share, and two loops of one thread: sums along time,
+and along a line."""
 
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
 import warp as wp
+
+from epo_lightning.solvers.gauss_newton.fused_kernel.layout import Fast
 
 SYNC = """
 #if defined(__CUDA_ARCH__)
@@ -22,6 +25,21 @@ LANE = """
 #else
     return {cpu};
 #endif
+"""
+# Memory of a multiprocessor if it has room, and otherwise a part of the other memory.
+_FAST = """
+#if defined(__CUDA_ARCH__)
+    if ({shared}) {
+        __shared__ alignas(32) {number} memory[{shared} ? {numbers} : 1];
+        return wp::array_t<{number}>(memory, {numbers});
+    }
+#endif
+    return wp::array_t<{number}>(work.data + place, {numbers});
+"""
+_PUT = """
+    typedef {number} T;
+    struct alignas(4 * sizeof(T)) Four { T x, y, z, w; };
+    *(Four*)(to.data + place) = Four{x, y, z, w};
 """
 # Numbers are read in batches, so that their ways from memory overlap; sources and results may be the same array.
 _SUMS = """
@@ -65,18 +83,25 @@ _SUMS_BACK = """
     }
 """
 # The line's segment that is nearest to a point; -1 if no comparison is true, because an input is NaN. What is left of the
-# point's coordinates on the segment need not be exact, and is computed again.
+# point's coordinates on the segment need not be exact, and is computed again: a GPU divides fast.
 _NEAREST_SEGMENT = """
     typedef {number} T;
-    const T* from = points.data + first;
-    T from_x = from[0], from_y = from[1], least = INFINITY;
+    struct alignas(2 * sizeof(T)) Point { T x, y; };
+    const Point* const line = (const Point*)(points.data + first);
+    Point from = line[0];
+    T least = INFINITY;
     int nearest = -1;
     #pragma unroll 4
     for (int q = 0; q + 1 < count; ++q) {
-        const T to_x = from[2 * q + 2], to_y = from[2 * q + 3];
-        const T dx = to_x - from_x, dy = to_y - from_y, off_x = x - from_x, off_y = y - from_y;
-        const T length = dx * dx + dy * dy;
-        const T raw = length > T(0) ? (off_x * dx + off_y * dy) / length : T(0);
+        const Point to = line[q + 1];
+        const T dx = to.x - from.x, dy = to.y - from.y, off_x = x - from.x, off_y = y - from.y;
+        const T length = dx * dx + dy * dy, ahead = off_x * dx + off_y * dy;
+#if defined(__CUDA_ARCH__)
+        const T ratio = sizeof(T) == 4 ? T(__fdividef(ahead, length)) : ahead / length;
+#else
+        const T ratio = ahead / length;
+#endif
+        const T raw = length > T(0) ? ratio : T(0);
         const T along = raw < T(0) ? T(0) : raw > T(1) ? T(1) : raw;
         const T gap_x = off_x - along * dx, gap_y = off_y - along * dy;
         const T square = gap_x * gap_x + gap_y * gap_y;
@@ -84,16 +109,15 @@ _NEAREST_SEGMENT = """
             least = square;
             nearest = q;
         }
-        from_x = to_x;
-        from_y = to_y;
+        from = to;
     }
     return nearest;
 """
 
 
 @no_type_check
-def make(T: Any, backwards: bool) -> SimpleNamespace:
-    """The functions for numbers of type ``T``.
+def make(T: Any, fast: Fast, backwards: bool) -> SimpleNamespace:
+    """The functions for numbers of type ``T``, with fast memory for ``fast``.
 
     Threads of a CPU run one after the other from barrier to barrier, in the order of their numbers, or if ``backwards`` in
     the opposite one.
@@ -107,6 +131,14 @@ def make(T: Any, backwards: bool) -> SimpleNamespace:
     @wp.func_native(LANE.replace("{cpu}", cpu_lane(backwards)))
     def lane() -> int: ...
 
+    memory = _FAST.replace("{number}", number).replace("{numbers}", str(fast.numbers))
+
+    @wp.func_native(memory.replace("{shared}", str(int(fast.shared))))
+    def fast_memory(work: Array, place: int) -> Array: ...
+
+    @wp.func_native(_PUT.replace("{number}", number))
+    def put(to: Array, place: int, x: T, y: T, z: T, w: T): ...
+
     @wp.func_native(_SUMS.replace("{number}", number))
     def sums(source: Array, first: int, stride: int, count: int, start: T, scale: T, target: Array, place: int): ...
 
@@ -116,7 +148,15 @@ def make(T: Any, backwards: bool) -> SimpleNamespace:
     @wp.func_native(_NEAREST_SEGMENT.replace("{number}", number))
     def nearest_segment(points: Array, first: int, count: int, x: T, y: T) -> int: ...
 
-    return SimpleNamespace(sync=sync, lane=lane, sums=sums, sums_back=sums_back, nearest_segment=nearest_segment)
+    return SimpleNamespace(
+        sync=sync,
+        lane=lane,
+        fast_memory=fast_memory,
+        put=put,
+        sums=sums,
+        sums_back=sums_back,
+        nearest_segment=nearest_segment,
+    )
 
 
 def number_type(T: Any) -> str:

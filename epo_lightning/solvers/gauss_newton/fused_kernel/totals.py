@@ -6,21 +6,22 @@ from typing import Any, no_type_check
 import warp as wp
 
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import MOTION, PULL, RATE
-from epo_lightning.solvers.gauss_newton.fused_kernel.layout import CONTROL_ITEMS
 
 
 @no_type_check
-def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) -> SimpleNamespace:
+def make(
+    T: Any, threads: SimpleNamespace, games: SimpleNamespace, expansion: SimpleNamespace, func: Any
+) -> SimpleNamespace:
     """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
-    sync, lane, sums_back = threads.sync, threads.lane, threads.sums_back
+    sync, lane = threads.sync, threads.lane
+    control_items, force_place = expansion.control_items, expansion.force_place
     Game, Layout, Array, A = games.Game, games.Layout, games.Array, games.agents
     P = A * (A - 1) // 2
-    wide = 4 * A  # columns of the Hessian of a state's costs; its gradient is one more row
 
     @wp.func
     def total(at: Layout, work: Array, K: int, end: int):
         """The energy: the sums along time of agents, then of pairs."""
-        parts = at.costs + 8 * A * K
+        parts = at.energy + (A + P) * K
         for e in range(lane(), A + P, wp.block_dim()):
             part = T(0.0)
             for k in range(end):
@@ -32,49 +33,59 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
             energy += work[parts + e]
         return energy
 
+    # ---- The gradient by the controls, backwards in time; its sums are in the place of the recursion's arrays
+
+    @wp.func
+    def forget_slopes(costs: Array):
+        """Sets the sums of all agents to zero: of forces by position, heading and speed, and of squared slopes."""
+        for e in range(lane(), 5 * A, wp.block_dim()):
+            costs[e] = T(0.0)
+        sync()
+
     @func
-    def squared_slope(g: Game, n: int, at: Layout, work: Array, end: int):
-        """The squared norm of the gradient by the controls: sums of the forces backwards in time."""
-        stride = (wide + 1) * wide
-        forces = at.hessian + wide * wide
-        for e in range(lane(), 2 * n, wp.block_dim()):
-            i = e // 2
-            axis = e - 2 * i
-            sums_back(work, forces + 4 * i + axis, stride, end, work, at.costs + e * g.K)
+    def add_slopes(g: Game, n: int, costs: Array, first: int, last: int, end: int):
+        """Adds the forces of some steps to the sums, and the squares of the derivatives by their controls."""
+        for i in range(lane(), n, wp.block_dim()):
+            x = costs[5 * i]
+            y = costs[5 * i + 1]
+            turned = costs[5 * i + 2]
+            faster = costs[5 * i + 3]
+            squared = costs[5 * i + 4]
+            for back in range(last - first):
+                k = last - 1 - back
+                here = control_items(k) + i
+                force = force_place(k, first, i)
+                turned += costs[force + 2]
+                faster += costs[force + 3]
+                turning = costs[here + PULL * A]
+                speeding = costs[here + (PULL + 1) * A]
+                if k + 1 < end:  # later positions move with heading and speed, and the next change starts from this control
+                    later = control_items(k + 1) + i
+                    turned += costs[later + MOTION * A] * x + costs[later + (MOTION + 1) * A] * y
+                    faster += costs[later + (MOTION + 2) * A] * x + costs[later + (MOTION + 3) * A] * y
+                    turning -= costs[later + RATE * A]
+                    speeding -= costs[later + (RATE + 1) * A]
+                x += costs[force]
+                y += costs[force + 1]
+                turning += g.dt * turned
+                speeding += g.dt * faster
+                squared += turning * turning + speeding * speeding
+            costs[5 * i] = x
+            costs[5 * i + 1] = y
+            costs[5 * i + 2] = turned
+            costs[5 * i + 3] = faster
+            costs[5 * i + 4] = squared
         sync()
-        # By heading and speed of a state: its own, and those of later positions through its motion.
-        for e in range(lane(), 2 * n * end, wp.block_dim()):
-            r = e // end
-            k = e - r * end
-            i = r // 2
-            axis = r - 2 * i
-            force = work[forces + k * stride + 4 * i + 2 + axis]
-            if k + 1 < end:
-                moved = at.control + ((k + 1) * CONTROL_ITEMS + MOTION + 2 * axis) * A + i
-                force += work[moved] * work[at.costs + 2 * i * g.K + k + 1]
-                force += work[moved + A] * work[at.costs + (2 * i + 1) * g.K + k + 1]
-            work[at.costs + (2 * A + r) * g.K + k] = force
+
+    @wp.func
+    def squared_slope(n: int, costs: Array):
+        """The squared norm of the gradient."""
+        squared = T(0.0)
+        for i in range(n):
+            squared += costs[5 * i + 4]
         sync()
-        for r in range(lane(), 2 * n, wp.block_dim()):
-            by = at.costs + (2 * A + r) * g.K
-            sums_back(work, by, 1, end, work, by)
-            i = r // 2
-            item = at.control + wp.where(r == 2 * i, 0, A) + i
-            squared = T(0.0)
-            for k in range(end):
-                slope = work[item + (k * CONTROL_ITEMS + PULL) * A] + g.dt * work[by + k]
-                if k + 1 < end:
-                    slope -= work[item + ((k + 1) * CONTROL_ITEMS + RATE) * A]
-                squared += slope * slope
-            work[at.costs + (4 * A + r) * g.K] = squared
-        sync()
-        norm = T(0.0)
-        for r in range(2 * n):
-            norm += work[at.costs + (4 * A + r) * g.K]
-        sync()
-        return norm
+        return squared
 
     return SimpleNamespace(
-        total=total,
-        squared_slope=squared_slope,
+        total=total, forget_slopes=forget_slopes, add_slopes=add_slopes, squared_slope=squared_slope
     )

@@ -16,7 +16,7 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
     """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
     sync, lane, sums, sums_back = threads.sync, threads.lane, threads.sums, threads.sums_back
     Game, Gradients, Layout, trace = games.Game, games.Gradients, games.Layout, games.trace
-    Array, Numbers, A = games.Array, games.Numbers, games.agents
+    Array, Numbers, A, horizon = games.Array, games.Numbers, games.agents, games.horizon
 
     @wp.func
     def tangent(at: Layout, K: int, along_d: int, quantity: int, i: int):
@@ -24,34 +24,35 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
         return at.tangents + ((4 * along_d + quantity) * A + i) * (K + 1)
 
     @func
-    def roll_tangents(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, directions: Array):
+    def roll_tangents(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, path: Array, directions: Array):
         """Tangents of the trajectories along mu and along the step d: sums along time, as the trajectories are."""
+        K = horizon(g)
         for e in range(lane(), 4 * n, wp.block_dim()):
             i = e // 4
             channel = (e // 2) % 2
             along_d = e % 2
-            to = tangent(at, g.K, along_d, wp.where(channel == TURN_RATE, TURNED, SPEED), i)
+            to = tangent(at, K, along_d, wp.where(channel == TURN_RATE, TURNED, SPEED), i)
             if along_d == 1:
-                first = (game * g.N + agents[i]) * g.K * 2 + channel
-                sums(directions, first, 2, g.K, T(0.0), g.dt, work, to)
+                first = (game * g.N + agents[i]) * K * 2 + channel
+                sums(directions, first, 2, K, T(0.0), g.dt, work, to)
             else:
-                sums(work, at.mu + 2 * i * g.K + channel, 2, g.K, T(0.0), g.dt, work, to)
+                sums(work, at.mu + 2 * i * K + channel, 2, K, T(0.0), g.dt, work, to)
         sync()
-        for e in range(lane(), 2 * n * (g.K + 1), wp.block_dim()):
+        for e in range(lane(), 2 * n * (K + 1), wp.block_dim()):
             k = e // (2 * n)
             i = (e - k * 2 * n) // 2
             along_d = e % 2
-            s = work[trace(at, g.K, SINE, i) + k]
-            c = work[trace(at, g.K, COSINE, i) + k]
-            across = work[trace(at, g.K, SPEED, i) + k] * work[tangent(at, g.K, along_d, TURNED, i) + k]
-            speed = work[tangent(at, g.K, along_d, SPEED, i) + k]
-            work[tangent(at, g.K, along_d, X, i) + k] = g.dt * (speed * c - across * s)
-            work[tangent(at, g.K, along_d, Y, i) + k] = g.dt * (speed * s + across * c)
+            s = path[trace(at, K, SINE, i) + k]
+            c = path[trace(at, K, COSINE, i) + k]
+            across = path[trace(at, K, SPEED, i) + k] * work[tangent(at, K, along_d, TURNED, i) + k]
+            speed = work[tangent(at, K, along_d, SPEED, i) + k]
+            work[tangent(at, K, along_d, X, i) + k] = g.dt * (speed * c - across * s)
+            work[tangent(at, K, along_d, Y, i) + k] = g.dt * (speed * s + across * c)
         sync()
         for e in range(lane(), 4 * n, wp.block_dim()):
             i = e // 4
-            to = tangent(at, g.K, e % 2, wp.where((e // 2) % 2 == 0, X, Y), i)
-            sums(work, to, 1, g.K, T(0.0), T(1.0), work, to)
+            to = tangent(at, K, e % 2, wp.where((e // 2) % 2 == 0, X, Y), i)
+            sums(work, to, 1, K, T(0.0), T(1.0), work, to)
         sync()
 
     @wp.func
@@ -61,42 +62,43 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
         return at.along + (quantity * A + i) * K
 
     @func
-    def pull_states(g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array):
+    def pull_states(g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array, path: Array):
         """Adds the pullback of the cotangent of the states to that of the controls: sums backwards in time."""
+        K = horizon(g)
         for e in range(lane(), 4 * n, wp.block_dim()):
             i = e // 4
             q = e - 4 * i
-            first = 4 * (game * g.N + agents[i]) * g.K + q
+            first = 4 * (game * g.N + agents[i]) * K + q
             if q < 2:
-                sums_back(by.states, first, 4, g.K, work, along(at, g.K, q, i))
+                sums_back(by.states, first, 4, K, work, along(at, K, q, i))
         sync()
-        for e in range(lane(), n * g.K, wp.block_dim()):
-            i = e // g.K
-            k = e - i * g.K
-            first = 4 * ((game * g.N + agents[i]) * g.K + k)
+        for e in range(lane(), n * K, wp.block_dim()):
+            i = e // K
+            k = e - i * K
+            first = 4 * ((game * g.N + agents[i]) * K + k)
             heading = by.states[first + 2]
             speed = by.states[first + 3]
-            if k + 1 < g.K:
-                c = work[trace(at, g.K, COSINE, i) + k + 1]
-                s = work[trace(at, g.K, SINE, i) + k + 1]
-                x = work[along(at, g.K, 0, i) + k + 1]
-                y = work[along(at, g.K, 1, i) + k + 1]
-                heading += g.dt * work[trace(at, g.K, SPEED, i) + k + 1] * (c * y - s * x)
+            if k + 1 < K:
+                c = path[trace(at, K, COSINE, i) + k + 1]
+                s = path[trace(at, K, SINE, i) + k + 1]
+                x = work[along(at, K, 0, i) + k + 1]
+                y = work[along(at, K, 1, i) + k + 1]
+                heading += g.dt * path[trace(at, K, SPEED, i) + k + 1] * (c * y - s * x)
                 speed += g.dt * (c * x + s * y)
-            work[along(at, g.K, 6, i) + k] = heading
-            work[along(at, g.K, 7, i) + k] = speed
+            work[along(at, K, 6, i) + k] = heading
+            work[along(at, K, 7, i) + k] = speed
         sync()
         for e in range(lane(), 2 * n, wp.block_dim()):
             i = e // 2
-            to = along(at, g.K, 6 + e - 2 * i, i)
-            sums_back(work, to, 1, g.K, work, to)
+            to = along(at, K, 6 + e - 2 * i, i)
+            sums_back(work, to, 1, K, work, to)
         sync()
-        for e in range(lane(), 2 * n * g.K, wp.block_dim()):
+        for e in range(lane(), 2 * n * K, wp.block_dim()):
             k = e // (2 * n)
             i = (e - k * 2 * n) // 2
             channel = e % 2
-            u = 2 * ((game * g.N + agents[i]) * g.K + k) + channel
-            force = work[along(at, g.K, wp.where(channel == TURN_RATE, 6, 7), i) + k]
+            u = 2 * ((game * g.N + agents[i]) * K + k) + channel
+            force = work[along(at, K, wp.where(channel == TURN_RATE, 6, 7), i) + k]
             by.controls[u] = by.controls[u] + g.dt * force
         sync()
 
