@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 
 import pytest
@@ -46,8 +47,12 @@ def assert_same_as_pytorch(energy, scene, game, damping, steps=3):
 
 @pytest.mark.parametrize("pair", [("proximity",), *STATE_PAIRS, tuple(PAIR_FEATURES)])
 @pytest.mark.parametrize("agents", [2, 3, 8])
-def test_games_of_different_lengths_are_those_of_pytorch(pair, agents):
-    """With absent agents, fixed margins, strides and lines that slide."""
+@pytest.mark.parametrize("threads", [None, kernels.TEAM])
+def test_games_of_different_lengths_are_those_of_pytorch(pair, agents, threads, monkeypatch):
+    """With absent agents, fixed margins, strides and lines that slide, also with a GPU's places in fast memory."""
+    if threads is not None:
+        made = functools.partial(kernels.make, True, fused.size_for(agents), None, 6, threads)
+        monkeypatch.setattr(fused, "kernels", lambda *_: made())
     scene = random_scene(4, agents, history=2, size=1.5, dtype=torch.float64)
     scene.size[..., 1] *= 0.4
     scene.agent_mask[1, 0] = False

@@ -51,7 +51,7 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     X,
     Y,
 )
-from epo_lightning.solvers.gauss_newton.fused_kernel.layout import CONTROL_ITEMS, PAIR_ROWS, Fast
+from epo_lightning.solvers.gauss_newton.fused_kernel.layout import CONTROL_ITEMS, Fast
 from epo_lightning.solvers.gauss_newton.structured import LEAST_RAISED_DAMPING
 
 
@@ -90,10 +90,15 @@ def make(
         games.margin_slot,
         games.horizon,
     )
-    steps, control_place, hessian_place, rows_place = fast.steps, fast.control, fast.hessian, fast.rows
+    steps, control_place, own_place, rows_place, values_place = (
+        fast.steps,
+        fast.control,
+        fast.own,
+        fast.rows,
+        fast.values,
+    )
     Array, Numbers, A = games.Array, games.Numbers, games.agents
     P = A * (A - 1) // 2
-    wide = 4 * A  # columns of the Hessian of a state's costs; its gradient is one more row
     four = wp.types.vector(4, T)
     block = wp.types.matrix((4, 4), T)
 
@@ -107,7 +112,12 @@ def make(
     @wp.func
     def force_place(k: int, first: int, i: int):
         """The gradient of the costs of a state by agent i's position, heading and speed."""
-        return hessian_place + (k - first) * (wide + 1) * wide + wide * wide + 4 * i
+        return own_place + (((k - first) * A + i) * 5 + 4) * 4
+
+    @wp.func
+    def row_place(slot: int, step: int, i: int, other: int):
+        """The gradient of a pair feature by agent i's position, heading and speed."""
+        return rows_place + (((slot * steps + step) * A + i) * A + other) * 4
 
     # ---- Pairs
 
@@ -123,9 +133,8 @@ def make(
         costs: Array,
         first: int,
         last: int,
-        curved: int,
     ):
-        """The rows and energies of all pairs and, if ``curved``, their blocks of the Hessians."""
+        """Values, gradients and energies of all pairs."""
         K = horizon(g)
         all_pairs = (g.N * (g.N - 1)) // 2
         for e in range(lane(), (last - first) * P, wp.block_dim()):
@@ -136,7 +145,6 @@ def make(
             i = first_agent(p)
             j = p - pair_index(i, i + 1, A) + i + 1
             energy = T(0.0)
-            cross = block(T(0.0))
             for slot in range(pair_count(g)):
                 of_one = four(T(0.0))
                 of_other = four(T(0.0))
@@ -171,32 +179,10 @@ def make(
                     of_other = w * four(-x, -y, turn2, faster2)
                     pushed = w * value
                 energy += T(0.5) * pushed * pushed
-                cross += wp.outer(of_one, of_other)
-                row = rows_place + (slot * steps + step) * PAIR_ROWS * P + p
-                for q in range(4):
-                    costs[row + q * P] = of_one[q]
-                    costs[row + (4 + q) * P] = of_other[q]
-                costs[row + 8 * P] = pushed
+                put(costs, row_place(slot, step, i, j), of_one[0], of_one[1], of_one[2], of_one[3])
+                put(costs, row_place(slot, step, j, i), of_other[0], of_other[1], of_other[2], of_other[3])
+                costs[values_place + (slot * steps + step) * P + p] = pushed
             work[at.energy + (A + p) * K + k] = energy
-            if curved == 1:
-                whole = hessian_place + step * (wide + 1) * wide
-                for q in range(4):
-                    put(
-                        costs,
-                        whole + (4 * i + q) * wide + 4 * j,
-                        cross[q, 0],
-                        cross[q, 1],
-                        cross[q, 2],
-                        cross[q, 3],
-                    )
-                    put(
-                        costs,
-                        whole + (4 * j + q) * wide + 4 * i,
-                        cross[0, q],
-                        cross[1, q],
-                        cross[2, q],
-                        cross[3, q],
-                    )
 
     # ---- Agents
 
@@ -432,23 +418,16 @@ def make(
                     for other in range(n):
                         if other != i:
                             pair = pair_index(wp.min(i, other), wp.max(i, other), A)
-                            at_pair = rows_place + (f * steps + step) * PAIR_ROWS * P + pair
-                            side = wp.where(other < i, 4 * P, 0)
-                            here = four(
-                                costs[at_pair + side],
-                                costs[at_pair + side + P],
-                                costs[at_pair + side + 2 * P],
-                                costs[at_pair + side + 3 * P],
-                            )
-                            force += costs[at_pair + 8 * P] * here
+                            at_row = row_place(f, step, i, other)
+                            here = four(costs[at_row], costs[at_row + 1], costs[at_row + 2], costs[at_row + 3])
+                            force += costs[values_place + (f * steps + step) * P + pair] * here
                             if curved == 1:
                                 own += wp.outer(here, here)
             to = force_place(k, first, i)
             put(costs, to, force[0], force[1], force[2], force[3])
             if curved == 1:
                 for q in range(4):
-                    to = hessian_place + step * (wide + 1) * wide + (4 * i + q) * wide + 4 * i
-                    put(costs, to, own[q, 0], own[q, 1], own[q, 2], own[q, 3])
+                    put(costs, to - 16 + 4 * q, own[q, 0], own[q, 1], own[q, 2], own[q, 3])
             work[at.energy + i * K + k] = work[at.energy + i * K + k] + energy
         sync()
 

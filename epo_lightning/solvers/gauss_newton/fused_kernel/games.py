@@ -191,10 +191,6 @@ def make(
         def pair_count(g: Game):
             return g.pair_count
 
-        @wp.func
-        def horizon(g: Game):
-            return g.K
-
     else:
 
         @wp.func
@@ -216,6 +212,14 @@ def make(
         @wp.func
         def pair_count(g: Game):
             return pair_number
+
+    if steps is None:
+
+        @wp.func
+        def horizon(g: Game):
+            return g.K
+
+    else:
 
         @wp.func
         def horizon(g: Game):

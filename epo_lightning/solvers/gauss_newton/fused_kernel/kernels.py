@@ -151,7 +151,7 @@ def make(
                     for back in range((end + together - 1) // together):
                         last = end - back * together
                         first = wp.max(last - together, 0)
-                        expand_pairs(g, game, n, agents, at, work, path, costs, first, last, stepping)
+                        expand_pairs(g, game, n, agents, at, work, path, costs, first, last)
                         expand_controls(g, game, n, agents, at, work, path, costs, controls, first, last, raised)
                         sync()
                         expand_states(
@@ -172,7 +172,9 @@ def make(
                             keep,
                         )
                         if stepping == 1:
-                            solved = eliminate(work, at.linear, costs, factors, first, last, end, g.dt)
+                            solved = eliminate(
+                                work, at.linear, costs, factors, run.record, pair_count(g), first, last, end, g.dt
+                            )
                             positive = wp.min(positive, solved)
                         else:
                             add_slopes(g, n, costs, first, last, end)
@@ -205,6 +207,7 @@ def make(
                         agents,
                         n,
                         K,
+                        1,
                     )
                     if lane() == 0:
                         agents[flag] = sound * positive
@@ -301,6 +304,7 @@ def make(
                             agents,
                             n,
                             K,
+                            0,
                         )
                         roll_tangents(g, game, n, agents, at, work, path, directions)
                         forget_products(g, at, work)

@@ -8,8 +8,6 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import WARP
 
 CONTROL_ITEMS = 13
 """Numbers of an agent and a control: see ``PULL`` and the others in `constants.py`."""
-PAIR_ROWS = 9
-"""Numbers of a pair feature at a state: its gradient by the first and by the second agent (4 each), and its value."""
 PAIR_COTANGENTS = 10
 """Numbers of a pair at a state in the adjoint: 6 of positions, 2 of heading and speed of each agent."""
 
@@ -54,7 +52,7 @@ def layout(agents: int, steps: int, own: int, pair: int, fast: Fast) -> Layout:
     shared = {
         "path": 0 if fast.path >= 0 else 6 * A * (K + 1),
         "linear": 2 * A * K,
-        "fast": 0 if fast.shared else fast.numbers,
+        "fast": fast.numbers,
     }
     of_step = {"energy": (A + P) * (K + 1)}
     of_adjoint = {
@@ -87,18 +85,22 @@ class Fast:
     Attributes:
         steps: C, the number of those steps.
         control: derivatives by controls [C + 1, 13, A], at k modulo C + 1: the recursion needs those of the next step too.
-        hessian: of the costs of a state by positions, headings and speeds, and their gradient [C, 4 A + 1, 4 A].
+        own: second derivatives of a state's costs by position, heading and speed of an agent, and the gradient [C, A, 5, 4].
         path: trajectories and their sines and cosines [6, A, K + 1]; -1 where they are in the other memory.
-        rows: pair features [F, C, 9, P].
+        factors: what the recursion keeps of a step and its linear terms [K, :func:`factor_numbers` + 2 A]; -1 without room.
+        rows: gradients of pair features by the state of an agent, with every other agent [F, C, A, A, 4].
+        values: of pair features [F, C, P].
         numbers: of all together. The first ones, up to ``control``, are the arrays of the recursion.
         shared: whether this is shared memory.
     """
 
     steps: int
     control: int
-    hessian: int
+    own: int
     path: int
+    factors: int
     rows: int
+    values: int
     numbers: int
     shared: bool
 
@@ -107,7 +109,7 @@ STEPS_ON_CPUS = 4
 """Steps whose costs are in fast memory at a time on a CPU."""
 MOST_SHARED = 46_000
 """Bytes of shared memory that a game may have, below the 48 kB that a compiler reserves without being asked."""
-SHARED_OF_MANY = 13_200
+SHARED_OF_MANY = 13_400
 """Bytes with which 16 games are in the shared memory of a multiprocessor of an H100 or H200 at a time."""
 
 
@@ -122,21 +124,41 @@ def fast(agents: int, pair: int, horizon: int | None, double: bool, threads: int
         threads: of a game: of few games, one has the memory of a multiprocessor nearly for itself.
     """
     A, P = agents, agents * (agents - 1) // 2
-    sizes = {"control": CONTROL_ITEMS * A, "hessian": (4 * A + 1) * 4 * A, "rows": pair * PAIR_ROWS * P}
-    recursion = 5 * 2 * A * (6 * A + 4)  # the value function and two arrays of a row per control
-    steps, path, most = STEPS_ON_CPUS, 0, 0
+    each = {"control": CONTROL_ITEMS * A, "own": 20 * A, "rows": pair * 4 * A * A, "values": pair * P}
+    recursion = recursion_numbers(A)
+    steps, path, factors = STEPS_ON_CPUS, 0, 0
     if horizon is not None:
         most = (SHARED_OF_MANY if threads == WARP else MOST_SHARED) // (8 if double else 4)
         path = 6 * A * (horizon + 1)
         path = path if path <= most // 3 else 0
-        left = most - recursion - sizes["control"] - path
-        steps = max(1, min(left // sum(sizes.values()), horizon))
-    places = [recursion]
-    for count in ((steps + 1) * sizes["control"], steps * sizes["hessian"], path, steps * sizes["rows"]):
-        places.append(places[-1] + -(-count // 4) * 4)
-    control, hessian, at_path, rows, numbers = places
+        left = most - recursion - each["control"] - path - 16
+        steps = min(max(left // sum(each.values()), WARP // A), horizon)  # at least so many that no thread of a warp waits
+        factors = horizon * (factor_numbers(A) + 2 * A)
+        factors = factors if steps == horizon and factors <= left - steps * sum(each.values()) else 0
+    counts = {
+        "recursion": recursion,
+        "control": (steps + 1) * each["control"],
+        "own": steps * each["own"],
+        "path": path,
+        "factors": factors,
+        "rows": steps * each["rows"],
+        "values": steps * each["values"],
+    }
+    places, numbers = {}, 0
+    for name, count in counts.items():
+        places[name] = numbers if count or name in each else -1
+        numbers += -(-count // 4) * 4
+    del places["recursion"]
     shared = horizon is not None and numbers * (8 if double else 4) <= MOST_SHARED
-    return Fast(steps, control, hessian, at_path if path else -1, rows, numbers, shared)
+    return Fast(steps, **places, numbers=numbers, shared=shared)
+
+
+def recursion_numbers(agents: int) -> int:
+    """Numbers of the recursion's arrays: the value function, and two arrays of a row per control; or what it streams."""
+    controls = 2 * agents
+    way_back = 4 * controls * (3 * controls + 4) + controls * 8 * agents
+    streamed = 4 * 3 * controls + 4 * (factor_numbers(agents) + controls)
+    return max(way_back, streamed)
 
 
 def factor_numbers(agents: int) -> int:

@@ -5,6 +5,7 @@
     struct alignas(4 * sizeof(T)) Four { T at[4]; };
     constexpr int A = $A$, M = 2 * A, D = 3 * M, LD = D + 4, WIDE = 4 * A, ITEMS = $ITEMS$ * A;
     constexpr int FACTOR = M * D + M + WIDE;  // gains [M, D], second derivatives by changes of controls [M], motions [4, A]
+    constexpr bool KEPT = $FACTORS$ >= 0;  // factors and linear terms are in fast memory too
 #if defined(__CUDA_ARCH__)
     constexpr int LANES = 32, WARPS = WP_TILE_BLOCK_DIM / LANES, THREADS = WP_TILE_BLOCK_DIM;
     const int thread = threadIdx.x, threads = THREADS, lane = thread % LANES, lanes = LANES, warp = thread / LANES;
@@ -23,12 +24,16 @@
     // The value function of the state after the last step is in fast memory if that step is not the last one of the game.
     T* const P = fast.data;      // [D, LD]: the value function of the next state, and in column D its gradient
     T* const W = P + D * LD;     // [M, LD]: H_cp, H_cz before the motion, and H_cc = dt W_cz + W_cc
-    T* const G = W + M * LD;     // [M, LD]
+    // [M, WIDTH]: the columns of an agent's p, z and c beside each other; the gradient has a place that is left.
+    constexpr int WIDTH = 8 * A, GRADIENT = 6;
+    T* const G = W + M * LD;
     T* const verdict = P + D + 1; // behind the columns of the first row
     constexpr int RING = $STEPS$ + 1;
     const T* const controls = fast.data + $CONTROL$;  // [RING, ITEMS]
-    const Four* const costs = (const Four*)(fast.data + $HESSIAN$);  // [STEPS, WIDE + 1, A]
+    const Four* const own = (const Four*)(fast.data + $OWN$);    // [STEPS, A, 5]
+    const Four* const rows = (const Four*)(fast.data + $ROWS$);  // [pairs, STEPS, A, A]
     constexpr int COLUMNS = (D + LANES) / LANES, ROWS = (A + WARPS - 1) / WARPS;  // of a thread, at most
+    const bool RECORDED = !KEPT || record;
     int positive = 1;
     for (int k = last - 1; k >= first; --k) {
         const T* const now = controls + k % RING * ITEMS;
@@ -37,33 +42,46 @@
         for (int column = 0; column < COLUMNS; ++column) {
             const int c = lane + column * lanes;
             if (c > D) break;
-            const int row = c == D ? WIDE : 4 * ((c % M) / 2) + (c < M ? 0 : 2) + c % 2;
-            const Four* const cost = costs + ((k - first) * (WIDE + 1) + row) * A;
-            T *const Pc = P + c, *const Wc = W + c, *const Gc = G + c;
+            const bool of_gradient = c == D, of_state = c < 2 * M;
+            const int agent = of_gradient ? -1 : c % M / 2, quantity = of_gradient ? 4 : c / M * 2 + c % 2;
+            T *const Pc = P + c, *const Wc = W + c;
+            const T* const Gc = G + (of_gradient ? GRADIENT : 8 * agent + quantity);
             T g[M];
             #pragma unroll
-            for (int r = 0; r < M; ++r) g[r] = k == end - 1 ? T(0) : Gc[r * LD];
+            for (int r = 0; r < M; ++r) g[r] = k == end - 1 ? T(0) : Gc[r * WIDTH];
             #pragma unroll
             for (int t = 0; t < ROWS; ++t) {
-                const int a = warp + t * WARPS;
+                const int a = WARPS == 1 ? t : warp + t * WARPS;
                 if (a >= A) break;
                 T value[6] = {T(0), T(0), T(0), T(0), T(0), T(0)};
-                if (c < 2 * M || c == D) {
-                    const Four own = cost[a];
-                    #pragma unroll
-                    for (int q = 0; q < 4; ++q) value[q] = own.at[q];
+                if (of_gradient || a == agent) {
+                    if (quantity < 5 && (of_gradient || of_state)) {
+                        const Four cost = own[((k - first) * A + a) * 5 + quantity];
+                        #pragma unroll
+                        for (int q = 0; q < 4; ++q) value[q] = cost.at[q];
+                    }
+                } else if (of_state) {
+                    for (int f = 0; f < pairs; ++f) {
+                        const Four* const step = rows + (f * $STEPS$ + k - first) * A * A;
+                        const Four row = step[a * A + agent];
+                        const T other = step[agent * A + a].at[quantity];
+                        #pragma unroll
+                        for (int q = 0; q < 4; ++q) value[q] += other * row.at[q];
+                    }
                 }
                 if (k < end - 1) {
                     #pragma unroll
                     for (int r = 0; r < M; ++r) {
+                        const Four here = *(const Four*)(G + r * WIDTH + 8 * a);
                         #pragma unroll
-                        for (int part = 0; part < 3; ++part) {
-                            const Two here = *(const Two*)(G + r * LD + part * M + 2 * a);
-                            value[2 * part] -= here.at[0] * g[r];
-                            value[2 * part + 1] -= here.at[1] * g[r];
+                        for (int q = 0; q < 4; ++q) value[q] -= here.at[q] * g[r];
+                        if (WARPS > 1 || r >= 2 * a) {  // the columns of c have zeros above the diagonal
+                            const Two of_change = *(const Two*)(G + r * WIDTH + 8 * a + 4);
+                            value[4] -= of_change.at[0] * g[r];
+                            value[5] -= of_change.at[1] * g[r];
                         }
                     }
-                    if (c < 2 * M || c == D) {
+                    if (of_state || of_gradient) {
                         #pragma unroll
                         for (int q = 0; q < 4; ++q) value[q] += Pc[(q / 2 * M + 2 * a + q % 2) * LD];
                     }
@@ -85,15 +103,18 @@
         }
         EPO_SYNC();
         T* const factor = factors.data + k * FACTOR;
+        T* const kept = fast.data + $FACTORS$ + k * (FACTOR + M);  // if there is room
         if (WARPS < 4 || warp < 3) {
             T L[M][M];  // the lower triangle, with reciprocals on the diagonal
             #pragma unroll
             for (int r = 0; r < M; ++r) {
                 #pragma unroll
-                for (int s = 0; s <= r; s += 2) {
-                    const Two by_state = *(const Two*)(W + r * LD + M + s), by_change = *(const Two*)(W + r * LD + 2 * M + s);
-                    L[r][s] = dt * by_state.at[0] + by_change.at[0];
-                    if (s < r) L[r][s + 1] = dt * by_state.at[1] + by_change.at[1];
+                for (int s = 0; s <= r; s += 4) {
+                    const Four by_state = *(const Four*)(W + r * LD + M + s), by_change = *(const Four*)(W + r * LD + 2 * M + s);
+                    #pragma unroll
+                    for (int q = 0; q < 4; ++q) {
+                        if (s + q <= r) L[r][s + q] = dt * by_state.at[q] + by_change.at[q];
+                    }
                 }
                 L[r][r] += now[($DAMPED_STIFFNESS$ + r % 2) * A + r / 2];
             }
@@ -120,7 +141,7 @@
                 const bool of_change = c >= 2 * M && c < D, moving = c >= M && c < 2 * M;
                 const int a = (c % M) / 2;
                 const T *const Wc = W + c, *const Wp = W + 2 * a, *const motion = now + ($MOTION$ + 2 * (c % 2)) * A + a;
-                T *const Gc = G + c, *const gain = factor + c;
+                T *const Gc = G + (c == D ? GRADIENT : 8 * a + c / M * 2 + c % 2), *const gain = factor + c;
                 const T z0 = moving ? motion[0] : T(0), z1 = moving ? motion[A] : T(0);
                 const T coupling = moving && c % 2 ? now[$COUPLING$ * A + a] : T(0);
                 const T scale = of_change ? -now[($RATE_STIFFNESS$ + c % 2) * A + a] : T(1);
@@ -133,23 +154,26 @@
                 }
                 if (c == D) {
                     #pragma unroll
-                    for (int r = 0; r < M; ++r) work.data[linear + k * M + r] = h[r];
+                    for (int r = 0; r < M; ++r) (KEPT ? kept[FACTOR + r] : work.data[linear + k * M + r]) = h[r];
                 }
                 #pragma unroll
                 for (int r = 0; r < M; ++r) {
                     h[r] *= L[r][r];
                     #pragma unroll
                     for (int s = r + 1; s < M; ++s) h[s] -= L[s][r] * h[r];
-                    Gc[r * LD] = scale * h[r];
+                    Gc[r * WIDTH] = scale * h[r];
                 }
                 #pragma unroll
                 for (int r = M - 1; r >= 0; --r) {
                     h[r] *= L[r][r];
                     #pragma unroll
                     for (int s = 0; s < r; ++s) h[s] -= L[r][s] * h[r];
-                    if (c < D) gain[r * D] = h[r];  // the gains, and of the columns of c the inverse of H_cc
+                    // The gains, and of the columns of c the inverse of H_cc.
+                    if (c < D && RECORDED) gain[r * D] = h[r];
+                    if (c < D && KEPT) kept[r * D + c] = h[r];
                 }
-                if (of_change) factor[M * D + c - 2 * M] = -scale;
+                if (of_change && RECORDED) factor[M * D + c - 2 * M] = -scale;
+                if (of_change && KEPT) kept[M * D + c - 2 * M] = -scale;
             }
         }
         if (WARPS < 4 || warp >= 3) {  // H_pz and H_zz: motions act on the columns too
@@ -160,7 +184,8 @@
                 P[i * LD + M + s] += P[i * LD + 2 * a] * motion[0] + P[i * LD + 2 * a + 1] * motion[A];
             }
             for (int e = thread - HELPERS; e < WIDE; e += threads - HELPERS) {
-                factor[M * D + M + e] = now[$MOTION$ * A + e];
+                if (RECORDED) factor[M * D + M + e] = now[$MOTION$ * A + e];
+                if (KEPT) kept[M * D + M + e] = now[$MOTION$ * A + e];
             }
         }
         EPO_SYNC();
@@ -252,27 +277,38 @@
     T* const known = states + 2 * D;  // [D]: p, z and h - S c, with which the gains are multiplied
     T* const shares = known + D;      // [3, M]: the products with each of them
     T* const buffers = shares + D;
+    const bool streamed = !KEPT || kept == 0;
     EPO_SYNC();
     if (warp == 0) {
-        for (int ahead = 0; ahead < DEPTH - 1; ++ahead) request(buffers, ahead);
-        for (int j = lane; j < D; j += lanes) states[j] = T(0);
-        wait();
-        for (int j = lane; j < D; j += lanes) known[j] = j < 2 * M ? T(0) : buffers[FACTOR + j - 2 * M];
+        if (streamed) {
+            for (int ahead = 0; ahead < DEPTH - 1; ++ahead) request(buffers, ahead);
+            wait();
+        }
+        const T* next = streamed ? buffers : fast.data + $FACTORS$;
+        for (int j = lane; j < D; j += lanes) states[j] = T(0), known[j] = j < 2 * M ? T(0) : next[FACTOR + j - 2 * M];
         for (int k = 0; k < end; ++k) {
             EPO_SYNC_LANES();
             const T* const x = states + (k & 1) * D;
             T* const after = states + ((k + 1) & 1) * D;
-            const T* const factor = buffers + (k % DEPTH) * STREAM;
-            const T* const next = buffers + ((k + 1) % DEPTH) * STREAM;
+            const T* const factor = next;
+            next = streamed ? buffers + ((k + 1) % DEPTH) * STREAM : factor + STREAM;
             for (int e = lane; e < D; e += lanes) {
                 const int r = e % M, first = e - r;
-                T share = T(0);
+                T share[4] = {T(0), T(0), T(0), T(0)};
                 #pragma unroll
-                for (int c = 0; c < M; ++c) share += factor[r * D + first + c] * known[first + c];
-                shares[e] = share;
+                for (int c = 0; c < M; c += 4) {
+                    const Four gain = *(const Four*)(factor + r * D + first + c), by = *(const Four*)(known + first + c);
+                    #pragma unroll
+                    for (int q = 0; q < 4; ++q) share[q] += gain.at[q] * by.at[q];
+                }
+                shares[e] = (share[0] + share[1]) + (share[2] + share[3]);
             }
-            request(buffers, k + DEPTH - 1);
-            wait();
+            if (streamed) {
+                request(buffers, k + DEPTH - 1);
+                wait();
+            } else {
+                EPO_SYNC_LANES();
+            }
             for (int j = lane; j < D; j += lanes) {
                 const int r = j % M, a = r / 2;
                 const T* const motion = factor + M * D + M + r % 2 * A + a;

@@ -32,7 +32,9 @@ def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNames
         "SHARED": int(fast.shared),
         "STEPS": fast.steps,
         "CONTROL": fast.control,
-        "HESSIAN": fast.hessian,
+        "OWN": fast.own,
+        "ROWS": fast.rows,
+        "FACTORS": fast.factors,
         **{name: getattr(constants, name) for name in ("PULL", "RATE", "DAMPED_STIFFNESS", "RATE_STIFFNESS")},
         **{name: getattr(constants, name) for name in ("COUPLING", "MOTION")},
     }
@@ -43,7 +45,16 @@ def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNames
 
     @wp.func_native(head + code["eliminate"])
     def eliminate(
-        work: Array, linear: int, fast: Array, factors: Array, first: int, last: int, end: int, dt: T
+        work: Array,
+        linear: int,
+        fast: Array,
+        factors: Array,
+        record: int,
+        pairs: int,
+        first: int,
+        last: int,
+        end: int,
+        dt: T,
     ) -> int: ...
 
     @wp.func_native(head + code["stream"] + code["pull"])
@@ -63,6 +74,7 @@ def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNames
         rows: wp.array(dtype=wp.int32),
         count: int,
         K: int,
+        kept: int,
     ): ...
 
     return SimpleNamespace(eliminate=eliminate, pull=pull, push=push)

@@ -91,18 +91,25 @@ _NEAREST_SEGMENT = """
     Point from = line[0];
     T least = INFINITY;
     int nearest = -1;
-    #pragma unroll 4
+    #pragma unroll 8
     for (int q = 0; q + 1 < count; ++q) {
         const Point to = line[q + 1];
         const T dx = to.x - from.x, dy = to.y - from.y, off_x = x - from.x, off_y = y - from.y;
         const T length = dx * dx + dy * dy, ahead = off_x * dx + off_y * dy;
 #if defined(__CUDA_ARCH__)
-        const T ratio = sizeof(T) == 4 ? T(__fdividef(ahead, length)) : ahead / length;
+        T along;  // between 0 and 1, and 0 instead of NaN where the length is zero
+        if (sizeof(T) == 4) {
+            const float whole = length, part = ahead;
+            float inverse;
+            asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(whole));
+            along = __saturatef(part * inverse);
+        } else {
+            along = fmin(fmax(ahead / length, T(0)), T(1));
+        }
 #else
-        const T ratio = ahead / length;
-#endif
-        const T raw = length > T(0) ? ratio : T(0);
+        const T raw = length > T(0) ? ahead / length : T(0);
         const T along = raw < T(0) ? T(0) : raw > T(1) ? T(1) : raw;
+#endif
         const T gap_x = off_x - along * dx, gap_y = off_y - along * dy;
         const T square = gap_x * gap_x + gap_y * gap_y;
         if (square < least) {
