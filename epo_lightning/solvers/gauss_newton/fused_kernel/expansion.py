@@ -74,12 +74,11 @@ def make(
         residuals.add_residual,
         residuals.steering,
     )
-    Game, Layout, pair_index, first_agent, weight, trace, nearest_point = (
+    Game, Layout, pair_index, first_agent, trace, nearest_point = (
         games.Game,
         games.Layout,
         games.pair_index,
         games.first_agent,
-        games.weight,
         games.trace,
         games.nearest_point,
     )
@@ -90,12 +89,13 @@ def make(
         games.margin_slot,
         games.horizon,
     )
-    steps, control_place, own_place, rows_place, values_place = (
+    own_count = games.own_count
+    steps, control_place, own_place, rows_place, weights_place = (
         fast.steps,
         fast.control,
         fast.own,
         fast.rows,
-        fast.values,
+        fast.weights,
     )
     Array, Numbers, A = games.Array, games.Numbers, games.agents
     P = A * (A - 1) // 2
@@ -110,14 +110,47 @@ def make(
         return control_place + (k % (steps + 1)) * (CONTROL_ITEMS * A)
 
     @wp.func
-    def force_place(k: int, first: int, i: int):
-        """The gradient of the costs of a state by agent i's position, heading and speed."""
-        return own_place + (((k - first) * A + i) * 5 + 4) * 4
-
-    @wp.func
     def row_place(slot: int, step: int, i: int, other: int):
         """The gradient of a pair feature by agent i's position, heading and speed."""
         return rows_place + (((slot * steps + step) * A + i) * A + other) * 4
+
+    @wp.func
+    def value_place(slot: int, step: int, pair: int):
+        """The value of a pair feature."""
+        return row_place(slot, step, pair // 4, pair // 4) + pair % 4
+
+    @wp.func
+    def weight(g: Game, costs: Array, feature: int, i: int):
+        """The weight of an own feature that the energy has."""
+        return costs[weights_place + own_slot(g, feature) * A + i]
+
+    @wp.func
+    def pair_weight_place(g: Game, slot: int, margin: int, pair: int):
+        """The weight of a pair feature, or its margin."""
+        return weights_place + own_count(g) * A + (slot * 2 + margin) * P + pair
+
+    @func
+    def copy_weights(g: Game, game: int, n: int, agents: Numbers, costs: Array):
+        """Copies the weights and margins of a game to fast memory."""
+        for e in range(lane(), own_count(g) * A, wp.block_dim()):
+            slot = e // A
+            i = e - slot * A
+            if i < n:
+                costs[weights_place + e] = g.own[slot * g.G * g.N + game * g.N + agents[i]]
+        all_pairs = (g.N * (g.N - 1)) // 2
+        for e in range(lane(), pair_count(g) * P, wp.block_dim()):
+            slot = e // P
+            p = e - slot * P
+            i = first_agent(p)
+            j = p - pair_index(i, i + 1, A) + i + 1
+            if j < n:
+                place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
+                costs[pair_weight_place(g, slot, 0, p)] = g.pair[slot * g.G * all_pairs + place]
+                margin = T(0.0)
+                if margin_slot(g, slot) >= 0:
+                    margin = g.margins[margin_slot(g, slot) * g.G * all_pairs + place]
+                costs[pair_weight_place(g, slot, 1, p)] = margin
+        sync()
 
     # ---- Pairs
 
@@ -136,7 +169,6 @@ def make(
     ):
         """Values, gradients and energies of all pairs."""
         K = horizon(g)
-        all_pairs = (g.N * (g.N - 1)) // 2
         for e in range(lane(), (last - first) * P, wp.block_dim()):
             step = e // P
             k = first + step
@@ -152,11 +184,8 @@ def make(
                 if j < n and state % g.pair_stride == 0:
                     one = 2 * ((game // g.M) * g.N + agents[i])
                     other = 2 * ((game // g.M) * g.N + agents[j])
-                    place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
-                    w = g.pair[slot * g.G * all_pairs + place]
-                    margin = T(0.0)
-                    if margin_slot(g, slot) >= 0:
-                        margin = g.margins[margin_slot(g, slot) * g.G * all_pairs + place]
+                    w = costs[pair_weight_place(g, slot, 0, p)]
+                    margin = costs[pair_weight_place(g, slot, 1, p)]
                     value, x, y, turn1, faster1, turn2, faster2, by_margin = evaluate_pair(
                         pair_feature(g, slot),
                         path[trace(at, K, X, i) + state],
@@ -181,7 +210,7 @@ def make(
                 energy += T(0.5) * pushed * pushed
                 put(costs, row_place(slot, step, i, j), of_one[0], of_one[1], of_one[2], of_one[3])
                 put(costs, row_place(slot, step, j, i), of_other[0], of_other[1], of_other[2], of_other[3])
-                costs[values_place + (slot * steps + step) * P + p] = pushed
+                costs[value_place(slot, step, p)] = pushed
             work[at.energy + (A + p) * K + k] = energy
 
     # ---- Agents
@@ -196,7 +225,7 @@ def make(
         return four(-along * s, along * c, g.dt * c, g.dt * s)
 
     @wp.func
-    def rate_costs(g: Game, channel: int, row: int, u: int, k: int, value: T, controls: Array):
+    def rate_costs(g: Game, costs: Array, channel: int, i: int, u: int, k: int, value: T, controls: Array):
         """Energy, first and second derivative by the change of a control since the step before, which has none at first."""
         energy = T(0.0)
         force = T(0.0)
@@ -207,11 +236,11 @@ def make(
             rate = wp.where(turning, TURNACC, JERK)
             rate_bounded = wp.where(turning, TURNACCB, JERKB)
             if own_slot(g, rate) >= 0:
-                energy, force, stiffness = add_residual(weight(g, rate, row), change, T(1.0), energy, force, stiffness)
+                energy, force, stiffness = add_residual(weight(g, costs, rate, i), change, T(1.0), energy, force, stiffness)
             if own_slot(g, rate_bounded) >= 0:
                 signal = wp.where(turning, BOUND_TURNACC, BOUND_JERK)
                 energy, force, stiffness = add_residual(
-                    weight(g, rate_bounded, row),
+                    weight(g, costs, rate_bounded, i),
                     excess(g, signal, change),
                     excess_slope(g, signal, change),
                     energy,
@@ -221,7 +250,7 @@ def make(
         return energy, force * (T(1.0) / g.dt), stiffness * (T(1.0) / (g.dt * g.dt))
 
     @wp.func
-    def control_costs(g: Game, channel: int, row: int, u: int, value: T):
+    def control_costs(g: Game, costs: Array, channel: int, i: int, u: int, value: T):
         """Energy, first and second derivative by a control, without those of its change."""
         turning = channel == TURN_RATE
         plain = wp.where(turning, TURNR, ACC)
@@ -231,14 +260,14 @@ def make(
         force = T(0.0)
         stiffness = T(0.0)
         if own_slot(g, plain) >= 0:
-            energy, force, stiffness = add_residual(weight(g, plain, row), value, T(1.0), energy, force, stiffness)
+            energy, force, stiffness = add_residual(weight(g, costs, plain, i), value, T(1.0), energy, force, stiffness)
         if own_slot(g, referring) >= 0:
             off = value - g.reference_controls[u]
-            energy, force, stiffness = add_residual(weight(g, referring, row), off, T(1.0), energy, force, stiffness)
+            energy, force, stiffness = add_residual(weight(g, costs, referring, i), off, T(1.0), energy, force, stiffness)
         if own_slot(g, bounded) >= 0:
             signal = wp.where(turning, BOUND_TURNR, BOUND_ACC)
             energy, force, stiffness = add_residual(
-                weight(g, bounded, row),
+                weight(g, costs, bounded, i),
                 excess(g, signal, value),
                 excess_slope(g, signal, value),
                 energy,
@@ -286,13 +315,13 @@ def make(
                     u = row * K * 2 + 2 * k + channel
                     value = controls[u]
                     turning = channel == TURN_RATE
-                    each, force, stiffness = control_costs(g, channel, row, u, value)
-                    rate_energy, rate_force, rate_stiffness = rate_costs(g, channel, row, u, k, value, controls)
+                    each, force, stiffness = control_costs(g, costs, channel, i, u, value)
+                    rate_energy, rate_force, rate_stiffness = rate_costs(g, costs, channel, i, u, k, value, controls)
                     energy += each + rate_energy
                     if turning and own_slot(g, STEER) >= 0:
                         wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
                         angle, by_turn, by_speed, turn_turn, turn_speed, speed_speed = steering(wheelbase, value, speed)
-                        w = weight(g, STEER, row)
+                        w = weight(g, costs, STEER, i)
                         energy += T(0.5) * w * w * angle * angle
                         force += w * w * angle * by_turn
                         stiffness += w * w * by_turn * by_turn
@@ -353,21 +382,21 @@ def make(
                 push = T(0.0)
                 stiffness = T(0.0)
                 if own_slot(g, VEL) >= 0:
-                    energy, push, stiffness = add_residual(weight(g, VEL, row), v, T(1.0), energy, push, stiffness)
+                    energy, push, stiffness = add_residual(weight(g, costs, VEL, i), v, T(1.0), energy, push, stiffness)
                 if own_slot(g, VELREF) >= 0:
                     apart = v - g.speeds[(game // g.M) * g.N + agents[i]]
                     energy, push, stiffness = add_residual(
-                        weight(g, VELREF, row), apart, T(1.0), energy, push, stiffness
+                        weight(g, costs, VELREF, i), apart, T(1.0), energy, push, stiffness
                     )
                 if own_slot(g, VELB) >= 0:
                     over = excess(g, BOUND_VEL, v)
                     slope = excess_slope(g, BOUND_VEL, v)
-                    energy, push, stiffness = add_residual(weight(g, VELB, row), over, slope, energy, push, stiffness)
+                    energy, push, stiffness = add_residual(weight(g, costs, VELB, i), over, slope, energy, push, stiffness)
                 if own_slot(g, STEER) >= 0 and state < end:
                     wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
                     turn = controls[row * K * 2 + 2 * state + TURN_RATE]
                     angle, by_turn, by_speed, turn_turn, turn_speed, speed_speed = steering(wheelbase, turn, v)
-                    w = weight(g, STEER, row)
+                    w = weight(g, costs, STEER, i)
                     push += w * w * angle * by_speed
                     stiffness += w * w * by_speed * by_speed
                 heading_push = T(0.0)
@@ -382,7 +411,7 @@ def make(
                 if own_slot(g, LANE) >= 0:
                     near_x, near_y, ahead_x, ahead_y = nearest_point(g, agents[g.N + i], px, py)
                     if agents[g.N + i] >= 0:
-                        w = weight(g, LANE, row)
+                        w = weight(g, costs, LANE, i)
                         energy, fx, xx = add_residual(w, px - near_x, T(1.0), energy, fx, xx)
                         energy, fy, yy = add_residual(w, py - near_y, T(1.0), energy, fy, yy)
                         if g.slides == 1:  # the nearest point of the line moves with the agent
@@ -401,10 +430,10 @@ def make(
                     if own_slot(g, HEADING) >= 0:
                         off = path[trace(at, K, TURNED, i) + state] - g.headings[row]
                         energy, heading_push, heading_stiffness = add_residual(
-                            weight(g, HEADING, row), off, T(1.0), energy, heading_push, heading_stiffness
+                            weight(g, costs, HEADING, i), off, T(1.0), energy, heading_push, heading_stiffness
                         )
                     if own_slot(g, GOAL) >= 0:
-                        w = weight(g, GOAL, row)
+                        w = weight(g, costs, GOAL, i)
                         energy, fx, xx = add_residual(w, px - g.goals[2 * row], T(1.0), energy, fx, xx)
                         energy, fy, yy = add_residual(w, py - g.goals[2 * row + 1], T(1.0), energy, fy, yy)
                 force = four(fx, fy, heading_push, push)
@@ -420,10 +449,10 @@ def make(
                             pair = pair_index(wp.min(i, other), wp.max(i, other), A)
                             at_row = row_place(f, step, i, other)
                             here = four(costs[at_row], costs[at_row + 1], costs[at_row + 2], costs[at_row + 3])
-                            force += costs[values_place + (f * steps + step) * P + pair] * here
+                            force += costs[value_place(f, step, pair)] * here
                             if curved == 1:
                                 own += wp.outer(here, here)
-            to = force_place(k, first, i)
+            to = own_place + (step * A + i) * 20 + 16
             put(costs, to, force[0], force[1], force[2], force[3])
             if curved == 1:
                 for q in range(4):
@@ -432,8 +461,7 @@ def make(
         sync()
 
     return SimpleNamespace(
-        control_items=control_items,
-        force_place=force_place,
+        copy_weights=copy_weights,
         expand_pairs=expand_pairs,
         expand_controls=expand_controls,
         expand_states=expand_states,

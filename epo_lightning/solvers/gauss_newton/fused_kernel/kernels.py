@@ -20,6 +20,7 @@ from epo_lightning.solvers.gauss_newton.fused_kernel import totals as all_totals
 from epo_lightning.solvers.gauss_newton.fused_kernel import trajectories as all_trajectories
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import DAMPED, PAIRS, SOLVED, STOPPED, TEAM, WARP
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
+from epo_lightning.solvers.gauss_newton.kernel.interface import OWN
 from epo_lightning.solvers.gauss_newton.structured import RETRIES
 
 REGISTERS = {WARP: 128, TEAM: 255}
@@ -53,19 +54,20 @@ def make(
     """
     T = wp.float64 if double else wp.float32
     func = functools.partial(wp.func, inline=None if features else False)
-    fast = layout.fast(agents, len(features.pair) if features else PAIRS, steps, double, count)
-    basics = threads.make(T, fast, backwards)
+    own, pair = (len(features.own), len(features.pair)) if features else (len(OWN), PAIRS)
+    fast = layout.fast(agents, own, pair, steps, double, count)
+    basics = threads.make(T, agents, fast, backwards)
     games = all_games.make(T, agents, features, steps, fast, basics, func)
     pairs = pair_features.make(T, func)
     residuals = all_residuals.make(T, games)
     expansion = expansions.make(T, basics, games, residuals, pairs, fast, func)
-    totals = all_totals.make(T, basics, games, expansion, func)
+    totals = all_totals.make(T, basics, games)
     recursion = recursions.make(T, agents, fast, backwards)
     trajectories = all_trajectories.make(T, basics, games, func)
     products = all_products.make(T, basics, games, func)
     pair_adjoint = pair_adjoints.make(T, basics, games, pairs, trajectories, products, func).pair_adjoint
     adjoint = adjoints.make(T, basics, games, residuals, trajectories, products, func)
-    sync, lane, fast_memory = basics.sync, basics.lane, basics.fast_memory
+    sync, lane, fast_memory, fast_numbers = basics.sync, basics.lane, basics.fast_memory, basics.fast_numbers
     Game, Run, Gradients, part, set_up = games.Game, games.Run, games.Gradients, games.part, games.set_up
     pair_count = games.pair_count
     end_of, valid, trace, roll, path_of, horizon = (
@@ -76,18 +78,20 @@ def make(
         games.path_of,
         games.horizon,
     )
-    expand_pairs, expand_controls, expand_states = (
+    copy_weights, expand_pairs, expand_controls, expand_states = (
+        expansion.copy_weights,
         expansion.expand_pairs,
         expansion.expand_controls,
         expansion.expand_states,
     )
-    total, forget_slopes, add_slopes, squared_slope = (
-        totals.total,
-        totals.forget_slopes,
-        totals.add_slopes,
-        totals.squared_slope,
+    total, squared_slope = totals.total, totals.squared_slope
+    begin, add_slopes, eliminate, pull, push = (
+        recursion.begin,
+        recursion.add_slopes,
+        recursion.eliminate,
+        recursion.pull,
+        recursion.push,
     )
-    eliminate, pull, push = recursion.eliminate, recursion.pull, recursion.push
     roll_tangents, pull_states = trajectories.roll_tangents, trajectories.pull_states
     forget_products, add_products = products.forget_products, products.add_products
     position_adjoint, motion_adjoint, control_adjoint = (
@@ -114,13 +118,15 @@ def make(
         work = part(run.work, wp.int64(block) * wp.int64(at.numbers), at.numbers)
         costs = fast_memory(work, at.fast)
         path = path_of(work, costs)
-        agents = wp.array(
+        memory = wp.array(
             ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
         )
+        agents = fast_numbers(memory)
         for game in range(block, g.G, run.blocks):
             n = set_up(g, game, agents)
             end = end_of(g, game)
             sound = valid(g, game, n, agents)
+            copy_weights(g, game, n, agents, costs)
             status = SOLVED
             if sound == 0:
                 status = STOPPED
@@ -145,8 +151,7 @@ def make(
                 raised = T(0.0)
                 while positive == 0 and attempt <= RETRIES:
                     positive = int(1)
-                    if stepping == 0:
-                        forget_slopes(costs)
+                    begin(costs, end)
                     # Backwards in time: the costs of a few steps, then the recursion over them.
                     for back in range((end + together - 1) // together):
                         last = end - back * together
@@ -177,7 +182,7 @@ def make(
                             )
                             positive = wp.min(positive, solved)
                         else:
-                            add_slopes(g, n, costs, first, last, end)
+                            add_slopes(costs, n, first, last, g.dt)
                     if positive == 0:
                         status = wp.max(status, DAMPED)
                         raised = wp.where(attempt == 0, T(10.0), T(10.0) * raised)
@@ -257,9 +262,10 @@ def make(
         work = part(run.work, wp.int64(block) * wp.int64(at.numbers), at.numbers)
         costs = fast_memory(work, at.fast)
         path = path_of(work, costs)
-        agents = wp.array(
+        memory = wp.array(
             ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
         )
+        agents = fast_numbers(memory)
         for game in range(block, g.G, run.blocks):
             n = set_up(g, game, agents)
             end = end_of(g, game)

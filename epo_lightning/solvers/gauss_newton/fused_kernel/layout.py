@@ -88,8 +88,9 @@ class Fast:
         own: second derivatives of a state's costs by position, heading and speed of an agent, and the gradient [C, A, 5, 4].
         path: trajectories and their sines and cosines [6, A, K + 1]; -1 where they are in the other memory.
         factors: what the recursion keeps of a step and its linear terms [K, :func:`factor_numbers` + 2 A]; -1 without room.
-        rows: gradients of pair features by the state of an agent, with every other agent [F, C, A, A, 4].
-        values: of pair features [F, C, P].
+        weights: of own features [O, A], of pair features [F, P], and their margins [F, P].
+        rows: gradients of pair features by the state of an agent, with every other agent [F, C, A, A, 4]; the values of all
+            pairs are in the places of agents with themselves.
         numbers: of all together. The first ones, up to ``control``, are the arrays of the recursion.
         shared: whether this is shared memory.
     """
@@ -99,8 +100,8 @@ class Fast:
     own: int
     path: int
     factors: int
+    weights: int
     rows: int
-    values: int
     numbers: int
     shared: bool
 
@@ -113,25 +114,27 @@ SHARED_OF_MANY = 13_400
 """Bytes with which 16 games are in the shared memory of a multiprocessor of an H100 or H200 at a time."""
 
 
-def fast(agents: int, pair: int, horizon: int | None, double: bool, threads: int) -> Fast:
-    """Places for games of ``agents`` agents with ``pair`` pair features.
+def fast(agents: int, own: int, pair: int, horizon: int | None, double: bool, threads: int) -> Fast:
+    """Places for games of ``agents`` agents with ``own`` and ``pair`` features.
 
     Args:
         agents: A.
+        own: O.
         pair: F.
         horizon: K on a GPU; None on a CPU.
         double: whether numbers have double precision.
         threads: of a game: of few games, one has the memory of a multiprocessor nearly for itself.
     """
     A, P = agents, agents * (agents - 1) // 2
-    each = {"control": CONTROL_ITEMS * A, "own": 20 * A, "rows": pair * 4 * A * A, "values": pair * P}
+    each = {"control": CONTROL_ITEMS * A, "own": 20 * A, "rows": pair * 4 * A * A}
     recursion = recursion_numbers(A)
+    weights = own * A + 2 * pair * P
     steps, path, factors = STEPS_ON_CPUS, 0, 0
     if horizon is not None:
         most = (SHARED_OF_MANY if threads == WARP else MOST_SHARED) // (8 if double else 4)
         path = 6 * A * (horizon + 1)
         path = path if path <= most // 3 else 0
-        left = most - recursion - each["control"] - path - 16
+        left = most - recursion - each["control"] - path - weights - 16
         steps = min(max(left // sum(each.values()), WARP // A), horizon)  # at least so many that no thread of a warp waits
         factors = horizon * (factor_numbers(A) + 2 * A)
         factors = factors if steps == horizon and factors <= left - steps * sum(each.values()) else 0
@@ -141,12 +144,12 @@ def fast(agents: int, pair: int, horizon: int | None, double: bool, threads: int
         "own": steps * each["own"],
         "path": path,
         "factors": factors,
+        "weights": weights,
         "rows": steps * each["rows"],
-        "values": steps * each["values"],
     }
     places, numbers = {}, 0
     for name, count in counts.items():
-        places[name] = numbers if count or name in each else -1
+        places[name] = numbers if count or name not in ("path", "factors") else -1
         numbers += -(-count // 4) * 4
     del places["recursion"]
     shared = horizon is not None and numbers * (8 if double else 4) <= MOST_SHARED

@@ -5,6 +5,8 @@
     struct alignas(4 * sizeof(T)) Four { T at[4]; };
     constexpr int A = $A$, M = 2 * A, D = 3 * M, LD = D + 4, WIDE = 4 * A, ITEMS = $ITEMS$ * A;
     constexpr int FACTOR = M * D + M + WIDE;  // gains [M, D], second derivatives by changes of controls [M], motions [4, A]
+    constexpr int RING = $STEPS$ + 1;
+    constexpr int WIDTH = 8 * A, GRADIENT = 6;  // see G below
     constexpr bool KEPT = $FACTORS$ >= 0;  // factors and linear terms are in fast memory too
 #if defined(__CUDA_ARCH__)
     constexpr int LANES = 32, WARPS = WP_TILE_BLOCK_DIM / LANES, THREADS = WP_TILE_BLOCK_DIM;
@@ -18,84 +20,115 @@
     #define EPO_SYNC() WP_TILE_SYNC()
     #define EPO_SYNC_LANES() WP_TILE_SYNC()
 #endif
-    (void)A, (void)LD, (void)WIDE, (void)ITEMS, (void)FACTOR, (void)M, (void)D, (void)lanes, (void)lane, (void)warp;
+    (void)LD, (void)ITEMS, (void)FACTOR, (void)RING, (void)WIDTH, (void)GRADIENT, (void)KEPT;
+    (void)threads, (void)thread, (void)lanes, (void)lane, (void)warp;
+
+// ---- begin
+    // After the last step there are no costs, and no controls whose changes cost anything.
+    for (int e = thread; e < (D + M) * LD + M * WIDTH; e += threads) fast.data[e] = T(0);
+    for (int e = thread; e < ITEMS; e += threads) fast.data[$CONTROL$ + end % RING * ITEMS + e] = T(0);
+    EPO_SYNC();
+
+// ---- slopes
+    // Sums backwards in time, of forces by position, heading and speed, and of the squared derivatives by controls. Positions
+    // move with the headings and speeds before, and the next change starts from a control.
+    for (int i = thread; i < count; i += threads) {
+        T* const sums = fast.data + 5 * i;
+        T x = sums[0], y = sums[1], turned = sums[2], faster = sums[3], squared = sums[4];
+        #pragma unroll 4
+        for (int k = last - 1; k >= first; --k) {
+            const T* const now = fast.data + $CONTROL$ + k % RING * ITEMS + i;
+            const T* const later = fast.data + $CONTROL$ + (k + 1) % RING * ITEMS + i;
+            const T* const motion = later + $MOTION$ * A;
+            const Four force = ((const Four*)(fast.data + $OWN$))[((k - first) * A + i) * 5 + 4];
+            turned += force.at[2] + motion[0] * x + motion[A] * y;
+            faster += force.at[3] + motion[2 * A] * x + motion[3 * A] * y;
+            x += force.at[0];
+            y += force.at[1];
+            const T turning = now[$PULL$ * A] - later[$RATE$ * A] + dt * turned;
+            const T speeding = now[($PULL$ + 1) * A] - later[($RATE$ + 1) * A] + dt * faster;
+            squared += turning * turning + speeding * speeding;
+        }
+        sums[0] = x, sums[1] = y, sums[2] = turned, sums[3] = faster, sums[4] = squared;
+    }
+    EPO_SYNC();
 
 // ---- eliminate
     // The value function of the state after the last step is in fast memory if that step is not the last one of the game.
     T* const P = fast.data;      // [D, LD]: the value function of the next state, and in column D its gradient
     T* const W = P + D * LD;     // [M, LD]: H_cp, H_cz before the motion, and H_cc = dt W_cz + W_cc
     // [M, WIDTH]: the columns of an agent's p, z and c beside each other; the gradient has a place that is left.
-    constexpr int WIDTH = 8 * A, GRADIENT = 6;
     T* const G = W + M * LD;
     T* const verdict = P + D + 1; // behind the columns of the first row
-    constexpr int RING = $STEPS$ + 1;
     const T* const controls = fast.data + $CONTROL$;  // [RING, ITEMS]
     const Four* const own = (const Four*)(fast.data + $OWN$);    // [STEPS, A, 5]
     const Four* const rows = (const Four*)(fast.data + $ROWS$);  // [pairs, STEPS, A, A]
     constexpr int COLUMNS = (D + LANES) / LANES, ROWS = (A + WARPS - 1) / WARPS;  // of a thread, at most
+#if defined(__CUDA_ARCH__)
+    auto root = [](T x) {  // 1 / sqrt(x): in single precision one instruction, with an error in the last digit
+        if (sizeof(T) == 8) return T(rsqrt(x));
+        const float given = x;
+        float found;
+        asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(found) : "f"(given));
+        return T(found);
+    };
+#endif
     const bool RECORDED = !KEPT || record;
-    int positive = 1;
+    int positive = 1, place = last % RING;
     for (int k = last - 1; k >= first; --k) {
-        const T* const now = controls + k % RING * ITEMS;
-        const T* const later = controls + (k + 1) % RING * ITEMS;
+        const T* const later = controls + place * ITEMS;
+        place = place == 0 ? RING - 1 : place - 1;
+        const T* const now = controls + place * ITEMS;
+        const Four* const owns = own + (k - first) * A * 5;
         #pragma unroll
         for (int column = 0; column < COLUMNS; ++column) {
             const int c = lane + column * lanes;
             if (c > D) break;
             const bool of_gradient = c == D, of_state = c < 2 * M;
-            const int agent = of_gradient ? -1 : c % M / 2, quantity = of_gradient ? 4 : c / M * 2 + c % 2;
+            const int agent = c % M / 2, quantity = of_gradient ? 4 : c / M * 2 + c % 2;
             T *const Pc = P + c, *const Wc = W + c;
             const T* const Gc = G + (of_gradient ? GRADIENT : 8 * agent + quantity);
             T g[M];
             #pragma unroll
-            for (int r = 0; r < M; ++r) g[r] = k == end - 1 ? T(0) : Gc[r * WIDTH];
+            for (int r = 0; r < M; ++r) g[r] = Gc[r * WIDTH];
             #pragma unroll
             for (int t = 0; t < ROWS; ++t) {
                 const int a = WARPS == 1 ? t : warp + t * WARPS;
                 if (a >= A) break;
+                const bool alone = of_gradient || a == agent;
                 T value[6] = {T(0), T(0), T(0), T(0), T(0), T(0)};
-                if (of_gradient || a == agent) {
-                    if (quantity < 5 && (of_gradient || of_state)) {
-                        const Four cost = own[((k - first) * A + a) * 5 + quantity];
-                        #pragma unroll
-                        for (int q = 0; q < 4; ++q) value[q] = cost.at[q];
-                    }
-                } else if (of_state) {
+                if (of_gradient || of_state) {
+                    const Four cost = owns[a * 5 + quantity];
+                    #pragma unroll
+                    for (int q = 0; q < 4; ++q) value[q] = Pc[(q / 2 * M + 2 * a + q % 2) * LD] + (alone ? cost.at[q] : T(0));
                     for (int f = 0; f < pairs; ++f) {
                         const Four* const step = rows + (f * $STEPS$ + k - first) * A * A;
                         const Four row = step[a * A + agent];
-                        const T other = step[agent * A + a].at[quantity];
+                        const T other = alone ? T(0) : step[agent * A + a].at[quantity];
                         #pragma unroll
-                        for (int q = 0; q < 4; ++q) value[q] += other * row.at[q];
-                    }
-                }
-                if (k < end - 1) {
-                    #pragma unroll
-                    for (int r = 0; r < M; ++r) {
-                        const Four here = *(const Four*)(G + r * WIDTH + 8 * a);
-                        #pragma unroll
-                        for (int q = 0; q < 4; ++q) value[q] -= here.at[q] * g[r];
-                        if (WARPS > 1 || r >= 2 * a) {  // the columns of c have zeros above the diagonal
-                            const Two of_change = *(const Two*)(G + r * WIDTH + 8 * a + 4);
-                            value[4] -= of_change.at[0] * g[r];
-                            value[5] -= of_change.at[1] * g[r];
-                        }
-                    }
-                    if (of_state || of_gradient) {
-                        #pragma unroll
-                        for (int q = 0; q < 4; ++q) value[q] += Pc[(q / 2 * M + 2 * a + q % 2) * LD];
-                    }
-                    #pragma unroll
-                    for (int q = 0; q < 2; ++q) {
-                        const T stiffness = later[($RATE_STIFFNESS$ + q) * A + a], rate = later[($RATE$ + q) * A + a];
-                        value[4 + q] += c == 2 * M + 2 * a + q ? stiffness : c == D ? -rate : T(0);
+                        for (int q = 0; q < 4; ++q) value[q] += alone ? T(0) : other * row.at[q];
                     }
                 }
                 #pragma unroll
                 for (int q = 0; q < 2; ++q) {
-                    const T pull = now[($PULL$ + q) * A + a];
+                    const T stiffness = later[($RATE_STIFFNESS$ + q) * A + a], rate = later[($RATE$ + q) * A + a];
+                    value[4 + q] = c == 2 * M + 2 * a + q ? stiffness : c == D ? now[($PULL$ + q) * A + a] - rate : T(0);
+                }
+                #pragma unroll
+                for (int r = 0; r < M; ++r) {
+                    const Four here = *(const Four*)(G + r * WIDTH + 8 * a);
+                    #pragma unroll
+                    for (int q = 0; q < 4; ++q) value[q] -= here.at[q] * g[r];
+                    if (WARPS > 1 || r >= 2 * a) {  // the columns of c have zeros above the diagonal
+                        const Two of_change = *(const Two*)(G + r * WIDTH + 8 * a + 4);
+                        value[4] -= of_change.at[0] * g[r];
+                        value[5] -= of_change.at[1] * g[r];
+                    }
+                }
+                #pragma unroll
+                for (int q = 0; q < 2; ++q) {
                     const T* const motion = now + ($MOTION$ + 2 * q) * A + a;
-                    Wc[(2 * a + q) * LD] = dt * value[2 + q] + value[4 + q] + (c == D ? pull : T(0));
+                    Wc[(2 * a + q) * LD] = dt * value[2 + q] + value[4 + q];
                     Pc[(2 * a + q) * LD] = value[q];
                     Pc[(M + 2 * a + q) * LD] = value[2 + q] + motion[0] * value[0] + motion[A] * value[1];
                 }
@@ -122,7 +155,7 @@
             for (int j = 0; j < M; ++j) {
                 if (!(L[j][j] > T(0))) positive = 0;
 #if defined(__CUDA_ARCH__)
-                L[j][j] = rsqrt(L[j][j]);
+                L[j][j] = root(L[j][j]);
 #else
                 L[j][j] = T(1) / sqrt(L[j][j]);
 #endif
@@ -273,10 +306,10 @@
 // ---- push
     // The changes of the controls, -(K x + H_cc^-1 (h - S c)) with the controls c of the step before, forward in time. They go
     // to [agents, K, 2] from `place` on, in the rows of the agents or in their own ones, 0 to n - 1.
-    T* const states = fast.data;      // [2, D]: of a step and the one after it
-    T* const known = states + 2 * D;  // [D]: p, z and h - S c, with which the gains are multiplied
-    T* const shares = known + D;      // [3, M]: the products with each of them
+    T* const known = fast.data;       // [2, D]: of a step and the next one: p, z and h - S c, with which gains are multiplied
+    T* const shares = known + 2 * D;  // [3, M]: the products with each of them
     T* const buffers = shares + D;
+    constexpr int ITEMS_EACH = (D + LANES - 1) / LANES;  // of a thread, at most
     const bool streamed = !KEPT || kept == 0;
     EPO_SYNC();
     if (warp == 0) {
@@ -285,21 +318,29 @@
             wait();
         }
         const T* next = streamed ? buffers : fast.data + $FACTORS$;
-        for (int j = lane; j < D; j += lanes) states[j] = T(0), known[j] = j < 2 * M ? T(0) : next[FACTOR + j - 2 * M];
+        T state[ITEMS_EACH];
+        #pragma unroll
+        for (int t = 0; t < ITEMS_EACH; ++t) {
+            const int j = lane + t * lanes;
+            state[t] = T(0);
+            if (j < D) known[j] = j < 2 * M ? T(0) : next[FACTOR + j - 2 * M];
+        }
         for (int k = 0; k < end; ++k) {
             EPO_SYNC_LANES();
-            const T* const x = states + (k & 1) * D;
-            T* const after = states + ((k + 1) & 1) * D;
+            const T* const by = known + (k & 1) * D;
+            T* const after = known + ((k + 1) & 1) * D;
             const T* const factor = next;
             next = streamed ? buffers + ((k + 1) % DEPTH) * STREAM : factor + STREAM;
-            for (int e = lane; e < D; e += lanes) {
-                const int r = e % M, first = e - r;
+            #pragma unroll
+            for (int t = 0; t < ITEMS_EACH; ++t) {
+                const int e = lane + t * lanes, r = e % M, first = e - r;
+                if (e >= D) break;
                 T share[4] = {T(0), T(0), T(0), T(0)};
                 #pragma unroll
                 for (int c = 0; c < M; c += 4) {
-                    const Four gain = *(const Four*)(factor + r * D + first + c), by = *(const Four*)(known + first + c);
+                    const Four gain = *(const Four*)(factor + r * D + first + c), with = *(const Four*)(by + first + c);
                     #pragma unroll
-                    for (int q = 0; q < 4; ++q) share[q] += gain.at[q] * by.at[q];
+                    for (int q = 0; q < 4; ++q) share[q] += gain.at[q] * with.at[q];
                 }
                 shares[e] = (share[0] + share[1]) + (share[2] + share[3]);
             }
@@ -309,20 +350,17 @@
             } else {
                 EPO_SYNC_LANES();
             }
-            for (int j = lane; j < D; j += lanes) {
-                const int r = j % M, a = r / 2;
+            #pragma unroll
+            for (int t = 0; t < ITEMS_EACH; ++t) {
+                const int j = lane + t * lanes, r = j % M, a = r / 2;
+                if (j >= D) break;
                 const T* const motion = factor + M * D + M + r % 2 * A + a;
                 const T change = -(shares[r] + shares[M + r] + shares[2 * M + r]);
-                T moved = change, use = change;
-                if (j < M) {
-                    moved = x[j] + motion[0] * x[M + 2 * a] + motion[2 * A] * x[M + 2 * a + 1];
-                } else if (j < 2 * M) {
-                    moved = x[j] + dt * change;
-                } else if (k + 1 < end) {
-                    use = next[FACTOR + r] - next[M * D + r] * change;
-                }
-                after[j] = moved;
-                known[j] = j < 2 * M ? moved : use;
+                const Two moving = *(const Two*)(by + M + 2 * a);
+                const T moved = state[t] + motion[0] * moving.at[0] + motion[2 * A] * moving.at[1];
+                const T use = next[FACTOR + r] - next[M * D + r] * change;  // read by nothing after the last step
+                state[t] = j < M ? moved : state[t] + dt * change;
+                after[j] = j < 2 * M ? state[t] : use;
                 if (j >= 2 * M && a < count) {
                     to.data[place + 2 * ((own_rows ? a : rows.data[a]) * K + k) + 1 - r % 2] = change;
                 }

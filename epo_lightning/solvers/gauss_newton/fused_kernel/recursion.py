@@ -43,6 +43,12 @@ def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNames
     head, *bodies = source.split("// ---- ")
     code = dict(body.split("\n", 1) for body in bodies)
 
+    @wp.func_native(head + code["begin"])
+    def begin(fast: Array, end: int): ...
+
+    @wp.func_native(head + code["slopes"])
+    def add_slopes(fast: Array, count: int, first: int, last: int, dt: T): ...
+
     @wp.func_native(head + code["eliminate"])
     def eliminate(
         work: Array,
@@ -77,4 +83,4 @@ def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNames
         kept: int,
     ): ...
 
-    return SimpleNamespace(eliminate=eliminate, pull=pull, push=push)
+    return SimpleNamespace(begin=begin, add_slopes=add_slopes, eliminate=eliminate, pull=pull, push=push)

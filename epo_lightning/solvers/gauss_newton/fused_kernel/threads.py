@@ -36,6 +36,14 @@ _FAST = """
 #endif
     return wp::array_t<{number}>(work.data + place, {numbers});
 """
+_FAST_NUMBERS = """
+#if defined(__CUDA_ARCH__)
+    __shared__ int numbers[{count}];
+    return wp::array_t<int>(numbers, {count});
+#else
+    return given;
+#endif
+"""
 _PUT = """
     typedef {number} T;
     struct alignas(4 * sizeof(T)) Four { T x, y, z, w; };
@@ -123,8 +131,8 @@ _NEAREST_SEGMENT = """
 
 
 @no_type_check
-def make(T: Any, fast: Fast, backwards: bool) -> SimpleNamespace:
-    """The functions for numbers of type ``T``, with fast memory for ``fast``.
+def make(T: Any, agents: int, fast: Fast, backwards: bool) -> SimpleNamespace:
+    """The functions for numbers of type ``T`` and games of up to ``agents`` agents, with fast memory for ``fast``.
 
     Threads of a CPU run one after the other from barrier to barrier, in the order of their numbers, or if ``backwards`` in
     the opposite one.
@@ -143,6 +151,9 @@ def make(T: Any, fast: Fast, backwards: bool) -> SimpleNamespace:
     @wp.func_native(memory.replace("{shared}", str(int(fast.shared))))
     def fast_memory(work: Array, place: int) -> Array: ...
 
+    @wp.func_native(_FAST_NUMBERS.replace("{count}", str(2 * agents + 2)))
+    def fast_numbers(given: wp.array(dtype=wp.int32)) -> wp.array(dtype=wp.int32): ...
+
     @wp.func_native(_PUT.replace("{number}", number))
     def put(to: Array, place: int, x: T, y: T, z: T, w: T): ...
 
@@ -159,6 +170,7 @@ def make(T: Any, fast: Fast, backwards: bool) -> SimpleNamespace:
         sync=sync,
         lane=lane,
         fast_memory=fast_memory,
+        fast_numbers=fast_numbers,
         put=put,
         sums=sums,
         sums_back=sums_back,
