@@ -267,7 +267,7 @@ class _Call:
         """Launch a kernel on PyTorch's current stream, with memory for its blocks."""
         wp, device = warp(), self.iterates.device
         work = self.iterates.new_empty(self.blocks * self.memory)
-        numbers = torch.empty(self.blocks * (2 * self.shape[2] + 2), dtype=torch.int32, device=device)
+        numbers = torch.empty(self.blocks * (4 * self.shape[2] + 2), dtype=torch.int32, device=device)
         self.arguments.work, self.arguments.numbers = _flat(work), _flat(numbers)
         stream: Any = contextlib.nullcontext()
         if device.type == "cuda":

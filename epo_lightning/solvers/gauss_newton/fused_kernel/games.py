@@ -231,16 +231,23 @@ def make(
     def set_up(g: Game, game: int, agents: Numbers):
         """The n present agents in ``agents[0..n)``, and the starts of their lines (-1 without one) in ``agents[N..N+n)``."""
         b = game // g.M
+        line_of = 2 * g.N + 2  # by agent, also the absent ones, which have -2
+        for a in range(lane(), g.N, wp.block_dim()):
+            line = int(-2)
+            if g.present[b * g.N + a] != wp.uint8(0):
+                line = -1
+                if own_slot(g, LANE) >= 0:
+                    chosen = int(g.reference[game * g.N + a])
+                    if chosen >= 0 and chosen < g.lines:
+                        if g.exists[(b * g.N + a) * g.lines + chosen] != wp.uint8(0):
+                            line = ((b * g.N + a) * g.lines + chosen) * g.points * 2
+            agents[line_of + a] = line
+        sync()
         n = int(0)
         for a in range(g.N):
-            if g.present[b * g.N + a] != wp.uint8(0):
+            line = agents[line_of + a]
+            if line >= -1:
                 if lane() == 0:
-                    line = int(-1)
-                    if own_slot(g, LANE) >= 0:
-                        chosen = int(g.reference[game * g.N + a])
-                        if chosen >= 0 and chosen < g.lines:
-                            if g.exists[(b * g.N + a) * g.lines + chosen] != wp.uint8(0):
-                                line = ((b * g.N + a) * g.lines + chosen) * g.points * 2
                     agents[n] = a
                     agents[g.N + n] = line
                 n += 1

@@ -119,7 +119,7 @@ def make(
         costs = fast_memory(work, at.fast)
         path = path_of(work, costs)
         memory = wp.array(
-            ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
+            ptr=run.numbers.ptr + wp.uint64(block * (4 * g.N + 2) * 4), shape=(4 * g.N + 2,), dtype=wp.int32
         )
         agents = fast_numbers(memory)
         for game in range(block, g.G, run.blocks):
@@ -263,7 +263,7 @@ def make(
         costs = fast_memory(work, at.fast)
         path = path_of(work, costs)
         memory = wp.array(
-            ptr=run.numbers.ptr + wp.uint64(block * (2 * g.N + 2) * 4), shape=(2 * g.N + 2,), dtype=wp.int32
+            ptr=run.numbers.ptr + wp.uint64(block * (4 * g.N + 2) * 4), shape=(4 * g.N + 2,), dtype=wp.int32
         )
         agents = fast_numbers(memory)
         for game in range(block, g.G, run.blocks):

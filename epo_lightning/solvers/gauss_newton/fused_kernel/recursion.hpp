@@ -56,7 +56,7 @@
 // ---- eliminate
     // The value function of the state after the last step is in fast memory if that step is not the last one of the game.
     T* const P = fast.data;      // [D, LD]: the value function of the next state, and in column D its gradient
-    T* const W = P + D * LD;     // [M, LD]: H_cp, H_cz before the motion, and H_cc = dt W_cz + W_cc
+    T* const W = P + D * LD;     // [M, LD]: H_cp, H_cz before the motion, and W_cc, with H_cc = dt W_cz + W_cc
     // [M, WIDTH]: the columns of an agent's p, z and c beside each other; the gradient has a place that is left.
     T* const G = W + M * LD;
     T* const verdict = P + D + 1; // behind the columns of the first row
@@ -73,6 +73,8 @@
         return T(found);
     };
 #endif
+    // Where a warp has all columns, those of c get H_cc in place of W_cc, from which it differs by a product of theirs of z.
+    constexpr bool JOINED = LANES > D;
     const bool RECORDED = !KEPT || record;
     int positive = 1, place = last % RING;
     for (int k = last - 1; k >= first; --k) {
@@ -82,7 +84,7 @@
         const Four* const owns = own + (k - first) * A * 5;
         #pragma unroll
         for (int column = 0; column < COLUMNS; ++column) {
-            const int c = lane + column * lanes;
+            const int c = JOINED && lane > D ? D : lane + column * lanes;  // all threads take part in the exchange below
             if (c > D) break;
             const bool of_gradient = c == D, of_state = c < 2 * M;
             const int agent = c % M / 2, quantity = of_gradient ? 4 : c / M * 2 + c % 2;
@@ -128,7 +130,14 @@
                 #pragma unroll
                 for (int q = 0; q < 2; ++q) {
                     const T* const motion = now + ($MOTION$ + 2 * q) * A + a;
-                    Wc[(2 * a + q) * LD] = dt * value[2 + q] + value[4 + q];
+                    T by_control = dt * value[2 + q] + value[4 + q];
+#if defined(__CUDA_ARCH__)
+                    if (JOINED) {
+                        const T of_state = __shfl_sync(~0u, by_control, lane - M);
+                        by_control += c >= 2 * M && c < D ? dt * of_state : T(0);
+                    }
+#endif
+                    Wc[(2 * a + q) * LD] = by_control;
                     Pc[(2 * a + q) * LD] = value[q];
                     Pc[(M + 2 * a + q) * LD] = value[2 + q] + motion[0] * value[0] + motion[A] * value[1];
                 }
@@ -143,7 +152,9 @@
             for (int r = 0; r < M; ++r) {
                 #pragma unroll
                 for (int s = 0; s <= r; s += 4) {
-                    const Four by_state = *(const Four*)(W + r * LD + M + s), by_change = *(const Four*)(W + r * LD + 2 * M + s);
+                    const Four by_change = *(const Four*)(W + r * LD + 2 * M + s);
+                    Four by_state = {T(0), T(0), T(0), T(0)};
+                    if (!JOINED) by_state = *(const Four*)(W + r * LD + M + s);
                     #pragma unroll
                     for (int q = 0; q < 4; ++q) {
                         if (s + q <= r) L[r][s + q] = dt * by_state.at[q] + by_change.at[q];
@@ -319,10 +330,13 @@
         }
         const T* next = streamed ? buffers : fast.data + $FACTORS$;
         T state[ITEMS_EACH];
+        T* target[ITEMS_EACH];  // of the changes of a control; none for p and z, and for agents that are absent
         #pragma unroll
         for (int t = 0; t < ITEMS_EACH; ++t) {
-            const int j = lane + t * lanes;
+            const int j = lane + t * lanes, r = j % M, a = r / 2;
             state[t] = T(0);
+            target[t] = nullptr;
+            if (j >= 2 * M && j < D && a < count) target[t] = to.data + place + 2 * (own_rows ? a : rows.data[a]) * K + 1 - r % 2;
             if (j < D) known[j] = j < 2 * M ? T(0) : next[FACTOR + j - 2 * M];
         }
         for (int k = 0; k < end; ++k) {
@@ -361,9 +375,7 @@
                 const T use = next[FACTOR + r] - next[M * D + r] * change;  // read by nothing after the last step
                 state[t] = j < M ? moved : state[t] + dt * change;
                 after[j] = j < 2 * M ? state[t] : use;
-                if (j >= 2 * M && a < count) {
-                    to.data[place + 2 * ((own_rows ? a : rows.data[a]) * K + k) + 1 - r % 2] = change;
-                }
+                if (target[t]) target[t][2 * k] = change;
             }
         }
     }

@@ -91,7 +91,8 @@ _SUMS_BACK = """
     }
 """
 # The line's segment that is nearest to a point; -1 if no comparison is true, because an input is NaN. What is left of the
-# point's coordinates on the segment need not be exact, and is computed again: a GPU divides fast.
+# point's coordinates on the segment need not be exact, and is computed again: a GPU divides fast. Points are read
+# in batches, as numbers of sums are.
 _NEAREST_SEGMENT = """
     typedef {number} T;
     struct alignas(2 * sizeof(T)) Point { T x, y; };
@@ -99,32 +100,37 @@ _NEAREST_SEGMENT = """
     Point from = line[0];
     T least = INFINITY;
     int nearest = -1;
-    #pragma unroll 8
-    for (int q = 0; q + 1 < count; ++q) {
-        const Point to = line[q + 1];
-        const T dx = to.x - from.x, dy = to.y - from.y, off_x = x - from.x, off_y = y - from.y;
-        const T length = dx * dx + dy * dy, ahead = off_x * dx + off_y * dy;
+    for (int begin = 0; begin + 1 < count; begin += 8) {
+        Point batch[8];
+        #pragma unroll
+        for (int j = 0; j < 8; ++j) batch[j] = line[begin + j + 1 < count ? begin + j + 1 : count - 1];
+        #pragma unroll
+        for (int j = 0; j < 8; ++j) {
+            const Point to = batch[j];
+            const T dx = to.x - from.x, dy = to.y - from.y, off_x = x - from.x, off_y = y - from.y;
+            const T length = dx * dx + dy * dy, ahead = off_x * dx + off_y * dy;
 #if defined(__CUDA_ARCH__)
-        T along;  // between 0 and 1, and 0 instead of NaN where the length is zero
-        if (sizeof(T) == 4) {
-            const float whole = length, part = ahead;
-            float inverse;
-            asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(whole));
-            along = __saturatef(part * inverse);
-        } else {
-            along = fmin(fmax(ahead / length, T(0)), T(1));
-        }
+            T along;  // between 0 and 1, and 0 instead of NaN where the length is zero
+            if (sizeof(T) == 4) {
+                const float whole = length, part = ahead;
+                float inverse;
+                asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(whole));
+                along = __saturatef(part * inverse);
+            } else {
+                along = fmin(fmax(ahead / length, T(0)), T(1));
+            }
 #else
-        const T raw = length > T(0) ? ahead / length : T(0);
-        const T along = raw < T(0) ? T(0) : raw > T(1) ? T(1) : raw;
+            const T raw = length > T(0) ? ahead / length : T(0);
+            const T along = raw < T(0) ? T(0) : raw > T(1) ? T(1) : raw;
 #endif
-        const T gap_x = off_x - along * dx, gap_y = off_y - along * dy;
-        const T square = gap_x * gap_x + gap_y * gap_y;
-        if (square < least) {
-            least = square;
-            nearest = q;
+            const T gap_x = off_x - along * dx, gap_y = off_y - along * dy;
+            const T square = gap_x * gap_x + gap_y * gap_y;
+            if (square < least && begin + j + 1 < count) {
+                least = square;
+                nearest = begin + j;
+            }
+            from = to;
         }
-        from = to;
     }
     return nearest;
 """
@@ -151,7 +157,7 @@ def make(T: Any, agents: int, fast: Fast, backwards: bool) -> SimpleNamespace:
     @wp.func_native(memory.replace("{shared}", str(int(fast.shared))))
     def fast_memory(work: Array, place: int) -> Array: ...
 
-    @wp.func_native(_FAST_NUMBERS.replace("{count}", str(2 * agents + 2)))
+    @wp.func_native(_FAST_NUMBERS.replace("{count}", str(4 * agents + 2)))
     def fast_numbers(given: wp.array(dtype=wp.int32)) -> wp.array(dtype=wp.int32): ...
 
     @wp.func_native(_PUT.replace("{number}", number))
