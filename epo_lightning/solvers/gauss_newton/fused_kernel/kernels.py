@@ -212,7 +212,6 @@ def make(
                         agents,
                         n,
                         K,
-                        1,
                     )
                     if lane() == 0:
                         agents[flag] = sound * positive
@@ -310,7 +309,6 @@ def make(
                             agents,
                             n,
                             K,
-                            0,
                         )
                         roll_tangents(g, game, n, agents, at, work, path, directions)
                         forget_products(g, at, work)

@@ -243,10 +243,12 @@
     return positive;
 
 // ---- stream
-    // What a step of the next two functions reads, in fast memory: the factor and the linear terms [M]. While a step is
-    // computed, the numbers of the next three are on their way. The first warp of a game works, and its other ones wait.
+    // What a step of the next two functions reads: the factor and the linear terms [M]. It is in fast memory if there is room
+    // for all steps. Otherwise the numbers of the next three are on their way there while a step is computed. The first warp
+    // of a game works, and its other ones wait.
     constexpr int STREAM = FACTOR + M, DEPTH = 4;
     constexpr int UNIT = 16 / sizeof(T);  // numbers that are copied at once
+    constexpr int EACH = (D + LANES - 1) / LANES;  // numbers of a state of a thread, at most
     auto request = [&](T* buffers, int k) {
         const T* const factor = factors.data + k * FACTOR;
         const T* const others = work.data + linear + k * M - FACTOR;
@@ -272,32 +274,56 @@
 #endif
         EPO_SYNC_LANES();
     };
+    auto numbers_of = [&](T* buffers, int k) { return KEPT ? fast.data + $FACTORS$ + k * STREAM : buffers + (k % DEPTH) * STREAM; };
 
 // ---- pull
     // Linear terms backwards in time: h becomes the gradient by the controls of a step, for another right-hand side.
     T* const states = fast.data;  // [2, D]: of a step and the one before it
-    T* const q = states + 2 * D;
-    T* const buffers = q + M;
+    T* const slope = states + 2 * D;
+    T* const buffers = slope + M;
     EPO_SYNC();
+    if (KEPT) {  // a step that is differentiated is not the one that was taken last
+        for (int e = 4 * thread; e < end * FACTOR; e += 4 * threads) {
+            const int k = e / FACTOR;
+            *(Four*)(numbers_of(buffers, k) + e - k * FACTOR) = *(const Four*)(factors.data + e);
+        }
+        for (int e = thread; e < end * M; e += threads) numbers_of(buffers, e / M)[FACTOR + e % M] = work.data[linear + e];
+        EPO_SYNC();
+    }
     if (warp == 0) {
-        for (int back = 0; back < DEPTH - 1; ++back) request(buffers, end - 1 - back);
+        for (int back = 0; back < DEPTH - 1 && !KEPT; ++back) request(buffers, end - 1 - back);
         for (int j = lane; j < 2 * D; j += lanes) states[j] = T(0);
         for (int k = end - 1; k >= 0; --k) {
-            wait();
+            if (KEPT) {
+                EPO_SYNC_LANES();
+            } else {
+                wait();
+            }
             const T* const y = states + (k & 1) * D;
             T* const before = states + ((k + 1) & 1) * D;
-            const T* const factor = buffers + (k % DEPTH) * STREAM;
-            const T* const motions = factor + M * D + M;
+            T* const numbers = numbers_of(buffers, k);
+            const T* const motions = numbers + M * D + M;
+            T gain[EACH][M];  // read before the barrier, which nothing passes
+            #pragma unroll
+            for (int t = 0; t < EACH; ++t) {
+                const int j = lane + t * lanes;
+                #pragma unroll
+                for (int r = 0; r < M; ++r) gain[t][r] = j < D ? numbers[r * D + j] : T(0);
+            }
             for (int r = lane; r < M; r += lanes) {
-                q[r] = factor[FACTOR + r] + dt * y[M + r] + y[2 * M + r];
-                work.data[linear + k * M + r] = q[r];
+                const T found = numbers[FACTOR + r] + dt * y[M + r] + y[2 * M + r];
+                slope[r] = found;
+                (KEPT ? numbers[FACTOR + r] : work.data[linear + k * M + r]) = found;
             }
             EPO_SYNC_LANES();
-            request(buffers, k - DEPTH + 1);
-            for (int j = lane; j < D; j += lanes) {
+            if (!KEPT) request(buffers, k - DEPTH + 1);
+            #pragma unroll
+            for (int t = 0; t < EACH; ++t) {
+                const int j = lane + t * lanes;
+                if (j >= D) break;
                 T sum = T(0);
                 #pragma unroll
-                for (int r = 0; r < M; ++r) sum += factor[r * D + j] * q[r];
+                for (int r = 0; r < M; ++r) sum += gain[t][r] * slope[r];
                 if (j < 2 * M) {
                     T moved = y[j] - sum;
                     if (j >= M) {
@@ -307,7 +333,7 @@
                     }
                     before[j] = moved;
                 } else {
-                    before[j] = factor[M * D + j - 2 * M] * sum;
+                    before[j] = numbers[M * D + j - 2 * M] * sum;
                 }
             }
         }
@@ -320,55 +346,59 @@
     T* const known = fast.data;       // [2, D]: of a step and the next one: p, z and h - S c, with which gains are multiplied
     T* const shares = known + 2 * D;  // [3, M]: the products with each of them
     T* const buffers = shares + D;
-    constexpr int ITEMS_EACH = (D + LANES - 1) / LANES;  // of a thread, at most
-    const bool streamed = !KEPT || kept == 0;
     EPO_SYNC();
     if (warp == 0) {
-        if (streamed) {
+        if (!KEPT) {
             for (int ahead = 0; ahead < DEPTH - 1; ++ahead) request(buffers, ahead);
             wait();
         }
-        const T* next = streamed ? buffers : fast.data + $FACTORS$;
-        T state[ITEMS_EACH];
-        T* target[ITEMS_EACH];  // of the changes of a control; none for p and z, and for agents that are absent
+        T state[EACH];
+        T* target[EACH];  // of the changes of a control; none for p and z, and for agents that are absent
         #pragma unroll
-        for (int t = 0; t < ITEMS_EACH; ++t) {
+        for (int t = 0; t < EACH; ++t) {
             const int j = lane + t * lanes, r = j % M, a = r / 2;
             state[t] = T(0);
             target[t] = nullptr;
             if (j >= 2 * M && j < D && a < count) target[t] = to.data + place + 2 * (own_rows ? a : rows.data[a]) * K + 1 - r % 2;
-            if (j < D) known[j] = j < 2 * M ? T(0) : next[FACTOR + j - 2 * M];
+            if (j < D) known[j] = j < 2 * M ? T(0) : numbers_of(buffers, 0)[FACTOR + j - 2 * M];
         }
         for (int k = 0; k < end; ++k) {
-            EPO_SYNC_LANES();
             const T* const by = known + (k & 1) * D;
             T* const after = known + ((k + 1) & 1) * D;
-            const T* const factor = next;
-            next = streamed ? buffers + ((k + 1) % DEPTH) * STREAM : factor + STREAM;
+            const T* const numbers = numbers_of(buffers, k);
+            const T* const next = numbers_of(buffers, k + 1);
+            Four gain[EACH][M / 4];  // read before the barrier, which nothing passes
             #pragma unroll
-            for (int t = 0; t < ITEMS_EACH; ++t) {
-                const int e = lane + t * lanes, r = e % M, first = e - r;
-                if (e >= D) break;
+            for (int t = 0; t < EACH; ++t) {
+                const int j = lane + t * lanes, r = j % M;
+                #pragma unroll
+                for (int c = 0; c < M / 4; ++c) gain[t][c] = *(const Four*)(numbers + (j < D ? r * D + j - r : 0) + 4 * c);
+            }
+            EPO_SYNC_LANES();
+            #pragma unroll
+            for (int t = 0; t < EACH; ++t) {
+                const int j = lane + t * lanes;
+                if (j >= D) break;
                 T share[4] = {T(0), T(0), T(0), T(0)};
                 #pragma unroll
-                for (int c = 0; c < M; c += 4) {
-                    const Four gain = *(const Four*)(factor + r * D + first + c), with = *(const Four*)(by + first + c);
+                for (int c = 0; c < M / 4; ++c) {
+                    const Four with = *(const Four*)(by + j - j % M + 4 * c);
                     #pragma unroll
-                    for (int q = 0; q < 4; ++q) share[q] += gain.at[q] * with.at[q];
+                    for (int q = 0; q < 4; ++q) share[q] += gain[t][c].at[q] * with.at[q];
                 }
-                shares[e] = (share[0] + share[1]) + (share[2] + share[3]);
+                shares[j] = (share[0] + share[1]) + (share[2] + share[3]);
             }
-            if (streamed) {
+            if (KEPT) {
+                EPO_SYNC_LANES();
+            } else {
                 request(buffers, k + DEPTH - 1);
                 wait();
-            } else {
-                EPO_SYNC_LANES();
             }
             #pragma unroll
-            for (int t = 0; t < ITEMS_EACH; ++t) {
+            for (int t = 0; t < EACH; ++t) {
                 const int j = lane + t * lanes, r = j % M, a = r / 2;
                 if (j >= D) break;
-                const T* const motion = factor + M * D + M + r % 2 * A + a;
+                const T* const motion = numbers + M * D + M + r % 2 * A + a;
                 const T change = -(shares[r] + shares[M + r] + shares[2 * M + r]);
                 const Two moving = *(const Two*)(by + M + 2 * a);
                 const T moved = state[t] + motion[0] * moving.at[0] + motion[2 * A] * moving.at[1];

@@ -80,7 +80,6 @@ def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNames
         rows: wp.array(dtype=wp.int32),
         count: int,
         K: int,
-        kept: int,
     ): ...
 
     return SimpleNamespace(begin=begin, add_slopes=add_slopes, eliminate=eliminate, pull=pull, push=push)
