@@ -337,13 +337,16 @@ class EPO(Forecaster):
         return self.probabilities(z, positions, current, scene.agent_mask)
 
     def _states_of_initial_strategies(self, scene: Scene, parameters: GameParameters) -> Tensor | None:
-        """The states of the initial strategies, [B, M, N, K, 4]; None for solvers that choose among candidates."""
-        if TABLES in self.solver.provides:
+        """The states of the initial strategies, [B, M, N, K, 4]; None for solvers that choose among candidates.
+
+        If gradients reach the initial strategies through the solution (``backward=unrolled``), the loss term ``initial`` is
+        not used: their states have no gradient, and in training, where nothing else reads them, they are None.
+        """
+        taught = self.differentiable_solve.teaches_start
+        if TABLES in self.solver.provides or (taught and self.training):
             return None
         controls = parameters.initial_controls[..., : self.task.horizon, :]
-        # If gradients reach the initial strategies through the solution (backward=unrolled), the loss term `initial` is not
-        # used, so their states are computed without a gradient.
-        controls = controls.detach() if self.differentiable_solve.teaches_start else controls
+        controls = controls.detach() if taught else controls
         states = self.energy.dynamics.rollout(self.energy.current_states(scene), controls, scene.dt)
         return states.expand(-1, self.modes, -1, -1, -1)
 

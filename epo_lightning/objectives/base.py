@@ -45,7 +45,8 @@ class Objective(ABC):
 
         Args:
             scene: the scene with its future.
-            forecast: the forecast with ``parameters``, ``solution`` and ``initial_states``.
+            forecast: the forecast with ``parameters`` and ``solution``, and with ``initial_states`` unless gradients reach
+                the initial strategies through the solution.
             energy: the energy that was minimised.
             step: number of optimisation steps so far.
 

@@ -58,7 +58,7 @@ class Imitation(Objective):
             entropy = order_loss(forecast.order_logits, *energy.pair_order.observed(scene))
             terms["probability"] = (self.weights["probability"], entropy)
         starts = forecast.initial_states
-        # EPO detaches them if the solution already teaches the strategies.
+        # EPO leaves them out, or detaches them, if the solution already teaches the strategies.
         if starts is not None and starts.requires_grad:
             initial = dataclasses.replace(forecast, states=starts)
             closest = imitation_terms(scene, initial, self.weights, *how)["imitation"][1]

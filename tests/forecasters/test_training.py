@@ -185,3 +185,12 @@ def test_a_power_below_one_or_without_end_is_refused(name: str, power: float) ->
     config["objective" if name == "epo" else "forecaster"]["power"] = power
     with pytest.raises(Exception, match="power must be 1 or more, and finite, not"):
         build_forecaster(model(**config))
+
+
+@pytest.mark.parametrize("backward", ["unrolled", "truncated"])
+def test_training_has_states_of_initial_strategies_only_where_they_are_taught(backward):
+    """With ``unrolled``, the strategies learn through the solution, and no loss reads the states."""
+    forecaster, scene = build("epo", backward={"name": backward}), random_scene(2, 2)
+    assert (forecaster.train()(scene).initial_states is None) == (backward == "unrolled")
+    assert ("initial" in forecaster.weighted_losses(scene)[1]) == (backward != "unrolled")
+    assert forecaster.predict(scene).initial_states.isfinite().all()
