@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from epo_lightning.decoders.mlp import MLP
-from epo_lightning.game.pairs import pairs
+from epo_lightning.game.pairs import of_pairs, pairs
 
 
 class DecodedOrders(NamedTuple):
@@ -64,8 +64,8 @@ class Orders(nn.Module):
         """
         first, second = pairs(z.shape[1], z.device)
         z = torch.where(mask[..., None], z, 0.0)
-        forth = self.mlp(torch.cat((z[:, first], z[:, second]), -1))[..., 0]
-        back = self.mlp(torch.cat((z[:, second], z[:, first]), -1))[..., 0]
+        agents = of_pairs(z)
+        forth, back = (self.mlp(ends.flatten(-2))[..., 0] for ends in (agents, agents.flip(-2)))
         matter = matter & mask[:, first] & mask[:, second]
         logits = torch.where(matter, forth + back if self.symmetric else forth - back, 0.0)
         order = most_likely(logits, matter, self.games)

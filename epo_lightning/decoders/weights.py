@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from epo_lightning.decoders.mlp import MLP
-from epo_lightning.game.pairs import pairs
+from epo_lightning.game.pairs import of_pairs, pairs
 
 
 def _by_name(weights: Float[Tensor, "B R out"], names: Sequence[str], games: int) -> dict[str, Float[Tensor, "B M R"]]:
@@ -127,20 +127,20 @@ class PairWeights(nn.Module):
         """Weights by feature name; zero for pairs that are not ``chosen``, for which nothing is computed."""
         if self.mlp is None:
             return {}
-        first, second = pairs(z.shape[1], z.device)
         if chosen is None:
-            return _by_name(self._between(z[:, first], z[:, second]), self.features, self.games)
+            return _by_name(self._between(of_pairs(z)), self.features, self.games)
+        agents = torch.stack(pairs(z.shape[1], z.device), 1)
         scene, pair = chosen.nonzero(as_tuple=True)
-        decoded = self._between(z[scene, first[pair]], z[scene, second[pair]])
+        decoded = self._between(z[scene[:, None], agents[pair]])
         weights = decoded.new_zeros(*chosen.shape, decoded.shape[-1]).index_put((scene, pair), decoded)
         return _by_name(weights, self.features, self.games)
 
-    def _between(self, first: Float[Tensor, "*batch D"], second: Float[Tensor, "*batch D"]) -> Tensor:
+    def _between(self, agents: Float[Tensor, "*batch 2 D"]) -> Tensor:
         """Weights of all features and games from the features of both agents of each pair."""
         assert self.mlp is not None
-        weights = self.mlp(torch.cat((first, second), -1))
+        weights = self.mlp(agents.flatten(-2))
         if self.symmetric:
-            weights = 0.5 * (weights + self.mlp(torch.cat((second, first), -1)))
+            weights = 0.5 * (weights + self.mlp(agents.flip(-2).flatten(-2)))
         return self.start * weights.exp() if self.positive else self.start + weights
 
 
