@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
 
 @dataclass(frozen=True)
@@ -143,8 +144,7 @@ def distances(
             f"{list(future.shape)} [B, N, K, 4] and its mask {list(mask.shape)}: the horizon K of data and model must agree"
         )
     observed = mask[:, None]
-    truth = torch.where(mask[..., None], future[..., :2], 0.0)[:, None]
-    offset = torch.where(observed[..., None], positions - truth, 0.0)
+    offset = torch.where(observed[..., None], positions - future[:, None, ..., :2], 0.0)
     error = torch.linalg.vector_norm(offset, dim=-1) if power == 1.0 else (offset.abs() ** power).mean(-1)
     return error.sum(-1) / observed.sum(-1).clamp_min(1)
 
@@ -194,7 +194,7 @@ def scene_probability(
     log_probabilities: Float[Tensor, "B M"], mode: Int[Tensor, " B"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, ""]:
     """L_prob: cross entropy between the joint futures' probabilities and the closest one; 0 where nothing was observed."""
-    entropy = _cross_entropy(log_probabilities.gather(1, mode[:, None])[:, 0])
+    entropy = _cross_entropy(log_probabilities, mode)
     return torch.where(mask.flatten(1).any(1), entropy, 0.0).mean()
 
 
@@ -212,7 +212,7 @@ def goal(
     counts = observed & exists.any(-1)
     way = torch.where((exists & counts[..., None])[..., None], candidates - final[:, :, None], torch.inf)
     closest = way.square().sum(-1).argmin(-1)
-    cost = _cross_entropy(log_probabilities.gather(-1, closest[..., None])[..., 0])
+    cost = _cross_entropy(log_probabilities.mT, closest)
     return _mean_over_agents(cost, counts[..., None]).mean()
 
 
@@ -233,13 +233,18 @@ def marginal_probability(
     log_probabilities: Float[Tensor, "B M N"], mode: Int[Tensor, "B N"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, ""]:
     """Cross entropy between each agent's probabilities and its own closest future, averaged over agents."""
-    return _mean_over_agents(_cross_entropy(log_probabilities.gather(1, mode[:, None])[:, 0]), mask).mean()
+    return _mean_over_agents(_cross_entropy(log_probabilities, mode), mask).mean()
 
 
-def _cross_entropy(log_probability: Tensor) -> Tensor:
-    """-log p. A mode with p = 0 (a repeated one) costs -log of the smallest positive number, without a gradient."""
-    least = math.log(torch.finfo(log_probability.dtype).tiny)
-    return -torch.where(log_probability == -torch.inf, least, log_probability)
+def _cross_entropy(
+    log_probabilities: Float[Tensor, "B choices *agents"], chosen: Int[Tensor, "B *agents"]
+) -> Float[Tensor, "B *agents"]:
+    """-log p of the chosen ones.
+
+    A mode with p = 0 (a repeated one) costs -log of the smallest positive number, without a gradient.
+    """
+    cost = F.nll_loss(log_probabilities, chosen, reduction="none")
+    return torch.where(cost == torch.inf, -math.log(torch.finfo(cost.dtype).tiny), cost)
 
 
 def joint_density(log_density: Float[Tensor, " B"], mask: Bool[Tensor, "B N K"]) -> Float[Tensor, ""]:
