@@ -55,7 +55,13 @@ def make(
         PairSlots(*known.margin_slots),
     )
     own_number, pair_number = len(known.own), len(known.pair)
-    sync, lane, sums, nearest_segment = threads.sync, threads.lane, threads.sums, threads.nearest_segment
+    sync, lane, sums, direction, nearest_segment = (
+        threads.sync,
+        threads.lane,
+        threads.sums,
+        threads.direction,
+        threads.nearest_segment,
+    )
     in_fast_memory = fast.path
 
     # The fields of `layout.Layout`, as a structure of Warp.
@@ -357,14 +363,12 @@ def make(
         for e in range(lane(), n * (K + 1), wp.block_dim()):
             i = e // (K + 1)
             k = e - i * (K + 1)
-            heading = path[trace(at, K, TURNED, i) + k]
-            s = wp.sin(heading)
-            c = wp.cos(heading)
+            sine = trace(at, K, SINE, i) + k
+            cosine = trace(at, K, COSINE, i) + k
+            direction(path[trace(at, K, TURNED, i) + k], path, sine, cosine)
             along = g.dt * path[trace(at, K, SPEED, i) + k]
-            path[trace(at, K, SINE, i) + k] = s
-            path[trace(at, K, COSINE, i) + k] = c
-            path[trace(at, K, X, i) + k] = along * c
-            path[trace(at, K, Y, i) + k] = along * s
+            path[trace(at, K, X, i) + k] = along * path[cosine]
+            path[trace(at, K, Y, i) + k] = along * path[sine]
         sync()
         for e in range(lane(), 2 * n, wp.block_dim()):
             i = e // 2

@@ -268,20 +268,22 @@ def make(
         for game in range(block, g.G, run.blocks):
             n = set_up(g, game, agents)
             end = end_of(g, game)
-            if by.along_states == 1:
-                last = part(run.iterates, wp.int64(run.steps) * run.iterate_stride, everything)
-                roll(g, game, n, agents, at, path, last)
-                pull_states(g, by, game, n, agents, at, work, path)
             for turn in range(run.steps + 1):
                 s = run.steps - turn
+                # A step that was not taken passes its cotangent on unchanged.
+                active = by.along_states
                 if s < run.steps:
-                    if run.taken[s * g.G + game] == 1:  # a step that was not taken passes its cotangent on unchanged
-                        controls = part(run.iterates, wp.int64(s) * run.iterate_stride, everything)
+                    active = run.taken[s * g.G + game]
+                if active == 1:
+                    controls = part(run.iterates, wp.int64(s) * run.iterate_stride, everything)
+                    roll(g, game, n, agents, at, path, controls)
+                    if s == run.steps:
+                        pull_states(g, by, game, n, agents, at, work, path)
+                    else:
                         directions = part(run.directions, wp.int64(s) * run.direction_stride, everything)
                         tape = wp.int64(s) * wp.int64(run.slots) + wp.int64(game)
                         factors = part(run.factors, tape * wp.int64(factors_of_step), factors_of_step)
                         nearest = part(run.nearest, tape * wp.int64(each_nearest), each_nearest)
-                        roll(g, game, n, agents, at, path, controls)
                         # mu = alpha H^-1 times the cotangent; zero after the end of the game.
                         m = 2 * n
                         for e in range(lane(), m * K, wp.block_dim()):

@@ -12,7 +12,7 @@ import warp as wp
 @no_type_check
 def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) -> SimpleNamespace:
     """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
-    sync, lane = threads.sync, threads.lane
+    sync, lane, row_sum = threads.sync, threads.lane, threads.row_sum
     Game, Gradients, Layout, pair_index, pair_first, weight = (
         games.Game,
         games.Gradients,
@@ -52,9 +52,7 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
         for e in range(lane(), own_count(g) * n, wp.block_dim()):
             slot = e // n
             i = e - slot * n
-            value = T(0.0)
-            for k in range(end):
-                value += work[at.weights + (slot * A + i) * K + k]
+            value = row_sum(work, at.weights + (slot * A + i) * K, end)
             to = slot * g.G * g.N + game * g.N + agents[i]
             by.own[to] = by.own[to] + value
         all_pairs = (g.N * (g.N - 1)) // 2
@@ -65,11 +63,8 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
             for slot in range(pair_count(g)):
                 product = pair_product_place(g, at, K, 0, slot, pair_index(i, j, A))
                 by_margin = pair_product_place(g, at, K, 1, slot, pair_index(i, j, A))
-                value = T(0.0)
-                slope = T(0.0)
-                for k in range(end):
-                    value += work[product + k]
-                    slope += work[by_margin + k]
+                value = row_sum(work, product, end)
+                slope = row_sum(work, by_margin, end)
                 to = slot * g.G * all_pairs + place
                 by.pair[to] = by.pair[to] + value
                 if margin_slot(g, slot) >= 0:

@@ -49,12 +49,14 @@ _PUT = """
     struct alignas(4 * sizeof(T)) Four { T x, y, z, w; };
     *(Four*)(to.data + place) = Four{x, y, z, w};
 """
-# Numbers are read in batches, so that their ways from memory overlap; sources and results may be the same array.
+# Numbers are read in batches, so that their ways from memory overlap; sources and results may be the same array. Loops are not
+# unrolled further: a kernel whose code exceeds the 128 kB that a multiprocessor holds takes more than twice as long.
 _SUMS = """
     typedef {number} T;
     T sum = 0;
     const T* from = source.data + first;
     T* to = target.data + place;
+    #pragma unroll 1
     for (int begin = 0; begin <= count; begin += 8) {
         T batch[8];
         #pragma unroll
@@ -75,6 +77,7 @@ _SUMS_BACK = """
     T sum = 0;
     const T* from = source.data + first;
     T* to = target.data + place;
+    #pragma unroll 1
     for (int end = count; end > 0; end -= 8) {
         T batch[8];
         #pragma unroll
@@ -90,6 +93,26 @@ _SUMS_BACK = """
         }
     }
 """
+# Sine and cosine at once, by multiples of pi on a GPU: the error of the factor is that of the angle, and no code for angles
+# beyond 100,000 is in the way of the rest.
+_DIRECTION = """
+#if defined(__CUDA_ARCH__)
+    typedef {number} T;
+    T s, c;
+    sincospi(angle * T(0.31830988618379067), &s, &c);
+    to.data[sine] = s;
+    to.data[cosine] = c;
+#else
+    to.data[sine] = sin(angle);
+    to.data[cosine] = cos(angle);
+#endif
+"""
+_ROW_SUM = """
+    {number} sum = 0;
+    #pragma unroll 1
+    for (int k = 0; k < count; ++k) sum += source.data[first + k];
+    return sum;
+"""
 # The line's segment that is nearest to a point; -1 if no comparison is true, because an input is NaN. What is left of the
 # point's coordinates on the segment need not be exact, and is computed again: a GPU divides fast. Points are read
 # in batches, as numbers of sums are.
@@ -100,6 +123,7 @@ _NEAREST_SEGMENT = """
     Point from = line[0];
     T least = INFINITY;
     int nearest = -1;
+    #pragma unroll 1
     for (int begin = 0; begin + 1 < count; begin += 8) {
         Point batch[8];
         #pragma unroll
@@ -169,6 +193,12 @@ def make(T: Any, agents: int, fast: Fast, backwards: bool) -> SimpleNamespace:
     @wp.func_native(_SUMS_BACK.replace("{number}", number))
     def sums_back(source: Array, first: int, stride: int, count: int, target: Array, place: int): ...
 
+    @wp.func_native(_DIRECTION.replace("{number}", number))
+    def direction(angle: T, to: Array, sine: int, cosine: int): ...
+
+    @wp.func_native(_ROW_SUM.replace("{number}", number))
+    def row_sum(source: Array, first: int, count: int) -> T: ...
+
     @wp.func_native(_NEAREST_SEGMENT.replace("{number}", number))
     def nearest_segment(points: Array, first: int, count: int, x: T, y: T) -> int: ...
 
@@ -180,6 +210,8 @@ def make(T: Any, agents: int, fast: Fast, backwards: bool) -> SimpleNamespace:
         put=put,
         sums=sums,
         sums_back=sums_back,
+        direction=direction,
+        row_sum=row_sum,
         nearest_segment=nearest_segment,
     )
 

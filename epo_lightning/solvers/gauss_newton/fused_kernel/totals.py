@@ -9,7 +9,7 @@ import warp as wp
 @no_type_check
 def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace) -> SimpleNamespace:
     """The functions for numbers of type ``T``."""
-    sync, lane = threads.sync, threads.lane
+    sync, lane, row_sum = threads.sync, threads.lane, threads.row_sum
     Layout, Array, A = games.Layout, games.Array, games.agents
     P = A * (A - 1) // 2
 
@@ -18,15 +18,9 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace) -> SimpleName
         """The energy: the sums along time of agents, then of pairs."""
         parts = at.energy + (A + P) * K
         for e in range(lane(), A + P, wp.block_dim()):
-            part = T(0.0)
-            for k in range(end):
-                part += work[at.energy + e * K + k]
-            work[parts + e] = part
+            work[parts + e] = row_sum(work, at.energy + e * K, end)
         sync()
-        energy = T(0.0)
-        for e in range(A + P):
-            energy += work[parts + e]
-        return energy
+        return row_sum(work, parts, A + P)
 
     @wp.func
     def squared_slope(n: int, costs: Array):
