@@ -120,8 +120,11 @@ def kernels(
 
 
 def resident(fast: Fast, dtype: torch.dtype) -> int:
-    """Blocks of a launch: as many as an H100 or H200 holds at a time. Each solves several games in turn, in the same memory."""
-    shared = 1024 + fast.numbers * dtype.itemsize * int(fast.shared)  # a block takes 1 kB more than it asks for
+    """Blocks of a launch: as many as an H100 or H200 holds at a time. Each solves several games in turn, in the same memory.
+
+    A block also takes some integers, and 1 kB more than it asks for, of the 228 kB that a multiprocessor has.
+    """
+    shared = 1280 + fast.numbers * dtype.itemsize * int(fast.shared)
     return MULTIPROCESSORS * min(16, 228 * 1024 // shared)
 
 
@@ -167,11 +170,11 @@ class _Call:
             self._describe(energy, scene, parameters, step_size, damping)
             self._reserve(controls)
 
-    def _array(self, tensor: Tensor, dtype: torch.dtype | None = None) -> Any:
-        """A tensor as a flat array of Warp; it lives as long as this call."""
+    def _read(self, name: str, tensor: Tensor, dtype: torch.dtype | None = None) -> None:
+        """Have the kernels read a tensor, which lives as long as this call."""
         tensor = tensor.detach().to(self.dtype if dtype is None else dtype).contiguous()
         self.kept.append(tensor)
-        return _flat(tensor)
+        _point(self.game, **{name: tensor})
 
     def _describe(
         self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, step_size: float, damping: Tensor
@@ -191,35 +194,36 @@ class _Call:
             if not isinstance(bound := energy.bounds.get(name, {}), Mapping):
                 bounds[2 * index : 2 * index + 2] = bound
         game.bounds = type(game.bounds)(*bounds)
-        game.initial = self._array(scene.current)
-        game.present = self._array(scene.agent_mask.view(torch.uint8), torch.uint8)
+        self._read("initial", scene.current)
+        self._read("present", scene.agent_mask.view(torch.uint8), torch.uint8)
         size = scene.current.new_zeros(batch, agents, 2) if scene.size is None else scene.size
-        game.size = self._array(size)
-        game.own = self._array(_stacked(self.own)) if self.own else self._array(size)
+        self._read("size", size)
+        self._read("own", _stacked(self.own) if self.own else size)
         if self.features.pair:
-            game.pair = self._array(_stacked(self.pair))
+            self._read("pair", _stacked(self.pair))
             pairs = (batch, modes, agents * (agents - 1) // 2)
             fixed = self.features.margins[len(self.margins) :]
             margins = [*self.margins, *(energy.margin(scene, parameters, name).expand(pairs) for name in fixed)]
             if margins:
-                game.margins = self._array(_stacked([margin.to(self.dtype) for margin in margins]))
+                self._read("margins", _stacked([margin.to(self.dtype) for margin in margins]))
         for name, tensor in self.others.items():
             if tensor is not None:
-                setattr(game, name, self._array(tensor))
+                self._read(name, tensor)
         if scene.game_steps is not None:
-            game.cut, game.ends = 1, self._array(scene.game_steps, torch.int64)
+            game.cut = 1
+            self._read("ends", scene.game_steps, torch.int64)
         if "lane" in energy.own:
             assert scene.references is not None
             assert scene.reference_mask is not None
             assert parameters.reference is not None
-            game.references = self._array(scene.references)
-            game.exists = self._array(scene.reference_mask.view(torch.uint8), torch.uint8)
-            game.reference = self._array(parameters.reference, torch.int64)
+            self._read("references", scene.references)
+            self._read("exists", scene.reference_mask.view(torch.uint8), torch.uint8)
+            self._read("reference", parameters.reference, torch.int64)
             game.lines, game.points = scene.references.shape[2:4]
         if "velref" in energy.own:
             assert scene.reference_speed is not None
-            game.speeds = self._array(scene.reference_speed)
-        game.damping = self._array(damping)
+            self._read("speeds", scene.reference_speed)
+        self._read("damping", damping)
         game.damping_of_game, game.damping_of_agent = (agents, 1) if damping.dim() == 3 else (1, 0)
 
     def _reserve(self, controls: Tensor) -> None:
@@ -249,7 +253,7 @@ class _Call:
             setattr(run.at, name, place)
         run.iterate_stride = controls.numel() if stacked else 0
         run.direction_stride = controls.numel() if self.record else 0
-        for name in (
+        written = (
             "start",
             "iterates",
             "directions",
@@ -258,17 +262,18 @@ class _Call:
             "energy",
             "gradient_norm",
             "status",
-        ):
-            setattr(run, name, _flat(getattr(self, name)))
-        for name in ("factors", "nearest", "taken"):
-            setattr(run, name, _flat(getattr(self, name)))
+            "factors",
+            "nearest",
+            "taken",
+        )
+        _point(run, **{name: getattr(self, name) for name in written})
 
     def _launch(self, kernel: Any, *inputs: Any) -> None:
         """Launch a kernel on PyTorch's current stream, with memory for its blocks."""
         wp, device = warp(), self.iterates.device
         work = self.iterates.new_empty(self.blocks * self.memory)
         numbers = torch.empty(self.blocks * (4 * self.shape[2] + 2), dtype=torch.int32, device=device)
-        self.arguments.work, self.arguments.numbers = _flat(work), _flat(numbers)
+        _point(self.arguments, work=work, numbers=numbers)
         stream: Any = contextlib.nullcontext()
         if device.type == "cuda":
             stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
@@ -281,7 +286,6 @@ class _Call:
                 device=wp.device_from_torch(device),
             )
         # The memory is released as soon as the kernel is enqueued: PyTorch hands it out again in the order of the stream.
-        self.arguments.work = self.arguments.numbers = None
 
     def run(self) -> None:
         """Take all steps; fills the results."""
@@ -299,14 +303,8 @@ class _Call:
         pair, margins = new((len(self.pair), *pairs)), new((len(self.margins) + len(self.pair), *pairs))
         others = {name: None if tensor is None else new(tensor.shape) for name, tensor in self.others.items()}
         by = self.kernels.Gradients()
-        by.controls, by.own, by.pair, by.margins = _flat(controls), _flat(own), _flat(pair), _flat(margins)
-        for name, gradient in others.items():
-            if gradient is not None:
-                setattr(by, name, _flat(gradient))
-        if iterates is not None:
-            by.along_iterates, by.iterates = 1, _flat(iterates)
-        if states is not None:
-            by.along_states, by.states = 1, _flat(states)
+        _point(by, controls=controls, own=own, pair=pair, margins=margins, iterates=iterates, states=states, **others)
+        by.along_iterates, by.along_states = int(iterates is not None), int(states is not None)
         self._launch(self.kernels.differentiate, by)
         count = len(self.own)
         found = [*own[:count].unbind(0), *pair.unbind(0), *margins[: len(self.margins)].unbind(0)]
@@ -318,9 +316,14 @@ def _stacked(tensors: list[Tensor]) -> Tensor:
     return torch.stack(tensors) if len(tensors) > 1 else tensors[0]
 
 
-def _flat(tensor: Tensor) -> Any:
-    """A contiguous tensor as a flat array of Warp in the same memory; None for an empty one.
+def _point(structure: Any, **tensors: Tensor | None) -> None:
+    """Point arrays of a structure of Warp to the memory of contiguous tensors, whose owner keeps them.
 
-    Those that may be larger than Warp's (iterates, factors, memory) are cut short: the kernels find their parts by pointers.
+    Descriptors take a fraction of the time of Warp's arrays. Tensors that may be larger than these (iterates, factors,
+    memory) are cut short: the kernels find their parts by pointers.
     """
-    return warp().from_torch(tensor.view(-1)[:LONGEST], requires_grad=False) if tensor.numel() else None
+    fields = structure.__ctype__()
+    for name, tensor in tensors.items():
+        if tensor is not None and tensor.numel():
+            flat = tensor.view(-1)[:LONGEST]
+            setattr(fields, name, warp().from_torch(flat, requires_grad=False, return_ctype=True))

@@ -115,7 +115,16 @@ def make(
 
     @func
     def position_adjoint(
-        g: Game, by: Gradients, game: int, n: int, agents: Numbers, at: Layout, work: Array, path: Array, nearest: Array, end: int
+        g: Game,
+        by: Gradients,
+        game: int,
+        n: int,
+        agents: Numbers,
+        at: Layout,
+        work: Array,
+        path: Array,
+        nearest: Array,
+        end: int,
     ):
         """The cotangents of positions and of their tangents at all states, summed over the states from each on."""
         K = horizon(g)
@@ -238,7 +247,9 @@ def make(
                 by_speed_of = g.dt * (along0 + across1 * heading1 + across2 * heading2)
                 if own_slot(g, STEER) >= 0:
                     u = row * K * 2 + 2 * state + TURN_RATE
-                    by_speed_of += steering_adjoint(g, game, agents, at, work, path, controls, directions, i, u, state, 1)
+                    by_speed_of += steering_adjoint(
+                        g, game, agents, at, work, path, controls, directions, i, u, state, 1
+                    )
             if own_slot(g, VEL) >= 0:
                 by_speed_of += residual_adjoint(g, at, work, VEL, row, i, k, v, T(1.0), speed1, speed2)
             if own_slot(g, VELREF) >= 0:

@@ -236,7 +236,9 @@ def make(
             rate = wp.where(turning, TURNACC, JERK)
             rate_bounded = wp.where(turning, TURNACCB, JERKB)
             if own_slot(g, rate) >= 0:
-                energy, force, stiffness = add_residual(weight(g, costs, rate, i), change, T(1.0), energy, force, stiffness)
+                energy, force, stiffness = add_residual(
+                    weight(g, costs, rate, i), change, T(1.0), energy, force, stiffness
+                )
             if own_slot(g, rate_bounded) >= 0:
                 signal = wp.where(turning, BOUND_TURNACC, BOUND_JERK)
                 energy, force, stiffness = add_residual(
@@ -263,7 +265,9 @@ def make(
             energy, force, stiffness = add_residual(weight(g, costs, plain, i), value, T(1.0), energy, force, stiffness)
         if own_slot(g, referring) >= 0:
             off = value - g.reference_controls[u]
-            energy, force, stiffness = add_residual(weight(g, costs, referring, i), off, T(1.0), energy, force, stiffness)
+            energy, force, stiffness = add_residual(
+                weight(g, costs, referring, i), off, T(1.0), energy, force, stiffness
+            )
         if own_slot(g, bounded) >= 0:
             signal = wp.where(turning, BOUND_TURNR, BOUND_ACC)
             energy, force, stiffness = add_residual(
@@ -391,7 +395,9 @@ def make(
                 if own_slot(g, VELB) >= 0:
                     over = excess(g, BOUND_VEL, v)
                     slope = excess_slope(g, BOUND_VEL, v)
-                    energy, push, stiffness = add_residual(weight(g, costs, VELB, i), over, slope, energy, push, stiffness)
+                    energy, push, stiffness = add_residual(
+                        weight(g, costs, VELB, i), over, slope, energy, push, stiffness
+                    )
                 if own_slot(g, STEER) >= 0 and state < end:
                     wheelbase = T(WHEELBASE) * g.size[2 * ((game // g.M) * g.N + agents[i])]
                     turn = controls[row * K * 2 + 2 * state + TURN_RATE]

@@ -9,13 +9,12 @@ import warp as wp
 from epo_lightning.solvers.gauss_newton.fused_kernel import adjoint as adjoints
 from epo_lightning.solvers.gauss_newton.fused_kernel import expansion as expansions
 from epo_lightning.solvers.gauss_newton.fused_kernel import games as all_games
-from epo_lightning.solvers.gauss_newton.fused_kernel import layout
+from epo_lightning.solvers.gauss_newton.fused_kernel import layout, threads
 from epo_lightning.solvers.gauss_newton.fused_kernel import pair_adjoint as pair_adjoints
 from epo_lightning.solvers.gauss_newton.fused_kernel import pairs as pair_features
 from epo_lightning.solvers.gauss_newton.fused_kernel import products as all_products
 from epo_lightning.solvers.gauss_newton.fused_kernel import recursion as recursions
 from epo_lightning.solvers.gauss_newton.fused_kernel import residuals as all_residuals
-from epo_lightning.solvers.gauss_newton.fused_kernel import threads
 from epo_lightning.solvers.gauss_newton.fused_kernel import totals as all_totals
 from epo_lightning.solvers.gauss_newton.fused_kernel import trajectories as all_trajectories
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import DAMPED, PAIRS, SOLVED, STOPPED, TEAM, WARP

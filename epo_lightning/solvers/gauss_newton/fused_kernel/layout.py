@@ -135,7 +135,9 @@ def fast(agents: int, own: int, pair: int, horizon: int | None, double: bool, th
         path = 6 * A * (horizon + 1)
         path = path if path <= most // 3 else 0
         left = most - recursion - each["control"] - path - weights - 16
-        steps = min(max(left // sum(each.values()), WARP // A), horizon)  # at least so many that no thread of a warp waits
+        steps = min(
+            max(left // sum(each.values()), WARP // A), horizon
+        )  # at least so many that no thread of a warp waits
         factors = horizon * (factor_numbers(A) + 2 * A)
         factors = factors if steps == horizon and factors <= left - steps * sum(each.values()) else 0
     counts = {

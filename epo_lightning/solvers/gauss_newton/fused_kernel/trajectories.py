@@ -24,7 +24,9 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
         return at.tangents + ((4 * along_d + quantity) * A + i) * (K + 1)
 
     @func
-    def roll_tangents(g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, path: Array, directions: Array):
+    def roll_tangents(
+        g: Game, game: int, n: int, agents: Numbers, at: Layout, work: Array, path: Array, directions: Array
+    ):
         """Tangents of the trajectories along mu and along the step d: sums along time, as the trajectories are."""
         K = horizon(g)
         for e in range(lane(), 4 * n, wp.block_dim()):
