@@ -380,7 +380,7 @@ def make(
 
     @func
     def nearest_point(g: Game, line: int, x: T, y: T):
-        """The nearest point of a line, and the tangent there where the point moves along; the point itself without a line."""
+        """The nearest point of a line, and the tangent there where it moves along; without a line, the point itself."""
         # Without a nearest segment an input is NaN, and the nearest point stays NaN.
         near_x = T(wp.nan)
         near_y = T(wp.nan)

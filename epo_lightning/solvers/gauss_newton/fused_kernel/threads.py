@@ -49,8 +49,8 @@ _PUT = """
     struct alignas(4 * sizeof(T)) Four { T x, y, z, w; };
     *(Four*)(to.data + place) = Four{x, y, z, w};
 """
-# Numbers are read in batches, so that their ways from memory overlap; sources and results may be the same array. Loops are not
-# unrolled further: a kernel whose code exceeds the 128 kB that a multiprocessor holds takes more than twice as long.
+# Numbers are read in batches, so that their ways from memory overlap; sources and results may be the same array. Loops are
+# not unrolled further: a kernel whose code exceeds the 128 kB that a multiprocessor holds takes more than twice as long.
 _SUMS = """
     typedef {number} T;
     T sum = 0;
