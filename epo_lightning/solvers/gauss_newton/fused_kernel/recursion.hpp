@@ -10,7 +10,9 @@
     constexpr bool KEPT = $FACTORS$ >= 0;  // factors and linear terms are in fast memory too
 #if defined(__CUDA_ARCH__)
     constexpr int LANES = 32, WARPS = WP_TILE_BLOCK_DIM / LANES, THREADS = WP_TILE_BLOCK_DIM;
-    const int thread = threadIdx.x, threads = THREADS, lane = thread % LANES, lanes = LANES, warp = thread / LANES;
+    // Remainders of unsigned numbers are cheap, and numbers below 32 are known not to be negative.
+    const int thread = threadIdx.x, threads = THREADS, lane = threadIdx.x % unsigned(LANES), lanes = LANES;
+    const int warp = WARPS == 1 ? 0 : threadIdx.x / unsigned(LANES);
     #define EPO_SYNC() if (WARPS > 1) __syncthreads(); else __syncwarp()
     #define EPO_SYNC_LANES() __syncwarp()
     constexpr bool SHARED = $SHARED$;
@@ -137,6 +139,7 @@
                         by_control += c >= 2 * M && c < D ? dt * of_state : T(0);
                     }
 #endif
+                    if (lane + column * lanes > D) continue;
                     Wc[(2 * a + q) * LD] = by_control;
                     Pc[(2 * a + q) * LD] = value[q];
                     Pc[(M + 2 * a + q) * LD] = value[2 + q] + motion[0] * value[0] + motion[A] * value[1];
@@ -253,24 +256,25 @@
         const T* const factor = factors.data + k * FACTOR;
         const T* const others = work.data + linear + k * M - FACTOR;
         T* const to = buffers + (k % DEPTH) * STREAM;
+        #pragma unroll 1
         for (int e = lane * UNIT; e < STREAM && k >= 0 && k < end; e += lanes * UNIT) {
             const T* const from = (e < FACTOR ? factor : others) + e;
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800  // copies that nothing waits for, from Ampere on
             if (SHARED) {
                 const unsigned there = __cvta_generic_to_shared(to + e);
-                asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(there), "l"(__cvta_generic_to_global(from)));
+                asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(there), "l"(__cvta_generic_to_global(from)) : "memory");
                 continue;
             }
 #endif
             for (int q = 0; q < UNIT; ++q) to[e + q] = from[q];
         }
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
-        asm volatile("cp.async.commit_group;");
+        asm volatile("cp.async.commit_group;" ::: "memory");
 #endif
     };
     auto wait = [&]() {  // for the oldest of DEPTH - 1 requests
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
-        asm volatile("cp.async.wait_group %0;" ::"n"(DEPTH - 2));
+        asm volatile("cp.async.wait_group %0;" ::"n"(DEPTH - 2) : "memory");
 #endif
         EPO_SYNC_LANES();
     };
@@ -370,9 +374,9 @@
             Four gain[EACH][M / 4];  // read before the barrier, which nothing passes
             #pragma unroll
             for (int t = 0; t < EACH; ++t) {
-                const int j = lane + t * lanes, r = j % M;
+                const int j = lane + t * lanes, first = j / M * M, row = j < D ? (j - first) * D : 0;
                 #pragma unroll
-                for (int c = 0; c < M / 4; ++c) gain[t][c] = *(const Four*)(numbers + (j < D ? r * D + j - r : 0) + 4 * c);
+                for (int c = 0; c < M / 4; ++c) gain[t][c] = *(const Four*)(numbers + row + (j < D ? first : 0) + 4 * c);
             }
             EPO_SYNC_LANES();
             #pragma unroll
@@ -382,7 +386,7 @@
                 T share[4] = {T(0), T(0), T(0), T(0)};
                 #pragma unroll
                 for (int c = 0; c < M / 4; ++c) {
-                    const Four with = *(const Four*)(by + j - j % M + 4 * c);
+                    const Four with = *(const Four*)(by + j / M * M + 4 * c);
                     #pragma unroll
                     for (int q = 0; q < 4; ++q) share[q] += gain[t][c].at[q] * with.at[q];
                 }
