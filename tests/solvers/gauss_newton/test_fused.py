@@ -156,7 +156,7 @@ def test_machine_code_for_gpus_is_made_without_one(architecture, games, tmp_path
         threads = kernels.TEAM if games <= fused.FEW else kernels.WARP
         needed = 4 * fast(4, 9, 1, 20, False, threads).numbers
         assert needed <= resources.shared <= needed + 2048, "all functions of a game have one array in shared memory"
-        assert 10_000 < resources.code < 128 * 1024, "the instructions that a multiprocessor holds"
+        assert 10_000 < resources.code < 128 * 1024, "more code makes threads wait for instructions"
         if threads == kernels.WARP:
             assert 16 * resources.shared <= 228 * 1024, "16 games on a multiprocessor"
     with pytest.raises(ValueError, match="does not begin as an ELF file"):

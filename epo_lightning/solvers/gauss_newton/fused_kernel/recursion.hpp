@@ -371,7 +371,8 @@
             T* const after = known + ((k + 1) & 1) * D;
             const T* const numbers = numbers_of(buffers, k);
             const T* const next = numbers_of(buffers, k + 1);
-            Four gain[EACH][M / 4];  // read before the barrier, which nothing passes
+            // Read before the barrier, which nothing passes. (The compiler ptxas of CUDA 13.4 makes a wrong number of j - j % M.)
+            Four gain[EACH][M / 4];
             #pragma unroll
             for (int t = 0; t < EACH; ++t) {
                 const int j = lane + t * lanes, first = j / M * M, row = j < D ? (j - first) * D : 0;
