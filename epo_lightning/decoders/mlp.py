@@ -60,7 +60,9 @@ class _NormalisePresent(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "rows F"], *_: Any) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, gradient: Float[Tensor, "rows F"] | None, *_: Any) -> tuple[Tensor | None, ...]:
+        if gradient is None:  # the result has no effect on the loss
+            return None, None, None, None, None
         here, count, normalised, scale = ctx.saved_tensors
         gradient = torch.where(here, gradient, 0.0)
         by_bias, by_weight = gradient.sum(0), (gradient * normalised).sum(0)

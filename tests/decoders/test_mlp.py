@@ -34,3 +34,32 @@ def test_statistics_of_present_rows_need_no_selection(filling, present, monkeypa
         found.append([output[mask].detach(), given.grad[mask], *gradients, *statistics])
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(other, one, rtol=0, atol=1e-10)
+
+
+def test_the_derivative_of_normalised_rows_is_that_of_finite_differences():
+    """Also where nothing depends on the result, so that no gradient arrives."""
+    rows, weight, bias = (torch.randn(shape, dtype=torch.float64, requires_grad=True) for shape in ((5, 3), (3,), (3,)))
+    present = torch.tensor([True, False, True, True, False])
+
+    def normalise(rows, weight, bias):
+        return mlp._NormalisePresent.apply(rows, present, weight, bias, 1e-5)[0][present]
+
+    assert torch.autograd.gradcheck(normalise, (rows, weight, bias))
+    whole = mlp._NormalisePresent.apply(rows, present, weight, bias, 1e-5)
+    gradients = torch.autograd.grad(_without_gradient(whole[0]), (rows, weight, bias), allow_unused=True)
+    assert gradients == (None, None, None)
+
+
+def _without_gradient(tensor):
+    """A sum of the tensor whose derivative is undefined instead of zero, as a solver's of parameters that it ignores."""
+
+    class Undefined(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, tensor):
+            return tensor.sum()
+
+        @staticmethod
+        def backward(ctx, gradient):
+            return None
+
+    return Undefined.apply(tensor)

@@ -216,7 +216,10 @@ class _Call:
             assert scene.references is not None
             assert scene.reference_mask is not None
             assert parameters.reference is not None
-            self._read("references", scene.references)
+            references = scene.references.contiguous()
+            # The kernels read points as pairs of numbers, which a view may begin in the middle of.
+            aligned = references.data_ptr() % (2 * references.element_size()) == 0
+            self._read("references", references if aligned else references.clone())
             self._read("exists", scene.reference_mask.view(torch.uint8), torch.uint8)
             self._read("reference", parameters.reference, torch.int64)
             game.lines, game.points = scene.references.shape[2:4]

@@ -370,7 +370,7 @@
             const T* const by = known + (k & 1) * D;
             T* const after = known + ((k + 1) & 1) * D;
             const T* const numbers = numbers_of(buffers, k);
-            const T* const next = numbers_of(buffers, k + 1);
+            const T* const next = numbers_of(buffers, KEPT && k + 1 == end ? k : k + 1);  // not used after the last step
             // Read before the barrier, which nothing passes. (The compiler ptxas of CUDA 13.4 makes a wrong number of j - j % M.)
             Four gain[EACH][M / 4];
             #pragma unroll
@@ -407,7 +407,7 @@
                 const T change = -(shares[r] + shares[M + r] + shares[2 * M + r]);
                 const Two moving = *(const Two*)(by + M + 2 * a);
                 const T moved = state[t] + motion[0] * moving.at[0] + motion[2 * A] * moving.at[1];
-                const T use = next[FACTOR + r] - next[M * D + r] * change;  // read by nothing after the last step
+                const T use = next[FACTOR + r] - next[M * D + r] * change;
                 state[t] = j < M ? moved : state[t] + dt * change;
                 after[j] = j < 2 * M ? state[t] : use;
                 if (target[t]) target[t][2 * k] = change;
