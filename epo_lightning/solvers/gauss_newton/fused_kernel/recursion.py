@@ -19,10 +19,8 @@ import warp as wp
 from epo_lightning.solvers.gauss_newton.fused_kernel import constants, layout, threads
 
 
-@no_type_check
-def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNamespace:
-    """The recursions for numbers of type ``T``, with fast memory for ``fast``."""
-    Array = wp.array(dtype=T)
+def bodies(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> dict[str, str]:
+    """The functions of :func:`make` in C++, without their heads."""
     source = Path(__file__).with_name("recursion.hpp").read_text()
     values = {
         "T": threads.number_type(T),
@@ -40,16 +38,25 @@ def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNames
     }
     for name, value in values.items():
         source = source.replace(f"${name}$", str(value))
-    head, *bodies = source.split("// ---- ")
-    code = dict(body.split("\n", 1) for body in bodies)
+    head, *parts = source.split("// ---- ")
+    code = dict(part.split("\n", 1) for part in parts)
+    stream = code.pop("stream")
+    return {name: head + (stream if name in ("pull", "push") else "") + body for name, body in code.items()}
 
-    @wp.func_native(head + code["begin"])
+
+@no_type_check
+def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNamespace:
+    """The recursions for numbers of type ``T``, with fast memory for ``fast``."""
+    Array = wp.array(dtype=T)
+    code = bodies(T, agents, fast, backwards)
+
+    @wp.func_native(code["begin"])
     def begin(fast: Array, end: int): ...
 
-    @wp.func_native(head + code["slopes"])
+    @wp.func_native(code["slopes"])
     def add_slopes(fast: Array, count: int, first: int, last: int, dt: T): ...
 
-    @wp.func_native(head + code["eliminate"])
+    @wp.func_native(code["eliminate"])
     def eliminate(
         work: Array,
         linear: int,
@@ -63,10 +70,10 @@ def make(T: Any, agents: int, fast: layout.Fast, backwards: bool) -> SimpleNames
         dt: T,
     ) -> int: ...
 
-    @wp.func_native(head + code["stream"] + code["pull"])
+    @wp.func_native(code["pull"])
     def pull(work: Array, linear: int, fast: Array, factors: Array, end: int, dt: T): ...
 
-    @wp.func_native(head + code["stream"] + code["push"])
+    @wp.func_native(code["push"])
     def push(
         work: Array,
         linear: int,
