@@ -187,13 +187,15 @@ def test_the_largest_games_in_double_precision_fit_into_the_memory_of_a_multipro
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@pytest.mark.parametrize("agents", [2, 3, 8])
+@pytest.mark.parametrize(
+    ("agents", "pair"), [*((agents, tuple(PAIR_FEATURES)) for agents in (2, 3, 8)), (8, ("proximity",))]
+)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scenes", [fused.FEW // 2, fused.FEW])
-def test_a_gpu_gets_the_results_of_pytorch_on_a_cpu_also_in_a_cuda_graph(agents, dtype, scenes):
-    """The numbers of agents and of games choose the kernels."""
+def test_a_gpu_gets_the_results_of_pytorch_on_a_cpu_also_in_a_cuda_graph(agents, pair, dtype, scenes):
+    """The numbers of agents, of pair features and of games choose the kernels, and what is in shared memory."""
     scene = random_scene(scenes, agents, history=2, size=1.5, dtype=dtype)
-    energy, pair = FeatureEnergy(ALL, tuple(PAIR_FEATURES), BOUNDS), tuple(PAIR_FEATURES)
+    energy = FeatureEnergy(ALL, pair, BOUNDS)
     theirs, damping = leaves_of(random_game(scene, 2, 7, pair=pair)), torch.full((scenes, 2), 10.0, dtype=dtype)
     ours, there = leaves_of(theirs.to("cuda")), scene.to("cuda")
 
