@@ -31,10 +31,10 @@ class _Sum(torch.autograd.Function):
 
 
 class _NormalisePresent(torch.autograd.Function):
-    """Batch normalisation with the statistics of the rows that are present; the others get the value of their mean.
+    """Batch normalisation with the statistics of the rows that are present; the result of absent rows is the bias.
 
     Returns also the mean, the sum of squared deviations and the number of present rows. The derivative is written out:
-    automatic differentiation launches three times as many kernels, of which each takes a GPU longer than its few numbers.
+    automatic differentiation launches three times as many kernels, and for so few numbers a GPU's time is that of launches.
     """
 
     @staticmethod

@@ -256,7 +256,7 @@ class _Call:
             setattr(run.at, name, place)
         run.iterate_stride = controls.numel() if stacked else 0
         run.direction_stride = controls.numel() if self.record else 0
-        written = (
+        arrays = (
             "start",
             "iterates",
             "directions",
@@ -269,7 +269,7 @@ class _Call:
             "nearest",
             "taken",
         )
-        _point(run, **{name: getattr(self, name) for name in written})
+        _point(run, **{name: getattr(self, name) for name in arrays})
 
     def _launch(self, kernel: Any, *inputs: Any) -> None:
         """Launch a kernel on PyTorch's current stream, with memory for its blocks."""

@@ -69,7 +69,10 @@ def make(
 
     @wp.struct
     class Game:
-        """Tensors of G = B M games, contiguous, and the features of their energy, as :class:`Features` has them."""
+        """Tensors of G = B M games, contiguous, and the features of their energy, as :class:`Features` has them.
+
+        The damping of agent a in a game is at ``game * damping_of_game + a * damping_of_agent``.
+        """
 
         G: int
         M: int
@@ -158,6 +161,7 @@ def make(
 
     @wp.func
     def pair_first(pair: int, n: int):
+        """The first agent of a pair of n agents."""
         i = int(0)
         rest = pair
         while rest >= n - 1 - i:
@@ -167,7 +171,7 @@ def make(
 
     @wp.func
     def first_agent(pair: int):
-        """The first agent of a pair of A agents."""
+        """The same for a pair of A agents, without a loop that the compiler cannot unroll."""
         i = int(0)
         for r in range(1, A - 1):
             i += wp.where(pair >= r * A - (r * (r + 1)) // 2, 1, 0)

@@ -123,7 +123,7 @@ def fast(agents: int, own: int, pair: int, horizon: int | None, double: bool, th
         pair: F.
         horizon: K on a GPU; None on a CPU.
         double: whether numbers have double precision.
-        threads: of a game: of few games, one has the memory of a multiprocessor nearly for itself.
+        threads: number of threads of a game. Games with more than a warp are few, and each may have more memory.
     """
     A, P = agents, agents * (agents - 1) // 2
     each = {"control": CONTROL_ITEMS * A, "own": 20 * A, "rows": pair * 4 * A * A}
@@ -134,10 +134,9 @@ def fast(agents: int, own: int, pair: int, horizon: int | None, double: bool, th
         most = (SHARED_OF_MANY if threads == WARP else MOST_SHARED) // (8 if double else 4)
         path = 6 * A * (horizon + 1)
         path = path if path <= most // 3 else 0
-        left = most - recursion - each["control"] - path - weights - 16
-        steps = min(
-            max(left // sum(each.values()), WARP // A), horizon
-        )  # at least so many that no thread of a warp waits
+        left = most - recursion - each["control"] - path - weights - 16  # places are rounded up to multiples of four
+        # At least as many steps as give each thread of a warp an agent.
+        steps = min(max(left // sum(each.values()), WARP // A), horizon)
         factors = horizon * (factor_numbers(A) + 2 * A)
         factors = factors if steps == horizon and factors <= left - steps * sum(each.values()) else 0
     counts = {

@@ -1,4 +1,4 @@
-// The bodies of three functions, after what they share. `recursion.py` explains them, joins them and fills in the values
+// The bodies of five functions, after what they share. `recursion.py` explains them, joins them and fills in the values
 // between dollar signs. Arrays in fast memory have rows of LD numbers.
     typedef $T$ T;
     struct alignas(2 * sizeof(T)) Two { T at[2]; };
@@ -61,7 +61,7 @@
     T* const W = P + D * LD;     // [M, LD]: H_cp, H_cz before the motion, and W_cc, with H_cc = dt W_cz + W_cc
     // [M, WIDTH]: the columns of an agent's p, z and c beside each other; the gradient has a place that is left.
     T* const G = W + M * LD;
-    T* const verdict = P + D + 1; // behind the columns of the first row
+    T* const verdict = P + D + 1;  // behind the columns of the first row
     const T* const controls = fast.data + $CONTROL$;  // [RING, ITEMS]
     const Four* const own = (const Four*)(fast.data + $OWN$);    // [STEPS, A, 5]
     const Four* const rows = (const Four*)(fast.data + $ROWS$);  // [pairs, STEPS, A, A]
@@ -75,7 +75,7 @@
         return T(found);
     };
 #endif
-    // Where a warp has all columns, those of c get H_cc in place of W_cc, from which it differs by a product of theirs of z.
+    // Where a warp has all columns, it exchanges them: those of c hold H_cc = dt W_cz + W_cc itself, which is then read once.
     constexpr bool JOINED = LANES > D;
     const bool RECORDED = !KEPT || record;
     int positive = 1, place = last % RING;
@@ -286,7 +286,7 @@
     T* const slope = states + 2 * D;
     T* const buffers = slope + M;
     EPO_SYNC();
-    if (KEPT) {  // a step that is differentiated is not the one that was taken last
+    if (KEPT) {  // fast memory holds the factors of another step, or none
         for (int e = 4 * thread; e < end * FACTOR; e += 4 * threads) {
             const int k = e / FACTOR;
             *(Four*)(numbers_of(buffers, k) + e - k * FACTOR) = *(const Four*)(factors.data + e);
@@ -371,7 +371,8 @@
             T* const after = known + ((k + 1) & 1) * D;
             const T* const numbers = numbers_of(buffers, k);
             const T* const next = numbers_of(buffers, KEPT && k + 1 == end ? k : k + 1);  // not used after the last step
-            // Read before the barrier, which nothing passes. (The compiler ptxas of CUDA 13.4 makes a wrong number of j - j % M.)
+            // Read before the barrier, which nothing passes. (Written as j - j % M, the place is compiled to a wrong one by the
+            // ptxas of CUDA 13.4.)
             Four gain[EACH][M / 4];
             #pragma unroll
             for (int t = 0; t < EACH; ++t) {

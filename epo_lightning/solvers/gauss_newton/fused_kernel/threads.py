@@ -93,8 +93,8 @@ _SUMS_BACK = """
         }
     }
 """
-# Sine and cosine at once, by multiples of pi on a GPU: the error of the factor is that of the angle, and no code for angles
-# beyond 100,000 is in the way of the rest.
+# Sine and cosine at once. On a GPU they are those of a multiple of pi, whose error is about the rounding of the angle: the
+# plain functions bring a lot of code for angles that are very large.
 _DIRECTION = """
 #if defined(__CUDA_ARCH__)
     typedef {number} T;

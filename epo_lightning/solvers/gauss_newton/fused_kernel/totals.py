@@ -24,7 +24,7 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace) -> SimpleName
 
     @wp.func
     def squared_slope(n: int, costs: Array):
-        """The squared norm of the gradient by the controls, from the sums of the agents."""
+        """The squared norm of the gradient by the controls; each agent has five sums of `slopes` in `recursion.hpp`."""
         squared = T(0.0)
         for i in range(n):
             squared += costs[5 * i + 4]
