@@ -210,7 +210,7 @@ class FeatureEnergy(Energy):
         yield from self._of_agents(scene, parameters, (states, controls), (change, directions))
         first, second = pairs(controls.shape[2], controls.device)
         both = states[:, :, first], states[:, :, second]
-        yield from self._of_pairs(scene, parameters, both, (change[:, :, :, first], change[:, :, :, second]))
+        yield from self.pair_residuals(scene, parameters, both, (change[:, :, :, first], change[:, :, :, second]))
 
     def _of_agents(
         self, scene: Scene, parameters: GameParameters, at: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]
@@ -259,7 +259,7 @@ class FeatureEnergy(Energy):
         weight = self.own_weight(scene, parameters, name)[..., None]
         return weight * value, weight * change
 
-    def _of_pairs(
+    def pair_residuals(
         self, scene: Scene, parameters: GameParameters, both: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]
     ) -> Iterator[tuple[str, Tensor, Tensor]]:
         """Name, weighted residual and its change of every pair feature.
@@ -311,7 +311,7 @@ class FeatureEnergy(Energy):
     ) -> dict[str, Float[Tensor, "B C P"]]:
         """1/2 |w d|^2 by pair feature."""
         no_direction = first.new_zeros(0, *first.shape)
-        features = self._of_pairs(scene, parameters, (first, second), (no_direction, no_direction))
+        features = self.pair_residuals(scene, parameters, (first, second), (no_direction, no_direction))
         return {name: 0.5 * residual.square().sum(-1) for name, residual, _ in features}
 
     def check_horizon(self, steps: int) -> None:

@@ -20,6 +20,14 @@ class TestBothSides(SolverSuite):
     config = {"name": "both_sides"}
 
 
+class TestFeedback(SolverSuite):
+    """Agents that react to each other do not minimise the energy (`feedback/test_feedback.py`)."""
+
+    config = {"name": "feedback"}
+    test_a_solution_is_consistent_and_has_less_energy_than_its_start = None
+    test_the_gradient_vanishes_at_converged_solutions = None
+
+
 class TestBestResponseAtOnce(SolverSuite):
     config = {"name": "best_response", "order": "at_once"}
     converged = {"rounds": 400, "tolerance": 0.0}

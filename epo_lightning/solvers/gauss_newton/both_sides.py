@@ -62,12 +62,12 @@ class BothSides(Minimiser):
     modes: int = 2
 
     def __post_init__(self) -> None:
-        self.descent()  # checks its settings
+        self.open_loop()  # checks its settings
         for gamma in self.reflections:
             check_number("solver.reflections", gamma)
 
-    def descent(self) -> LevenbergMarquardt:
-        """The steps from each initial strategy to the minimum below it."""
+    def open_loop(self) -> LevenbergMarquardt:
+        """The steps from each initial strategy to the minimum below it, an open-loop equilibrium."""
         return LevenbergMarquardt(
             steps=self.steps,
             step_size=1.0,
@@ -76,6 +76,10 @@ class BothSides(Minimiser):
             newton_steps=self.newton_steps,
             backend=self.backend,
         )
+
+    def descent(self) -> Minimiser:
+        """The steps from each initial strategy to the equilibrium of its side."""
+        return self.open_loop()
 
     def strategies(self, modes: int) -> int:
         """One initial strategy per agent; the solver finds those of the other modes itself."""
@@ -105,7 +109,7 @@ class BothSides(Minimiser):
         Raises:
             ValueError: as :meth:`LevenbergMarquardt.run`.
         """
-        descend = self.descent()
+        descend = self.open_loop()
         game = dataclasses.replace(parameters.map(lambda tensor: tensor[:, :1]), context=parameters.context)
         # The game with and without its interaction, solved at once as two modes.
         weights = {name: torch.cat((weight, torch.zeros_like(weight)), 1) for name, weight in game.pair_weights.items()}

@@ -1,0 +1,99 @@
+"""Linear-quadratic games and their feedback Nash equilibria.
+
+The deviations x_k of the agents' states from a trajectory, and u_k of their controls, follow
+
+    x_{k+1} = A_k x_k + B_k u_k,  k = 0 .. K-1,
+
+where A and B have a block for every agent, and agent i minimises the sum over all stages of
+
+    1/2 x_{k+1}' Q_i x_{k+1} + q_i' x_{k+1} + 1/2 u_i' R_i u_i + r_i' u_i + 1/2 rho |u_k|^2,
+
+where u_i are its own controls. Q_i and q_i are the sums of its own cost and those of its pairs. In a feedback Nash
+equilibrium the agents have affine policies u_k = G_k x_k + f_k: each is the best answer to the policies of the others, from
+every state. So an agent counts on the reactions of the others; in an open-loop equilibrium
+(:mod:`~epo_lightning.solvers.gauss_newton`) it takes their controls as given.
+
+Letters: S games, n = 4 N joint states, m = 2 N joint controls; a number at the end of a letter is added to it (n1 = n + 1).
+Matrices with one more column hold a matrix and a vector: [Q | q] for a cost, [G | f] for a policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from epo_lightning.solvers.feedback import compiled
+
+
+@dataclass(frozen=True)
+class LQGame:
+    """S linear-quadratic games.
+
+    Attributes:
+        A, B: the dynamics of every agent.
+        own_cost: [Q | q] of every agent's own cost, by its state.
+        pair_cost: [Q | q] of the cost of every pair, by the states of both agents; each of the two counts it.
+        effort, push: R and r of every agent.
+        rho: weight of the squared joint controls in the cost of every agent, and of the squared joint states, at the stages
+            of the game.
+        free: mask of the controls that are chosen; the others stay zero, such as those after the end of a game.
+    """
+
+    A: Float[Tensor, "S N K 4 4"]
+    B: Float[Tensor, "S N K 4 2"]
+    own_cost: Float[Tensor, "S N K 4 5"]
+    pair_cost: Float[Tensor, "S P K 8 9"]
+    effort: Float[Tensor, "S N K 2 2"]
+    push: Float[Tensor, "S N K 2"]
+    rho: float
+    free: Bool[Tensor, "S N K"]
+
+    def equilibrium(self) -> Policy:
+        """The feedback Nash equilibrium, without a derivative."""
+        return Policy(*(torch.from_numpy(part) for part in compiled.equilibria(*self._arrays())))
+
+    def pull_back(
+        self, policy: Policy, cotangent: Float[Tensor, "S N K 2"], inputs: Sequence[Tensor]
+    ) -> tuple[Tensor, ...]:
+        """The derivative of <cotangent, u> by ``inputs``, tensors from which the game was computed.
+
+        Here u are the controls that the equilibrium's policies choose from x_0 = 0 on. It is right where all offsets are
+        zero, as at a solution of the iteration.
+        """
+        by_controls = cotangent.transpose(1, 2).flatten(2).contiguous().numpy()
+        arrays: list[Any] = [*self._arrays(), policy.gains.numpy(), policy.offsets.numpy(), by_controls]
+        bars = map(torch.from_numpy, compiled.pull_back(*arrays))
+        known = [(part, bar) for part, bar in zip(self._parts(), bars, strict=True) if part.requires_grad]
+        parts, cotangents = zip(*known, strict=True)
+        return torch.autograd.grad(
+            parts, inputs, cotangents, retain_graph=True, allow_unused=True, materialize_grads=True
+        )
+
+    def _parts(self) -> tuple[Tensor, ...]:
+        return self.A, self.B, self.own_cost, self.pair_cost, self.effort, self.push
+
+    def _arrays(self) -> tuple[Any, ...]:
+        return (
+            *(part.detach().contiguous().numpy() for part in self._parts()),
+            self.rho,
+            self.free.contiguous().numpy(),
+        )
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Affine policies u_k = G_k x_k + f_k of all agents.
+
+    Attributes:
+        gains, offsets: G and f.
+        unique: mask of the games whose equilibrium is unique, so that the policies are it.
+    """
+
+    gains: Float[Tensor, "S K m n"]
+    offsets: Float[Tensor, "S K m"]
+    unique: Bool[Tensor, " S"]

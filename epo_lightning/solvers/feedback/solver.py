@@ -1,0 +1,147 @@
+"""The solver ``feedback``: feedback equilibria on both sides on which agents can pass."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from epo_lightning.checks import check_number, check_whole
+from epo_lightning.forecast import GameParameters, Solution
+from epo_lightning.game.energy import Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.registry import register
+from epo_lightning.scene import Scene
+from epo_lightning.solvers.base import STATIONARY, Minimiser
+from epo_lightning.solvers.feedback.iteration import FeedbackGame, attach, iterate
+from epo_lightning.solvers.feedback.stages import check_stages
+from epo_lightning.solvers.gauss_newton.both_sides import BothSides
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+from epo_lightning.solvers.general import descent
+
+
+@dataclass(frozen=True)
+class ToFeedback(Minimiser):
+    """Iterated LQ games, from the open-loop equilibrium below every initial strategy to a feedback equilibrium.
+
+    Attributes:
+        iterations, tolerance, regularisation, terms: those of :class:`Feedback`.
+        open_loop: the steps to the open-loop equilibrium; None to begin at the initial strategies themselves.
+    """
+
+    needs_from_energy = BothSides.needs_from_energy
+    provides = frozenset({STATIONARY})
+
+    iterations: int
+    tolerance: float
+    regularisation: float
+    terms: int
+    open_loop: LevenbergMarquardt | None = None
+
+    def near_minimum(self) -> ToFeedback:
+        """The iterations without the steps to the open-loop equilibrium."""
+        return dataclasses.replace(self, open_loop=None)
+
+    @torch.no_grad()
+    def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
+        """Solve the open-loop game, then iterate.
+
+        Raises:
+            ConfigError: a feature of the energy is no sum over time steps.
+            ValueError: as :meth:`LevenbergMarquardt.run`.
+        """
+        if not isinstance(energy, FeatureEnergy):
+            raise ValueError(f"solver=feedback takes energy=features, not {type(energy).__name__}")
+        check_stages(energy)
+        scene, start = descent.begin(energy, scene, parameters)
+        if start.numel() == 0:
+            return descent.nothing(start)
+        parameters = parameters.for_every_mode(start.shape[1])
+        at_start = LevenbergMarquardt(steps=0)(energy, scene, dataclasses.replace(parameters, initial_controls=start))
+        if self.open_loop is not None:
+            start = self.open_loop(energy, scene, parameters).controls
+        game = self._game(energy, scene, parameters)
+        controls, status = iterate(game, _on_host(start), self.iterations, self.tolerance)
+        ended = dataclasses.replace(parameters, initial_controls=controls.to(start))
+        found = LevenbergMarquardt(steps=0)(energy, scene, ended)
+        status = torch.maximum(status.to(start.device), found.status)
+        return dataclasses.replace(found, initial_energy=at_start.energy, status=status)
+
+    def attach(
+        self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
+    ) -> tuple[Tensor, Tensor]:
+        """The controls with the derivative of the fixed point; ``exact`` has no meaning here."""
+        assert isinstance(energy, FeatureEnergy)
+        controls = attach(self._game(energy, scene, parameters), _on_host(solution.controls), self.terms)
+        return controls.to(solution.controls), solution.status
+
+    def _game(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> FeedbackGame:
+        return FeedbackGame(energy, scene.map(_on_host), parameters.map(_on_host), self.regularisation)
+
+
+def _on_host(tensor: Tensor) -> Tensor:
+    """The tensor on the CPU, numbers in double precision."""
+    return tensor.to("cpu", torch.double) if tensor.is_floating_point() else tensor.cpu()
+
+
+@register("solver", "feedback")
+@dataclass(frozen=True)
+class Feedback(BothSides):
+    """Feedback equilibria of one game: open-loop equilibria on both sides, from which LQ games are iterated.
+
+    The agents react to each other's deviations (:mod:`~epo_lightning.solvers.feedback.lq_game`). The solution is no minimum
+    of E, and has a derivative of its own: use ``backward=implicit``.
+
+    Attributes:
+        iterations: largest number of LQ games.
+        tolerance: change of the states [m, rad, m/s] in one iteration below which a game is solved.
+        regularisation: multiple of the identity that is added to the Hessians of every agent's cost by states and controls.
+            It is part of the game: policies depend on it. 5 in GameInference.jl (Peters, 2020), which the paper's data are
+            made with.
+        terms: largest number of terms of the series for the derivative (:func:`~.iteration.attach`).
+    """
+
+    iterations: int = 60
+    tolerance: float = 1e-3
+    regularisation: float = 5.0
+    terms: int = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_whole("solver.iterations", self.iterations)
+        check_number("solver.tolerance", self.tolerance)
+        check_number("solver.regularisation", self.regularisation, zero=True)
+        check_whole("solver.terms", self.terms)
+
+    def check(self, energy: Energy) -> None:
+        """Refuse features that are no sums over time steps.
+
+        Raises:
+            ConfigError: the feature.
+        """
+        if isinstance(energy, FeatureEnergy):
+            check_stages(energy)
+
+    def descent(self) -> ToFeedback:
+        """The steps from each initial strategy to the feedback equilibrium of its side."""
+        return ToFeedback(self.iterations, self.tolerance, self.regularisation, self.terms, self.open_loop())
+
+    def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
+        """Open-loop equilibria on both sides, and the feedback equilibria near them.
+
+        Raises:
+            ConfigError, ValueError: as :meth:`ToFeedback.__call__`.
+        """
+        found = super().__call__(energy, scene, parameters)
+        game = dataclasses.replace(parameters.for_every_mode(self.modes), initial_controls=found.controls)
+        return dataclasses.replace(
+            self.descent().near_minimum()(energy, scene, game), initial_energy=found.initial_energy
+        )
+
+    def attach(
+        self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
+    ) -> tuple[Tensor, Tensor]:
+        """As :meth:`ToFeedback.attach`."""
+        return self.descent().attach(energy, scene, parameters, solution, exact)

@@ -1,0 +1,147 @@
+"""The linear-quadratic game around a trajectory: dynamics and costs of every agent, stage by stage.
+
+The cost of agent i is its own features and those of all its pairs, J_i = E_i + sum_j E_ij (Eq. 6). A stage is a time step:
+the control u_k, and the state x_{k+1} that it leads to. So features must be sums over stages: those of controls, speeds,
+positions, goals and distances are. Rates couple the controls of two stages, and a steering angle a turn rate with the speed
+before it; these are not taken here. Second derivatives of residuals are left out (Gauss-Newton), so that all costs are
+convex.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from epo_lightning.forecast import GameParameters
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.features import Source
+from epo_lightning.game.game_end import free_controls
+from epo_lightning.game.pairs import pairs
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.solvers.feedback.compiled import CONTROL, STATE
+from epo_lightning.solvers.feedback.lq_game import LQGame
+
+_BETWEEN_STAGES = (Source.RATE, Source.STEERING, Source.TRAJECTORY)
+"""Sources of features that depend on more than one stage."""
+_AT_THE_END = (Source.FINAL_POSITION, Source.FINAL_HEADING)
+
+
+def check_stages(energy: FeatureEnergy) -> None:
+    """Refuse features that are no sums over stages.
+
+    Raises:
+        ConfigError: the features, and what to do.
+    """
+    own = [name for name, feature in energy.own_features.items() if feature.source in _BETWEEN_STAGES]
+    pair = [name for name, feature in energy.pair_features.items() if not (feature.declared or feature.stepwise)]
+    for kind, names in (("own", own), ("pair", pair)):
+        if names:
+            raise ConfigError(
+                f"solver=feedback takes features of single time steps, but energy.{kind} has {', '.join(names)}: leave "
+                "them out (energy=rpi_game has no such features), or choose solver=game"
+            )
+
+
+def lq_game(
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    states: Float[Tensor, "B M N K 4"],
+    controls: Float[Tensor, "B M N K 2"],
+    rho: float,
+) -> LQGame:
+    """The linear-quadratic games around joint trajectories, one per scene and mode: S = B M. Differentiable.
+
+    Args:
+        energy, scene, parameters: the game.
+        states, controls: the trajectories.
+        rho: weight of squared deviations of the joint states and controls, in the cost of every agent.
+    """
+    modes, horizon = controls.shape[1], controls.shape[3]
+    own_cost, effort, push = _own_costs(energy, scene, parameters, states, controls)
+    start = energy.current_states(scene)[..., None, :].expand_as(states[..., :1, :])
+    A, B = _dynamics(energy.dynamics, torch.cat((start, states), -2), scene.dt)
+    return LQGame(
+        A=A.flatten(0, 1),
+        B=B.flatten(0, 1),
+        own_cost=own_cost.flatten(0, 1),
+        pair_cost=_pair_costs(energy, scene, parameters, states).flatten(0, 1),
+        effort=effort.flatten(0, 1),
+        push=push.flatten(0, 1),
+        rho=rho,
+        free=free_controls(scene, horizon)[:, None].expand(-1, modes, -1, -1).flatten(0, 1),
+    )
+
+
+def _own_costs(
+    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, states: Tensor, controls: Tensor
+) -> tuple[Float[Tensor, "B M N K 4 5"], Float[Tensor, "B M N K 2 2"], Float[Tensor, "B M N K 2"]]:
+    """[Q | q] of every agent's own cost by its state, and R and r by its controls."""
+    horizon = controls.shape[3]
+    unit = torch.eye(STATE + CONTROL, dtype=controls.dtype, device=controls.device)[:, None, None, None, None]
+    moved = unit[..., :STATE].expand(-1, *states.shape), unit[..., STATE:].expand(-1, *controls.shape)
+    around = energy.surroundings(scene, parameters)
+    ends = scene.game_steps
+    if ends is None:
+        ends = torch.full((len(controls),), horizon, device=controls.device)
+    last = F.one_hot(ends - 1, horizon).to(controls.dtype)[:, None, None, :, None]
+    residuals, changes = [], []
+    for name, feature in energy.own_features.items():
+        residual, change = energy.own_residual(name, scene, parameters, around, (states, controls), moved)
+        if feature.source in _AT_THE_END:
+            residual, change = residual[..., None, :] * last, change[..., None, :] * last
+        else:
+            residual, change = residual.unflatten(-1, (horizon, -1)), change.unflatten(-1, (horizon, -1))
+        residuals.append(residual)
+        changes.append(change)
+    cost = _squared(torch.cat(residuals, -1), torch.cat(changes, -1).movedim(0, -1))
+    matrix, slope = cost[..., :-1], cost[..., -1]
+    own_cost = torch.cat((matrix[..., :STATE, :STATE], slope[..., :STATE, None]), -1)
+    return own_cost, matrix[..., STATE:, STATE:], slope[..., STATE:]
+
+
+def _pair_costs(
+    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, states: Tensor
+) -> Float[Tensor, "B M P K 8 9"]:
+    """[Q | q] of the cost of every pair by the states of both agents."""
+    batch, modes, agents, horizon = states.shape[:4]
+    first, second = pairs(agents, states.device)
+    none = states.new_zeros(batch, modes, len(first), horizon, 2 * STATE, 2 * STATE + 1)
+    if not energy.pair or not len(first):
+        return none
+    both = states[:, :, first], states[:, :, second]
+    unit = torch.eye(2 * STATE, dtype=states.dtype, device=states.device)[:, None, None, None, None]
+    moved = unit[..., :STATE].expand(-1, *both[0].shape), unit[..., STATE:].expand(-1, *both[1].shape)
+    _, residuals, changes = zip(*energy.pair_residuals(scene, parameters, both, moved), strict=True)
+    cost = _squared(torch.stack(residuals, -1), torch.stack(changes, -1).movedim(0, -1))
+    if energy.pair_stride == 1:
+        return cost
+    steps = torch.arange(horizon, device=states.device)[energy.pair_stride - 1 :: energy.pair_stride]
+    return none.index_copy(3, steps, cost)
+
+
+def _squared(
+    residual: Float[Tensor, "*batch R"], jacobian: Float[Tensor, "*batch R d"]
+) -> Float[Tensor, "*batch d d1"]:
+    """[J' J | J' r], the Gauss-Newton matrix and the gradient of 1/2 |r|^2."""
+    return jacobian.mT @ torch.cat((jacobian, residual[..., None]), -1)
+
+
+def _dynamics(
+    unicycle: Unicycle, states: Float[Tensor, "B M N K1 4"], dt: float
+) -> tuple[Float[Tensor, "B M N K 4 4"], Float[Tensor, "B M N K 4 2"]]:
+    """Derivatives of every agent's next state by its state and by its control, along x_0 .. x_K."""
+    heading, speed = states[..., HEADING], states[..., SPEED]
+    ahead = torch.stack((heading.cos(), heading.sin()), -1)
+    aside = speed[..., None] * torch.stack((-heading.sin(), heading.cos()), -1)
+    # The displacement is dt (beta v_k e_k + (1 - beta) v_{k+1} e_{k+1}); column 0: by the heading, column 1: by the speed.
+    by_node = dt * torch.stack((aside, ahead), -1)
+    before, after = unicycle.beta * by_node[..., :-1, :, :], (1.0 - unicycle.beta) * by_node[..., 1:, :, :]
+    A = torch.eye(STATE, dtype=states.dtype, device=states.device) + F.pad(before + after, (2, 0, 0, 2))
+    turned = dt * torch.eye(2, dtype=states.dtype, device=states.device).expand_as(after)
+    # Controls are the acceleration, which changes the speed, and the turn rate.
+    return A, torch.cat((dt * after, turned), -2).flip(-1)

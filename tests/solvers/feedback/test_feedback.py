@@ -1,0 +1,137 @@
+"""Feedback equilibria of driving games: against the generator of RPI, against open-loop minima, and their derivative."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+from games import leaves_of
+
+from epo_lightning.data.rpi import solve as generator
+from epo_lightning.data.rpi.game import GameConstants, main_game
+from epo_lightning.drive.rpi import ENERGY as TRUE_ENERGY
+from epo_lightning.drive.rpi import true_game
+from epo_lightning.forecast import GameParameters, Status
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import Scene
+from epo_lightning.solvers.backward import Implicit
+from epo_lightning.solvers.feedback.solver import Feedback
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+
+ENERGY = FeatureEnergy(own=["goal", "vel", "acc", "turnr"], pair=["clearance"], margins={"clearance": 0.5})
+HORIZON = 20
+EXACT = {"tolerance": 1e-11, "iterations": 300}
+
+
+def meeting(*directions: float, modes: int = 2, weight: float = 8.0) -> tuple[Scene, GameParameters]:
+    """Two agents that meet in the middle; agent 1 comes from one direction per scene."""
+    angle = torch.tensor(directions, dtype=torch.double)
+    from_left = torch.tensor([-1.3, 0.03, 0.0, 1.3], dtype=torch.double).expand(len(angle), 4)
+    other = torch.stack((-1.3 * angle.cos(), -1.3 * angle.sin(), angle, torch.full_like(angle, 1.3)), -1)
+    current = torch.stack((from_left, other), 1)
+    shape = (len(angle), modes, 2)
+    own = {"goal": 10.0, "vel": 3.0, "acc": 3.0, "turnr": 3.0}
+    scene = Scene(history=current[:, :, None], dt=0.1, size=torch.full((len(angle), 2, 2), 0.5, dtype=torch.double))
+    return scene, GameParameters(
+        own_weights={name: torch.full(shape, value, dtype=torch.double) for name, value in own.items()},
+        pair_weights={"clearance": torch.full((*shape[:2], 1), weight, dtype=torch.double)},
+        initial_controls=torch.zeros(*shape, HORIZON, 2, dtype=torch.double),
+        goals=-current[:, None, :, :2].expand(-1, modes, -1, -1),
+    )
+
+
+def test_solutions_are_those_of_the_generator_of_rpi() -> None:
+    """The same games, solved by code that the solver shares no line with."""
+    constants, steps = GameConstants(), 60
+    settings = dataclasses.replace(generator.SETTINGS["feedback"], step=1.0, tolerance=1e-9, iterations=400).array()
+    for number in range(3):
+        game = main_game(3, number, 1, 4, constants)
+        start = game.start.copy()
+        start[[3, 7]] = 0.6  # already on their way
+        u = np.zeros((steps, 4))
+        given = (start, u, constants.array(), game.goals, game.weight)
+        _, u, _, _ = generator.solve_potential(*given, np.ones(2), generator.SETTINGS["potential"].array())
+        x, _, converged, _ = generator.solve_feedback(start, u, *given[2:], settings)
+        assert converged
+        agents = torch.from_numpy(start).view(1, 2, 4)
+        scene = Scene(history=agents[:, :, None], dt=constants.dt, size=torch.full((1, 2, 2), 0.5, dtype=torch.double))
+        goals = torch.from_numpy(game.goals)[None]
+        ours = true_game(torch.tensor([game.weight]), goals[..., :2], goals[..., 2], steps)
+        ours = dataclasses.replace(ours, initial_controls=torch.from_numpy(u).view(1, 1, steps, 2, 2).transpose(2, 3))
+        found = Feedback(**EXACT).descent().near_minimum()(TRUE_ENERGY, scene, ours)
+        assert found.status.item() == Status.SOLVED
+        wanted = torch.from_numpy(x[1:]).view(steps, 2, 4).transpose(0, 1)
+        torch.testing.assert_close(found.states[0, 0], wanted, rtol=0, atol=1e-7)
+
+
+def test_the_modes_are_on_different_sides_and_not_those_of_the_open_loop_game() -> None:
+    scene, game = meeting(math.pi, 2.5, -2.5)
+    found = Feedback()(ENERGY, scene, game)
+    sight = found.states[..., 1, :, :2] - found.states[..., 0, :, :2]
+    turn = torch.atan2(sight[..., 1], sight[..., 0]).diff(dim=-1)
+    side = ((turn + math.pi) % (2 * math.pi) - math.pi).sum(-1).sign()
+    assert (side[:, 0] == -side[:, 1]).all()
+    assert (found.status == Status.SOLVED).all()
+    assert (found.gradient_norm > 1.0).all(), "an open-loop equilibrium has no gradient"
+    torch.testing.assert_close(found.energy, ENERGY(scene, game, found.controls))
+
+
+def test_agents_without_interaction_do_the_same_as_in_the_open_loop_game() -> None:
+    scene, game = meeting(math.pi, 2.5, weight=0.0)
+    found = Feedback(**EXACT)(ENERGY, scene, game)
+    alone = LevenbergMarquardt(steps=10, step_size=1.0, damping=1.0, adaptive=True, newton_steps=20)
+    with torch.no_grad():
+        torch.testing.assert_close(found.states, alone(ENERGY, scene, game).states, rtol=0, atol=1e-6)
+
+
+def test_solutions_have_the_derivative_of_the_fixed_point() -> None:
+    """Derivatives by weights and goals, against finite differences."""
+    scene, game = meeting(2.3, -2.6)
+    solver = Feedback(**EXACT, terms=80)
+    weigh = torch.randn(2, 2, 2, HORIZON, 4, dtype=torch.double)
+    leaves = leaves_of(game)
+    (Implicit()(solver, ENERGY, scene, leaves).states * weigh).sum().backward()
+    way = game.map(torch.randn_like)
+
+    def total(step: float) -> torch.Tensor:
+        own = {name: weight + step * way.own_weights[name][:, :1] for name, weight in game.own_weights.items()}
+        pair = {name: weight + step * way.pair_weights[name][:, :1] for name, weight in game.pair_weights.items()}
+        goals = game.goals + step * way.goals[:, :1]
+        moved = dataclasses.replace(game, own_weights=own, pair_weights=pair, goals=goals)
+        return (solver(ENERGY, scene, moved).states * weigh).sum()
+
+    slope = sum((leaves.own_weights[name].grad * way.own_weights[name][:, :1]).sum() for name in game.own_weights)
+    slope = slope + (leaves.pair_weights["clearance"].grad * way.pair_weights["clearance"][:, :1]).sum()
+    slope = slope + (leaves.goals.grad * way.goals[:, :1]).sum()
+    torch.testing.assert_close(slope, (total(1e-5) - total(-1e-5)) / 2e-5, rtol=1e-4, atol=1e-4)
+
+
+def test_more_terms_of_the_series_come_closer_to_the_derivative() -> None:
+    scene, game = meeting(2.3)
+
+    def slope(terms: int) -> torch.Tensor:
+        leaves = leaves_of(game)
+        Implicit()(Feedback(**EXACT, terms=terms), ENERGY, scene, leaves).states[..., :2].sum().backward()
+        return leaves.pair_weights["clearance"].grad
+
+    wanted = slope(80)
+    missed = [(slope(terms) - wanted).norm() / wanted.norm() for terms in (1, 4, 16)]
+    assert missed[0] > 0.05
+    assert missed[1] < 0.5 * missed[0]
+    assert missed[2] < 0.1 * missed[1]
+
+
+def test_too_few_iterations_are_reported() -> None:
+    scene, game = meeting(2.3)
+    assert (Feedback(iterations=1, tolerance=1e-9)(ENERGY, scene, game).status == Status.DAMPED).all()
+
+
+def test_single_precision_and_empty_batches() -> None:
+    scene, game = meeting(2.3)
+    exact = Feedback()(ENERGY, scene, game)
+    found = Feedback()(ENERGY, scene.to(torch.float32), game.to(torch.float32))
+    assert found.controls.dtype == torch.float32
+    torch.testing.assert_close(found.states.double(), exact.states, rtol=0, atol=1e-2)
+    assert Feedback()(ENERGY, scene[[]], game[[]]).states.shape == (0, 2, 2, HORIZON, 4)
