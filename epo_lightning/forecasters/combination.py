@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS
+from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, STAGES
 from epo_lightning.registry import ConfigError, parts
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, STEPS, TABLES
 
@@ -19,6 +19,7 @@ WORDS = {
     GRADIENT: "a gradient",
     RESIDUALS: "residuals (it must be half the sum of their squares)",
     FEATURES: "named features whose structure the solver knows",
+    STAGES: "features of single time steps alone (no jerk or other rates, no steering; energy=rpi_game has such features)",
     PATH: "a path that can be differentiated",
     STEPS: "steps that can be interrupted and continued",
     STATIONARY: "strategies at which the gradient vanishes",

@@ -24,11 +24,11 @@ from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import ConfigError, nearest, parts
 from epo_lightning.scene import Scene
 
-GRADIENT, RESIDUALS, FEATURES = "gradient", "residuals", "features"
-"""Optional properties of an energy. GRADIENT: it can be minimised along its gradient with
-respect to the controls. RESIDUALS: it is half the sum of
-squares of residuals. FEATURES: its residuals are named features, whose Jacobians have a structure that the fast solver
-uses."""
+GRADIENT, RESIDUALS, FEATURES, STAGES = "gradient", "residuals", "features", "stages"
+"""Optional properties of an energy. GRADIENT: it can be minimised along its gradient with respect to the controls.
+RESIDUALS: it is half the sum of squares of residuals. FEATURES: its residuals are named features, whose Jacobians have a
+structure that the fast solver uses. STAGES: each of these features depends on one time step, a control and the state that it
+leads to."""
 
 _TABLE_ENTRIES = 2_000_000
 """Largest number of (pair of candidates, step) entries that are evaluated together, which bounds the memory."""
@@ -59,7 +59,8 @@ class Energy(ABC):
     """The interface of all energies. Subclasses define the terms; this class adds them up.
 
     Attributes:
-        offers: the properties that the energy has, of :data:`GRADIENT`, :data:`RESIDUALS` and :data:`FEATURES`.
+        offers: the properties that the energy has, of :data:`GRADIENT`, :data:`RESIDUALS`, :data:`FEATURES` and
+            :data:`STAGES`.
         own, pair: names of the terms of agents (own terms) and of pairs (pair terms).
         dynamics: the map from controls to states.
     """

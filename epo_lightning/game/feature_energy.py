@@ -16,7 +16,7 @@ from epo_lightning.checks import check_whole
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import disc, separation
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy, check_names
+from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, STAGES, Energy, check_names
 from epo_lightning.game.feature_checks import check_bounds, check_inputs, check_margins, refuse_asymmetry
 from epo_lightning.game.feature_derivatives import (
     Bounds,
@@ -103,6 +103,8 @@ class FeatureEnergy(Energy):
         for name, feature in self.own_features.items():
             if feature.bounded and feature.signal not in self.bounds:
                 raise ConfigError(f"feature {name!r} needs energy.bounds.{feature.signal}: [lowest, highest]")
+        if not self.between_steps:
+            object.__setattr__(self, "offers", self.offers | {STAGES})
 
     @cached_property
     def own_features(self) -> dict[str, OwnFeature]:
@@ -113,6 +115,12 @@ class FeatureEnergy(Energy):
     def pair_features(self) -> dict[str, PairFeature]:
         """The pair features by name."""
         return {name: PAIR_FEATURES[name] for name in self.pair}
+
+    @cached_property
+    def between_steps(self) -> Sequence[str]:
+        """Names of the features that may depend on more than one time step."""
+        own = [name for name, feature in self.own_features.items() if not feature.stepwise]
+        return [*own, *(name for name, pair in self.pair_features.items() if not (pair.declared or pair.stepwise))]
 
     @cached_property
     def needs(self) -> set[str]:

@@ -98,6 +98,11 @@ class OwnFeature:
         return self.source is not Source.TRAJECTORY
 
     @property
+    def stepwise(self) -> bool:
+        """Whether the feature depends on the control and the next state of single time steps."""
+        return self.source not in (Source.RATE, Source.STEERING, Source.TRAJECTORY)
+
+    @property
     def linear(self) -> bool:
         """Whether the signal is linear in the controls of one channel."""
         return self.source in (Source.CONTROL, Source.RATE, Source.SPEED)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from epo_lightning.game.double_integrator import DoubleIntegrator
-from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy
+from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, STAGES, Energy
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 from .games import MODES, build_energy, game_of, in_order, padded, poisoned
@@ -41,7 +41,7 @@ class EnergySuite:
         assert set(own) <= set(energy.own)
         assert set(pair) <= set(energy.pair)
         assert energy.goal_terms <= set(energy.own)
-        assert energy.offers <= {GRADIENT, RESIDUALS, FEATURES}
+        assert energy.offers <= {GRADIENT, RESIDUALS, FEATURES, STAGES}
         assert energy.needs <= NEEDS
         assert ("order" in energy.needs) == (energy.pair_order is not None)
         assert set(energy.decoded_margins) <= set(pair)

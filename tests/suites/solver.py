@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from epo_lightning.forecast import GameParameters, Solution, Status
-from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, Energy
+from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, STAGES, Energy
 from epo_lightning.registry import build
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, STEPS, TABLES, Minimiser, Stepwise
@@ -65,7 +65,7 @@ class SolverSuite:
 
     def test_declared_properties_have_their_types(self):
         minimiser = build("solver", self.config)
-        assert minimiser.needs_from_energy <= {GRADIENT, RESIDUALS, FEATURES}
+        assert minimiser.needs_from_energy <= {GRADIENT, RESIDUALS, FEATURES, STAGES}
         assert minimiser.provides <= {PATH, STEPS, STATIONARY, SAMPLES, TABLES}
         assert minimiser.provides
         assert (STEPS in minimiser.provides) == isinstance(minimiser, Stepwise)

@@ -102,7 +102,7 @@ def pull_back(
             _pull_back_stage(
                 A[s, :, k],
                 B[s, :, k],
-                effort[s, :, k].copy(),  # contiguous
+                effort[s, :, k],
                 push[s, :, k],
                 rho,
                 free[s, :, k],
@@ -316,6 +316,28 @@ def _of_offsets(A: Array, B: Array, gains: Array, deviation_bar: Array) -> Array
 
 
 @njit(cache=True)
+def _add_product(left: Array, right: Array, rows: int, inner: int, width: int, scale: float, out: Array) -> None:
+    """Add ``scale`` times the product of the first ``inner`` columns of ``left`` and rows of ``right``.
+
+    ``rows`` and ``width`` are the numbers of rows and columns that are computed. Numbers are added along rows, which the
+    compiler vectorises; sums of products would keep their order.
+    """
+    for i in range(rows):
+        for k in range(inner):
+            factor = scale * left[i, k]
+            if factor != 0.0:
+                for j in range(width):
+                    out[i, j] += factor * right[k, j]
+
+
+@njit(cache=True)
+def _transpose(matrix: Array, out: Array) -> None:
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            out[j, i] = matrix[i, j]
+
+
+@njit(cache=True)
 def _pull_back_stage(
     A: Array,
     B: Array,
@@ -339,32 +361,50 @@ def _pull_back_stage(
     """
     agents, n = value.shape[0], value.shape[1]
     m = CONTROL * agents
-    closed, ahead = np.empty((n, n + 1)), np.empty((n, n + 1))
-    _close(A, B, policy, closed)
-    G, F = np.ascontiguousarray(policy[:, :n]), np.ascontiguousarray(closed[:, :n])
+    closed, ahead, ahead_bar = np.empty((n, n + 1)), np.empty((n, n + 1)), np.empty((n, n + 1))
+    spent, spent_bar = np.empty((CONTROL, n + 1)), np.empty((CONTROL, n + 1))
+    by_value, by_values = np.empty((n, n + 1)), np.zeros((n, n + 1))
+    value_turned, policy_turned, closed_turned = np.empty((n + 1, n)), np.empty((n + 1, m)), np.empty((n + 1, n))
     policy_bar, closed_bar = np.zeros((m, n + 1)), np.zeros((n, n + 1))
-    policy_bar[:, n] = offset_bar
-    # V = F' ahead + G_i' (R_i [G_i | f_i] + [0 | r_i]) + rho G' [G | f].
+    _close(A, B, policy, closed)
+    _transpose(policy, policy_turned)
+    _transpose(closed, closed_turned)
+    for r in range(m):
+        policy_bar[r, n] = offset_bar[r]
+    # V = F' ahead + G_i' (R_i [G_i | f_i] + [0 | r_i]) + rho G' [G | f], with ahead = V [F | B f] + [0 | v].
     for i in range(agents):
-        own = slice(CONTROL * i, CONTROL * i + CONTROL)
-        by_value = value_bar[i].copy()
-        through = by_value.T.copy()
+        by_value[:] = value_bar[i]
+        by_values += by_value
+        _transpose(by_value, value_turned)
         _carry(value[i], closed, ahead)
-        ahead_bar = F @ by_value
-        closed_bar[:, :n] += ahead @ through
-        spent = effort[i] @ policy[own]
-        spent[:, n] += push[i]
-        spent_bar = np.ascontiguousarray(G[own]) @ by_value
-        policy_bar[own, :n] += spent @ through
-        policy_bar[own] += effort[i].T @ spent_bar
-        effort_bar[i] += spent_bar @ policy[own].T
-        push_bar[i] += spent_bar[:, n]
-        policy_bar[:, :n] += rho * (policy @ through)
-        policy_bar += rho * (G @ by_value)
-        # ahead = V [F | B f] + [0 | v].
-        value_bar[i, :, :n] = ahead_bar @ closed.T
-        value_bar[i, :, n] = ahead_bar[:, n]
-        closed_bar += np.ascontiguousarray(value[i, :, :n]).T @ ahead_bar
+        ahead_bar[:] = 0.0
+        _add_product(closed, by_value, n, n, n + 1, 1.0, ahead_bar)
+        _add_product(ahead, value_turned, n, n + 1, n, 1.0, closed_bar)
+        value_bar[i] = 0.0
+        _add_product(ahead_bar, closed_turned, n, n + 1, n, 1.0, value_bar[i])
+        for a in range(n):
+            value_bar[i, a, n] = ahead_bar[a, n]
+            for b in range(n):
+                entry = value[i, a, b]
+                for column in range(n + 1):
+                    closed_bar[b, column] += entry * ahead_bar[a, column]
+        first = CONTROL * i
+        own, own_bar = policy[first : first + CONTROL], policy_bar[first : first + CONTROL]
+        spent[:] = 0.0
+        spent_bar[:] = 0.0
+        _add_product(effort[i], own, CONTROL, CONTROL, n + 1, 1.0, spent)
+        _add_product(own, by_value, CONTROL, n, n + 1, 1.0, spent_bar)
+        for r in range(CONTROL):
+            spent[r, n] += push[i, r]
+            push_bar[i, r] += spent_bar[r, n]
+            for c in range(CONTROL):
+                for column in range(n + 1):
+                    own_bar[c, column] += effort[i, r, c] * spent_bar[r, column]
+                    effort_bar[i, r, c] += spent_bar[r, column] * own[c, column]
+        _add_product(spent, value_turned, CONTROL, n + 1, n, 1.0, own_bar)
+    _transpose(by_values, value_turned)
+    _add_product(policy, value_turned, m, n + 1, n, rho, policy_bar)
+    _add_product(policy, by_values, m, n, n + 1, rho, policy_bar)
     # [F | B f] = [A | 0] + B [G | f].
     for i in range(agents):
         for a in range(STATE):
@@ -372,15 +412,15 @@ def _pull_back_stage(
             for b in range(STATE):
                 A_bar[i, a, b] += closed_bar[row, STATE * i + b]
             for c in range(CONTROL):
-                B_bar[i, a, c] += (closed_bar[row] * policy[CONTROL * i + c]).sum()
-                policy_bar[CONTROL * i + c] += B[i, a, c] * closed_bar[row]
+                for column in range(n + 1):
+                    B_bar[i, a, c] += closed_bar[row, column] * policy[CONTROL * i + c, column]
+                    policy_bar[CONTROL * i + c, column] += B[i, a, c] * closed_bar[row, column]
     # matrix [G | f] = right.
-    matrix, right = np.empty((m, m)), np.empty((m, n + 1))
-    _stationarity(A, B, effort, push, rho, free, value, matrix, right)
-    transposed = matrix.T.copy()
-    _solve(transposed, policy_bar)
-    right_bar = policy_bar
-    matrix_bar = -(right_bar @ policy.T)
+    matrix, right_bar, matrix_bar = np.empty((m, m)), np.empty((m, n + 1)), np.zeros((m, m))
+    _stationarity(A, B, effort, push, rho, free, value, matrix, right_bar)
+    right_bar[:] = policy_bar
+    _solve(matrix.T.copy(), right_bar)
+    _add_product(right_bar, policy_turned, m, n + 1, m, -1.0, matrix_bar)
     slope, slope_bar = np.empty((m, n + 1)), np.zeros((m, n + 1))
     _slopes(B, value, slope)
     # matrix = S B + R, right = -(S [A | 0] + [0 | s + r]) with [S | s] the slopes.
@@ -405,7 +445,8 @@ def _pull_back_stage(
             # [S | s] = B_i' [V_i | v_i].
             for a in range(STATE):
                 value_bar[i, STATE * i + a] += B[i, a, r] * slope_bar[row]
-                B_bar[i, a, r] += (value[i, STATE * i + a] * slope_bar[row]).sum()
+                for column in range(n + 1):
+                    B_bar[i, a, r] += value[i, STATE * i + a, column] * slope_bar[row, column]
 
 
 @njit(cache=True)

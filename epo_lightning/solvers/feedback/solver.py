@@ -10,13 +10,12 @@ from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole
 from epo_lightning.forecast import GameParameters, Solution
-from epo_lightning.game.energy import Energy
+from epo_lightning.game.energy import FEATURES, STAGES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.feedback.iteration import FeedbackGame, attach, iterate
-from epo_lightning.solvers.feedback.stages import check_stages
 from epo_lightning.solvers.gauss_newton.both_sides import BothSides
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.solvers.general import descent
@@ -31,7 +30,7 @@ class ToFeedback(Minimiser):
         open_loop: the steps to the open-loop equilibrium; None to begin at the initial strategies themselves.
     """
 
-    needs_from_energy = BothSides.needs_from_energy
+    needs_from_energy = frozenset({FEATURES, STAGES})
     provides = frozenset({STATIONARY})
 
     iterations: int
@@ -49,12 +48,16 @@ class ToFeedback(Minimiser):
         """Solve the open-loop game, then iterate.
 
         Raises:
-            ConfigError: a feature of the energy is no sum over time steps.
-            ValueError: as :meth:`LevenbergMarquardt.run`.
+            ValueError: the energy has other terms than features of single time steps; or as
+                :meth:`LevenbergMarquardt.run`.
         """
         if not isinstance(energy, FeatureEnergy):
             raise ValueError(f"solver=feedback takes energy=features, not {type(energy).__name__}")
-        check_stages(energy)
+        if energy.between_steps:
+            raise ValueError(
+                f"solver=feedback takes features of single time steps, and not {', '.join(energy.between_steps)}: leave "
+                "them out, or choose another solver"
+            )
         scene, start = descent.begin(energy, scene, parameters)
         if start.numel() == 0:
             return descent.nothing(start)
@@ -103,6 +106,8 @@ class Feedback(BothSides):
         terms: largest number of terms of the series for the derivative (:func:`~.iteration.attach`).
     """
 
+    needs_from_energy = frozenset({FEATURES, STAGES})
+
     iterations: int = 60
     tolerance: float = 1e-3
     regularisation: float = 5.0
@@ -115,15 +120,6 @@ class Feedback(BothSides):
         check_number("solver.regularisation", self.regularisation, zero=True)
         check_whole("solver.terms", self.terms)
 
-    def check(self, energy: Energy) -> None:
-        """Refuse features that are no sums over time steps.
-
-        Raises:
-            ConfigError: the feature.
-        """
-        if isinstance(energy, FeatureEnergy):
-            check_stages(energy)
-
     def descent(self) -> ToFeedback:
         """The steps from each initial strategy to the feedback equilibrium of its side."""
         return ToFeedback(self.iterations, self.tolerance, self.regularisation, self.terms, self.open_loop())
@@ -132,7 +128,7 @@ class Feedback(BothSides):
         """Open-loop equilibria on both sides, and the feedback equilibria near them.
 
         Raises:
-            ConfigError, ValueError: as :meth:`ToFeedback.__call__`.
+            ValueError: as :meth:`ToFeedback.__call__`.
         """
         found = super().__call__(energy, scene, parameters)
         game = dataclasses.replace(parameters.for_every_mode(self.modes), initial_controls=found.controls)

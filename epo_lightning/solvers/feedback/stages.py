@@ -20,30 +20,11 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import Source
 from epo_lightning.game.game_end import free_controls
 from epo_lightning.game.pairs import pairs
-from epo_lightning.registry import ConfigError
 from epo_lightning.scene import HEADING, SPEED, Scene
 from epo_lightning.solvers.feedback.compiled import CONTROL, STATE
 from epo_lightning.solvers.feedback.lq_game import LQGame
 
-_BETWEEN_STAGES = (Source.RATE, Source.STEERING, Source.TRAJECTORY)
-"""Sources of features that depend on more than one stage."""
 _AT_THE_END = (Source.FINAL_POSITION, Source.FINAL_HEADING)
-
-
-def check_stages(energy: FeatureEnergy) -> None:
-    """Refuse features that are no sums over stages.
-
-    Raises:
-        ConfigError: the features, and what to do.
-    """
-    own = [name for name, feature in energy.own_features.items() if feature.source in _BETWEEN_STAGES]
-    pair = [name for name, feature in energy.pair_features.items() if not (feature.declared or feature.stepwise)]
-    for kind, names in (("own", own), ("pair", pair)):
-        if names:
-            raise ConfigError(
-                f"solver=feedback takes features of single time steps, but energy.{kind} has {', '.join(names)}: leave "
-                "them out (energy=rpi_game has no such features), or choose solver=game"
-            )
 
 
 def lq_game(

@@ -9,14 +9,15 @@ from torch import Tensor
 
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.energy import STAGES
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import PAIR_FEATURES, PairFeature, Source
 from epo_lightning.game.pairs import pairs
-from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.feedback.compiled import CONTROL, STATE
 from epo_lightning.solvers.feedback.lq_game import LQGame
-from epo_lightning.solvers.feedback.stages import check_stages, lq_game
+from epo_lightning.solvers.feedback.solver import Feedback
+from epo_lightning.solvers.feedback.stages import lq_game
 
 OWN = ("goal", "heading", "lane", "velref", "vel", "acc", "turnr", "velb", "accb", "turnrb")
 PAIR = ("proximity", "clearance")
@@ -112,17 +113,15 @@ def test_agents_alone_and_energies_without_pairs_have_no_pair_costs() -> None:
 
 
 @pytest.mark.parametrize("name", ["jerk", "turnacc", "steer"])
-def test_features_between_stages_are_refused(name: str) -> None:
-    energy = FeatureEnergy(own=["goal", name], bounds=BOUNDS)
-    with pytest.raises(ConfigError, match=rf"of single time steps, but energy\.own has {name}: leave"):
-        check_stages(energy)
+def test_features_between_steps_are_refused(name: str) -> None:
+    energy, scene, game, _ = setup("euler", 1, None, own=("goal", name))
+    assert STAGES not in energy.offers
+    with pytest.raises(ValueError, match=f"takes features of single time steps, and not {name}: leave"):
+        Feedback().descent()(energy, scene, game)
 
 
-def test_undeclared_features_are_refused_unless_they_are_of_single_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(
-        PAIR_FEATURES, "whole", PairFeature(Source.TRAJECTORY, lambda one, other: one[..., 0] - other[..., 0])
-    )
-    monkeypatch.setattr(FeatureEnergy, "__post_init__", lambda self: None)
-    with pytest.raises(ConfigError, match=r"energy\.pair has whole"):
-        check_stages(FeatureEnergy(own=["goal"], pair=["whole"]))
-    check_stages(FeatureEnergy(own=["goal"], pair=["longitudinal"]))
+def test_functions_of_trajectories_are_refused_unless_they_are_of_single_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = PairFeature(Source.TRAJECTORY, lambda one, other: (one - other)[..., 0].square())
+    monkeypatch.setitem(PAIR_FEATURES, "whole", whole)
+    assert STAGES not in FeatureEnergy(own=["goal"], pair=["whole"]).offers
+    assert STAGES in FeatureEnergy(own=["goal"], pair=["longitudinal"]).offers
