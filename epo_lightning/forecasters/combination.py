@@ -107,6 +107,8 @@ class Combination:
                 if both.obstacle is None
             }
             working = list(two)[:6]
+        if not working:
+            raise ConfigError(f"{obstacle}. More than two parts would have to change: begin with an existing row")
         alternatives = Counter(word.partition("=")[0] for word in working)
         working.sort(
             key=lambda word: alternatives[word.partition("=")[0]]

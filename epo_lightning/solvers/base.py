@@ -19,8 +19,8 @@ from epo_lightning.scene import Scene
 
 PATH, STEPS, STATIONARY, SAMPLES, TABLES = "path", "steps", "stationary", "samples", "tables"
 """Properties that a minimiser can provide. PATH: its steps can be differentiated. STEPS: they can be interrupted and
-continued. STATIONARY: dE/du vanishes at its solution. SAMPLES: the solution is a sample of exp(-E). TABLES: the solution has
-energies and log-probabilities of candidates."""
+continued. STATIONARY: dE/du vanishes at its solution, or it attaches a derivative of its own. SAMPLES: the solution is a
+sample of exp(-E). TABLES: the solution has energies and log-probabilities of candidates."""
 
 
 class Minimiser(ABC):

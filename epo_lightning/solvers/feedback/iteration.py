@@ -28,7 +28,6 @@ from epo_lightning.scene import Scene
 from epo_lightning.solvers.feedback import compiled
 from epo_lightning.solvers.feedback.lq_game import LQGame, Policy
 from epo_lightning.solvers.feedback.stages import lq_game
-from epo_lightning.solvers.general.descent import wide
 
 _LARGEST_MOVE = 1.5
 """Largest change of a state in one iteration [m, rad, m/s], as in GameInference.jl (Peters, 2020)."""
@@ -92,7 +91,7 @@ def iterate(
         has no unique equilibrium or the next trajectory is not finite; such a game keeps its last trajectory.
     """
     batch, modes = controls.shape[:2]
-    game, controls = game.one_by_one(modes), controls.flatten(0, 1)[:, None]
+    game, controls = game.one_by_one(modes), controls.flatten(0, 1)[:, None].clone()
     states = game.states(controls)
     status = torch.full((len(controls),), int(Status.DAMPED), device=controls.device)
     length = controls.new_ones(len(controls))
@@ -132,7 +131,9 @@ def _step(
     return trial, chosen, change, policy.unique
 
 
-def attach(game: FeedbackGame, controls: Float[Tensor, "B M N K 2"], terms: int) -> Float[Tensor, "B M N K 2"]:
+def attach(
+    game: FeedbackGame, controls: Float[Tensor, "B M N K 2"], solved: Bool[Tensor, "B M"], terms: int
+) -> Float[Tensor, "B M N K 2"]:
     """The controls of a solution, with the derivative of the fixed point by the parameters of the game.
 
     The linear system with D_u is solved by a Neumann series, which is the adjoint of the iteration.
@@ -140,6 +141,7 @@ def attach(game: FeedbackGame, controls: Float[Tensor, "B M N K 2"], terms: int)
     Args:
         game: the game.
         controls: its solution.
+        solved: mask of the games with a derivative; that of the others is zero.
         terms: largest number of terms of the series. A single one is the derivative of one iteration.
     """
     tensors: list[Tensor] = []
@@ -149,48 +151,48 @@ def attach(game: FeedbackGame, controls: Float[Tensor, "B M N K 2"], terms: int)
         return tensor
 
     game.parameters.map(collect)
-    return _Attach.apply(game, terms, controls, *tensors)
+    return _Attach.apply(game, solved, terms, controls, *tensors)
 
 
 class _Attach(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, game: FeedbackGame, terms: int, controls: Tensor, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, game: FeedbackGame, solved: Tensor, terms: int, controls: Tensor, *tensors: Tensor) -> Tensor:
         ctx.game, ctx.terms = game, terms
-        ctx.save_for_backward(controls, *tensors)
+        ctx.save_for_backward(solved, controls, *tensors)
         return controls.view_as(controls)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        controls, *tensors = (
-            tensor.detach().requires_grad_(tensor.is_floating_point()) for tensor in ctx.saved_tensors
-        )
-        given = iter(tensors)
-        game = dataclasses.replace(ctx.game, parameters=ctx.game.parameters.map(lambda _: next(given)))
+        solved, controls, *given = ctx.saved_tensors
+        tensors = [tensor.detach().requires_grad_(tensor.is_floating_point()) for tensor in given]
+        rest = iter(tensors)
+        game = dataclasses.replace(ctx.game, parameters=ctx.game.parameters.map(lambda _: next(rest)))
+        rows = solved.flatten().nonzero()[:, 0]
+        at = controls.flatten(0, 1)[rows][:, None].requires_grad_()
         with torch.enable_grad():
-            around = game.around(game.states(controls), controls)
+            some = game.one_by_one(solved.shape[1])[rows]
+            around = some.around(some.states(at), at)
         policy = around.equilibrium()
 
         def pull_back(away: Tensor, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
             """D_u' or D_p' times a covector of the controls."""
-            return around.pull_back(policy, away.flatten(0, 1), inputs)
+            return around.pull_back(policy, away[:, 0], inputs)
 
-        wanted = _adjoint(lambda away: pull_back(away, [controls])[0], cotangent, ctx.terms)
-        taught = [tensor for tensor in tensors if tensor.requires_grad]
-        found = iter(pull_back(wanted, taught))
-        return None, None, None, *(next(found) if tensor.requires_grad else None for tensor in tensors)
+        wanted = _adjoint(lambda away: pull_back(away, [at])[0], cotangent.flatten(0, 1)[rows][:, None], ctx.terms)
+        found = iter(pull_back(wanted, [tensor for tensor in tensors if tensor.requires_grad]))
+        return None, None, None, None, *(next(found) if tensor.requires_grad else None for tensor in tensors)
 
 
-def _adjoint(by_controls: Callable[[Tensor], Tensor], cotangent: Tensor, terms: int) -> Tensor:
+def _adjoint(by_controls: Callable[[Tensor], Tensor], cotangent: Tensor, terms: int) -> Float[Tensor, "S 1 N K 2"]:
     """The solution y of -D_u' y = v for a cotangent v, where ``by_controls`` multiplies by D_u'.
 
     A game whose sum gets no closer to the solution gets no further terms.
     """
-    total, least = cotangent, cotangent.flatten(2).norm(dim=-1)
+    total, least = cotangent, cotangent.flatten(1).norm(dim=-1)
     for _ in range(terms - 1):
-        moved = by_controls(total)
-        missing = cotangent + moved
-        size = missing.flatten(2).norm(dim=-1)
-        total = torch.where(wide(size < least), total + missing, total)
+        missing = cotangent + by_controls(total)
+        size = missing.flatten(1).norm(dim=-1)
+        total = torch.where((size < least)[:, None, None, None, None], total + missing, total)
         least = torch.where(size < least, size, 0.0)
     return total

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole
-from epo_lightning.forecast import GameParameters, Solution
+from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import FEATURES, STAGES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import register
@@ -75,9 +75,13 @@ class ToFeedback(Minimiser):
     def attach(
         self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
     ) -> tuple[Tensor, Tensor]:
-        """The controls with the derivative of the fixed point; ``exact`` has no meaning here."""
+        """The controls with the derivative of the fixed point, which is zero where the status is STOPPED.
+
+        ``exact`` has no meaning here.
+        """
         assert isinstance(energy, FeatureEnergy)
-        controls = attach(self._game(energy, scene, parameters), _on_host(solution.controls), self.terms)
+        solved = _on_host(solution.status != Status.STOPPED)
+        controls = attach(self._game(energy, scene, parameters), _on_host(solution.controls), solved, self.terms)
         return controls.to(solution.controls), solution.status
 
     def _game(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> FeedbackGame:

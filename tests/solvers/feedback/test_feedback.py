@@ -123,6 +123,24 @@ def test_more_terms_of_the_series_come_closer_to_the_derivative() -> None:
     assert missed[2] < 0.1 * missed[1]
 
 
+def test_a_scene_with_nan_is_stopped_and_has_no_gradient() -> None:
+    scene, game = meeting(2.3, -2.6)
+    scene.history[1, 0, 0, 0] = torch.nan
+    leaves = leaves_of(game)
+    found = Implicit()(Feedback(), ENERGY, scene, leaves)
+    assert (found.status[1] == Status.STOPPED).all()
+    found.states[0].sum().backward()
+    for gradient in (leaves.goals.grad, leaves.pair_weights["clearance"].grad, leaves.own_weights["vel"].grad):
+        assert gradient[0].abs().sum() > 0
+        assert (gradient[1] == 0).all()
+
+
+def test_the_given_strategies_stay_unchanged() -> None:
+    scene, game = meeting(2.3)
+    Feedback().descent().near_minimum()(ENERGY, scene, game)
+    assert (game.initial_controls == 0).all()
+
+
 def test_too_few_iterations_are_reported() -> None:
     scene, game = meeting(2.3)
     assert (Feedback(iterations=1, tolerance=1e-9)(ENERGY, scene, game).status == Status.DAMPED).all()
