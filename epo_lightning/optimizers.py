@@ -57,7 +57,15 @@ class Adam:
             parameters: the parameters to learn.
             total_steps: number of steps that the schedule lasts.
             shared: those of ``parameters`` whose learning rate is multiplied by ``shared_factor``.
+
+        Raises:
+            ConfigError: ``shared_factor`` would have no effect.
         """
+        if self.shared_factor != 1 and not shared:
+            raise ConfigError(
+                f"optimizer.shared_factor={self.shared_factor:g} has no effect: this forecaster has no cost weights that "
+                "all scenes share. Set it to 1, or share weights: forecaster.own_weights=shared, or pair_weights"
+            )
         # fused: one call for all parameters, not a dozen for each
         adam = torch.optim.Adam(self._groups(parameters, shared), lr=self.lr, fused=True)
         shape = _SCHEDULES[self.schedule]
@@ -65,7 +73,7 @@ class Adam:
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def _groups(self, parameters: Iterable[nn.Parameter], shared: Sequence[nn.Parameter]) -> list[dict[str, Any]]:
-        if self.shared_factor == 1 or not shared:
+        if self.shared_factor == 1:
             return [{"params": parameters}]
         faster = {id(parameter) for parameter in shared}
         others = [parameter for parameter in parameters if id(parameter) not in faster]

@@ -37,9 +37,15 @@ def test_weights_of_all_scenes_learn_by_their_own_factor():
 def test_one_group_of_parameters_is_enough_without_a_factor():
     """Runs of versions without the factor can be continued."""
     network, shared = (torch.nn.Parameter(torch.zeros(1)) for _ in range(2))
-    for adam, given in ((Adam(shared_factor=1.0), [shared]), (Adam(shared_factor=10), [])):
-        (group,) = adam.configure([network, shared], 5, given)["optimizer"].param_groups
-        assert len(group["params"]) == 2
+    (group,) = Adam(shared_factor=1.0).configure([network, shared], 5, [shared])["optimizer"].param_groups
+    assert len(group["params"]) == 2
+
+
+def test_a_factor_without_shared_weights_is_refused():
+    with pytest.raises(
+        ConfigError, match=r"optimizer\.shared_factor=10 has no effect: .* Set it to 1, or share weights"
+    ):
+        Adam(shared_factor=10).configure([torch.nn.Parameter(torch.zeros(1))], 5)
 
 
 def test_all_parameters_may_be_shared():

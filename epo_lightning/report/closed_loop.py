@@ -123,5 +123,5 @@ def _of(values: Mapping[str, Value], name: str, file: Path, kind: str) -> Value:
 def _text(estimate: Mapping[str, float], unit: str | None) -> str:
     mean = estimate["mean"]
     scale, digits = (100, 1) if unit == SHARE else (1, 0 if abs(mean) >= 100 else 2 if abs(mean) >= 0.2 else 3)
-    middle, *ends = (f"{scale * estimate[name]:.{digits}f}" for name in ("mean", "low", "high"))
+    middle, *ends = (f"{scale * estimate[name]:z.{digits}f}" for name in ("mean", "low", "high"))
     return f"{middle} ({' to '.join(ends)})"

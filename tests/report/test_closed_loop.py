@@ -28,7 +28,7 @@ def results() -> dict[str, Any]:
             "plays": {
                 "planners": {
                     FIRST: {"collision": estimate(0.106, 0.082, 0.136), "cost": estimate(945.4, 889.0, 1004.0)},
-                    SECOND: {"collision": estimate(0.0, 0.0, 0.0076), "cost": estimate(0.1234, -0.5, 0.5)},
+                    SECOND: {"collision": estimate(0.0, 0.0, 0.0076), "cost": estimate(0.1234, -0.0001, 0.5)},
                 },
                 "differences": {
                     f"{FIRST} - {SECOND}": {"collision": estimate(0.106, 0.08, 0.13), "cost": estimate(1.5, 1.0, 2.0)}
@@ -61,7 +61,7 @@ def test_a_page_shows_estimates_differences_and_times(file: Path, tmp_path: Path
         [
             "| planner | cost | collision [%] |",
             "|:--|--:|--:|",
-            f"| {SECOND} | 0.123 (-0.500 to 0.500) | 0.0 (0.0 to 0.8) |",
+            f"| {SECOND} | 0.123 (0.000 to 0.500) | 0.0 (0.0 to 0.8) |",
             f"| {FIRST} | 945 (889 to 1004) | 10.6 (8.2 to 13.6) |",
             "10.6 (8.0 to 13.0)",
             "| planner | clock 99 % | clock median | plans |",

@@ -6,15 +6,15 @@ The deviations x_k of the agents' states from a trajectory, and u_k of their con
 
 where A and B have a block for every agent, and agent i minimises the sum over all stages of
 
-    1/2 x_{k+1}' Q_i x_{k+1} + q_i' x_{k+1} + 1/2 u_i' R_i u_i + r_i' u_i + 1/2 rho |u_k|^2,
+    1/2 x_{k+1}' Q_i x_{k+1} + q_i' x_{k+1} + 1/2 u_i' R_i u_i + r_i' u_i + 1/2 rho (|x_{k+1}|^2 + |u_k|^2),
 
 where u_i are its own controls. Q_i and q_i are the sums of its own cost and those of its pairs. In a feedback Nash
 equilibrium the agents have affine policies u_k = G_k x_k + f_k: each is the best answer to the policies of the others, from
 every state. So an agent counts on the reactions of the others; in an open-loop equilibrium
 (:mod:`~epo_lightning.solvers.gauss_newton`) it takes their controls as given.
 
-Letters: S games, n = 4 N joint states, m = 2 N joint controls; a number at the end of a letter is added to it (n1 = n + 1).
-Matrices with one more column hold a matrix and a vector: [Q | q] for a cost, [G | f] for a policy.
+Letters: S games, n = 4 N joint states, m = 2 N joint controls. Matrices with one more column hold a matrix and a vector:
+[Q | q] for a cost, [G | f] for a policy.
 """
 
 from __future__ import annotations
@@ -39,8 +39,7 @@ class LQGame:
         own_cost: [Q | q] of every agent's own cost, by its state.
         pair_cost: [Q | q] of the cost of every pair, by the states of both agents; each of the two counts it.
         effort, push: R and r of every agent.
-        rho: weight of the squared joint controls in the cost of every agent, and of the squared joint states, at the stages
-            of the game.
+        rho: weight of the squared joint states and controls in the cost of every agent; zero after the end of a game.
         free: mask of the controls that are chosen; the others stay zero, such as those after the end of a game.
     """
 
