@@ -22,7 +22,7 @@ WORDS = {
     STAGES: "features of single time steps alone (no jerk or other rates, no steering; energy=rpi_game has such features)",
     PATH: "a path that can be differentiated",
     STEPS: "steps that can be interrupted and continued",
-    STATIONARY: "strategies at which the gradient vanishes",
+    STATIONARY: "solutions with an implicit derivative",
     SAMPLES: "samples",
     TABLES: "energies of candidates",
 }
@@ -32,6 +32,8 @@ KINDS = ("energy", "solver", "backward", "objective")
 @dataclass(frozen=True)
 class Combination:
     """One part of each of the four kinds: instances, or only their classes, because declarations are class attributes.
+
+    Only an energy of features may offer more than its class does, which depends on its features.
 
     Attributes:
         names: registered names of the parts, by kind; for messages.

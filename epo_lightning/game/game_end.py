@@ -63,7 +63,9 @@ def at_end(values: Float[Tensor, "*lead B C N K X"], ends: Int[Tensor, " B"] | N
     """The entries of the last step of every game."""
     if ends is None:
         return values[..., -1, :]
-    return torch.take_along_dim(values, (ends - 1).view(*[1] * (values.dim() - 5), -1, 1, 1, 1, 1), -2)[..., 0, :]
+    return torch.take_along_dim(values, (ends.long() - 1).view(*[1] * (values.dim() - 5), -1, 1, 1, 1, 1), -2)[
+        ..., 0, :
+    ]
 
 
 def until(

@@ -64,12 +64,13 @@ def pull_back(
     free: Mask,
     gains: Array,
     offsets: Array,
+    unique: Mask,
     deviation_bar: Array,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """The derivative of :func:`equilibria`, from that by the controls which the policies choose from x_0 = 0 on, [S, K, m].
 
     It is right where all offsets are zero, as at a solution of the iteration: then the deviation from the trajectory is
-    zero, and depends on the gains and the dynamics only through the offsets.
+    zero, and depends on the gains and the dynamics only through the offsets. Games without a unique equilibrium have zeros.
 
     Returns:
         the derivatives by ``A``, ``B``, ``own_cost``, ``pair_cost``, ``effort`` and ``push``.
@@ -87,6 +88,8 @@ def pull_back(
     value, ahead = np.empty((agents, n, n + 1)), np.empty((n, n + 1))
     policy, closed = np.empty((m, n + 1)), np.empty((n, n + 1))
     for s in range(count):
+        if not unique[s]:
+            continue
         value[:] = 0.0
         for k in range(horizon - 1, -1, -1):
             _add_costs(own_cost[s, :, k], pair_cost[s, :, k], rho if free[s, :, k].any() else 0.0, value)
@@ -194,6 +197,9 @@ def _stationarity(
     for i in range(agents):
         for r in range(CONTROL):
             row = CONTROL * i + r
+            if not free[i]:
+                matrix[row, row] = 1.0
+                continue
             for j in range(agents):
                 for a in range(STATE):
                     entry = slope[row, STATE * j + a]
@@ -204,7 +210,7 @@ def _stationarity(
             right[row, n] = -slope[row, n] - push[i, r]
             for c in range(CONTROL):
                 matrix[row, CONTROL * i + c] += effort[i, r, c]
-            matrix[row, row] += rho if free[i] else 1.0
+            matrix[row, row] += rho
 
 
 @njit(cache=True)
@@ -425,6 +431,8 @@ def _pull_back_stage(
     _slopes(B, value, slope)
     # matrix = S B + R, right = -(S [A | 0] + [0 | s + r]) with [S | s] the slopes.
     for i in range(agents):
+        if not free[i]:
+            continue
         for r in range(CONTROL):
             row = CONTROL * i + r
             for j in range(agents):

@@ -23,6 +23,7 @@ from torch.autograd.function import once_differentiable
 
 from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.game_end import free_controls
 from epo_lightning.game.selection import games
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.feedback import compiled
@@ -60,7 +61,7 @@ class FeedbackGame:
         """The games of some scenes."""
         return dataclasses.replace(self, scene=self.scene[rows], parameters=self.parameters[rows])
 
-    def around(self, states: Float[Tensor, "B M N K 4"], controls: Float[Tensor, "B M N K 2"]) -> LQGame:
+    def linearised(self, states: Float[Tensor, "B M N K 4"], controls: Float[Tensor, "B M N K 2"]) -> LQGame:
         """The LQ games around trajectories."""
         return lq_game(self.energy, self.scene, self.parameters, states, controls, self.rho)
 
@@ -84,7 +85,7 @@ class FeedbackGame:
 def iterate(
     game: FeedbackGame, controls: Float[Tensor, "B M N K 2"], iterations: int, tolerance: float
 ) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
-    """Iterate LQ games until no state changes by ``tolerance`` or more.
+    """Iterate LQ games until their policies want to change no state by ``tolerance`` or more.
 
     Returns:
         the controls, and a status: SOLVED where the iteration has ended, DAMPED where it has not, STOPPED where an LQ game
@@ -100,35 +101,35 @@ def iterate(
         going = (status == Status.DAMPED).nonzero()[:, 0]
         if not len(going):
             break
-        trial, chosen, change, unique = _step(game[going], states[going], controls[going], length[going])
-        usable = unique & (change <= _LARGEST_MOVE)
+        trial, chosen, wanted, usable = _step(game[going], states[going], controls[going], length[going])
         moved = going[usable]
         states[moved], controls[moved] = trial[usable], chosen[usable]
-        status[moved] = torch.where(change[usable] < tolerance, int(Status.SOLVED), int(Status.DAMPED))
+        status[moved] = torch.where(wanted[usable] < tolerance, int(Status.SOLVED), int(Status.DAMPED))
         status[going[~usable]] = int(Status.STOPPED)
         # Policies that answer each other may oscillate.
-        slower = going[~(change < before[going])]
+        slower = going[~(wanted < before[going])]
         length[slower] = (0.5 * length[slower]).clamp_min(_SHORTEST)
-        before[going] = change
+        before[going] = wanted
     return controls.view(batch, modes, *controls.shape[2:]), status.view(batch, modes)
 
 
 def _step(
     game: FeedbackGame, states: Tensor, controls: Tensor, length: Float[Tensor, " S"]
 ) -> tuple[Float[Tensor, "S 1 N K 4"], Float[Tensor, "S 1 N K 2"], Float[Tensor, " S"], Bool[Tensor, " S"]]:
-    """The next trajectories, their largest changes, and a mask of the games with a unique equilibrium.
+    """The next trajectories, the largest change of a state that the policies want, and a mask of the usable steps.
 
-    Steps are halved until they change no state by too much.
+    Steps are halved until they change no state by too much. What happens after the end of a game does not count.
     """
-    policy = game.around(states, controls).equilibrium()
+    policy = game.linearised(states, controls).equilibrium()
+    counts = free_controls(game.scene, states.shape[3])[:, None, :, :, None]
     for _ in range(_HALVINGS):
         trial, chosen = game.follow(states, controls, policy, length)
-        change = (trial - states).flatten(1).abs().amax(-1)
+        change = torch.where(counts, trial - states, 0.0).flatten(1).abs().amax(-1)
         far = ~(change <= _LARGEST_MOVE)
         if not far.any():
             break
         length = torch.where(far, 0.5 * length, length)
-    return trial, chosen, change, policy.unique
+    return trial, chosen, change / length, policy.unique & ~far
 
 
 def attach(
@@ -141,7 +142,7 @@ def attach(
     Args:
         game: the game.
         controls: its solution.
-        solved: mask of the games with a derivative; that of the others is zero.
+        solved: mask of the games that are solved; the derivative of the others is zero.
         terms: largest number of terms of the series. A single one is the derivative of one iteration.
     """
     tensors: list[Tensor] = []
@@ -172,14 +173,14 @@ class _Attach(torch.autograd.Function):
         at = controls.flatten(0, 1)[rows][:, None].requires_grad_()
         with torch.enable_grad():
             some = game.one_by_one(solved.shape[1])[rows]
-            around = some.around(some.states(at), at)
-        policy = around.equilibrium()
+            local = some.linearised(some.states(at), at)
+        policy = local.equilibrium()
 
-        def pull_back(away: Tensor, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        def pull_back(covector: Tensor, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
             """D_u' or D_p' times a covector of the controls."""
-            return around.pull_back(policy, away[:, 0], inputs)
+            return local.pull_back(policy, covector[:, 0], inputs)
 
-        wanted = _adjoint(lambda away: pull_back(away, [at])[0], cotangent.flatten(0, 1)[rows][:, None], ctx.terms)
+        wanted = _adjoint(lambda v: pull_back(v, [at])[0], cotangent.flatten(0, 1)[rows][:, None], ctx.terms)
         found = iter(pull_back(wanted, [tensor for tensor in tensors if tensor.requires_grad]))
         return None, None, None, None, *(next(found) if tensor.requires_grad else None for tensor in tensors)
 

@@ -40,7 +40,7 @@ class LQGame:
         pair_cost: [Q | q] of the cost of every pair, by the states of both agents; each of the two counts it.
         effort, push: R and r of every agent.
         rho: weight of the squared joint states and controls in the cost of every agent; zero after the end of a game.
-        free: mask of the controls that are chosen; the others stay zero, such as those after the end of a game.
+        free: mask of the controls that are chosen; policies leave the others as they are, such as those after the end.
     """
 
     A: Float[Tensor, "S N K 4 4"]
@@ -65,7 +65,7 @@ class LQGame:
         zero, as at a solution of the iteration.
         """
         by_controls = cotangent.transpose(1, 2).flatten(2).contiguous().numpy()
-        arrays: list[Any] = [*self._arrays(), policy.gains.numpy(), policy.offsets.numpy(), by_controls]
+        arrays: list[Any] = [*self._arrays(), *(part.numpy() for part in vars(policy).values()), by_controls]
         bars = map(torch.from_numpy, compiled.pull_back(*arrays))
         known = [(part, bar) for part, bar in zip(self._parts(), bars, strict=True) if part.requires_grad]
         parts, cotangents = zip(*known, strict=True)

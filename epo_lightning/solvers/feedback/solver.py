@@ -51,13 +51,7 @@ class ToFeedback(Minimiser):
             ValueError: the energy has other terms than features of single time steps; or as
                 :meth:`LevenbergMarquardt.run`.
         """
-        if not isinstance(energy, FeatureEnergy):
-            raise ValueError(f"solver=feedback takes energy=features, not {type(energy).__name__}")
-        if energy.between_steps:
-            raise ValueError(
-                f"solver=feedback takes features of single time steps, and not {', '.join(energy.between_steps)}: leave "
-                "them out, or choose another solver"
-            )
+        energy = _checked(energy)
         scene, start = descent.begin(energy, scene, parameters)
         if start.numel() == 0:
             return descent.nothing(start)
@@ -75,17 +69,34 @@ class ToFeedback(Minimiser):
     def attach(
         self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
     ) -> tuple[Tensor, Tensor]:
-        """The controls with the derivative of the fixed point, which is zero where the status is STOPPED.
+        """The controls with the derivative of the fixed point, which is zero where the game is not solved.
 
-        ``exact`` has no meaning here.
+        ``exact`` has no meaning here: Gauss-Newton costs are part of the fixed point.
         """
         assert isinstance(energy, FeatureEnergy)
-        solved = _on_host(solution.status != Status.STOPPED)
+        solved = _on_host(solution.status == Status.SOLVED)
         controls = attach(self._game(energy, scene, parameters), _on_host(solution.controls), solved, self.terms)
         return controls.to(solution.controls), solution.status
 
     def _game(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> FeedbackGame:
+        scene = dataclasses.replace(scene, future=None, future_mask=None, lanes=None, lane_mask=None)  # not used
         return FeedbackGame(energy, scene.map(_on_host), parameters.map(_on_host), self.regularisation)
+
+
+def _checked(energy: Energy) -> FeatureEnergy:
+    """The energy, whose features are all of single time steps.
+
+    Raises:
+        ValueError: it is another one; the message names the features.
+    """
+    if not isinstance(energy, FeatureEnergy):
+        raise ValueError(f"solver=feedback takes energy=features, not {type(energy).__name__}")
+    if energy.between_steps:
+        raise ValueError(
+            f"solver=feedback takes features of single time steps, and not {', '.join(energy.between_steps)}: leave them "
+            "out, or choose another solver"
+        )
+    return energy
 
 
 def _on_host(tensor: Tensor) -> Tensor:
@@ -103,7 +114,7 @@ class Feedback(BothSides):
 
     Attributes:
         iterations: largest number of LQ games.
-        tolerance: change of the states [m, rad, m/s] in one iteration below which a game is solved.
+        tolerance: largest change of a state [m, rad, m/s] that the policies of a solved game want.
         regularisation: multiple of the identity that is added to the Hessians of every agent's cost by states and controls.
             It is part of the game: policies depend on it. 5 in GameInference.jl (Peters, 2020), which the paper's data are
             made with.
@@ -134,7 +145,7 @@ class Feedback(BothSides):
         Raises:
             ValueError: as :meth:`ToFeedback.__call__`.
         """
-        found = super().__call__(energy, scene, parameters)
+        found = super().__call__(_checked(energy), scene, parameters)
         game = dataclasses.replace(parameters.for_every_mode(self.modes), initial_controls=found.controls)
         return dataclasses.replace(
             self.descent().near_minimum()(energy, scene, game), initial_energy=found.initial_energy

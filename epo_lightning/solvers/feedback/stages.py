@@ -69,7 +69,7 @@ def _own_costs(
     ends = scene.game_steps
     if ends is None:
         ends = torch.full((len(controls),), horizon, device=controls.device)
-    last = F.one_hot(ends - 1, horizon).to(controls.dtype)[:, None, None, :, None]
+    last = F.one_hot(ends.long() - 1, horizon).to(controls.dtype)[:, None, None, :, None]
     residuals, changes = [], []
     for name, feature in energy.own_features.items():
         residual, change = energy.own_residual(name, scene, parameters, around, (states, controls), moved)
@@ -79,7 +79,12 @@ def _own_costs(
             residual, change = residual.unflatten(-1, (horizon, -1)), change.unflatten(-1, (horizon, -1))
         residuals.append(residual)
         changes.append(change)
-    cost = _squared(torch.cat(residuals, -1), torch.cat(changes, -1).movedim(0, -1))
+    none = controls.new_zeros(*controls.shape[:4], 0)  # an energy may have no own features
+    residual, change = (
+        torch.cat((none, *residuals), -1),
+        torch.cat((none.expand(STATE + CONTROL, *none.shape), *changes), -1),
+    )
+    cost = _squared(residual, change.movedim(0, -1))
     matrix, slope = cost[..., :-1], cost[..., -1]
     own_cost = torch.cat((matrix[..., :STATE, :STATE], slope[..., :STATE, None]), -1)
     return own_cost, matrix[..., STATE:, STATE:], slope[..., STATE:]

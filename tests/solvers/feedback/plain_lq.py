@@ -47,11 +47,8 @@ def equilibrium(game: LQGame) -> tuple[Tensor, Tensor]:
     n, m = STATE * agents, CONTROL * agents
     A, B, own_effort = joint(game.A), joint(game.B), joint(game.effort)
     Q, q = joint_costs(game)
-    still = (
-        torch.where(game.free.transpose(1, 2), torch.tensor(game.rho, dtype=torch.double), 1.0)
-        .repeat_interleave(CONTROL, -1)
-        .diag_embed()
-    )
+    free = game.free.transpose(1, 2).repeat_interleave(CONTROL, -1)[..., None]
+    eye = torch.eye(m, dtype=torch.double)
     V, v = torch.zeros(count, agents, n, n, dtype=torch.double), torch.zeros(count, agents, n, dtype=torch.double)
     gains, offsets = [], []
     for k in range(horizon - 1, -1, -1):
@@ -62,7 +59,8 @@ def equilibrium(game: LQGame) -> tuple[Tensor, Tensor]:
             at = (game.B[:, i, k].mT @ v[:, i, STATE * i : STATE * (i + 1), None])[..., 0] + game.push[:, i, k]
             rows.append(slope @ B[:, k])
             right.append(torch.cat((slope @ A[:, k], at[..., None]), -1))
-        policy = torch.linalg.solve(torch.cat(rows, 1) + own_effort[:, k] + still[:, k], -torch.cat(right, 1))
+        matrix = torch.where(free[:, k], torch.cat(rows, 1) + own_effort[:, k] + game.rho * eye, eye)
+        policy = torch.linalg.solve(matrix, torch.where(free[:, k], -torch.cat(right, 1), 0.0))
         G, f = policy[..., :n], policy[..., n]
         gains.append(G)
         offsets.append(f)

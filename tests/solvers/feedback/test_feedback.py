@@ -153,3 +153,31 @@ def test_single_precision_and_empty_batches() -> None:
     assert found.controls.dtype == torch.float32
     torch.testing.assert_close(found.states.double(), exact.states, rtol=0, atol=1e-2)
     assert Feedback()(ENERGY, scene[[]], game[[]]).states.shape == (0, 2, 2, HORIZON, 4)
+
+
+def test_steps_after_the_end_of_a_game_have_no_effect() -> None:
+    scene, game = meeting(2.3, -2.6)
+    solver = Feedback().descent().near_minimum()
+    wanted = solver(ENERGY, scene, game)
+    longer = torch.nn.functional.pad(game.initial_controls, (0, 0, 0, 30), value=4.0)
+    ends = torch.full((2,), HORIZON, dtype=torch.int32)
+    found = solver(
+        ENERGY, dataclasses.replace(scene, game_steps=ends), dataclasses.replace(game, initial_controls=longer)
+    )
+    assert torch.equal(found.status, wanted.status)
+    torch.testing.assert_close(found.states[..., :HORIZON, :], wanted.states, rtol=0, atol=1e-9)
+
+
+def test_only_solved_games_have_a_gradient() -> None:
+    scene, game = meeting(2.3)
+    leaves = leaves_of(game)
+    Implicit()(Feedback(iterations=1, tolerance=1e-9), ENERGY, scene, leaves).states.sum().backward()
+    assert (leaves.goals.grad == 0).all()
+
+
+def test_an_energy_of_pairs_alone_can_be_solved() -> None:
+    scene, game = meeting(2.3)
+    pairs = dataclasses.replace(ENERGY, own=[])
+    found = Feedback()(pairs, scene, dataclasses.replace(game, own_weights={}))
+    assert (found.status == Status.SOLVED).all()
+    assert found.states.isfinite().all()
