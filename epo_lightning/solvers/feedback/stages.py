@@ -1,6 +1,6 @@
 """The linear-quadratic game around a trajectory: dynamics and costs of every agent, stage by stage.
 
-The cost of agent i is its own features and those of all its pairs, J_i = E_i + sum_j E_ij (Eq. 6). A stage is a time step:
+The cost of agent i is its own features and those of all its pairs, J_i = E_i + sum_j E_ij (Theorem 1). A stage is a time step:
 the control u_k, and the state x_{k+1} that it leads to. So features must be sums over stages: those of controls, speeds,
 positions, goals and distances are. Rates couple the controls of two stages, and a steering angle a turn rate with the speed
 before it; these are not taken here. Second derivatives of residuals are left out (Gauss-Newton), so that all costs are
@@ -80,11 +80,9 @@ def _own_costs(
         residuals.append(residual)
         changes.append(change)
     none = controls.new_zeros(*controls.shape[:4], 0)  # an energy may have no own features
-    residual, change = (
-        torch.cat((none, *residuals), -1),
-        torch.cat((none.expand(STATE + CONTROL, *none.shape), *changes), -1),
-    )
-    cost = _squared(residual, change.movedim(0, -1))
+    residual = torch.cat((none, *residuals), -1)
+    jacobian = torch.cat((none.expand(STATE + CONTROL, *none.shape), *changes), -1).movedim(0, -1)
+    cost = _squared(residual, jacobian)
     matrix, slope = cost[..., :-1], cost[..., -1]
     own_cost = torch.cat((matrix[..., :STATE, :STATE], slope[..., :STATE, None]), -1)
     return own_cost, matrix[..., STATE:, STATE:], slope[..., STATE:]
