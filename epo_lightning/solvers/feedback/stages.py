@@ -2,9 +2,9 @@
 
 The cost of agent i is its own features and those of all its pairs, J_i = E_i + sum_j E_ij (Theorem 1). A stage is a time
 step: the control u_k, and the state x_{k+1} that it leads to. So features must be sums over stages: those of controls,
-speeds, positions, goals and distances are. Rates couple the controls of two stages, and a steering angle a turn rate with the
-speed before it; these are not taken here. Second derivatives of residuals are left out (Gauss-Newton), so that all costs are
-convex.
+speeds, positions, goals and distances are. Rates couple the controls of two stages, and a steering angle a turn rate with
+the speed before it; these are not taken here. Second derivatives of residuals are left out (Gauss-Newton), so that all costs
+are convex.
 """
 
 from __future__ import annotations
