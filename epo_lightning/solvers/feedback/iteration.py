@@ -3,7 +3,7 @@ linear-quadratic approximations for nonlinear multi-player general-sum different
 
 In every iteration the LQ game around the trajectory is solved, and the agents follow its policies, with their offsets
 multiplied by a step length, to the next trajectory. The iteration ends at a trajectory from which the policies of the LQ
-game around it do not deviate.
+game around it deviate by less than a tolerance.
 
 The derivative is that of this fixed point. Let D(u, p) be the deviation from the controls u that the LQ game suggests. At a
 solution D(u, p) = 0, so du/dp = -D_u^-1 D_p (implicit function theorem).

@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.solvers.feedback import compiled
+from epo_lightning.solvers.feedback import compiled, compiled_adjoint
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,9 @@ class LQGame:
         zero, as at a solution of the iteration.
         """
         by_controls = cotangent.transpose(1, 2).flatten(2).contiguous().numpy()
-        arrays: list[Any] = [*self._arrays(), *(part.numpy() for part in vars(policy).values()), by_controls]
-        bars = map(torch.from_numpy, compiled.pull_back(*arrays))
+        found = (part.numpy() for part in (policy.gains, policy.offsets, policy.unique))
+        arrays: list[Any] = [*self._arrays(), *found, by_controls]
+        bars = map(torch.from_numpy, compiled_adjoint.pull_back(*arrays))
         known = [(part, bar) for part, bar in zip(self._parts(), bars, strict=True) if part.requires_grad]
         parts, cotangents = zip(*known, strict=True)
         return torch.autograd.grad(

@@ -69,7 +69,7 @@ class ToFeedback(Minimiser):
     def attach(
         self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
     ) -> tuple[Tensor, Tensor]:
-        """The controls with the derivative of the fixed point, which is zero where the game is not solved.
+        """Controls with the derivative of the fixed point, which is zero where the game is not solved, and the status.
 
         ``exact`` has no meaning here: Gauss-Newton costs are part of the fixed point.
         """
@@ -154,5 +154,5 @@ class Feedback(BothSides):
     def attach(
         self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
     ) -> tuple[Tensor, Tensor]:
-        """As :meth:`ToFeedback.attach`."""
+        """The controls with their derivative, and a status, as :meth:`ToFeedback.attach`."""
         return self.descent().attach(energy, scene, parameters, solution, exact)

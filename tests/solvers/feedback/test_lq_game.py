@@ -60,9 +60,9 @@ def test_the_compiled_recursion_agrees_with_a_plain_one(agents: int, horizon: in
 
 @SIZES
 def test_every_policy_is_the_best_answer_to_the_others(agents: int, horizon: int) -> None:
-    """The minimum of one agent's cost over its controls, a dense linear system, if the others keep their policies.
+    """No agent gains by other controls than its policy chooses, if the others keep their policies, from any state.
 
-    In a feedback equilibrium of an LQ game the answer is the agent's own policy, from any state.
+    Its cost is quadratic in a deviation of its controls, so a gradient of zero and a convex Hessian prove it.
     """
     game = random_game(agents, horizon)
     policy = game.equilibrium()
@@ -102,7 +102,7 @@ def test_the_derivative_at_an_equilibrium_is_that_of_the_plain_recursion(agents:
     leaves = [getattr(game, name).requires_grad_() for name in names]
     cotangent = torch.randn(3, agents, horizon, 2, dtype=torch.double)
     found = game.pull_back(game.equilibrium(), cotangent, leaves)
-    suggested = plain_lq.deviation(dataclasses.replace(game))
+    suggested = plain_lq.deviation(game)
     wanted = torch.autograd.grad(
         suggested, leaves, cotangent.transpose(1, 2).flatten(2), allow_unused=True, materialize_grads=True
     )
