@@ -3,23 +3,18 @@ linear-quadratic approximations for nonlinear multi-player general-sum different
 
 In every iteration the LQ game around the trajectory is solved, and the agents follow its policies, with their offsets
 multiplied by a step length, to the next trajectory. The iteration ends at a trajectory from which the policies of the LQ
-game around it deviate by less than a tolerance.
-
-The derivative is that of this fixed point. Let D(u, p) be the deviation from the controls u that the LQ game suggests. At a
-solution D(u, p) = 0, so du/dp = -D_u^-1 D_p (implicit function theorem).
+game around it deviate by less than a tolerance. Anderson acceleration halves the number of LQ games.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
@@ -27,6 +22,7 @@ from epo_lightning.game.game_end import free_controls
 from epo_lightning.game.selection import games
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.feedback import compiled
+from epo_lightning.solvers.feedback.anderson import Anderson
 from epo_lightning.solvers.feedback.lq_game import LQGame, Policy
 from epo_lightning.solvers.feedback.stages import lq_game
 
@@ -35,6 +31,8 @@ _LARGEST_MOVE = 1.5
 _HALVINGS = 20
 _SHORTEST = 0.5
 """Step length of a game whose changes do not become smaller. Shorter ones creep."""
+_REMEMBERED = 3
+"""Number of trajectories of Anderson acceleration."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +78,11 @@ class FeedbackGame:
         visited, chosen = compiled.follow(*arrays)
         return torch.from_numpy(visited).view_as(states), torch.from_numpy(chosen).view_as(controls)
 
+    def change(self, states: Float[Tensor, "B M N K 4"], others: Float[Tensor, "B M N K 4"]) -> Float[Tensor, " B"]:
+        """The largest change of a state. What happens after the end of a game does not count."""
+        counts = free_controls(self.scene, states.shape[3])[:, None, :, :, None]
+        return torch.where(counts, others - states, 0.0).flatten(1).abs().amax(-1)
+
 
 @torch.no_grad()
 def iterate(
@@ -97,103 +100,66 @@ def iterate(
     status = torch.full((len(controls),), int(Status.DAMPED), device=controls.device)
     length = controls.new_ones(len(controls))
     before = torch.full_like(length, torch.inf)
+    memory = Anderson(len(controls), _REMEMBERED, controls[0].numel())
     for _ in range(iterations):
         going = (status == Status.DAMPED).nonzero()[:, 0]
         if not len(going):
             break
-        trial, chosen, wanted, usable = _step(game[going], states[going], controls[going], length[going])
-        moved = going[usable]
-        states[moved], controls[moved] = trial[usable], chosen[usable]
-        status[moved] = torch.where(wanted[usable] < tolerance, int(Status.SOLVED), int(Status.DAMPED))
-        status[going[~usable]] = int(Status.STOPPED)
+        some = game[going]
+        step = _step(some, states[going], controls[going], length[going])
+        status[going[step.wanted < tolerance]] = int(Status.SOLVED)
+        status[going[~step.usable]] = int(Status.STOPPED)
         # Policies that answer each other may oscillate.
-        slower = going[~(wanted < before[going])]
+        slower = going[~(step.wanted < before[going])]
         length[slower] = (0.5 * length[slower]).clamp_min(_SHORTEST)
-        before[going] = wanted
+        memory.forget(slower)
+        before[going] = step.wanted
+        flat, deviations = controls[going].flatten(1), step.deviations.flatten(1)
+        guess = memory.next(going, flat, deviations).view_as(step.controls)
+        memory.remember(going, flat, deviations)
+        states[going], controls[going] = _guarded(some, states[going], step, guess)
     return controls.view(batch, modes, *controls.shape[2:]), status.view(batch, modes)
 
 
-def _step(
-    game: FeedbackGame, states: Tensor, controls: Tensor, length: Float[Tensor, " S"]
-) -> tuple[Float[Tensor, "S 1 N K 4"], Float[Tensor, "S 1 N K 2"], Float[Tensor, " S"], Bool[Tensor, " S"]]:
-    """The next trajectories, the largest change of a state that the policies want, and a mask of the usable steps.
+@dataclass(frozen=True)
+class _Step:
+    """A step of S games.
 
-    Steps are halved until they change no state by too much. What happens after the end of a game does not count.
+    Attributes:
+        states, controls: the next trajectories.
+        deviations: the changes of the controls that the policies want.
+        wanted: the largest change of a state that they want.
+        usable: mask of the games that have a next trajectory; the others stay where they are.
     """
+
+    states: Float[Tensor, "S 1 N K 4"]
+    controls: Float[Tensor, "S 1 N K 2"]
+    deviations: Float[Tensor, "S 1 N K 2"]
+    wanted: Float[Tensor, " S"]
+    usable: Bool[Tensor, " S"]
+
+
+def _step(game: FeedbackGame, states: Tensor, controls: Tensor, length: Float[Tensor, " S"]) -> _Step:
+    """The step that the policies of the LQ games suggest, halved until it changes no state by too much."""
     policy = game.linearised(states, controls).equilibrium()
-    counts = free_controls(game.scene, states.shape[3])[:, None, :, :, None]
     for _ in range(_HALVINGS):
         trial, chosen = game.follow(states, controls, policy, length)
-        change = torch.where(counts, trial - states, 0.0).flatten(1).abs().amax(-1)
+        change = game.change(states, trial)
         far = ~(change <= _LARGEST_MOVE)
         if not far.any():
             break
         length = torch.where(far, 0.5 * length, length)
-    return trial, chosen, change / length, policy.unique & ~far
+    usable = policy.unique & ~far
+    known = usable[:, None, None, None, None]
+    trial, chosen = torch.where(known, trial, states), torch.where(known, chosen, controls)
+    deviations = (chosen - controls) / length[:, None, None, None, None]
+    return _Step(trial, chosen, deviations, torch.where(usable, change / length, torch.inf), usable)
 
 
-def attach(
-    game: FeedbackGame, controls: Float[Tensor, "B M N K 2"], solved: Bool[Tensor, "B M"], terms: int
-) -> Float[Tensor, "B M N K 2"]:
-    """The controls of a solution, with the derivative of the fixed point by the parameters of the game.
-
-    The linear system with D_u is solved by a Neumann series, which is the adjoint of the iteration.
-
-    Args:
-        game: the game.
-        controls: its solution.
-        solved: mask of the games that are solved; the derivative of the others is zero.
-        terms: largest number of terms of the series. A single one is the derivative of one iteration.
-    """
-    tensors: list[Tensor] = []
-
-    def collect(tensor: Tensor) -> Tensor:
-        tensors.append(tensor)
-        return tensor
-
-    game.parameters.map(collect)
-    return _Attach.apply(game, solved, terms, controls, *tensors)
-
-
-class _Attach(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, game: FeedbackGame, solved: Tensor, terms: int, controls: Tensor, *tensors: Tensor) -> Tensor:
-        ctx.game, ctx.terms = game, terms
-        ctx.save_for_backward(solved, controls, *tensors)
-        return controls.view_as(controls)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        solved, controls, *given = ctx.saved_tensors
-        tensors = [tensor.detach().requires_grad_(tensor.is_floating_point()) for tensor in given]
-        rest = iter(tensors)
-        game = dataclasses.replace(ctx.game, parameters=ctx.game.parameters.map(lambda _: next(rest)))
-        rows = solved.flatten().nonzero()[:, 0]
-        at = controls.flatten(0, 1)[rows][:, None].requires_grad_()
-        with torch.enable_grad():
-            some = game.one_by_one(solved.shape[1])[rows]
-            local = some.linearised(some.states(at), at)
-        policy = local.equilibrium()
-
-        def pull_back(covector: Tensor, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-            """D_u' or D_p' times a covector of the controls."""
-            return local.pull_back(policy, covector[:, 0], inputs)
-
-        wanted = _adjoint(lambda v: pull_back(v, [at])[0], cotangent.flatten(0, 1)[rows][:, None], ctx.terms)
-        found = iter(pull_back(wanted, [tensor for tensor in tensors if tensor.requires_grad]))
-        return None, None, None, None, *(next(found) if tensor.requires_grad else None for tensor in tensors)
-
-
-def _adjoint(by_controls: Callable[[Tensor], Tensor], cotangent: Tensor, terms: int) -> Float[Tensor, "S 1 N K 2"]:
-    """The solution y of -D_u' y = v for a cotangent v, where ``by_controls`` multiplies by D_u'.
-
-    A game whose sum gets no closer to the solution gets no further terms.
-    """
-    total, least = cotangent, cotangent.flatten(1).norm(dim=-1)
-    for _ in range(terms - 1):
-        missing = cotangent + by_controls(total)
-        size = missing.flatten(1).norm(dim=-1)
-        total = torch.where((size < least)[:, None, None, None, None], total + missing, total)
-        least = torch.where(size < least, size, 0.0)
-    return total
+def _guarded(
+    game: FeedbackGame, states: Tensor, step: _Step, guess: Tensor
+) -> tuple[Float[Tensor, "S 1 N K 4"], Float[Tensor, "S 1 N K 2"]]:
+    """The trajectories of guessed controls, and those of the step where these are too far."""
+    guessed = game.states(guess)
+    near = (game.change(states, guessed) <= _LARGEST_MOVE)[:, None, None, None, None]
+    return torch.where(near, guessed, step.states), torch.where(near, guess, step.controls)

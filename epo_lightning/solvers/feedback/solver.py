@@ -15,7 +15,8 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
-from epo_lightning.solvers.feedback.iteration import FeedbackGame, attach, iterate
+from epo_lightning.solvers.feedback.derivative import attach
+from epo_lightning.solvers.feedback.iteration import FeedbackGame, iterate
 from epo_lightning.solvers.gauss_newton.both_sides import BothSides
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.solvers.general import descent
@@ -118,12 +119,12 @@ class Feedback(BothSides):
         regularisation: multiple of the identity that is added to the Hessians of every agent's cost by states and controls.
             It is part of the game: policies depend on it. 5 in GameInference.jl (Peters, 2020), which the paper's data are
             made with.
-        terms: largest number of terms of the series for the derivative (:func:`~.iteration.attach`).
+        terms: number of steps of GMRES for the derivative (:func:`~.derivative.attach`).
     """
 
     needs_from_energy = frozenset({FEATURES, STAGES})
 
-    iterations: int = 60
+    iterations: int = 30
     tolerance: float = 1e-3
     regularisation: float = 5.0
     terms: int = 4

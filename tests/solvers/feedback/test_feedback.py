@@ -6,6 +6,8 @@ import dataclasses
 import math
 
 import numpy as np
+import pytest
+import scipy.sparse.linalg
 import torch
 from games import leaves_of
 
@@ -17,6 +19,9 @@ from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Implicit
+from epo_lightning.solvers.feedback import derivative, iteration
+from epo_lightning.solvers.feedback.anderson import Anderson
+from epo_lightning.solvers.feedback.lq_game import LQGame, Policy
 from epo_lightning.solvers.feedback.solver import Feedback
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -108,7 +113,63 @@ def test_solutions_have_the_derivative_of_the_fixed_point() -> None:
     torch.testing.assert_close(slope, (total(1e-5) - total(-1e-5)) / 2e-5, rtol=1e-4, atol=1e-4)
 
 
-def test_more_terms_of_the_series_come_closer_to_the_derivative() -> None:
+def test_acceleration_reaches_the_same_equilibria_in_fewer_games(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, game = meeting(math.pi, 2.3, -2.6, 1.2)
+    counted: list[int] = []
+
+    class Plain(Anderson):
+        def remember(self, *_: torch.Tensor) -> None:
+            pass
+
+    def solve(memory: type[Anderson]) -> torch.Tensor:
+        counted.append(0)
+        monkeypatch.setattr(iteration, "Anderson", memory)
+        found = Feedback(**EXACT)(ENERGY, scene, game)
+        assert (found.status == Status.SOLVED).all()
+        return found.states
+
+    def equilibrium(local: LQGame) -> Policy:
+        counted[-1] += len(local.A)
+        return one(local)
+
+    one = LQGame.equilibrium
+    monkeypatch.setattr(LQGame, "equilibrium", equilibrium)
+    torch.testing.assert_close(solve(Anderson), solve(Plain), rtol=0, atol=1e-7)
+    assert counted[0] < 0.8 * counted[1]
+
+
+def test_the_adjoint_is_that_of_the_linear_system() -> None:
+    """All steps of GMRES against a dense solution; fewer steps against SciPy's."""
+    generator = torch.Generator().manual_seed(0)
+    matrix = torch.randn(3, 12, 12, generator=generator, dtype=torch.double) / 12 - torch.eye(12, dtype=torch.double)
+    cotangent = torch.randn(3, 1, 2, 3, 2, generator=generator, dtype=torch.double)
+
+    def by_controls(covector: torch.Tensor) -> torch.Tensor:
+        return (matrix @ covector.flatten(1)[..., None]).view_as(covector)
+
+    flat = cotangent.flatten(1)
+    exact = torch.linalg.solve(-matrix, flat)
+    torch.testing.assert_close(derivative._gmres(by_controls, cotangent, 12).flatten(1), exact)
+    found = derivative._gmres(by_controls, cotangent, 3).flatten(1)
+    for system, vector, ours in zip(-matrix, flat, found, strict=True):
+        wanted, _ = scipy.sparse.linalg.gmres(system.numpy(), vector.numpy(), restart=3, maxiter=1, rtol=0)
+        np.testing.assert_allclose(ours.numpy(), wanted, atol=1e-9)
+
+
+def test_modes_without_loss_do_not_change_the_gradient_of_the_others() -> None:
+    scene, game = meeting(2.3, -2.6)
+
+    def gradient(share: float) -> torch.Tensor:
+        leaves = leaves_of(game)
+        states = Implicit()(Feedback(**EXACT), ENERGY, scene, leaves).states
+        (states[:, 0].sum() + share * states[:, 1].sum()).backward()
+        return leaves.goals.grad
+
+    assert (gradient(0.0)[:, 1] == 0).all()
+    torch.testing.assert_close(gradient(0.0)[:, 0], gradient(1.0)[:, 0])
+
+
+def test_more_steps_of_gmres_come_closer_to_the_derivative() -> None:
     scene, game = meeting(2.3)
 
     def slope(terms: int) -> torch.Tensor:
