@@ -189,6 +189,11 @@ def check(settings: Settings, forecaster: LightningModule) -> None:
     if not settings.trainer.graph:
         return
     solver = getattr(forecaster, "solver", None)
+    if getattr(solver, "on_host", False):
+        raise ConfigError(
+            f"trainer.graph=true with solver.name={settings.solver['name']}: its games are solved on the host, which a CUDA "
+            "graph cannot contain; set trainer.graph=false"
+        )
     backend = getattr(solver, "backend", BACKENDS[0])
     on_host = backend == "auto" and (importlib.util.find_spec("warp") is None or getattr(solver, "adaptive", False))
     if backend not in BACKENDS or on_host:

@@ -33,10 +33,12 @@ class Minimiser(ABC):
         needs_from_energy: properties that the energy must offer (:mod:`epo_lightning.game.energy`).
         provides: properties of the solution, of :data:`PATH`, :data:`STEPS`, :data:`STATIONARY`, :data:`SAMPLES`,
             :data:`TABLES`.
+        on_host: whether games on a GPU are always copied to the CPU and solved there.
     """
 
     needs_from_energy: ClassVar[frozenset[str]] = frozenset()
     provides: ClassVar[frozenset[str]] = frozenset()
+    on_host: ClassVar[bool] = False
 
     @abstractmethod
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:

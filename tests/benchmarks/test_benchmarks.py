@@ -28,6 +28,7 @@ from benchmarks import (
     epo_layer,
     explore,
     extraction,
+    feedback_games,
     figures,
     forecast_speed,
     generation,
@@ -189,6 +190,24 @@ def test_true_games_are_measured(capsys, tmp_path):
     assert float(lines[0].split("executed ")[1].split()[0]) < 1e-5
     assert "fewer than 4000" in refused(true_game.main, "--records", 4000, *small)
     assert "data=rpi" in refused(true_game.main, "data=drawn")
+
+
+@pytest.mark.slow
+def test_feedback_games_are_measured(capsys, tmp_path):
+    small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "data.solver=feedback"]
+    generate = RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, solver="feedback", recipe=2)
+    generate.generate(workers=1, progress=False)
+    feedback_games.main(["--records", "2", *small])
+    text = capsys.readouterr().out
+    assert re.findall(r"^\S+ times", text, re.MULTILINE) == ["1 times", "0.3 times"]
+    games = {
+        title: float(number) for title, number in re.findall(r"^(w.*?) +solved .* (\S+) LQ games", text, re.MULTILINE)
+    }
+    assert games["with acceleration"] <= games["without"]
+    errors = [float(error) for error in re.findall(r"relative error (\S+),", text)]
+    assert len(errors) == 8
+    assert errors[3] < 0.01 < errors[0]
+    assert "data=rpi" in refused(feedback_games.main, "data=drawn")
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +13,7 @@ from epo_lightning.checks import check_number, check_whole
 from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import FEATURES, STAGES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.registry import register
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.feedback.derivative import attach
@@ -33,6 +34,7 @@ class ToFeedback(Minimiser):
 
     needs_from_energy = frozenset({FEATURES, STAGES})
     provides = frozenset({STATIONARY})
+    on_host = True
 
     iterations: int
     tolerance: float
@@ -72,10 +74,21 @@ class ToFeedback(Minimiser):
     ) -> tuple[Tensor, Tensor]:
         """Controls with the derivative of the fixed point, which is zero where the game is not solved, and the status.
 
-        ``exact`` has no meaning here: Gauss-Newton costs are part of the fixed point.
+        Warns, once per process, if more than half of the games are not solved.
+
+        Raises:
+            ConfigError: ``exact`` is false. Gauss-Newton costs are part of the fixed point, and cannot be left out.
         """
+        if not exact:
+            raise ConfigError("backward.hessian=gauss_newton has no effect with solver=feedback: leave it out")
         assert isinstance(energy, FeatureEnergy)
         solved = _on_host(solution.status == Status.SOLVED)
+        if (share := 1.0 - solved.double().mean().item()) > 0.5:
+            warnings.warn(
+                f"solver=feedback: {100 * share:.0f} % of the games of a batch are not solved, so they have no gradient: raise "
+                "solver.iterations, or start with other weights (docs/troubleshooting.md)",
+                stacklevel=2,
+            )
         controls = attach(self._game(energy, scene, parameters), _on_host(solution.controls), solved, self.terms)
         return controls.to(solution.controls), solution.status
 
@@ -123,6 +136,7 @@ class Feedback(BothSides):
     """
 
     needs_from_energy = frozenset({FEATURES, STAGES})
+    on_host = True
 
     iterations: int = 30
     tolerance: float = 1e-3
@@ -155,5 +169,9 @@ class Feedback(BothSides):
     def attach(
         self, energy: Energy, scene: Scene, parameters: GameParameters, solution: Solution, exact: bool
     ) -> tuple[Tensor, Tensor]:
-        """The controls with their derivative, and a status, as :meth:`ToFeedback.attach`."""
+        """The controls with their derivative, and a status.
+
+        Raises:
+            ConfigError: as :meth:`ToFeedback.attach`.
+        """
         return self.descent().attach(energy, scene, parameters, solution, exact)

@@ -17,6 +17,7 @@ from epo_lightning.drive.rpi import ENERGY as TRUE_ENERGY
 from epo_lightning.drive.rpi import true_game
 from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.feedback import derivative, iteration
@@ -229,10 +230,18 @@ def test_steps_after_the_end_of_a_game_have_no_effect() -> None:
     torch.testing.assert_close(found.states[..., :HORIZON, :], wanted.states, rtol=0, atol=1e-9)
 
 
-def test_only_solved_games_have_a_gradient() -> None:
+def test_a_hessian_without_second_derivatives_is_refused() -> None:
+    scene, game = meeting(2.3)
+    with pytest.raises(ConfigError, match=r"backward\.hessian=gauss_newton has no effect with solver=feedback"):
+        Implicit(hessian="gauss_newton")(Feedback(), ENERGY, scene, leaves_of(game))
+
+
+def test_only_solved_games_have_a_gradient_and_many_others_a_warning() -> None:
     scene, game = meeting(2.3)
     leaves = leaves_of(game)
-    Implicit()(Feedback(iterations=1, tolerance=1e-9), ENERGY, scene, leaves).states.sum().backward()
+    with pytest.warns(UserWarning, match="100 % of the games of a batch are not solved"):
+        found = Implicit()(Feedback(iterations=1, tolerance=1e-9), ENERGY, scene, leaves)
+    found.states.sum().backward()
     assert (leaves.goals.grad == 0).all()
 
 
