@@ -83,10 +83,10 @@ class ToFeedback(Minimiser):
             raise ConfigError("backward.hessian=gauss_newton has no effect with solver=feedback: leave it out")
         assert isinstance(energy, FeatureEnergy)
         solved = _on_host(solution.status == Status.SOLVED)
-        if (share := 1.0 - solved.double().mean().item()) > 0.5:
+        if solved.numel() > 2 * solved.sum():
             warnings.warn(
-                f"solver=feedback: {100 * share:.0f} % of the games of a batch are not solved, so they have no gradient: raise "
-                "solver.iterations, or start with other weights (docs/troubleshooting.md)",
+                "solver=feedback: more than half of the games of a batch are not solved and have no gradient: raise "
+                "solver.iterations, or begin with other weights (docs/troubleshooting.md)",
                 stacklevel=2,
             )
         controls = attach(self._game(energy, scene, parameters), _on_host(solution.controls), solved, self.terms)
