@@ -3,7 +3,7 @@ linear-quadratic approximations for nonlinear multi-player general-sum different
 
 In every iteration the LQ game around the trajectory is solved, and the agents follow its policies, with their offsets
 multiplied by a step length, to the next trajectory. The iteration ends at a trajectory from which the policies of the LQ
-game around it deviate by less than a tolerance. Anderson acceleration halves the number of LQ games.
+game around it deviate by less than a tolerance. Anderson acceleration saves a part of the LQ games.
 """
 
 from __future__ import annotations
