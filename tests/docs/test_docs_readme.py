@@ -29,7 +29,7 @@ CHEAPER = {
 NOT_RUN = {
     "make run": "installs, and takes minutes",
     "make test": "these tests",
-    "epo train resume=runs/rpi/v_lstm_epo_relaxed/long-s0": "the run is finished here; tests/experiment/test_resume.py kills one",
+    "epo train resume=runs/rpi/v_lstm_epo_relaxed/long-s0": "the run is finished; tests/experiment/test_resume.py kills one",
     ". .venv/bin/activate": "tests run in an environment",
     "epo explore run=rpi/v_lstm_epo_game_refined": "serves a page until Ctrl-C; tests/explore opens it in a browser",
     "epo generate data=highway_sim": "minutes of simulation; tests/data/simulate",
