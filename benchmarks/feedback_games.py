@@ -11,23 +11,20 @@ and goals.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from unittest import mock
 
 import torch
 from torch import Tensor
 
-from benchmarks.measure import positive
-from benchmarks.true_game import TrueGames, parts
+from benchmarks.true_game import TrueGames, command_line, parts
 from epo_lightning.data.rpi.subgames import FUTURE
-from epo_lightning.experiment import assembly
 from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.registry import ConfigError
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.feedback import iteration
 from epo_lightning.solvers.feedback.anderson import Anderson
@@ -47,21 +44,18 @@ class Plain(Anderson):
         """Forget the points at once."""
 
 
-class Counted:
-    """A number of solved LQ games, while they are counted."""
+@contextmanager
+def counted() -> Iterator[list[int]]:
+    """A list that gets the number of LQ games of every iteration."""
+    numbers: list[int] = []
+    solve_lq = LQGame.equilibrium
 
-    def __init__(self) -> None:
-        self.games = 0
+    def equilibrium(local: LQGame) -> Policy:
+        numbers.append(len(local.A))
+        return solve_lq(local)
 
-    def __call__(self) -> mock._patch[object]:
-        """A context in which LQ games are counted."""
-        solve = LQGame.equilibrium
-
-        def equilibrium(local: LQGame) -> Policy:
-            self.games += len(local.A)
-            return solve(local)
-
-        return mock.patch.object(LQGame, "equilibrium", equilibrium)
+    with mock.patch.object(LQGame, "equilibrium", equilibrium):
+        yield numbers
 
 
 @dataclass(frozen=True)
@@ -91,12 +85,14 @@ def quantiles(values: Tensor) -> str:
 @torch.no_grad()
 def solve(title: str, solver: Feedback, games: Games, exact: Solution | None = None) -> Solution:
     """Solve all games and print a line."""
-    counted, start = Counted(), time.process_time()
-    with counted():
+    start = time.process_time()
+    with counted() as numbers:
         found = solver(games.energy, games.records.scene, games.parameters)
     spent = 1e3 * (time.process_time() - start) / len(found.status)
     solved = found.status == Status.SOLVED
-    line = f"{title:28} solved {int(solved.sum())} of {solved.numel()}  {counted.games / solved.numel():5.1f} LQ games each"
+    line = (
+        f"{title:28} solved {int(solved.sum())} of {solved.numel()}  {sum(numbers) / solved.numel():5.1f} LQ games each"
+    )
     if exact is not None:
         far = (found.states - exact.states)[..., :FUTURE, :].abs().amax((2, 3, 4))
         line += f"  {spent:5.1f} ms of CPU per record  error {quantiles(far[solved & (exact.status == Status.SOLVED)])}"
@@ -137,17 +133,7 @@ def compare(solver: Feedback, games: Games) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--split", default="test")
-    parser.add_argument("--records", type=positive, default=400)
-    parser.add_argument("overrides", nargs="*", metavar="override")
-    arguments = parser.parse_args(argv)
-    assembly.quiet()
-    torch.set_num_threads(1)
-    try:
-        measure(arguments.split, arguments.records, arguments.overrides)
-    except ConfigError as error:
-        raise SystemExit(f"feedback_games: {error}") from None
+    command_line("feedback_games", __doc__.splitlines()[0], measure, argv)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -138,9 +138,11 @@ def measure(split: str, count: int, overrides: Sequence[str]) -> None:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def command_line(
+    name: str, title: str, measure: Callable[[str, int, Sequence[str]], None], argv: Sequence[str] | None
+) -> None:
+    """Run a measurement of records, given a split, their number, and overrides of `epo train`."""
+    parser = argparse.ArgumentParser(description=title)
     parser.add_argument("--split", default="test")
     parser.add_argument("--records", type=positive, default=400)
     parser.add_argument("overrides", nargs="*", metavar="override")
@@ -150,7 +152,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         measure(arguments.split, arguments.records, arguments.overrides)
     except ConfigError as error:
-        raise SystemExit(f"true_game: {error}") from None
+        raise SystemExit(f"{name}: {error}") from None
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line."""
+    command_line("true_game", __doc__.splitlines()[0], measure, argv)
 
 
 if __name__ == "__main__":
