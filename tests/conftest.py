@@ -9,8 +9,6 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
 
 from jaxtyping import install_import_hook
 
-import epo_lightning.solvers.feedback.compiled_adjoint  # noqa: F401 - before the hook: numba compiles no decorated functions
-
 # Everything that speaks the alphabet of shapes; compiled kernels take no decorators.
 CHECKED = (
     "batch",

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -72,11 +71,17 @@ class FeedbackGame:
     ) -> tuple[Float[Tensor, "B M N K 4"], Float[Tensor, "B M N K 2"]]:
         """States and controls of agents that follow the policies around trajectories, each with its step length."""
         start = self.energy.current_states(self.scene).expand_as(states[..., 0, :])
-        given = (*(part.flatten(0, 1) for part in (start, states, controls)), policy.gains, policy.offsets, length)
-        arrays: list[Any] = [part.contiguous().numpy() for part in given]
-        arrays += [self.scene.dt, self.energy.dynamics.beta]
-        visited, chosen = compiled.follow(*arrays)
-        return torch.from_numpy(visited).view_as(states), torch.from_numpy(chosen).view_as(controls)
+        visited, chosen = compiled.follow(
+            start.flatten(0, 1),
+            states.flatten(0, 1),
+            controls.flatten(0, 1),
+            policy.gains,
+            policy.offsets,
+            length,
+            self.scene.dt,
+            self.energy.dynamics.beta,
+        )
+        return visited.view_as(states), chosen.view_as(controls)
 
     def change(self, states: Float[Tensor, "B M N K 4"], others: Float[Tensor, "B M N K 4"]) -> Float[Tensor, " B"]:
         """The largest change of a state. What happens after the end of a game does not count."""

@@ -21,13 +21,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.solvers.feedback import compiled, compiled_adjoint
+from epo_lightning.solvers.feedback import compiled
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,12 @@ class LQGame:
     free: Bool[Tensor, "S N K"]
 
     def equilibrium(self) -> Policy:
-        """The feedback Nash equilibrium, without a derivative."""
-        return Policy(*(torch.from_numpy(part) for part in compiled.equilibria(*self._arrays())))
+        """The feedback Nash equilibrium, without a derivative.
+
+        Raises:
+            RuntimeError: the library of the compiled layer is missing.
+        """
+        return Policy(*compiled.equilibria(self._parts(), self.rho, self.free))
 
     def pull_back(
         self, policy: Policy, cotangent: Float[Tensor, "S N K 2"], inputs: Sequence[Tensor]
@@ -64,25 +67,17 @@ class LQGame:
         Here u are the controls that the equilibrium's policies choose from x_0 = 0 on. It is right where all offsets are
         zero, as at a solution of the iteration.
         """
-        by_controls = cotangent.transpose(1, 2).flatten(2).contiguous().numpy()
-        found = (part.numpy() for part in (policy.gains, policy.offsets, policy.unique))
-        arrays: list[Any] = [*self._arrays(), *found, by_controls]
-        bars = map(torch.from_numpy, compiled_adjoint.pull_back(*arrays))
-        known = [(part, bar) for part, bar in zip(self._parts(), bars, strict=True) if part.requires_grad]
-        parts, cotangents = zip(*known, strict=True)
+        parts, policies = self._parts(), (policy.gains, policy.offsets, policy.unique)
+        by_controls = cotangent.transpose(1, 2).flatten(2)
+        bars = compiled.pull_back(parts, self.rho, self.free, policies, by_controls)
+        known = [(part, bar) for part, bar in zip(parts, bars, strict=True) if part.requires_grad]
+        outputs, cotangents = zip(*known, strict=True)
         return torch.autograd.grad(
-            parts, inputs, cotangents, retain_graph=True, allow_unused=True, materialize_grads=True
+            outputs, inputs, cotangents, retain_graph=True, allow_unused=True, materialize_grads=True
         )
 
     def _parts(self) -> tuple[Tensor, ...]:
         return self.A, self.B, self.own_cost, self.pair_cost, self.effort, self.push
-
-    def _arrays(self) -> tuple[Any, ...]:
-        return (
-            *(part.detach().contiguous().numpy() for part in self._parts()),
-            self.rho,
-            self.free.contiguous().numpy(),
-        )
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,8 @@ are convex.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -17,10 +19,10 @@ from torch import Tensor
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.game.features import Source
+from epo_lightning.game.features import OwnFeature, Source
 from epo_lightning.game.game_end import free_controls
 from epo_lightning.game.pairs import pairs
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.scene import HEADING, SPEED, Scene, X, Y
 from epo_lightning.solvers.feedback.compiled import CONTROL, STATE
 from epo_lightning.solvers.feedback.lq_game import LQGame
 
@@ -63,29 +65,37 @@ def _own_costs(
 ) -> tuple[Float[Tensor, "B M N K 4 5"], Float[Tensor, "B M N K 2 2"], Float[Tensor, "B M N K 2"]]:
     """[Q | q] of every agent's own cost by its state, and R and r by its controls."""
     horizon = controls.shape[3]
-    unit = torch.eye(STATE + CONTROL, dtype=controls.dtype, device=controls.device)[:, None, None, None, None]
-    moved = unit[..., :STATE].expand(-1, *states.shape), unit[..., STATE:].expand(-1, *controls.shape)
     around = energy.surroundings(scene, parameters)
     ends = scene.game_steps
     if ends is None:
         ends = torch.full((len(controls),), horizon, device=controls.device)
     last = F.one_hot(ends.long() - 1, horizon).to(controls.dtype)[:, None, None, :, None]
-    residuals, changes = [], []
+    costs = _Quadratic(STATE + CONTROL, controls[..., 0])
     for name, feature in energy.own_features.items():
+        entries = _entries(feature)
+        moved = costs.moved(entries, states, controls)
         residual, change = energy.own_residual(name, scene, parameters, around, (states, controls), moved)
         if feature.source in _AT_THE_END:
             residual, change = residual[..., None, :] * last, change[..., None, :] * last
         else:
             residual, change = residual.unflatten(-1, (horizon, -1)), change.unflatten(-1, (horizon, -1))
-        residuals.append(residual)
-        changes.append(change)
-    none = controls.new_zeros(*controls.shape[:4], 0)  # an energy may have no own features
-    residual = torch.cat((none, *residuals), -1)
-    jacobian = torch.cat((none.expand(STATE + CONTROL, *none.shape), *changes), -1).movedim(0, -1)
-    cost = _squared(residual, jacobian)
-    matrix, slope = cost[..., :-1], cost[..., -1]
-    own_cost = torch.cat((matrix[..., :STATE, :STATE], slope[..., :STATE, None]), -1)
-    return own_cost, matrix[..., STATE:, STATE:], slope[..., STATE:]
+        costs.add(entries, residual, change)
+    by_controls = costs.block(range(STATE, STATE + CONTROL))
+    return costs.block(range(STATE)), by_controls[..., :CONTROL], by_controls[..., CONTROL]
+
+
+def _entries(feature: OwnFeature) -> Sequence[int]:
+    """The entries of (x, y, heading, speed, acceleration, turn rate) on which a feature of single time steps depends."""
+    match feature.source:
+        case Source.CONTROL:
+            return (STATE + feature.channel,)
+        case Source.SPEED:
+            return (SPEED,)
+        case Source.FINAL_HEADING:
+            return (HEADING,)
+        case Source.POSITION | Source.FINAL_POSITION:
+            return (X, Y)
+    raise AssertionError(feature)
 
 
 def _pair_costs(
@@ -97,22 +107,51 @@ def _pair_costs(
     none = states.new_zeros(batch, modes, len(first), horizon, 2 * STATE, 2 * STATE + 1)
     if not energy.pair or not len(first):
         return none
-    both = states[:, :, first], states[:, :, second]
-    unit = torch.eye(2 * STATE, dtype=states.dtype, device=states.device)[:, None, None, None, None]
-    moved = unit[..., :STATE].expand(-1, *both[0].shape), unit[..., STATE:].expand(-1, *both[1].shape)
-    _, residuals, changes = zip(*energy.pair_residuals(scene, parameters, both, moved), strict=True)
-    cost = _squared(torch.stack(residuals, -1), torch.stack(changes, -1).movedim(0, -1))
-    if energy.pair_stride == 1:
-        return cost
     steps = torch.arange(horizon, device=states.device)[energy.pair_stride - 1 :: energy.pair_stride]
-    return none.index_copy(3, steps, cost)
+    both = states[:, :, first], states[:, :, second]
+    costs = _Quadratic(2 * STATE, both[0][..., steps, 0])
+    distances = all(feature.declared for feature in energy.pair_features.values())
+    entries = (X, Y, STATE + X, STATE + Y) if distances else range(2 * STATE)
+    moved = costs.moved(entries, *both)
+    for _, residual, change in energy.pair_residuals(scene, parameters, both, moved):
+        costs.add(entries, residual[..., None], change[..., None])
+    cost = costs.block(range(2 * STATE))
+    return cost if energy.pair_stride == 1 else none.index_copy(3, steps, cost)
 
 
-def _squared(
-    residual: Float[Tensor, "*batch R"], jacobian: Float[Tensor, "*batch R d"]
-) -> Float[Tensor, "*batch d d1"]:
-    """[J' J | J' r], the Gauss-Newton matrix and the gradient of 1/2 |r|^2."""
-    return jacobian.mT @ torch.cat((jacobian, residual[..., None]), -1)
+class _Quadratic:
+    """[J' J | J' r], the Gauss-Newton matrix and the gradient of 1/2 |r|^2, entry by entry: most are zero."""
+
+    def __init__(self, size: int, like: Float[Tensor, "*batch"]) -> None:
+        self._size = size
+        self._unit = torch.eye(size, dtype=like.dtype, device=like.device)[:, None, None, None, None]
+        self._zero = torch.zeros_like(like)
+        self._found: dict[tuple[int, int], Tensor] = {}
+
+    def moved(self, entries: Sequence[int], first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+        """Changes of two arrays, which have the entries in their last dimensions, by one for every entry: [D, ...]."""
+        mine, others = self._unit[list(entries)].split((first.shape[-1], second.shape[-1]), -1)
+        return mine.expand(-1, *first.shape), others.expand(-1, *second.shape)
+
+    def add(
+        self, entries: Sequence[int], residual: Float[Tensor, "*batch R"], change: Float[Tensor, "D *batch R"]
+    ) -> None:
+        """Add a residual, and its derivatives by some entries."""
+        along = dict(zip(entries, change, strict=True))
+        for a in entries:
+            self._add(a, self._size, (along[a] * residual).sum(-1))
+            for b in entries:
+                if b >= a:
+                    self._add(a, b, (along[a] * along[b]).sum(-1))
+
+    def block(self, entries: range) -> Float[Tensor, "*batch d d1"]:
+        """The part of some entries."""
+        rows = [self._found.get((min(a, b), max(a, b)), self._zero) for a in entries for b in (*entries, self._size)]
+        return torch.stack(rows, -1).unflatten(-1, (len(entries), len(entries) + 1))
+
+    def _add(self, row: int, column: int, cost: Tensor) -> None:
+        known = self._found.get((row, column))
+        self._found[row, column] = cost if known is None else known + cost
 
 
 def _dynamics(

@@ -12,7 +12,7 @@ from torch import Tensor
 from epo_lightning.game.pairs import pairs
 from epo_lightning.solvers.feedback.lq_game import LQGame
 
-SIZES = pytest.mark.parametrize(("agents", "horizon"), [(1, 4), (2, 7), (3, 5)])
+SIZES = pytest.mark.parametrize(("agents", "horizon"), [(1, 4), (2, 7), (3, 5), (5, 3)])
 
 
 def convex(*shape: int) -> Tensor:
@@ -126,9 +126,49 @@ def test_the_derivative_by_costs_is_that_of_finite_differences(agents: int, hori
     torch.testing.assert_close((slope * way).sum(), (chosen(1e-4) - chosen(-1e-4)) / 2e-4, rtol=1e-7, atol=1e-9)
 
 
-def test_a_game_without_a_unique_equilibrium_is_reported() -> None:
+def test_a_game_without_a_unique_equilibrium_is_reported_and_has_no_effect_on_the_others() -> None:
     game = random_game(2, 3, rho=0.0)
-    effort, B = game.effort.clone(), game.B.clone()
+    effort, B, cotangent = game.effort.clone(), game.B.clone(), torch.ones(3, 2, 3, 2, dtype=torch.double)
     effort[1], B[1] = 0.0, 0.0  # controls without any effect
-    unique = dataclasses.replace(game, effort=effort, B=B).equilibrium().unique
-    assert unique.tolist() == [True, False, True]
+    broken = dataclasses.replace(game, effort=effort, B=B.requires_grad_())
+    policy, sound = broken.equilibrium(), game.equilibrium()
+    assert policy.unique.tolist() == [True, False, True]
+    assert torch.equal(policy.gains[[0, 2]], sound.gains[[0, 2]])
+    assert not policy.gains[1].any()
+    (slope,) = broken.pull_back(policy, cotangent, [B])
+    assert slope[[0, 2]].any()
+    assert not slope[1].any()
+
+
+@pytest.mark.parametrize("agents", [2, 4])
+def test_a_game_depends_neither_on_its_neighbours_nor_on_the_number_of_threads(agents: int) -> None:
+    game = random_game(agents, 4, games=19)
+    game.own_cost.requires_grad_()
+    cotangent = torch.randn(19, agents, 4, 2, dtype=torch.double)
+    policy = game.equilibrium()
+    (slope,) = game.pull_back(policy, cotangent, [game.own_cost])
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        again = game.equilibrium()
+        (slope_again,) = game.pull_back(again, cotangent, [game.own_cost])
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(again.gains, policy.gains)
+    assert torch.equal(slope_again, slope)
+    some = dataclasses.replace(
+        game,
+        **{field.name: getattr(game, field.name)[5:7] for field in dataclasses.fields(game) if field.name != "rho"},
+    )
+    few = some.equilibrium()
+    assert torch.equal(few.gains, policy.gains[5:7])
+    assert torch.equal(few.offsets, policy.offsets[5:7])
+    (slope_few,) = some.pull_back(few, cotangent[5:7], [some.own_cost])
+    assert torch.equal(slope_few, slope[5:7])
+    poisoned = dataclasses.replace(game, own_cost=game.own_cost.detach().clone())
+    poisoned.own_cost[6] = torch.nan
+    others = torch.arange(19) != 6
+    found = poisoned.equilibrium()
+    assert found.unique.tolist() == others.tolist()
+    assert torch.equal(found.gains[others], policy.gains[others])
+    assert found.gains[6].isfinite().all()

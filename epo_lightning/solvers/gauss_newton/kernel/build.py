@@ -152,12 +152,13 @@ def build(target: Path = LIBRARY, portable: bool = False) -> None:
     with tempfile.TemporaryDirectory() as folder:
         built = [f"-DHAS_{level.upper()}" for level in levels]
         compile_ = [*compiler, *options, f"-DEPO_FINGERPRINT={fingerprint()}", *built, "-c"]
-        objects = {f"{folder}/{level}.o": [*flags, f"-DEPO_LEVEL={level}"] for level, flags in levels.items()}
-        commands = [[*compile_, *flags, str(HERE / "solve.cpp"), "-o", object_] for object_, flags in objects.items()]
-        commands.append([*compile_, str(HERE / "dispatch.cpp"), "-o", f"{folder}/dispatch.o"])
-        _run(commands)
+        sources = {f"{folder}/dispatch.o": [str(HERE / "dispatch.cpp")]}
+        for level, flags in levels.items():
+            for name in ("solve", "lq_game"):
+                sources[f"{folder}/{level}.{name}.o"] = [*flags, f"-DEPO_LEVEL={level}", str(HERE / f"{name}.cpp")]
+        _run([[*compile_, *source, "-o", object_] for object_, source in sources.items()])
         linked = Path(folder) / target.name
-        _run([[*compiler, *options, "-shared", *objects, f"{folder}/dispatch.o", "-o", str(linked)]])
+        _run([[*compiler, *options, "-shared", *sources, "-o", str(linked)]])
         if not sanitized:  # a sanitized library loads only where the sanitizers' runtime was loaded first
             load(linked)
         # Replaced at once, so that a process that loads it meanwhile gets a whole library.

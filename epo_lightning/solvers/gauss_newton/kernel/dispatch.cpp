@@ -84,6 +84,26 @@ int64_t in_parallel(int64_t count, const Body& body) {
     return outcome;
 }
 
+/// Whole registers of problems for every thread.
+struct Ranges {
+    int64_t problems, lanes, registers, count;
+    Ranges(int64_t problems, int64_t lanes, int64_t threads)
+        : problems(problems), lanes(lanes), registers((problems + lanes - 1) / lanes),
+          count(std::max<int64_t>(1, std::min(threads, registers))) {}
+    int64_t edge(int64_t range) const { return std::min(problems, lanes * (registers * range / count)); }
+};
+
+/// Runs body(first, last) in parallel for ranges of problems, and returns as `in_parallel` does.
+template <class Body>
+int64_t in_ranges(int64_t problems, int64_t threads, const Body& body) {
+    try {
+        const Ranges ranges(problems, chosen->lanes, threads);
+        return in_parallel(ranges.count, [&](int64_t range) { body(ranges.edge(range), ranges.edge(range + 1)); });
+    } catch (...) {
+        return 1;
+    }
+}
+
 }  // namespace
 
 extern "C" {
@@ -123,13 +143,11 @@ int64_t epo_solve(int64_t doubles, const EpoGame* game, const EpoRun* run, int64
     *tape = nullptr;
     try {
         const EpoLevel& level = *chosen;
-        const int64_t problems = game->B * game->M, lanes = level.lanes, registers = (problems + lanes - 1) / lanes;
-        const int64_t ranges = std::max<int64_t>(1, std::min(threads, registers));
-        const auto edge = [&](int64_t range) { return std::min(problems, lanes * (registers * range / ranges)); };
-        std::unique_ptr<Handle> handle(new Handle{&level, doubles != 0, std::vector<void*>(std::size_t(ranges))});
-        const int64_t outcome = in_parallel(ranges, [&](int64_t range) {
+        const Ranges ranges(game->B * game->M, level.lanes, threads);
+        std::unique_ptr<Handle> handle(new Handle{&level, doubles != 0, std::vector<void*>(std::size_t(ranges.count))});
+        const int64_t outcome = in_parallel(ranges.count, [&](int64_t range) {
             const auto solve = doubles ? level.solve_double : level.solve_float;
-            handle->tapes[range] = solve(game, run, edge(range), edge(range + 1));
+            handle->tapes[range] = solve(game, run, ranges.edge(range), ranges.edge(range + 1));
         });
         if (outcome == 0 && run->record) *tape = handle.release();
         return outcome;
@@ -147,6 +165,21 @@ int64_t epo_differentiate(const void* tape, const EpoGame* game, const EpoRun* r
     } catch (...) {
         return 1;
     }
+}
+
+/// Writes the equilibria of linear-quadratic games. Returns 0, or 1 if there was not enough memory; so do the next two functions.
+int64_t epo_lq_equilibria(const EpoLQGames* games, int64_t threads) {
+    return in_ranges(games->S, threads, [&](int64_t first, int64_t last) { chosen->lq_equilibria(games, first, last); });
+}
+
+/// The adjoint of a call of `epo_lq_equilibria`.
+int64_t epo_lq_pull_back(const EpoLQGames* games, const EpoLQGradients* gradients, int64_t threads) {
+    return in_ranges(games->S, threads, [&](int64_t first, int64_t last) { chosen->lq_pull_back(games, gradients, first, last); });
+}
+
+/// Writes the trajectories that follow policies.
+int64_t epo_lq_follow(const EpoPolicies* policies, int64_t threads) {
+    return in_ranges(policies->S, threads, [&](int64_t first, int64_t last) { chosen->lq_follow(policies, first, last); });
 }
 
 void epo_release(void* tape) { delete static_cast<Handle*>(tape); }

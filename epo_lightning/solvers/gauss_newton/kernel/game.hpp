@@ -100,6 +100,37 @@ struct EpoGradients {
     void* goal_headings;       // [B, M, N], zero on entry
     void* reference_controls;  // [B, M, N, K, 2], zero on entry
 };
+
+/// S linear-quadratic games of N agents over K steps, and their equilibria, in double precision; see `solvers/feedback/lq_game.py`.
+/// All arrays are contiguous.
+struct EpoLQGames {
+    int64_t S, N, K;
+    double rho;
+    const double *A, *B;           // [S, N, K, 4, 4], [S, N, K, 4, 2]
+    const double* own_cost;        // [S, N, K, 4, 5]
+    const double* pair_cost;       // [S, P, K, 8, 9]
+    const double *effort, *push;   // [S, N, K, 2, 2], [S, N, K, 2]
+    const uint8_t* free;           // [S, N, K]
+    double *gains, *offsets;       // [S, K, 2 N, 4 N], [S, K, 2 N]
+    uint8_t* unique;               // [S]
+};
+
+/// The cotangent that the adjoint reads, and the gradients that it writes.
+struct EpoLQGradients {
+    const double* controls;        // [S, K, 2 N]
+    double *A, *B, *own_cost, *pair_cost, *effort, *push;  // as in EpoLQGames
+};
+
+/// Policies of S games of N agents around given trajectories, and the trajectories that follow them.
+struct EpoPolicies {
+    int64_t S, N, K;
+    double dt, beta;               // time step [s]; share of the velocity before a step in its displacement
+    const double* start;           // [S, N, 4]
+    const double *states, *controls;  // [S, N, K, 4], [S, N, K, 2]
+    const double *gains, *offsets;  // as in EpoLQGames
+    const double* length;          // [S] factor of the offsets
+    double *visited, *chosen;      // [S, N, K, 4], [S, N, K, 2]
+};
 }
 
 /// The functions of one level of instructions; float first.
@@ -110,5 +141,8 @@ struct EpoLevel {
     void (*differentiate_double)(const void* tape, const EpoGame*, const EpoRun*, const EpoGradients*);
     void (*release_float)(void* tape);
     void (*release_double)(void* tape);
+    void (*lq_equilibria)(const EpoLQGames*, int64_t first, int64_t last);
+    void (*lq_pull_back)(const EpoLQGames*, const EpoLQGradients*, int64_t first, int64_t last);
+    void (*lq_follow)(const EpoPolicies*, int64_t first, int64_t last);
     int64_t lanes;
 };

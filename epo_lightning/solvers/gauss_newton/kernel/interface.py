@@ -104,6 +104,38 @@ class EpoGradients(ctypes.Structure):
     )
 
 
+_PARTS = ("A", "B", "own_cost", "pair_cost", "effort", "push")
+
+
+class EpoLQGames(ctypes.Structure):
+    """Linear-quadratic games and their equilibria; fields as in `game.hpp`."""
+
+    _fields_ = (
+        *((name, Integer) for name in ("S", "N", "K")),
+        ("rho", Real),
+        *((name, Address) for name in (*_PARTS, "free", "gains", "offsets", "unique")),
+    )
+
+
+class EpoLQGradients(ctypes.Structure):
+    """The cotangent that the adjoint of equilibria reads and the gradients that it writes; fields as in `game.hpp`."""
+
+    _fields_ = tuple((name, Address) for name in ("controls", *_PARTS))
+
+
+class EpoPolicies(ctypes.Structure):
+    """Policies around trajectories, and the trajectories that follow them; fields as in `game.hpp`."""
+
+    _fields_ = (
+        *((name, Integer) for name in ("S", "N", "K")),
+        *((name, Real) for name in ("dt", "beta")),
+        *(
+            (name, Address)
+            for name in ("start", "states", "controls", "gains", "offsets", "length", "visited", "chosen")
+        ),
+    )
+
+
 class _Entry(ctypes.Structure):
     _fields_ = (("name", ctypes.c_char_p), ("value", Real))
 
@@ -111,7 +143,7 @@ class _Entry(ctypes.Structure):
 def layout() -> dict[str, float]:
     """Sizes, offsets and constants that this module shares with the kernel, under the names of `layout.hpp`."""
     found: dict[str, float] = {}
-    for structure in (EpoGame, EpoRun, EpoGradients):
+    for structure in (EpoGame, EpoRun, EpoGradients, EpoLQGames, EpoLQGradients, EpoPolicies):
         name = structure.__name__
         found[f"sizeof {name}"] = ctypes.sizeof(structure)
         found |= {f"{name}.{field[0]}": getattr(structure, field[0]).offset for field in structure._fields_}
@@ -179,8 +211,11 @@ def find() -> ctypes.CDLL | str:
     loaded.epo_solve.argtypes = (Integer, *run, Integer, ctypes.POINTER(Address))
     loaded.epo_differentiate.argtypes = (Address, *run, ctypes.POINTER(EpoGradients))
     loaded.epo_release.argtypes, loaded.epo_release.restype = (Address,), None
-    for name in ("epo_solve", "epo_differentiate", "epo_levels", "epo_built"):
-        getattr(loaded, name).restype = Integer
+    loaded.epo_lq_equilibria.argtypes = (ctypes.POINTER(EpoLQGames), Integer)
+    loaded.epo_lq_pull_back.argtypes = (ctypes.POINTER(EpoLQGames), ctypes.POINTER(EpoLQGradients), Integer)
+    loaded.epo_lq_follow.argtypes = (ctypes.POINTER(EpoPolicies), Integer)
+    for name in ("solve", "differentiate", "lq_equilibria", "lq_pull_back", "lq_follow", "levels", "built"):
+        getattr(loaded, f"epo_{name}").restype = Integer
     loaded.epo_choose.argtypes, loaded.epo_choose.restype = (Integer,), None
     return loaded
 

@@ -16,7 +16,7 @@ struct EpoLayoutEntry {
 #define EPO_CONSTANT(name) {#name, double(name)}
 
 constexpr EpoLayoutEntry kLayout[] = {
-    EPO_SIZE(EpoGame), EPO_SIZE(EpoRun), EPO_SIZE(EpoGradients),
+    EPO_SIZE(EpoGame), EPO_SIZE(EpoRun), EPO_SIZE(EpoGradients), EPO_SIZE(EpoLQGames), EPO_SIZE(EpoLQGradients), EPO_SIZE(EpoPolicies),
     EPO_FIELD(EpoGame, B), EPO_FIELD(EpoGame, M), EPO_FIELD(EpoGame, N), EPO_FIELD(EpoGame, K),
     EPO_FIELD(EpoGame, lines), EPO_FIELD(EpoGame, points), EPO_FIELD(EpoGame, pair_stride), EPO_FIELD(EpoGame, dt),
     EPO_FIELD(EpoGame, bounds), EPO_FIELD(EpoGame, initial), EPO_FIELD(EpoGame, initial_b), EPO_FIELD(EpoGame, initial_n),
@@ -34,6 +34,16 @@ constexpr EpoLayoutEntry kLayout[] = {
     EPO_FIELD(EpoGradients, controls), EPO_FIELD(EpoGradients, iterates), EPO_FIELD(EpoGradients, states),
     EPO_FIELD(EpoGradients, own), EPO_FIELD(EpoGradients, pair), EPO_FIELD(EpoGradients, margins),
     EPO_FIELD(EpoGradients, goals), EPO_FIELD(EpoGradients, goal_headings), EPO_FIELD(EpoGradients, reference_controls),
+    EPO_FIELD(EpoLQGames, S), EPO_FIELD(EpoLQGames, N), EPO_FIELD(EpoLQGames, K), EPO_FIELD(EpoLQGames, rho),
+    EPO_FIELD(EpoLQGames, A), EPO_FIELD(EpoLQGames, B), EPO_FIELD(EpoLQGames, own_cost), EPO_FIELD(EpoLQGames, pair_cost),
+    EPO_FIELD(EpoLQGames, effort), EPO_FIELD(EpoLQGames, push), EPO_FIELD(EpoLQGames, free), EPO_FIELD(EpoLQGames, gains),
+    EPO_FIELD(EpoLQGames, offsets), EPO_FIELD(EpoLQGames, unique), EPO_FIELD(EpoLQGradients, controls),
+    EPO_FIELD(EpoLQGradients, A), EPO_FIELD(EpoLQGradients, B), EPO_FIELD(EpoLQGradients, own_cost),
+    EPO_FIELD(EpoLQGradients, pair_cost), EPO_FIELD(EpoLQGradients, effort), EPO_FIELD(EpoLQGradients, push),
+    EPO_FIELD(EpoPolicies, S), EPO_FIELD(EpoPolicies, N), EPO_FIELD(EpoPolicies, K), EPO_FIELD(EpoPolicies, dt),
+    EPO_FIELD(EpoPolicies, beta), EPO_FIELD(EpoPolicies, start), EPO_FIELD(EpoPolicies, states),
+    EPO_FIELD(EpoPolicies, controls), EPO_FIELD(EpoPolicies, gains), EPO_FIELD(EpoPolicies, offsets),
+    EPO_FIELD(EpoPolicies, length), EPO_FIELD(EpoPolicies, visited), EPO_FIELD(EpoPolicies, chosen),
     EPO_CONSTANT(GOAL), EPO_CONSTANT(LANE), EPO_CONSTANT(VELREF), EPO_CONSTANT(VEL), EPO_CONSTANT(ACC), EPO_CONSTANT(TURNR),
     EPO_CONSTANT(JERK), EPO_CONSTANT(TURNACC), EPO_CONSTANT(STEER), EPO_CONSTANT(VELB), EPO_CONSTANT(ACCB),
     EPO_CONSTANT(TURNRB), EPO_CONSTANT(JERKB), EPO_CONSTANT(TURNACCB), EPO_CONSTANT(HEADING), EPO_CONSTANT(ACCREF), EPO_CONSTANT(TURNRREF),

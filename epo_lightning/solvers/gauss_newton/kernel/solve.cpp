@@ -9,6 +9,7 @@
 #include <limits>
 #include <memory>
 
+#include "lq_game.hpp"
 #include "step.hpp"
 
 namespace EPO_LEVEL {
@@ -668,6 +669,9 @@ const EpoLevel& level() {
         },
         [](void* tape) { delete static_cast<Tape<float>*>(tape); },
         [](void* tape) { delete static_cast<Tape<double>*>(tape); },
+        lq_equilibria,
+        lq_pull_back,
+        lq_follow,
         Lanes<float>::W,
     };
     return functions;
