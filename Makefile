@@ -5,7 +5,7 @@
 # make smoke       train every experiment for a few steps on drawn scenes (a minute)
 # make docs        build the documentation as a site, with references of API and configuration, in build/docs
 # make tables      write docs/tables and the pages of results (docs/*.md.j2) anew from the results files in results/
-# make checkpoint  train the checkpoints that ship with the package anew (half an hour; one: NAME=rpi/v_lstm_epo)
+# make checkpoint  train the checkpoints that ship with the package anew (an hour; one: NAME=rpi/v_lstm_epo)
 # make asan        test the kernel with the sanitizers of addresses and undefined behaviour (Clang, Linux)
 # make wheel       build a package for this platform, with the compiled layer, in dist/
 # make clean       remove what these made, except the data in cache/ and the runs in runs/
