@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import platform
 
 import plain_lq
 import pytest
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from epo_lightning.game.pairs import pairs
 from epo_lightning.solvers.feedback.lq_game import LQGame
+from epo_lightning.solvers.gauss_newton.kernel import interface
 
 SIZES = pytest.mark.parametrize(("agents", "horizon"), [(1, 4), (2, 7), (3, 5), (5, 3)])
 
@@ -172,3 +174,25 @@ def test_a_game_depends_neither_on_its_neighbours_nor_on_the_number_of_threads(a
     assert found.unique.tolist() == others.tolist()
     assert torch.equal(found.gains[others], policy.gains[others])
     assert found.gains[6].isfinite().all()
+
+
+def test_all_levels_of_instructions_agree() -> None:
+    library = interface.library()
+    count = library.epo_levels()
+    if library.epo_built() == 1 and platform.machine() == "x86_64":
+        pytest.skip("the kernel was built for this machine only; build.py --portable builds all levels")
+    game = random_game(2, 5, linear=False, games=9)
+    game.own_cost.requires_grad_()
+    cotangent = torch.randn(9, 2, 5, 2, dtype=torch.double)
+    gains, slopes = [], []
+    try:
+        for level in range(count):
+            library.epo_choose(level)
+            policy = game.equilibrium()
+            gains.append(policy.gains)
+            slopes += game.pull_back(policy, cotangent, [game.own_cost])
+    finally:
+        library.epo_choose(count - 1)
+    for found in (gains, slopes):
+        for one in found[:-1]:
+            torch.testing.assert_close(one, found[-1], rtol=1e-10, atol=1e-10)

@@ -534,18 +534,16 @@ NOINLINE void follow(const EpoPolicies& policies, Arena<double>& arena, const Bl
     }
 }
 
-/// Calls call(arena, block) for the games first .. last, W at a time. The number of agents is known at compile time up to 3.
+/// Calls call(arena, block) for the games first .. last, W at a time. The number of agents is known at compile time for two of them.
 template <class Call>
 void for_each_block(int64_t agents, int64_t horizon, int64_t first, int64_t last, const Call& call) {
     Arena<double> arena;
     for (int64_t start = first; start < last; start += W) {
         arena.clear();
-        switch (agents) {
-            case 1: call(arena, Block<1>(agents, horizon, start, last)); break;
-            case 2: call(arena, Block<2>(agents, horizon, start, last)); break;
-            case 3: call(arena, Block<3>(agents, horizon, start, last)); break;
-            default: call(arena, Block<0>(agents, horizon, start, last));
-        }
+        if (agents == 2)
+            call(arena, Block<2>(agents, horizon, start, last));
+        else
+            call(arena, Block<0>(agents, horizon, start, last));
     }
 }
 
