@@ -52,5 +52,11 @@ class Anderson:
 
 
 def least_squares(columns: Float[Tensor, "R D H"], wanted: Float[Tensor, "R D"]) -> Float[Tensor, "R H"]:
-    """The smallest x with the least |columns x - wanted|; columns may be zero or depend on each other."""
-    return torch.linalg.lstsq(columns, wanted[..., None], driver="gelsd").solution[..., 0]
+    """The smallest x with the least |columns x - wanted|; columns may be zero or depend on each other.
+
+    It is NaN where a column or ``wanted`` is not finite, which LAPACK would refuse for all rows.
+    """
+    finite = columns.isfinite().flatten(1).all(-1) & wanted.isfinite().all(-1)
+    known = torch.where(finite[:, None, None], columns, 0.0), torch.where(finite[:, None], wanted, 0.0)[..., None]
+    solution = torch.linalg.lstsq(*known, driver="gelsd").solution[..., 0]
+    return torch.where(finite[:, None], solution, torch.nan)

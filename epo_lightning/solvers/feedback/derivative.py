@@ -67,7 +67,10 @@ class _Attach(torch.autograd.Function):
             return local.pull_back(policy, covector[:, 0], inputs)
 
         wanted = torch.where(local.free[:, None, ..., None], cotangent.flatten(0, 1)[rows][:, None], 0.0)
-        adjoint = _gmres(lambda covector: pull_back(covector, [at])[0], wanted, ctx.terms)
+        # Norms of very small or large cotangents would underflow or overflow.
+        scale = wanted.abs().amax((1, 2, 3, 4), keepdim=True)
+        scale = torch.where(scale > 0, scale, 1.0)
+        adjoint = scale * _gmres(lambda covector: pull_back(covector, [at])[0], wanted / scale, ctx.terms)
         found = iter(pull_back(adjoint, [tensor for tensor in tensors if tensor.requires_grad]))
         return None, None, None, None, *(next(found) if tensor.requires_grad else None for tensor in tensors)
 

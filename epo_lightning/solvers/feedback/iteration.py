@@ -1,9 +1,11 @@
 """Iterated linear-quadratic games: from a trajectory to a feedback equilibrium (Fridovich-Keil et al., "Efficient iterative
 linear-quadratic approximations for nonlinear multi-player general-sum differential games", ICRA 2020).
 
-In every iteration the LQ game around the trajectory is solved, and the agents follow its policies, with their offsets
-multiplied by a step length, to the next trajectory. The iteration ends at a trajectory from which the policies of the LQ
-game around it deviate by less than a tolerance. Anderson acceleration saves a part of the LQ games.
+In every iteration the LQ game around the trajectory is solved, and the agents follow its policies to the next trajectory.
+Anderson acceleration saves a part of the LQ games: it guesses a better next trajectory, and where a guess is too far away, the
+agents follow the policies with their offsets multiplied by a step length. The iteration ends after a trajectory from which the
+policies deviate by less than a tolerance. Its next trajectory, which is nearly always closer to the equilibrium, is the
+solution.
 """
 
 from __future__ import annotations
@@ -93,7 +95,7 @@ class FeedbackGame:
 def iterate(
     game: FeedbackGame, controls: Float[Tensor, "B M N K 2"], iterations: int, tolerance: float
 ) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
-    """Iterate LQ games until their policies want to change no state by ``tolerance`` or more.
+    """Iterate LQ games until their policies want to change no state by ``tolerance`` or more, and take this last step.
 
     Returns:
         the controls, and a status: SOLVED where the iteration has ended, DAMPED where it has not, STOPPED where an LQ game
@@ -114,7 +116,7 @@ def iterate(
         step = _step(some, states[going], controls[going], length[going])
         status[going[step.wanted < tolerance]] = int(Status.SOLVED)
         status[going[~step.usable]] = int(Status.STOPPED)
-        # Policies that answer each other may oscillate.
+        # Policies that answer each other may oscillate: acceleration begins anew, and steps without it are shorter.
         slower = going[~(step.wanted < before[going])]
         length[slower] = (0.5 * length[slower]).clamp_min(_SHORTEST)
         memory.forget(slower)

@@ -84,3 +84,13 @@ def test_least_squares_takes_the_smallest_of_many_solutions() -> None:
     columns = torch.stack((column, column, torch.zeros_like(column)), -1)[None]
     found = least_squares(columns, torch.tensor([[2.0, 4.0, 5.0]], dtype=torch.double))
     torch.testing.assert_close(found, torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.double))
+
+
+def test_rows_that_are_not_finite_have_no_solution_and_do_not_change_the_others() -> None:
+    torch.manual_seed(0)
+    columns, wanted = torch.randn(3, 6, 2, dtype=torch.double), torch.randn(3, 6, dtype=torch.double)
+    sound = least_squares(columns, wanted)
+    wanted[1, 2], columns[2, 0, 1] = torch.nan, torch.inf
+    found = least_squares(columns, wanted)
+    assert torch.equal(found[0], sound[0])
+    assert found[1:].isnan().all()

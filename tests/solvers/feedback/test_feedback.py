@@ -197,6 +197,32 @@ def test_a_scene_with_nan_is_stopped_and_has_no_gradient() -> None:
         assert (gradient[1] == 0).all()
 
 
+@pytest.mark.parametrize("scale", [1e-200, 1e-5, 1e200])
+def test_the_derivative_is_linear_in_the_cotangent_at_all_scales(scale: float) -> None:
+    scene, game = meeting(2.3)
+    slopes = []
+    for factor in (1.0, scale):
+        leaves = leaves_of(game)
+        Implicit()(Feedback(), ENERGY, scene, leaves).states.backward(factor * torch.ones(1, 2, 2, HORIZON, 4).double())
+        slopes.append(leaves.goals.grad / factor)
+    torch.testing.assert_close(slopes[1], slopes[0], rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_cotangent_that_is_not_finite_stays_in_its_own_game(value: float) -> None:
+    scene, game = meeting(2.3, -2.6)
+    slopes = []
+    for other in (1.0, value):
+        leaves = leaves_of(game)
+        cotangent = torch.ones(2, 2, 2, HORIZON, 4, dtype=torch.double)
+        cotangent[1] = other
+        Implicit()(Feedback(), ENERGY, scene, leaves).states.backward(cotangent)
+        slopes.append(leaves.goals.grad)
+    assert torch.equal(slopes[1][0], slopes[0][0])
+    assert slopes[0].isfinite().all()
+    assert not slopes[1][1].isfinite().all()
+
+
 def test_the_given_strategies_stay_unchanged() -> None:
     scene, game = meeting(2.3)
     Feedback().descent().near_minimum()(ENERGY, scene, game)
