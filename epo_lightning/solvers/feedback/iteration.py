@@ -2,9 +2,9 @@
 linear-quadratic approximations for nonlinear multi-player general-sum differential games", ICRA 2020).
 
 In every iteration the LQ game around the trajectory is solved, and the agents follow its policies to the next trajectory.
-Anderson acceleration saves a part of the LQ games: it guesses a better next trajectory, and where a guess is too far away, the
-agents follow the policies with their offsets multiplied by a step length. The iteration ends after a trajectory from which the
-policies deviate by less than a tolerance. Its next trajectory, which is nearly always closer to the equilibrium, is the
+Anderson acceleration saves a part of the LQ games: it guesses a better next trajectory. Where a guess is too far away, the
+agents follow the policies with their offsets multiplied by a step length. The iteration ends after a trajectory from which
+the policies deviate by less than a tolerance; the next one, which is nearly always closer to the equilibrium, is the
 solution.
 """
 
