@@ -225,7 +225,7 @@ def manifest(folder: Path, command: str = "", config: Mapping[str, Any] | None =
     """
     if not folder.is_dir():
         kind = folder.name.partition("-")[0].upper()
-        hint = f"; make it with `{command}`, and the other data.* settings of this command, if it has any" if command else ""
+        hint = f"; make it with `{command}`, and any other data.* settings of this command" if command else ""
         raise CacheError(f"no {kind} data at {folder}{hint}")
     path = folder / MANIFEST
     try:
