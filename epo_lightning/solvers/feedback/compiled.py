@@ -38,6 +38,7 @@ def equilibria(parts: Sequence[Tensor], rho: float, free: Bool[Tensor, "S N K"])
 
     Raises:
         RuntimeError: the library is missing.
+        MemoryError: there is not enough memory.
     """
     count, agents, horizon = free.shape
     found = (
@@ -70,6 +71,7 @@ def pull_back(
 
     Raises:
         RuntimeError: the library is missing.
+        MemoryError: there is not enough memory.
     """
     *parts, free, controls = _contiguous((*parts, free, controls))
     bars = tuple(map(torch.empty_like, parts))
@@ -99,6 +101,7 @@ def follow(
 
     Raises:
         RuntimeError: the library is missing.
+        MemoryError: there is not enough memory.
     """
     given = _contiguous((start, states, controls, gains, offsets, length))
     visited, chosen = torch.empty_like(given[1]), torch.empty_like(given[2])
@@ -117,7 +120,4 @@ def _games(parts: Sequence[Tensor], rho: float, free: Tensor, policies: Policies
 
 
 def _call(name: str, *structures: EpoLQGames | EpoLQGradients | EpoPolicies) -> None:
-    if getattr(interface.library(), name)(*structures, torch.get_num_threads()) != 0:
-        raise MemoryError(
-            "there is not enough memory for linear-quadratic games: solve fewer scenes or modes at a time"
-        )
+    interface.check(getattr(interface.library(), name)(*structures, torch.get_num_threads()))

@@ -129,14 +129,14 @@ class _Quadratic:
         self._found: dict[tuple[int, int], Tensor] = {}
 
     def moved(self, entries: Sequence[int], first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """Changes of two arrays, which have the entries in their last dimensions, by one for every entry: [D, ...]."""
+        """Changes of two arrays [..., d] and [..., e] by one in each of D entries, counted through both: [D, ...]."""
         mine, others = self._unit[list(entries)].split((first.shape[-1], second.shape[-1]), -1)
         return mine.expand(-1, *first.shape), others.expand(-1, *second.shape)
 
     def add(
         self, entries: Sequence[int], residual: Float[Tensor, "*batch R"], change: Float[Tensor, "D *batch R"]
     ) -> None:
-        """Add a residual, and its derivatives by some entries."""
+        """Add 1/2 |r|^2 of a residual r, from its derivatives by the entries on which it depends."""
         along = dict(zip(entries, change, strict=True))
         for a in entries:
             self._add(a, self._size, (along[a] * residual).sum(-1))
@@ -145,7 +145,7 @@ class _Quadratic:
                     self._add(a, b, (along[a] * along[b]).sum(-1))
 
     def block(self, entries: range) -> Float[Tensor, "*batch d d1"]:
-        """The part of some entries."""
+        """Rows and columns of some entries, and their gradient as the last column."""
         rows = [self._found.get((min(a, b), max(a, b)), self._zero) for a in entries for b in (*entries, self._size)]
         return torch.stack(rows, -1).unflatten(-1, (len(entries), len(entries) + 1))
 

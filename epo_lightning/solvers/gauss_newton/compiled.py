@@ -323,7 +323,7 @@ class _Call:
             MemoryError: the library could not allocate its memory.
         """
         tape = self.tape.address
-        _check(interface.library().epo_solve(self.doubles, self.game, self.arguments, self.threads, tape))
+        interface.check(interface.library().epo_solve(self.doubles, self.game, self.arguments, self.threads, tape))
 
     def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor | None]:
         """Gradients by ``inputs``, for cotangents of the final controls, of all iterates and of the states.
@@ -356,7 +356,7 @@ class _Call:
         for gradient in references:
             gradients.reference_controls = gradient.data_ptr()
 
-        _check(interface.library().epo_differentiate(self.tape.address, self.game, self.arguments, gradients))
+        interface.check(interface.library().epo_differentiate(self.tape.address, self.game, self.arguments, gradients))
         return [*own.unbind(0), *pair.unbind(0), *margins.unbind(0), *goals, *headings, *references]
 
 
@@ -431,8 +431,3 @@ def _definite(call: _Call) -> Tensor:
 def _as(dtype: torch.dtype, tensor: Tensor) -> Tensor:
     # `to` takes a microsecond even if the type is right already, and there are twenty tensors.
     return tensor if tensor.dtype == dtype else tensor.to(dtype)
-
-
-def _check(outcome: int) -> None:
-    if outcome:
-        raise MemoryError("there is not enough memory for the compiled layer: solve fewer scenes or modes at a time")

@@ -230,3 +230,13 @@ def library() -> ctypes.CDLL:
     if isinstance(found, str):
         raise RuntimeError(f"the compiled layer is missing: {found}")
     return found
+
+
+def check(outcome: int) -> None:
+    """Check what a function of the library has returned.
+
+    Raises:
+        MemoryError: there was not enough memory for its work.
+    """
+    if outcome:
+        raise MemoryError("there is not enough memory for the compiled layer: solve fewer scenes or modes at a time")

@@ -101,7 +101,7 @@ struct Stage {
           pair_cost(arena.take(72 * block.pairs())), effort(arena.take(4 * block.agents())), push(arena.take(2 * block.agents())),
           free(reinterpret_cast<M*>(arena.take(block.agents()))), rho{} {}
 
-    /// Calls call(part, length, rows of a game, row) for all that the stage has of every array.
+    /// Calls call(i, rows, row) for every agent i: step k of the agent is row `row` of the `rows` rows that a game has in an array.
     template <class Call>
     static INLINE void for_each_row(const Block<N>& block, int k, const Call& call) {
         const int n = block.agents(), K = block.K;
