@@ -11,7 +11,6 @@ CPU, or change from step to step except by tensors on the device.
 from __future__ import annotations
 
 import gc
-import importlib.util
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -24,6 +23,7 @@ from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import FIELDS, Scene
+from epo_lightning.warp_kernels import installed
 
 WARM_UP = 3
 """Training steps before the capture: they compile kernels and make handles of libraries, which a capture cannot contain."""
@@ -195,7 +195,7 @@ def check(settings: Settings, forecaster: LightningModule) -> None:
             "graph cannot contain; set trainer.graph=false"
         )
     backend = getattr(solver, "backend", BACKENDS[0])
-    on_host = backend == "auto" and (importlib.util.find_spec("warp") is None or getattr(solver, "adaptive", False))
+    on_host = backend == "auto" and (not installed() or getattr(solver, "adaptive", False))
     if backend not in BACKENDS or on_host:
         raise ConfigError(
             f"trainer.graph=true with solver.backend={backend}: games would be solved on the host, which a CUDA graph "

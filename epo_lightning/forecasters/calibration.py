@@ -81,13 +81,18 @@ class Calibration:
         observed = past.future[:, None, :, :, :2]  # type: ignore[index]
         present = scene.agent_mask[:, None, :, None, None]
 
-        def misses(s: Tensor, start: Tensor, minimiser: Minimiser) -> tuple[Tensor, Tensor, Tensor]:
-            """Weighted misses [B, M, R] of the history, their derivative by s, and the strategies of both copies."""
+        def misses(s: Tensor, start: Tensor, minimiser: Minimiser, scenes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """Weighted misses [B, M, R] of the history, their derivative by s, and the strategies of both copies.
+
+            All arguments and results are those of the B chosen ``scenes``.
+            """
+            games = copies.map(lambda tensor: tensor[scenes])
             factor = torch.cat((s, s + _DIFFERENCE), 1).exp()[..., None]
-            weights = {name: weight * factor for name, weight in copies.pair_weights.items()}
-            found = minimiser(energy, past, dataclasses.replace(copies, pair_weights=weights, initial_controls=start))
-            missed = found.states[..., :before, :2] - observed
-            here, beside = (torch.where(present, missed, 0.0).flatten(2) / self.noise).chunk(2, 1)
+            weights = {name: weight * factor for name, weight in games.pair_weights.items()}
+            games = dataclasses.replace(games, pair_weights=weights, initial_controls=start)
+            found = minimiser(energy, past[scenes], games)
+            missed = found.states[..., :before, :2] - observed[scenes]
+            here, beside = (torch.where(present[scenes], missed, 0.0).flatten(2) / self.noise).chunk(2, 1)
             return here, (beside - here) / _DIFFERENCE, found.controls
 
         games = next(iter(game.pair_weights.values())).shape[1]
@@ -95,7 +100,8 @@ class Calibration:
         damping = torch.ones_like(s)
         start = _with_history(past, game.initial_controls.shape[3])
         descent = minimiser.descent()
-        missed, change, controls = misses(s, start.expand(-1, 2 * games, -1, -1, -1), descent)
+        every = torch.arange(len(s), device=s.device)
+        missed, change, controls = misses(s, start.expand(-1, 2 * games, -1, -1, -1), descent, every)
         near = descent.near_minimum()
         done = torch.zeros_like(s, dtype=torch.bool)
         for taken in range(1, self.steps + _FURTHER + 1):
@@ -107,9 +113,12 @@ class Calibration:
             small = ~(size >= _CONVERGED) & ~done
             s = torch.where(small & trial.isfinite(), trial, s)
             done = done | small
-            if done.all():
+            going = (~done).any(1).nonzero()[:, 0]
+            if not len(going):
                 break
-            found = misses(trial, controls, near)
+            found = misses(trial[going], controls[going], near, going)
+            # Scenes that have ended are not solved again; nothing of them is better.
+            found = [old.index_copy(0, going, new) for old, new in zip((missed, change, controls), found, strict=True)]
             better = (self._cost(found[0], trial) < self._cost(missed, s)) & ~done
             damping = torch.where(better, (damping / 3.0).clamp_min(1.0), damping * 4.0)
             s = torch.where(better, trial, s)

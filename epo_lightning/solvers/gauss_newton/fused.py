@@ -8,9 +8,6 @@ in a CUDA graph. ``pip install 'epo_lightning[gpu]'`` brings Warp; it is importe
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import importlib.util
 from collections.abc import Mapping
 from dataclasses import asdict
 from types import SimpleNamespace
@@ -25,6 +22,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.compiled import take_steps
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
+from epo_lightning.warp_kernels import described, installed, launch, warp
 
 if TYPE_CHECKING:
     from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
@@ -44,7 +42,7 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
     """Reason why the fused kernels cannot solve a game; None where they can."""
     controls = parameters.initial_controls
     agents = scene.agent_mask.shape[1]
-    if importlib.util.find_spec("warp") is None:
+    if not installed():
         return "the fused kernels need NVIDIA Warp: pip install 'epo_lightning[gpu]'"
     if controls.device.type not in ("cpu", "cuda"):
         return f"the fused kernels run on CUDA devices and CPUs, and these tensors are on {controls.device}"
@@ -89,20 +87,6 @@ def solve(
         )
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates)
     return take_steps(call, parameters.initial_controls)
-
-
-@functools.cache
-def warp() -> Any:
-    """Warp, set up for kernels without derivatives of its own.
-
-    Raises:
-        ImportError: it is not installed.
-    """
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_ERROR
-    wp.init()
-    return wp
 
 
 def kernels(
@@ -273,22 +257,11 @@ class _Call:
 
     def _launch(self, kernel: Any, *inputs: Any) -> None:
         """Launch a kernel on PyTorch's current stream, with memory for its blocks."""
-        wp, device = warp(), self.iterates.device
+        device = self.iterates.device
         work = self.iterates.new_empty(self.blocks * self.memory)
         numbers = torch.empty(self.blocks * (4 * self.shape[2] + 2), dtype=torch.int32, device=device)
         _point(self.arguments, work=work, numbers=numbers)
-        stream: Any = contextlib.nullcontext()
-        if device.type == "cuda":
-            stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
-        with stream:
-            wp.launch_tiled(
-                kernel,
-                dim=[self.blocks],
-                inputs=[self.game, self.arguments, *inputs],
-                block_dim=self.kernels.threads,
-                device=wp.device_from_torch(device),
-            )
-        # The memory is released as soon as the kernel is enqueued: PyTorch hands it out again in the order of the stream.
+        launch(kernel, self.blocks, self.kernels.threads, [self.game, self.arguments, *inputs], device)
 
     def run(self) -> None:
         """Take all steps; fills the results."""
@@ -322,11 +295,11 @@ def _stacked(tensors: list[Tensor]) -> Tensor:
 def _point(structure: Any, **tensors: Tensor | None) -> None:
     """Point arrays of a structure of Warp to the memory of contiguous tensors, whose owner keeps them.
 
-    Descriptors take a fraction of the time of Warp's arrays. Tensors that may be larger than these (iterates, factors,
+    Tensors that may be larger than these (iterates, factors,
     memory) are cut short: the kernels find their parts by pointers.
     """
     fields = structure.__ctype__()
     for name, tensor in tensors.items():
         if tensor is not None and tensor.numel():
             flat = tensor.view(-1)[:LONGEST]
-            setattr(fields, name, warp().from_torch(flat, requires_grad=False, return_ctype=True))
+            setattr(fields, name, described(flat))

@@ -19,6 +19,7 @@ import torch
 from epo_lightning.solvers.gauss_newton import fused
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import TEAM, WARP
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
+from epo_lightning.warp_kernels import warp
 
 ARCHITECTURES = (80, 90)
 """Compute capabilities times ten: A100; H100 and H200."""
@@ -64,7 +65,7 @@ def compile_for(
         features: the features of the games.
         steps: number of steps of a game.
     """
-    wp = fused.warp()
+    wp = warp()
     dtype, device = torch.float64 if double else torch.float32, torch.device("cuda")
     kernels = fused.kernels(dtype, agents, steps, games, device, features)
     found = {}
