@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from epo_lightning.decoders.fused_norm import FusedNormalise
 from epo_lightning.host import readable
 from epo_lightning.warp_kernels import installed
 
@@ -105,8 +106,6 @@ class MaskedBatchNorm(nn.BatchNorm1d):
 
     def _fused(self, rows: Tensor, present: Tensor) -> Tensor:
         """The same by one kernel."""
-        from epo_lightning.decoders.fused_norm import FusedNormalise
-
         running = self.running_mean, self.running_var, self.num_batches_tracked
         return FusedNormalise.apply(rows, present, self.weight, self.bias, *running, self.eps, self.momentum)
 

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 from typing import Any, no_type_check
 
 import torch
-import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -67,7 +66,7 @@ class FusedNormalise(torch.autograd.Function):
 @no_type_check
 def kernels(dtype: torch.dtype) -> SimpleNamespace:
     """The two kernels for numbers of a type."""
-    warp()  # sets it up
+    wp = warp()
     T = wp.float64 if dtype == torch.float64 else wp.float32
     Rows, Row, Mask = wp.array2d(dtype=T), wp.array(dtype=T), wp.array(dtype=wp.uint8)
 

@@ -8,6 +8,7 @@ from backends import HostMustNotWait
 
 from epo_lightning.decoders import batch_norm
 from epo_lightning.decoders.batch_norm import MaskedBatchNorm, NormalisePresent
+from epo_lightning.decoders.fused_norm import THREADS, FusedNormalise, kernels
 from epo_lightning.decoders.mlp import MLP
 
 needs_warp = pytest.mark.skipif(
@@ -58,8 +59,6 @@ def by_operations(rows, present, weight, bias):
 
 
 def by_kernels(rows, present, weight, bias):
-    from epo_lightning.decoders.fused_norm import FusedNormalise
-
     running = torch.zeros_like(weight), torch.ones_like(weight), torch.tensor(0)
     return FusedNormalise.apply(rows, present, weight, bias, *(each.detach() for each in running), 1e-5, 0.1)
 
@@ -108,7 +107,6 @@ def test_kernels_compute_what_operations_do(rows, share, dtype, many_threads, mo
 @needs_warp
 @pytest.mark.parametrize("architecture", [80, 90])
 def test_kernels_fit_into_the_registers_of_gpus(architecture, tmp_path):
-    from epo_lightning.decoders.fused_norm import THREADS, kernels
     from epo_lightning.solvers.gauss_newton.fused_kernel.ahead_of_time import resources
     from epo_lightning.warp_kernels import warp
 
