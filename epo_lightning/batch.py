@@ -32,6 +32,17 @@ class Batch:
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         return type(self)(**{field.name: visit(getattr(self, field.name)) for field in fields})
 
+    def tensors(self) -> list[Tensor]:
+        """All tensors, in the order in which :meth:`map` visits them."""
+        found: list[Tensor] = []
+
+        def collect(tensor: Tensor) -> Tensor:
+            found.append(tensor)
+            return tensor
+
+        self.map(collect)
+        return found
+
     def to(self: Some, target: torch.device | torch.dtype | str) -> Some:
         """A copy on another device, or with its floating-point tensors in another precision."""
         if isinstance(target, torch.dtype):

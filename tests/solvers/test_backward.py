@@ -13,8 +13,9 @@ from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.backward import Implicit, Truncated
-from epo_lightning.solvers.base import Stepwise
+from epo_lightning.solvers.backward import Backward, Implicit, Truncated, Unrolled
+from epo_lightning.solvers.base import Minimiser, Stepwise
+from epo_lightning.solvers.feedback.solver import Feedback
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 OWN = ("acc", "turnr")
@@ -68,3 +69,23 @@ def test_an_implicit_derivative_keeps_the_status_of_the_minimiser(status: int) -
         weight[1] = 0.0  # no minimum: any controls cost nothing
     solution = Implicit()(Given(status), ENERGY, scene, leaves_of(parameters))
     assert solution.status.flatten().tolist() == [status, STOPPED]
+
+
+@pytest.mark.parametrize(
+    ("solver", "derivative"),
+    [
+        (LevenbergMarquardt(3, backend="pytorch"), Unrolled()),
+        (LevenbergMarquardt(3, backend="compiled"), Unrolled()),
+        (LevenbergMarquardt(50, adaptive=True, backend="pytorch"), Implicit()),
+        (LevenbergMarquardt(50, adaptive=True, backend="compiled"), Implicit()),
+        (Feedback(), Implicit()),
+    ],
+)
+def test_a_scene_that_changed_before_the_backward_pass_is_noticed(solver: Minimiser, derivative: Backward) -> None:
+    """The derivative would be that of another scene."""
+    scene = random_scene(2, 2, history=2, size=1.0, dtype=torch.float64)
+    energy = FeatureEnergy(OWN, ["proximity"])
+    solution = derivative(solver, energy, scene, leaves_of(random_game(scene, 2, 4, OWN)))
+    scene.history[0] += 1.0
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        solution.states.sum().backward()

@@ -30,27 +30,22 @@ def attach(
         solved: mask of the games that are solved; the derivative of the others is zero.
         terms: number of steps of GMRES, which solves the linear system with D_u.
     """
-    tensors: list[Tensor] = []
-
-    def collect(tensor: Tensor) -> Tensor:
-        tensors.append(tensor)
-        return tensor
-
-    game.parameters.map(collect)
-    return _Attach.apply(game, solved, terms, controls, *tensors)
+    return _Attach.apply(game, solved, terms, controls, *game.parameters.tensors())
 
 
 class _Attach(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, game: FeedbackGame, solved: Tensor, terms: int, controls: Tensor, *tensors: Tensor) -> Tensor:
         ctx.game, ctx.terms = game, terms
-        ctx.save_for_backward(solved, controls, *tensors)
+        # The scene is saved so that autograd raises an error if it was changed in place before the backward pass.
+        ctx.save_for_backward(solved, controls, *tensors, *game.scene.tensors())
         return controls.view_as(controls)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         solved, controls, *given = ctx.saved_tensors
+        given = given[: len(ctx.game.parameters.tensors())]
         tensors = [tensor.detach().requires_grad_(tensor.is_floating_point()) for tensor in given]
         rest = iter(tensors)
         game = dataclasses.replace(ctx.game, parameters=ctx.game.parameters.map(lambda _: next(rest)))

@@ -197,18 +197,11 @@ class _Road:
         return self._moved(things, False)
 
     def _moved(self, things: Sequence[Any], down: bool) -> tuple[Any, ...]:
-        tensors: list[Tensor] = []
-
-        def visit(function: Any) -> tuple[Any, ...]:
-            return tuple(function(thing) if isinstance(thing, Tensor) else thing.map(function) for thing in things)
-
-        def collect(tensor: Tensor) -> Tensor:
-            tensors.append(tensor)
-            return tensor
-
-        visit(collect)
+        tensors = [
+            tensor for thing in things for tensor in ((thing,) if isinstance(thing, Tensor) else thing.tensors())
+        ]
         moved = iter(_Move.apply(self._copies, down, *tensors))
-        return visit(lambda _: next(moved))
+        return tuple(next(moved) if isinstance(thing, Tensor) else thing.map(lambda _: next(moved)) for thing in things)
 
 
 class _Move(torch.autograd.Function):

@@ -65,7 +65,8 @@ class _Attach(torch.autograd.Function):
         decrement = 0.5 * (slope.flatten(1) * left).sum(-1)
         descent.warn_if_far(model.value, decrement, ctx.factors.status != Status.STOPPED)
         ctx.game = game
-        ctx.save_for_backward(*tensors)
+        # The scene is saved so that autograd raises an error if it was changed in place before the backward pass.
+        ctx.save_for_backward(*tensors, *game.scene.tensors())
         status = ctx.factors.status.view(controls.shape[:2])
         ctx.mark_non_differentiable(status)
         return controls.view_as(controls), status
@@ -73,7 +74,7 @@ class _Attach(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        factors, tensors = ctx.factors, ctx.saved_tensors
+        factors, tensors = ctx.factors, ctx.saved_tensors[: len(ctx.game.tensors())]
         definite = factors.status != Status.STOPPED
         adjoint = torch.where(definite[:, None, None, None], factors.solve(planar(cotangent)), 0.0)
         _, by = ctx.game.gradient_of_phi(factors.model, tensors, adjoint, torch.zeros_like(adjoint))

@@ -201,7 +201,8 @@ class _Step(torch.autograd.Function):
         value = model.value.view(controls.shape[:2])
         if any(ctx.needs_input_grad):
             ctx.game, ctx.factorised = game, factorised
-            ctx.save_for_backward(torch.where(accepted, step, 0.0), solved, *tensors)
+            # The scene is saved so that autograd raises an error if it was changed in place before the backward pass.
+            ctx.save_for_backward(torch.where(accepted, step, 0.0), solved, *tensors, *game.scene.tensors())
         ctx.mark_non_differentiable(status, value)
         return torch.where(accepted, moved, controls), status, value
 
@@ -211,6 +212,7 @@ class _Step(torch.autograd.Function):
         game, factorised = ctx.game, ctx.factorised
         model = factorised.model
         step, solved, *tensors = ctx.saved_tensors
+        tensors = tensors[: len(game.tensors())]
         shape = cotangent.shape
         adjoint = factorised.solve(game.step_size * planar(cotangent))
         adjoint = torch.where(solved.flatten()[:, None, None, None], adjoint, 0.0)
