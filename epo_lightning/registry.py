@@ -37,6 +37,14 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return (f"did you mean {close[0]!r}? " if close else "") + "known: " + (", ".join(known) or "none")
 
 
+def place(part: Any) -> str:
+    """File and line where a class or function is defined; the name of its module where these are unknown."""
+    try:
+        return f"{inspect.getsourcefile(part)}:{inspect.getsourcelines(part)[1]}"
+    except (OSError, TypeError):
+        return str(getattr(part, "__module__", type(part).__module__))
+
+
 def register(group: str, name: str) -> Callable[[Part], Part]:
     """Make a class or function available as the part ``name`` of a ``group`` (``"backbone"``, ``"solver"``, ...)."""
 

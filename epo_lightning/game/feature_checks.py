@@ -11,12 +11,12 @@ from torch import Tensor
 
 from epo_lightning.checks import is_number
 from epo_lightning.forecast import GameParameters
-from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, PairFeature
+from epo_lightning.game.features import BUILT_IN, OWN_FEATURES, PAIR_FEATURES, OwnFeature, PairFeature
 from epo_lightning.game.game_end import check_game_steps
 from epo_lightning.game.limits import check_bound
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.host import readable
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError, nearest, place
 from epo_lightning.scene import Scene
 
 if TYPE_CHECKING:
@@ -141,24 +141,15 @@ def check_margins(margins: Any) -> None:
             raise ConfigError(f"energy.margins.{name} must be a number of metres, 0 or more, not {margin!r}")
 
 
-def refuse_asymmetry(name: str, feature: PairFeature) -> None:
-    """Refuse a pair feature that costs the two agents of a pair different amounts: the game would have no potential.
+def refuse_flaws(kind: str, name: str, feature: OwnFeature | PairFeature) -> None:
+    """Refuse a feature whose function cannot work, or costs the two agents of a pair different amounts.
 
     Raises:
-        ConfigError: a feature that depends on the order of the agents, or a function that fails on trial inputs.
+        ConfigError: the message names the feature and its file, and says what is wrong.
     """
-    try:
-        costs = feature.asymmetry
-    except Exception as error:
-        takes = (
-            "states [.., K, 4] and sizes [.., 1, 2] of two agents"
-            if feature.needs
-            else "states [.., K, 4] of two agents"
-        )
-        raise ConfigError(
-            f"pair feature {name!r} fails on trial inputs: {type(error).__name__}: {error}. It takes the {takes} "
-            "and returns residuals [.., R]"
-        ) from error
+    if name not in BUILT_IN and feature.flaw is not None:
+        raise ConfigError(f"{kind} feature {name!r} ({place(feature.function)}) {feature.flaw}")
+    costs = feature.asymmetry if isinstance(feature, PairFeature) else None
     if costs is not None:
         raise ConfigError(
             f"pair feature {name!r} is not symmetric: for two trial agents 1/2 |r|^2 is {costs[0]:.4g}, and {costs[1]:.4g} "

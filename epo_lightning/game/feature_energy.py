@@ -17,7 +17,7 @@ from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import disc, separation
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, STAGES, Energy, check_names
-from epo_lightning.game.feature_checks import check_bounds, check_inputs, check_margins, refuse_asymmetry
+from epo_lightning.game.feature_checks import check_bounds, check_inputs, check_margins, refuse_flaws
 from epo_lightning.game.feature_derivatives import (
     Bounds,
     Surroundings,
@@ -96,8 +96,10 @@ class FeatureEnergy(Energy):
                 f"{type(self.dynamics).__name__}; energy=convex works with dynamics=double_integrator"
             )
         check_whole("energy.pair_stride", self.pair_stride)
+        for name, own in self.own_features.items():
+            refuse_flaws("own", name, own)
         for name, pair in self.pair_features.items():
-            refuse_asymmetry(name, pair)
+            refuse_flaws("pair", name, pair)
         check_bounds(self.bounds)
         check_margins(self.margins)
         for name, feature in self.own_features.items():

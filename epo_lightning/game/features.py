@@ -34,7 +34,7 @@ from typing import TypeVar
 
 from torch import Tensor
 
-from epo_lightning.game import symmetry
+from epo_lightning.game import symmetry, trials
 from epo_lightning.game.circles import disc, overlap, row_extent, row_overlap
 from epo_lightning.game.vehicles import half_sizes, headway, lateral, longitudinal, time_to_conflict
 from epo_lightning.registry import ConfigError
@@ -107,6 +107,20 @@ class OwnFeature:
         """Whether the signal is linear in the controls of one channel."""
         return self.source in (Source.CONTROL, Source.RATE, Source.SPEED)
 
+    @cached_property
+    def flaw(self) -> str | None:
+        """What makes the function useless as a feature (:mod:`~epo_lightning.game.trials`); None where nothing is wrong."""
+        if self.function is None:
+            return None
+        if self.declared:
+            takes = "It takes one signal [.., K] and returns a value for each of its values, [.., K]"
+            return trials.flaw(self.function, [trials.numbers()], [], takes)
+        states, _ = trials.agents()[0]
+        takes = (
+            "It takes states [.., K, 4] and controls [.., K, 2] and returns residuals [.., R]; a single one is [.., 1]"
+        )
+        return trials.flaw(self.function, [states, trials.numbers(2)], [], takes)
+
 
 @dataclass(frozen=True)
 class PairFeature:
@@ -135,6 +149,21 @@ class PairFeature:
     def declared(self) -> bool:
         """Whether the feature is a function of the distance, so that its Jacobian is known in closed form."""
         return self.source is Source.DISTANCE
+
+    @cached_property
+    def flaw(self) -> str | None:
+        """What makes the function useless as a feature (:mod:`~epo_lightning.game.trials`); None where nothing is wrong."""
+        states, sizes = zip(*trials.agents(), strict=True)
+        margin = [sizes[0][..., 0]] if self.margin else []
+        if self.declared:
+            takes = "It takes distances [.., K] and reaches [.., 1] and returns a value for each distance, [.., K]"
+            return trials.flaw(self.function, [trials.numbers().abs()], [sizes[0][..., 0]], takes)
+        with_sizes = " and sizes [.., 1, 2]" if self.needs else ""
+        takes = (
+            f"It takes the states [.., K, 4]{with_sizes} of two agents{' and a margin [.., 1]' if self.margin else ''} "
+            "and returns residuals [.., R]; a single one is [.., 1]"
+        )
+        return trials.flaw(self.function, states, [*(sizes if self.needs else ()), *margin], takes)
 
     @cached_property
     def asymmetry(self) -> tuple[float, float] | None:
@@ -195,11 +224,11 @@ max(0, r_i + r_j + m_ij - |p_i - p_j|), the same with a margin m_ij [m] (``GameP
 ``circles``, the overlap of two rows of circles [m] (:mod:`~epo_lightning.game.circles`); ``headway``, ``longitudinal``,
 ``lateral``, ``time_to_conflict``, missing distances [m] of vehicles with margins (:mod:`~epo_lightning.game.vehicles`)."""
 
-_BUILT_IN = {*OWN_FEATURES, *PAIR_FEATURES}
+BUILT_IN = {*OWN_FEATURES, *PAIR_FEATURES}
 
 
 def _refuse(name: str, source: Source, sources: tuple[Source, ...]) -> None:
-    if name in _BUILT_IN:
+    if name in BUILT_IN:
         raise ConfigError(f"{name!r} is a built-in feature; choose another name")
     if not isinstance(source, Source):
         raise ConfigError(

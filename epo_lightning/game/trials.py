@@ -1,0 +1,90 @@
+"""Trial calls of features, which tell what is wrong with a function before a solver calls it far from its file.
+
+The trial agents are of all sizes, 10 cm to 100 m apart, slow and fast, in all directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SHAPE = (4, 64)
+"""Leading dimensions of trial arguments."""
+_FEW = 3
+"""Trial agents of the second leading dimension that are enough to find a flaw."""
+_STEPS, _DT, _LARGEST = 40, 0.1, 10.0
+
+
+@cache
+def agents() -> tuple[tuple[Float[Tensor, "*batch K 4"], Float[Tensor, "*batch 1 2"]], ...]:
+    """States and sizes of the first and of the second trial agents, the same at every call."""
+    generator = torch.Generator().manual_seed(0)
+
+    def drawn(*shape: int) -> Tensor:
+        return torch.rand(*SHAPE, *shape, generator=generator, dtype=torch.float64, device="cpu")
+
+    apart = 10.0 ** (3.0 * drawn(1, 1) - 1.0)
+    time = _DT * torch.arange(1, _STEPS + 1, dtype=torch.float64, device="cpu")[:, None]
+    both = []
+    for _ in range(2):
+        heading = 7.0 * drawn(1, 1) - 3.5 + (drawn(1, 1) - 0.5) * time
+        speed = 30.0 * drawn(1, 1).square() + (drawn(1, 1) - 0.5) * time
+        way = _DT * (speed * torch.cat((heading.cos(), heading.sin()), -1)).cumsum(-2)
+        states = torch.cat((apart * (drawn(1, 2) - 0.5) + way, heading, speed), -1)
+        both.append((states, torch.tensor([10.0, 2.5], dtype=torch.float64, device="cpu") * (0.1 + 0.9 * drawn(1, 2))))
+    return tuple(both)
+
+
+@cache
+def numbers(*shape: int) -> Float[Tensor, "*batch K *shape"]:
+    """Values of signals or controls from -10 to 10, the same at every call."""
+    generator = torch.Generator().manual_seed(1)
+    drawn = torch.rand(*SHAPE, _STEPS, *shape, generator=generator, dtype=torch.float64, device="cpu")
+    return _LARGEST * (2.0 * drawn - 1.0)
+
+
+def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequence[Tensor], takes: str) -> str | None:
+    """What makes a function useless as a feature, as the end of a sentence about it; None where nothing is wrong.
+
+    Args:
+        function: the function.
+        moving: trial arguments that follow from the controls. A function of a single one, a signal, works elementwise;
+            others return residuals [.., R].
+        others: further trial arguments.
+        takes: what the function takes and returns, in words.
+    """
+    elementwise, leading = len(moving) == 1, (SHAPE[0], _FEW)
+    moving, others = ([argument[:, :_FEW] for argument in arguments] for arguments in (moving, others))
+    try:
+        given = [argument.clone() for argument in (*moving, *others)]
+        with torch.no_grad():
+            value = function(*given)
+        if any(not torch.equal(now, before) for now, before in zip(given, (*moving, *others), strict=True)):
+            return "changes its arguments in place: they are the trajectory itself. Write x = x - 1 instead of x -= 1"
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            kind = f"tensor of {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
+            return f"returns a {kind}, and not a tensor of floating-point numbers. {takes}"
+        if (value.shape != moving[0].shape) if elementwise else (value.dim() != 3 or value.shape[:2] != leading):
+            shapes = " and ".join(str(list(argument.shape)) for argument in (*moving, *others))
+            return f"returns the shape {list(value.shape)} for arguments of the shapes {shapes}. {takes}"
+        if elementwise:
+            with torch.no_grad():
+                backwards = function(moving[0].flip(-1), *others).flip(-1)
+            if not torch.allclose(backwards, value, rtol=1e-9, atol=1e-9, equal_nan=True):
+                return f"is not elementwise: a value depends on those of other steps. {takes}"
+        leaves = [argument.clone().requires_grad_() for argument in moving]
+        with torch.enable_grad():
+            found = function(*leaves, *(argument.clone() for argument in others))
+        if not found.requires_grad:
+            return "has no derivative by its arguments, so no solver can act on it: use differentiable operations"
+        weights = torch.rand(value.shape, generator=torch.Generator().manual_seed(2), dtype=value.dtype, device="cpu")
+        slopes = torch.autograd.grad(found, leaves, weights, allow_unused=True)
+    except Exception as error:
+        return f"fails on trial arguments: {type(error).__name__}: {error}. {takes}"
+    if value.max() > value.min() and all(slope is None or not slope.any() for slope in slopes):
+        return "has a derivative of zero everywhere, so no solver can act on it: comparisons and rounding have no other"
+    return None

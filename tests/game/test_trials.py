@@ -1,0 +1,119 @@
+"""Features whose functions cannot work are refused when an energy is built."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
+from epo_lightning.registry import ConfigError
+from epo_lightning.scene import SPEED
+
+
+@pytest.fixture(autouse=True)
+def _registered_features_stay():
+    own, pair = dict(OWN_FEATURES), dict(PAIR_FEATURES)
+    yield
+    for table, before in ((OWN_FEATURES, own), (PAIR_FEATURES, pair)):
+        table.clear()
+        table.update(before)
+
+
+def slowed(states, controls):
+    controls[..., 0] -= 1.0
+    return controls[..., 0]
+
+
+def slowed_speed(speed):
+    speed -= 1.2
+    return speed.relu()
+
+
+OF_TRAJECTORIES = {
+    "in place": (slowed, "changes its arguments in place"),
+    "no residuals": (
+        lambda states, controls: controls[..., 0].square().sum(-1),
+        r"returns the shape \[4, 3\] for arguments of the shapes .*\[\.\., R\]",
+    ),
+    "one for each control": (lambda states, controls: controls, r"returns the shape \[4, 3, 40, 2\]"),
+    "no batch": (lambda states, controls: states[0, 0], r"returns the shape \[40, 4\]"),
+    "comparison": (lambda states, controls: (controls[..., 0] > 0.1).float(), "has no derivative"),
+    "detached": (lambda states, controls: controls[..., 0].detach(), "has no derivative"),
+    "constant": (lambda states, controls: torch.ones_like(controls[..., 0]), "has no derivative"),
+    "rounded": (lambda states, controls: controls[..., 0].round(), "has a derivative of zero everywhere"),
+    "whole": (lambda states, controls: controls[..., 0].long(), "returns a tensor of torch.int64"),
+    "two": (lambda states, controls: (states[..., 0], controls[..., 0]), "returns a tuple"),
+    "NumPy": (
+        lambda states, controls: torch.as_tensor(controls[..., 0].numpy()),
+        "fails on trial arguments: RuntimeError",
+    ),
+    "one argument": (
+        lambda states: states[..., 0],
+        r"fails on trial arguments: TypeError.*takes states \[\.\., K, 4\] and",
+    ),
+}
+OF_SIGNALS = {
+    "in place": (slowed_speed, "changes its arguments in place"),
+    "differences": (lambda speed: speed.diff(dim=-1), r"returns the shape \[4, 3, 39\].*\[\.\., K\]"),
+    "sums": (lambda speed: speed.cumsum(-1), "is not elementwise"),
+    "two arguments": (lambda states, controls: states[..., 0], "fails on trial arguments: TypeError.*takes one signal"),
+}
+OF_PAIRS = {
+    "one": (
+        lambda first: first[..., 0],
+        r"fails on trial arguments: TypeError: .*takes the states \[\.\., K, 4\] of two",
+    ),
+    "far": (lambda first, second: first[..., 999, :2] - second[..., 999, :2], "fails on trial arguments: IndexError"),
+    "number": (lambda first, second: 1.0, "returns a float"),
+}
+
+
+def refused(kind, name, words):
+    """The energy names the feature and this file, and says what is wrong."""
+    given = {"own": ([name], []), "pair": (["acc"], [name])}[kind]
+    with pytest.raises(ConfigError, match=rf"^{kind} feature '{re.escape(name)}' \(.*test_trials.py:\d+\) {words}"):
+        FeatureEnergy(*given)
+
+
+@pytest.mark.parametrize("name", OF_TRAJECTORIES)
+def test_functions_of_trajectories(name):
+    function, words = OF_TRAJECTORIES[name]
+    own_feature(name)(function)
+    refused("own", name, words)
+
+
+@pytest.mark.parametrize("name", OF_SIGNALS)
+@pytest.mark.parametrize("source", [Source.SPEED, Source.CONTROL, Source.RATE])
+def test_functions_of_signals(name, source):
+    function, words = OF_SIGNALS[name]
+    own_feature(name, source)(function)
+    refused("own", name, words)
+
+
+@pytest.mark.parametrize("name", OF_PAIRS)
+def test_functions_of_pairs(name):
+    function, words = OF_PAIRS[name]
+    pair_feature(name)(function)
+    refused("pair", name, words)
+
+
+def test_a_function_of_the_distance():
+    pair_feature("gaps", Source.DISTANCE)(lambda distance, reach: (reach - distance).relu().diff(dim=-1))
+    refused("pair", "gaps", r"returns the shape \[4, 3, 39\]")
+
+
+def test_functions_that_work_are_accepted():
+    """Also hinges without any effect on the trial trajectories, and functions that are not finite there."""
+    own_feature("never")(lambda states, controls: (controls[..., 0] - 1e6).relu())
+    own_feature("last")(lambda states, controls: states[..., -1:, SPEED])
+    own_feature("root", Source.SPEED)(lambda speed: speed.sqrt())
+    own_feature("limit", Source.CONTROL)(lambda control: (control - 2.0).relu())
+    pair_feature("soft", Source.DISTANCE, margin=True)(lambda distance, reach: torch.exp(reach - distance))
+    FeatureEnergy(["never", "last", "root", "limit"], ["soft", "proximity"])
+
+
+def test_built_in_features_have_no_flaw():
+    assert all(feature.flaw is None for feature in (*OWN_FEATURES.values(), *PAIR_FEATURES.values()))
