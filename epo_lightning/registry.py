@@ -46,12 +46,20 @@ def place(part: Any) -> str:
 
 
 def register(group: str, name: str) -> Callable[[Part], Part]:
-    """Make a class or function available as the part ``name`` of a ``group`` (``"backbone"``, ``"solver"``, ...)."""
+    """Make a class or function available as the part ``name`` of a ``group`` (``"backbone"``, ``"solver"``, ...).
+
+    Raises:
+        ConfigError: an unknown group, or a name that another part of the group has.
+    """
+    if group not in _HOMES:
+        raise ConfigError(f"@register({group!r}, {name!r}): unknown group of parts {group!r}: {nearest(group, _HOMES)}")
 
     def add(part: Part) -> Part:
         taken = _PARTS.setdefault(group, {}).setdefault(name, part)
         if taken is not part:
-            raise ValueError(f"two {group} parts are called {name!r}: {taken!r} and {part!r}")
+            raise ConfigError(
+                f"two parts of the group {group!r} are called {name!r}, in {place(taken)} and {place(part)}: rename one"
+            )
         return part
 
     return add
@@ -76,6 +84,21 @@ _OF_AN_EXTRA = "epo_lightning.solvers.gauss_newton.fused_kernel."
 """Modules that import the package of an extra at once. They register no part, and are not imported by a look-up."""
 
 
+def _import(module: str) -> None:
+    """Import a module that may register parts.
+
+    Raises:
+        ConfigError: it imports a package that is not installed.
+    """
+    try:
+        import_module(module)
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"{module.replace('.', '/')}.py cannot be imported, and all parts in its folder with it: {error}. Install the "
+            "package, or import it inside the function that needs it"
+        ) from error
+
+
 @cache
 def _load(group: str) -> None:
     """Import all modules that may register parts of a group; called before the first look-up of a part of this group."""
@@ -83,7 +106,7 @@ def _load(group: str) -> None:
         home = import_module(f"epo_lightning.{_HOMES[group]}")
         for module in pkgutil.walk_packages(getattr(home, "__path__", []), f"{home.__name__}."):
             if not module.name.startswith(_OF_AN_EXTRA):
-                import_module(module.name)
+                _import(module.name)
     for entry in entry_points(group="epo_lightning.parts"):
         entry.load()
 
@@ -103,8 +126,18 @@ def lookup(group: str, name: str) -> Callable[..., Any]:
     _load(group)
     parts = _PARTS.get(group, {})
     if name not in parts:
-        raise ConfigError(f"unknown {group} {name!r}: {nearest(str(name), parts)}")
+        hint = nearest(str(name), parts)
+        new = f'. A new one has @register("{group}", "{name}") above it, in {_home(group)}'
+        raise ConfigError(f"unknown {group} {name!r}: {hint}{'' if hint.startswith('did you mean') else new}")
     return parts[name]
+
+
+def _home(group: str) -> str:
+    """Where parts of a group are found, in words."""
+    home = import_module(f"epo_lightning.{_HOMES[group]}")
+    return (
+        f"a file of epo_lightning/{_HOMES[group]}" if hasattr(home, "__path__") else f"epo_lightning/{_HOMES[group]}.py"
+    )
 
 
 def check_keys(group: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:

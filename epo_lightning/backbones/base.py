@@ -10,13 +10,34 @@ from torch import Tensor, nn
 from epo_lightning.decoders.goals import given_goals
 from epo_lightning.encoders.history import LSTMHistory, TransformerHistory
 from epo_lightning.encoders.polyline import LanePolylines
+from epo_lightning.registry import ConfigError, place
 from epo_lightning.scene import Scene
 
 
 class Backbone(nn.Module):
-    """Observation encoder phi_glob: ``forward(scene)`` returns features z [B, N, width] of all agents (Section 4.1)."""
+    """Observation encoder phi_glob: ``forward(scene)`` returns features z [B, N, width] of all agents (Section 4.1).
+
+    Attributes:
+        width: size of the features z; a subclass sets it.
+    """
 
     width: int
+
+    def __call__(self, scene: Scene) -> Float[Tensor, "B N D"]:
+        """The features of a scene's agents.
+
+        Raises:
+            ConfigError: ``forward`` returns something else.
+        """
+        z = super().__call__(scene)
+        expected = [*scene.agent_mask.shape, self.width]
+        if not isinstance(z, Tensor) or list(z.shape) != expected:
+            found = f"shape {list(z.shape)}" if isinstance(z, Tensor) else f"a {type(z).__name__}"
+            raise ConfigError(
+                f"the backbone {type(self).__name__} ({place(type(self))}) must return features z of shape [B, N, width] = "
+                f"{expected}, but it returns {found}"
+            )
+        return z
 
 
 @dataclass(eq=False, repr=False)

@@ -10,7 +10,7 @@ from typing import Any
 from epo_lightning import pretrained
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.checkpoint import read_checkpoint
-from epo_lightning.registry import ConfigError, build, check_keys, lookup, nearest
+from epo_lightning.registry import ConfigError, build, check_keys, lookup, nearest, place
 from epo_lightning.task import TASK_KEYS, Task
 
 __all__ = ["Forecaster", "Task", "build_forecaster", "check_model", "load"]
@@ -88,6 +88,11 @@ def build_forecaster(model: Mapping[str, Any]) -> Forecaster:
         parts["backbone"] = build(
             "backbone", model["backbone"], goal_input=model["goal"] == "all", map_input=task.map, scale=task.scale
         )
+        if not isinstance(getattr(parts["backbone"], "width", None), int):
+            part = type(parts["backbone"])
+            raise ConfigError(
+                f"the backbone {part.__name__} ({place(part)}) must set self.width, the size of its features z, to a number"
+            )
     if "dynamics" in named or "energy" in named:
         parts["dynamics"] = build("dynamics", model["dynamics"])
     if "energy" in named:

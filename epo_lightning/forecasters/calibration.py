@@ -116,9 +116,9 @@ class Calibration:
             going = (~done).any(1).nonzero()[:, 0]
             if not len(going):
                 break
-            found = misses(trial[going], controls[going], near, going)
+            solved = misses(trial[going], controls[going], near, going)
             # Scenes that have ended are not solved again; nothing of them is better.
-            found = [old.index_copy(0, going, new) for old, new in zip((missed, change, controls), found, strict=True)]
+            found = [old.index_copy(0, going, new) for old, new in zip((missed, change, controls), solved, strict=True)]
             better = (self._cost(found[0], trial) < self._cost(missed, s)) & ~done
             damping = torch.where(better, (damping / 3.0).clamp_min(1.0), damping * 4.0)
             s = torch.where(better, trial, s)

@@ -34,8 +34,17 @@ _TABLE_ENTRIES = 2_000_000
 """Largest number of (pair of candidates, step) entries that are evaluated together, which bounds the memory."""
 
 
-def check_names(key: str, names: Any, known: Collection[str], what: str) -> None:
+def check_names(
+    key: str, names: Any, known: Collection[str], what: str, hint: Callable[[str], str | None] = lambda _: None
+) -> None:
     """Check a list of names of terms: all are known, and no name is repeated.
+
+    Args:
+        key: key of the list in the configuration of the energy.
+        names: the list.
+        known: the names that there are.
+        what: what the names are names of.
+        hint: what to do about an unknown name, if there is more to say than the nearest known one.
 
     Raises:
         ConfigError: an unknown name (the message suggests the nearest known one), a repeated name, or no list.
@@ -50,7 +59,7 @@ def check_names(key: str, names: Any, known: Collection[str], what: str) -> None
         parts("energy")  # loads third-party packages, which may register the missing names
     for name in names:
         if name not in known:
-            raise ConfigError(f"unknown {key} {what} {name!r} in energy.{key}: {nearest(name, known)}")
+            raise ConfigError(f"unknown {key} {what} {name!r} in energy.{key}: {hint(name) or nearest(name, known)}")
     if len(set(names)) < len(names):
         raise ConfigError(f"energy.{key} names a {what} twice: {list(names)}")
 

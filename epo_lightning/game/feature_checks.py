@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from epo_lightning.checks import is_number
 from epo_lightning.forecast import GameParameters
+from epo_lightning.game.energy import check_names
 from epo_lightning.game.features import BUILT_IN, OWN_FEATURES, PAIR_FEATURES, OwnFeature, PairFeature
 from epo_lightning.game.game_end import check_game_steps
 from epo_lightning.game.limits import check_bound
@@ -21,6 +23,8 @@ from epo_lightning.scene import Scene
 
 if TYPE_CHECKING:
     from epo_lightning.game.feature_energy import FeatureEnergy
+
+_FEATURES: Mapping[str, Mapping[str, OwnFeature | PairFeature]] = {"own": OWN_FEATURES, "pair": PAIR_FEATURES}
 
 
 def check_inputs(energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
@@ -106,6 +110,26 @@ def _check_decoded_margins(energy: FeatureEnergy, scene: Scene, parameters: Game
             )
         if readable(margin) and ((margin < 0) & exists[:, None]).any():
             raise ValueError(f"margins[{name!r}] must be 0 or more [m], but the least one is {float(margin.min())}")
+
+
+def check_features(own: Any, pair: Any) -> None:
+    """Check the names of an energy's features.
+
+    Raises:
+        ConfigError: see :func:`~epo_lightning.game.energy.check_names`.
+    """
+    for key, names in (("own", own), ("pair", pair)):
+        check_names(key, names, _FEATURES[key], "feature", functools.partial(_advice, key))
+
+
+def _advice(key: str, name: str) -> str:
+    """What to do about an unknown name in ``energy.own`` or ``energy.pair``."""
+    other = "pair" if key == "own" else "own"
+    if name in _FEATURES[other]:
+        return f"the {other} features have it, so it belongs into energy.{other}"
+    known = nearest(name, _FEATURES[key])
+    new = f'. A new one has @{key}_feature("{name}") above its function, in a file of epo_lightning/game'
+    return known if known.startswith("did you mean") else known + new
 
 
 def check_bounds(bounds: Any) -> None:

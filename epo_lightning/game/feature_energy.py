@@ -16,8 +16,8 @@ from epo_lightning.checks import check_whole
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import disc, separation
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, STAGES, Energy, check_names
-from epo_lightning.game.feature_checks import check_bounds, check_inputs, check_margins, refuse_flaws
+from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, STAGES, Energy
+from epo_lightning.game.feature_checks import check_bounds, check_features, check_inputs, check_margins, refuse_flaws
 from epo_lightning.game.feature_derivatives import (
     Bounds,
     Surroundings,
@@ -86,8 +86,7 @@ class FeatureEnergy(Energy):
     lane_slides: bool = False
 
     def __post_init__(self) -> None:
-        check_names("own", self.own, OWN_FEATURES, "feature")
-        check_names("pair", self.pair, PAIR_FEATURES, "feature")
+        check_features(self.own, self.pair)
         if not self.own and not self.pair:
             raise ConfigError("an energy needs at least one feature")
         if not isinstance(self.dynamics, Unicycle):

@@ -37,7 +37,7 @@ from torch import Tensor
 from epo_lightning.game import symmetry, trials
 from epo_lightning.game.circles import disc, overlap, row_extent, row_overlap
 from epo_lightning.game.vehicles import half_sizes, headway, lateral, longitudinal, time_to_conflict
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, place
 from epo_lightning.scene import ACCELERATION, TURN_RATE
 
 Function = TypeVar("Function", bound=Callable[..., Tensor])
@@ -240,6 +240,15 @@ def _refuse(name: str, source: Source, sources: tuple[Source, ...]) -> None:
         )
 
 
+def _refuse_another(
+    kind: str, name: str, taken: OwnFeature | PairFeature | None, function: Callable[..., Tensor]
+) -> None:
+    """Refuse a second function for a name, except one from the same module: a cell of a notebook may run again."""
+    if taken is not None and taken.function is not None and taken.function.__module__ != function.__module__:
+        places = f"{place(taken.function)} and {place(function)}"
+        raise ConfigError(f"two {kind} features are called {name!r}, in {places}: rename one")
+
+
 def own_feature(
     name: str, source: Source = Source.TRAJECTORY, channel: int = ACCELERATION
 ) -> Callable[[Function], Function]:
@@ -253,11 +262,13 @@ def own_feature(
         channel: ``ACCELERATION`` or ``TURN_RATE``, for signals of controls.
 
     Raises:
-        ConfigError: the name of a built-in feature, or a source that custom functions cannot have.
+        ConfigError: the name of a built-in feature or of one in another module, or a source that custom functions cannot
+            have.
     """
     _refuse(name, source, (Source.CONTROL, Source.RATE, Source.SPEED, Source.TRAJECTORY))
 
     def add(function: Function) -> Function:
+        _refuse_another("own", name, OWN_FEATURES.get(name), function)
         OWN_FEATURES[name] = OwnFeature(source, name, channel, function=function)
         return function
 
@@ -281,7 +292,8 @@ def pair_feature(
             of states takes it as its last argument [.., 1].
 
     Raises:
-        ConfigError: the name of a built-in feature, a source that custom functions cannot have, or an unknown need.
+        ConfigError: the name of a built-in feature or of one in another module, a source that custom functions cannot
+            have, or an unknown need.
     """
     _refuse(name, source, (Source.DISTANCE, Source.TRAJECTORY))
     if needs is not None and (needs != "size" or source is not Source.TRAJECTORY):
@@ -291,6 +303,7 @@ def pair_feature(
         )
 
     def add(function: Function) -> Function:
+        _refuse_another("pair", name, PAIR_FEATURES.get(name), function)
         PAIR_FEATURES[name] = PairFeature(source, function, needs, margin=margin)
         return function
 

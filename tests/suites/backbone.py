@@ -12,6 +12,14 @@ from games import pad, random_scene, reordered
 from epo_lightning.registry import build, lookup
 from epo_lightning.scene import Scene
 
+PADDING: dict[str, tuple[dict[str, int], str]] = {
+    "absent agents": ({"agents": 3}, "scene.agent_mask"),
+    "unobserved steps": ({"steps": 4}, "scene.history_mask"),
+    "absent lanes": ({"lanes": 2}, "scene.lane_mask"),
+    "absent vectors of lanes": ({"vectors": 3}, "scene.lane_mask"),
+}
+"""What is added to a scene, and the mask that leaves it out."""
+
 
 class BackboneSuite:
     """A backbone gives every agent a feature, which depends on its scene alone, whether or not it reads a map."""
@@ -51,10 +59,16 @@ class BackboneSuite:
         assert (backbone(scene) - before)[0].abs().amax(1).gt(1e-6).all() == self.reads_map
 
     @pytest.mark.parametrize("filling", [0.0, 1e6, float("nan")])
-    def test_padding_independence(self, backbone, filling):
+    @pytest.mark.parametrize("padding", PADDING)
+    def test_padding_independence(self, backbone, padding, filling):
+        """Nothing that a mask leaves out has an effect."""
+        amount, mask = PADDING[padding]
         scene = random_scene(3, 2, lanes=5)
-        padded = backbone(pad(scene, agents=3, steps=4, filling=filling, lanes=2, vectors=3))
-        torch.testing.assert_close(padded[:, :2], backbone(scene), rtol=0, atol=1e-5)
+        padded = backbone(pad(scene, **{"agents": 0, **amount}, filling=filling))
+        advice = f"the features of agents depend on {padding}, which {mask} leaves out"
+        torch.testing.assert_close(
+            padded[:, :2], backbone(scene), rtol=0, atol=1e-5, msg=lambda found: f"{advice}:\n{found}"
+        )
 
     def test_padding_does_not_change_gradients(self, backbone):
         scene = random_scene(3, 2, lanes=5)

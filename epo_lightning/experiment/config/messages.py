@@ -62,6 +62,11 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
     options = options_of(instance, group) if option else []
     if not options:
         return f"unknown configuration {missing!r}: " + " ".join(message.split())
+    if option in parts(group):
+        return (
+            f"unknown option {group}={option}: there is a part of this name, but no file conf/{group}/{option}.yaml, which "
+            f"begins with the line `name: {option}`. {_known(option, options)}"
+        )
     return f"unknown option {group}={option}: {_known(option, options)}"
 
 
