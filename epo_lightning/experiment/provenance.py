@@ -1,10 +1,16 @@
-"""The code that made a result: the commit of the checkout, and the versions of packages."""
+"""The code that made a result: the commit of the checkout, a hash of the Python files, and the versions of packages."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
 import subprocess
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, entry_points, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 from epo_lightning.experiment.config.compose import PACKAGE
 from epo_lightning.solvers.gauss_newton.kernel import interface
@@ -12,6 +18,8 @@ from epo_lightning.solvers.gauss_newton.kernel.build import fingerprint
 
 CODE = ("epo_lightning", "conf", "sweeps", "pyproject.toml")
 """Code and settings in a checkout. Changes elsewhere, such as outputs of earlier commands, decide on no result."""
+READERS = ("report", "explore", "drive")
+"""Folders of the package that only read runs; changes there change no result."""
 PACKAGES = ("epo_lightning", "torch", "lightning", "hydra-core", "omegaconf", "torchmetrics", "numpy", "numba")
 
 
@@ -19,14 +27,40 @@ def versions() -> dict[str, str | None]:
     """Versions of the packages on which results depend; None for those that are not installed.
 
     The version of the compiled layer is a hash of its sources. Without it, PyTorch solves the same games with other
-    rounding errors, after which a training may end at other scores.
+    rounding errors, after which a training may end at other scores. ``code`` is :func:`code`.
     """
     found: dict[str, str | None] = dict.fromkeys(PACKAGES)
     for name in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
     built = not isinstance(interface.find(), str)
-    return {**found, "compiled layer": f"{fingerprint():x}" if built else None}
+    return {**found, "compiled layer": f"{fingerprint():x}" if built else None, "code": code()}
+
+
+@functools.cache
+def code() -> str:
+    """Hash of the Python files on which results depend, as they were when a process first asked for it.
+
+    They are those of this package without :data:`READERS`, and those beside the modules of other packages that register
+    parts.
+    """
+    files = {f"{path.relative_to(PACKAGE)}": path for path in sorted(PACKAGE.rglob("*.py"))}
+    files = {name: path for name, path in files.items() if Path(name).parts[0] not in READERS}
+    for entry in entry_points(group="epo_lightning.parts"):
+        found = find_spec(entry.module)
+        if found is not None and found.origin is not None:
+            home = Path(found.origin).parent
+            files |= {f"{entry.module}: {path.relative_to(home)}": path for path in sorted(home.rglob("*.py"))}
+    total = hashlib.sha256()
+    for name, path in files.items():
+        total.update(f"{name}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()[:16]
+
+
+def of_other_code(record: Mapping[str, Any]) -> bool:
+    """Whether a run began with other code than the present one; False for runs of versions that did not record it."""
+    recorded = record.get("versions")
+    return isinstance(recorded, Mapping) and recorded.get("code", code()) != code()
 
 
 def commit() -> str | None:

@@ -8,6 +8,7 @@ import platform
 import shlex
 import shutil
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from epo_lightning.experiment import assembly, callbacks, debugging, distributed
 from epo_lightning.experiment.config.settings import EvaluateSettings, Measured, Settings
 from epo_lightning.experiment.evaluate import score
 from epo_lightning.experiment.opening import refuse_changed, settings_of
-from epo_lightning.experiment.provenance import commit, versions
+from epo_lightning.experiment.provenance import commit, of_other_code, versions
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import check_unchanged, differences, identity, row_identity
 from epo_lightning.registry import ConfigError
@@ -178,7 +179,7 @@ def measure(run: RunFolder, settings: Settings, which: Measured, devices: int | 
 
 
 def refuse_other(run: RunFolder, config: dict[str, Any], data: Any) -> None:
-    """Refuse to continue a run with another configuration or other data than it began with.
+    """Refuse to continue a run with another configuration or other data than it began with; warn of other code.
 
     Raises:
         ConfigError: the configuration or the data has changed; the message names the difference.
@@ -196,6 +197,12 @@ def refuse_other(run: RunFolder, config: dict[str, Any], data: Any) -> None:
             f"continue it as it is with `epo train resume={run.path}`, or choose another run_dir"
         )
     refuse_changed(run, data)
+    if not run.finished and of_other_code(run.record):
+        warnings.warn(
+            f"{run.path} began with other code than the present one, with which it continues: a Python file has changed. "
+            "For a run of one code, choose another run_dir=<folder>",
+            stacklevel=2,
+        )
 
 
 def _keep_unlearned(trainer: Trainer, model: LightningModule, data: Any, run: RunFolder) -> None:
@@ -262,8 +269,9 @@ def _occupied(run: RunFolder) -> str:
     if not run.record_file.is_file():
         return f"{run.path} exists and is not a run folder: nothing is overwritten; choose another run_dir=<folder>"
     if run.finished:
+        other = " of other code than the present one" if of_other_code(run.record) else ""
         return (
-            f"{run.path} holds a finished run: nothing is overwritten; score it with `epo evaluate run={run.path}`, "
+            f"{run.path} holds a finished run{other}: nothing is overwritten; score it with `epo evaluate run={run.path}`, "
             "choose another seed=<number> or run_dir=<folder>, or skip finished runs with existing=continue"
         )
     return (

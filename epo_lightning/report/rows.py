@@ -103,6 +103,20 @@ class Row:
         return sorted({run.git_commit for run in self.runs})
 
     @property
+    def mixture(self) -> str:
+        """A note on runs that were trained by different code; empty if there are none, or if it was not recorded."""
+        seeds: dict[str, list[str]] = {}
+        for run in self.runs:
+            seeds.setdefault(run.code, []).append(str(run.seed))
+        if len(seeds) < 2 or "" in seeds:
+            return ""
+        groups = "; ".join(", ".join(same) for same in seeds.values())
+        return (
+            f"{self.name} ({self.runs[0].data}) mixes runs of different code (seeds {groups}): its mean is that of no "
+            "method. Train them all by the present code, in another folder (runs=<folder>)"
+        )
+
+    @property
     def commands(self) -> list[str]:
         """Commands of its runs, in the order of the seeds."""
         return [run.command for run in self.runs]

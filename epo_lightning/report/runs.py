@@ -42,6 +42,7 @@ class EvaluatedRun:
         trained_digest: digest of the data on which it was trained.
         metrics: scores by name, displacements in m; with the errors of inferred costs, where the true ones are known.
         git_commit: commit of the code; the installed version outside a checkout.
+        code: hash of the code; empty for runs of versions that did not record it.
         command: command of the training.
         parameters: number of trained parameters, where known.
         identity: hash of all settings that affect its result.
@@ -66,6 +67,7 @@ class EvaluatedRun:
     trained_digest: str
     metrics: Mapping[str, float]
     git_commit: str
+    code: str
     command: str
     parameters: int | None
     identity: str
@@ -274,6 +276,7 @@ def _evaluated(
         trained_digest=trained,
         metrics={name: float(value) for name, value in {**metrics, **of_costs}.items()},
         git_commit=str(record.get("git_commit") or _version(record)),
+        code=str((record.get("versions") or {}).get("code") or ""),
         command=mask(recorded("command")),  # older versions wrote secrets
         parameters=record.get("parameters"),
         identity=identity(config, trained),

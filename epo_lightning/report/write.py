@@ -33,7 +33,7 @@ from epo_lightning.report.render import (
 from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, read_parts, scored, scored_elsewhere
 from epo_lightning.report.selection import BestSetting, best_settings
 from epo_lightning.report.statistics import build_comparisons
-from epo_lightning.report.tables import Table, build_tables
+from epo_lightning.report.tables import Table, build_tables, distinct
 from epo_lightning.report.timings import places, read_timings, timing_sheet
 from epo_lightning.report.transfer import transfer_sheets, transfers, transfers_to_csv
 from epo_lightning.report.worth import LEGEND as WORTH_LEGEND
@@ -133,7 +133,8 @@ def write_report(
     worth, compared = ([comparison_sheet(entry) for entry in entries] for entries in (of_game, comparisons))
     best, hint = _best(report.evaluated)
     settings = [settings_sheet(best)] if best else []
-    notes = [*notes, *damaged, *([hint] if hint else [])]
+    mixtures = [row.mixture for row in distinct(tables) if row.mixture]
+    notes = [*mixtures, *notes, *damaged, *([hint] if hint else [])]
     made, charts = how_made(tables, timings), charts_of(tables, timings)
     costs = cost_sheets(tables, timings)
     elsewhere = transfers(report.runs)

@@ -8,6 +8,7 @@ import shlex
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -262,3 +263,53 @@ def test_a_commit_is_marked_for_changes_of_code_and_settings_alone(
         assert provenance.commit() == f"{commit}+", file
         git("stash", "-q", "--include-untracked", "--", file)
         assert provenance.commit() == commit
+
+
+def test_the_hash_of_the_code_is_that_of_the_files_on_which_results_depend(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "epo_lightning"
+    for file in ("backbones/mine.py", "report/page.py"):
+        (package / file).parent.mkdir(parents=True)
+        (package / file).write_text("x = 1\n")
+    other = tmp_path / "elsewhere" / "third"
+    other.mkdir(parents=True)
+    (other / "__init__.py").touch()
+    (other / "parts.py").write_text("x = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "elsewhere"))
+    monkeypatch.setattr(provenance, "PACKAGE", package)
+    found = EntryPoint("third", "third.parts", "epo_lightning.parts")
+    monkeypatch.setattr(provenance, "entry_points", lambda group: [found])
+    hashes = [provenance.code.__wrapped__()]
+    for file in (package / "backbones" / "mine.py", other / "parts.py"):
+        file.write_text("x = 2\n")
+        hashes.append(provenance.code.__wrapped__())
+    assert len(set(hashes)) == 3
+    (package / "report" / "page.py").write_text("x = 2\n")
+    (package / "README.md").write_text("words")
+    assert provenance.code.__wrapped__() == hashes[-1]
+
+
+def test_runs_of_other_code_are_pointed_out(
+    epo: Epo, refused: Callable[..., str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sweep keeps them and says so, as does a training in their folder; the report names the rows that mix them."""
+    words = ("sweep", "rpi_main", *TINY, "experiment=rpi/v_lstm", "score=test")
+    assert epo(*words, "seed=0,1") == 0
+    assert "Python file has changed" not in capsys.readouterr().out
+    monkeypatch.setattr(provenance, "code", lambda: "other")
+    assert epo(*words, "seed=0,1,2") == 0
+    assert (
+        "2 of the 2 finished runs are kept although a Python file has changed since they began"
+        in capsys.readouterr().out
+    )
+    assert epo("report", "runs=runs", "scenes=false") == 0
+    note = "V-LSTM (tiny) mixes runs of different code (seeds 0, 1; 2)"
+    assert note in capsys.readouterr().out.replace("\n", " ")
+    assert note in Path("report/results.md").read_text()
+    (run,) = (RunFolder(path.parent) for path in Path("runs").rglob("run.json") if '"seed": 0' in path.read_text())
+    train = ("train", "experiment=rpi/v_lstm", *TINY, "seed=0", f"run_dir={run.path}")
+    assert "holds a finished run of other code than the present one: nothing is overwritten" in refused(*train)
+    run.update(status="training")
+    with pytest.warns(UserWarning, match="began with other code than the present one, with which it continues"):
+        assert epo("train", f"resume={run.path}") == 0

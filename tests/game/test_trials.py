@@ -117,3 +117,34 @@ def test_functions_that_work_are_accepted():
 
 def test_built_in_features_have_no_flaw():
     assert all(feature.flaw is None for feature in (*OWN_FEATURES.values(), *PAIR_FEATURES.values()))
+
+
+def test_features_in_the_other_list_and_new_ones_are_explained():
+    for own, pair, words in (
+        (["proximity"], [], r"'proximity' in energy\.own: the pair features have it, so it belongs into energy\.pair"),
+        (["acc"], ["acc"], r"'acc' in energy\.pair: the own features have it, so it belongs into energy\.own"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            FeatureEnergy(own, pair)
+    with pytest.raises(
+        ConfigError, match=r'A new one has @own_feature\("zigzag"\) above its function, in a file of epo_l'
+    ):
+        FeatureEnergy(["zigzag"])
+    with pytest.raises(ConfigError, match="did you mean 'goal'"):
+        FeatureEnergy(["goals"])
+
+
+def test_two_features_of_one_name_are_named_with_their_places():
+    """A cell of a notebook may run again, with another function of the same module."""
+
+    def elsewhere(speed):
+        return speed
+
+    elsewhere.__module__ = "elsewhere"
+    for register in (own_feature, pair_feature):
+        register("mine")(lambda first, second: first[..., 0])
+        register("mine")(lambda first, second: second[..., 0])
+        with pytest.raises(
+            ConfigError, match=r"features are called 'mine', in .*test_trials.py:\d+ and .*:\d+: rename"
+        ):
+            register("mine")(elsewhere)

@@ -17,7 +17,8 @@ from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.config.settings import Settings, TrainerSettings
 from epo_lightning.experiment.config.sources import options_of
-from epo_lightning.experiment.sweeps.sweep import Job, Sweep
+from epo_lightning.experiment.provenance import of_other_code
+from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
 from epo_lightning.experiment.sweeps.watch import news, status, summary
 from epo_lightning.experiment.verbs import check_settings, make_data
 from epo_lightning.masking import mask
@@ -81,6 +82,7 @@ def run(
         )
         if jobs:
             print(f"{sweep.label}: {summary(Counter(states))}", flush=True)
+            _note_other_code(jobs, states)
         with news(sweep):
             if jobs:
                 missing = [job for job, state in zip(jobs, states, strict=True) if state != "done"]
@@ -95,6 +97,18 @@ def run(
     if done:
         print(f"next: epo report {sweep.label}" + (f" {word('runs', runs)}" if runs != "runs" else ""))
     return done
+
+
+def _note_other_code(jobs: Sequence[Job], states: Sequence[State]) -> None:
+    """Print how many of the finished runs were trained by other code than the present one."""
+    done = [job.run for job, state in zip(jobs, states, strict=True) if state == "done"]
+    others = [run for run in done if of_other_code(run.record)]
+    if others:
+        print(
+            f"{len(others)} of the {len(done)} finished runs are kept although a Python file has changed since they began, "
+            f"the first one {others[0].path}: choose another folder, runs=<folder>, to train all runs by the present code",
+            flush=True,
+        )
 
 
 def generate(name: str, overrides: Sequence[str], extra: Sequence[str]) -> None:

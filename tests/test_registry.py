@@ -1,0 +1,64 @@
+"""The registry of parts: what it refuses names the files, and says what to do."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from epo_lightning import registry
+from epo_lightning.registry import ConfigError, lookup, register
+
+
+@pytest.fixture(autouse=True)
+def _registered_parts_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    for group in registry._HOMES:
+        registry.parts(group)  # modules are imported, and register their parts, only once
+    monkeypatch.setattr(registry, "_PARTS", {group: dict(parts) for group, parts in registry._PARTS.items()})
+
+
+def part() -> None:
+    """A part."""
+
+
+def other() -> None:
+    """Another one."""
+
+
+def test_two_parts_of_one_name_are_named_with_their_places() -> None:
+    register("backbone", "mine")(part)
+    register("backbone", "mine")(part)  # the same again
+    here = rf"{__file__}:\d+"
+    with pytest.raises(ConfigError, match=f"two parts of the group 'backbone' are called 'mine', in {here} and {here}"):
+        register("backbone", "mine")(other)
+
+
+def test_unknown_groups_are_refused_where_a_part_is_registered() -> None:
+    with pytest.raises(ConfigError, match=r"@register\('backbones', 'gru'\): .*did you mean 'backbone'"):
+        register("backbones", "gru")
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "words"),
+    [
+        (
+            "backbone",
+            "recurrent",
+            r'A new one has @register\("backbone", "recurrent"\) above it, in a file of epo_light',
+        ),
+        ("optimizer", "muon", "above it, in epo_lightning/optimizers.py$"),
+        ("backbone", "v_lst", "did you mean 'v_lstm'. known: [^.]*$"),
+    ],
+)
+def test_unknown_parts_are_refused_with_the_place_of_new_ones(group: str, name: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=f"unknown {group} '{name}': .*{words}"):
+        lookup(group, name)
+
+
+def test_a_part_whose_file_needs_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "broken_part.py").write_text("import no_such_package\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "broken_part", raising=False)
+    with pytest.raises(ConfigError, match=r"broken_part.py cannot be imported, .*No module named 'no_such_package'"):
+        registry._import("broken_part")
