@@ -1,5 +1,6 @@
 # make run         from a bare machine to a first table with pictures: eight minutes on 2 idle cores, installation included
 # make install     the package and its command `epo` in .venv (`make run` does it)
+# make dev         install what the tests and checks need as well
 # make test        install everything and run the tests      make test-slow   the tests that take minutes
 # make lint        check style and types
 # make smoke       train every experiment for a few steps on drawn scenes (a minute)
@@ -26,7 +27,7 @@ INSTALLED := $(VENV)/.installed
 DOCUMENTABLE := $(VENV)/.documentable
 TESTABLE := $(VENV)/.testable
 
-.PHONY: run install test test-slow smoke asan lint docs tables checkpoint wheel clean
+.PHONY: run install dev test test-slow smoke asan lint docs tables checkpoint wheel clean
 
 install: $(INSTALLED)
 
@@ -75,6 +76,8 @@ endef
 $(INSTALLED): $(SOURCES)
 	$(call INSTALL,local)
 	touch $@
+
+dev: $(TESTABLE)
 
 $(DOCUMENTABLE): $(SOURCES)
 	$(call INSTALL,$(WITH_DOCS))

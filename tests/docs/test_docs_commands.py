@@ -28,6 +28,7 @@ OF_EXAMPLES = {
     "mine": "of the tutorial, which test_docs_tutorial.py runs",
     "gru": "of extend.md, whose code tests/backbones/test_documented_backbone.py runs",
     "curvature": "of extend.md, whose code tests/game/test_extend.py runs",
+    "rpi_curvature": "of extend.md",
     "my_conf": "of extend.md",
 }
 MAKEFILE = (ROOT / "Makefile").read_text()

@@ -15,7 +15,16 @@ from epo_lightning.experiment.config.compose import tree
 FOLDERS = "docs|tests|conf|sweeps|benchmarks|epo_lightning|docker"
 GENERATED = ROOT / "docs" / "reference"
 """Pages that the build of the site generates from the code."""
-EXAMPLES = {"mine", "gru", "test_gru", "curvature", "test_curvature", "plain_csv"}
+EXAMPLES = {
+    "mine",
+    "gru",
+    "test_gru",
+    "curvature",
+    "test_curvature",
+    "rpi_curvature",
+    "v_lstm_epo_curvature",
+    "plain_csv",
+}
 """Files that the pages tell a reader to write."""
 
 

@@ -11,6 +11,8 @@ import torch
 from games import leaves_of, random_game, random_scene
 from suites import FeatureSuite
 
+from epo_lightning.experiment.config import compose
+from epo_lightning.experiment.sweeps import sweeping
 from epo_lightning.forecast import Status
 from epo_lightning.game import features
 from epo_lightning.game.dynamics import Unicycle
@@ -69,6 +71,26 @@ def test_documented_features_work_beside_networks(documented):
     assert (solution.energy < solution.initial_energy).all()
     solution.controls.square().sum().backward()
     assert leaves.own_weights["latacc"].grad.abs().max() > 0
+
+
+def test_the_documented_row_differs_in_its_new_feature(documented, tmp_path):
+    """The files of the sections on features and on comparisons, as they stand."""
+    pieces = re.findall(
+        r"`((?:conf|sweeps)/[\w./]+\.yaml)`[^`]*:\n\n```yaml\n(.*?)^```$", PAGE.read_text(), re.DOTALL | re.MULTILINE
+    )
+    files = {name: text for name, text in pieces if "curvature" in name}
+    assert len(files) == 3
+    extra = [str(tmp_path)]
+    for name, text in files.items():
+        file = tmp_path / name.removeprefix("conf/")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    rows = compose.jobs("train", sweeping.words_of("curvature", ["data=drawn"], extra), extra)
+    assert len(rows) == 6
+    usual, new = (compose.compose("train", row, extra) for row in (rows[0], rows[3]))
+    assert set(new["energy"]["own"]) - set(usual["energy"]["own"]) == {"curvature"}
+    assert set(usual["energy"]["own"]) <= set(new["energy"]["own"])
+    assert {key for key in new if new[key] != usual[key]} == {"energy", "title", "experiment", "variant"}
 
 
 class TestDocumentedFeature(FeatureSuite):
