@@ -48,6 +48,8 @@ def place(part: Any) -> str:
 def register(group: str, name: str) -> Callable[[Part], Part]:
     """Make a class or function available as the part ``name`` of a ``group`` (``"backbone"``, ``"solver"``, ...).
 
+    A part that is defined again, as by a cell of a notebook that runs twice, replaces the one before.
+
     Raises:
         ConfigError: an unknown group, or a name that another part of the group has.
     """
@@ -55,11 +57,13 @@ def register(group: str, name: str) -> Callable[[Part], Part]:
         raise ConfigError(f"@register({group!r}, {name!r}): unknown group of parts {group!r}: {nearest(group, _HOMES)}")
 
     def add(part: Part) -> Part:
-        taken = _PARTS.setdefault(group, {}).setdefault(name, part)
-        if taken is not part:
+        known = _PARTS.setdefault(group, {})
+        taken = known.setdefault(name, part)
+        if (taken.__module__, taken.__qualname__) != (part.__module__, part.__qualname__):
             raise ConfigError(
                 f"two parts of the group {group!r} are called {name!r}, in {place(taken)} and {place(part)}: rename one"
             )
+        known[name] = part
         return part
 
     return add

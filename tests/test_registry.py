@@ -34,6 +34,20 @@ def test_two_parts_of_one_name_are_named_with_their_places() -> None:
         register("backbone", "mine")(other)
 
 
+def test_a_part_that_is_defined_again_replaces_the_one_before() -> None:
+    """A cell of a notebook runs twice."""
+
+    def again() -> type:
+        @register("backbone", "mine")
+        class Mine:
+            pass
+
+        return Mine
+
+    again()
+    assert again() is lookup("backbone", "mine")
+
+
 def test_unknown_groups_are_refused_where_a_part_is_registered() -> None:
     with pytest.raises(ConfigError, match=r"@register\('backbones', 'gru'\): .*did you mean 'backbone'"):
         register("backbones", "gru")
