@@ -82,15 +82,14 @@ class Calibration:
         present = scene.agent_mask[:, None, :, None, None]
 
         def misses(s: Tensor, start: Tensor, minimiser: Minimiser, scenes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            """Weighted misses [B, M, R] of the history, their derivative by s, and the strategies of both copies.
-
-            All arguments and results are those of the B chosen ``scenes``.
-            """
-            games = copies.map(lambda tensor: tensor[scenes])
+            """Weighted misses [S, M, R] of the history, their derivative by s, and the strategies of both copies, in the
+            S chosen ``scenes``, to which s and the initial strategies belong."""
+            chosen = copies[scenes]
             factor = torch.cat((s, s + _DIFFERENCE), 1).exp()[..., None]
-            weights = {name: weight * factor for name, weight in games.pair_weights.items()}
-            games = dataclasses.replace(games, pair_weights=weights, initial_controls=start)
-            found = minimiser(energy, past[scenes], games)
+            weights = {name: weight * factor for name, weight in chosen.pair_weights.items()}
+            found = minimiser(
+                energy, past[scenes], dataclasses.replace(chosen, pair_weights=weights, initial_controls=start)
+            )
             missed = found.states[..., :before, :2] - observed[scenes]
             here, beside = (torch.where(present[scenes], missed, 0.0).flatten(2) / self.noise).chunk(2, 1)
             return here, (beside - here) / _DIFFERENCE, found.controls
@@ -100,8 +99,8 @@ class Calibration:
         damping = torch.ones_like(s)
         start = _with_history(past, game.initial_controls.shape[3])
         descent = minimiser.descent()
-        every = torch.arange(len(s), device=s.device)
-        missed, change, controls = misses(s, start.expand(-1, 2 * games, -1, -1, -1), descent, every)
+        all_scenes = torch.arange(len(s), device=s.device)
+        missed, change, controls = misses(s, start.expand(-1, 2 * games, -1, -1, -1), descent, all_scenes)
         near = descent.near_minimum()
         done = torch.zeros_like(s, dtype=torch.bool)
         for taken in range(1, self.steps + _FURTHER + 1):
