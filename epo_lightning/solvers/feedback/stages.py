@@ -139,10 +139,10 @@ class _Quadratic:
         """Add 1/2 |r|^2 of a residual r, from its derivatives by the entries on which it depends."""
         along = dict(zip(entries, change, strict=True))
         for a in entries:
-            self._add(a, self._size, (along[a] * residual).sum(-1))
+            self._add(a, self._size, _product(along[a], residual))
             for b in entries:
                 if b >= a:
-                    self._add(a, b, (along[a] * along[b]).sum(-1))
+                    self._add(a, b, _product(along[a], along[b]))
 
     def block(self, entries: range) -> Float[Tensor, "*batch d d1"]:
         """Rows and columns of some entries, and their gradient as the last column."""
@@ -152,6 +152,12 @@ class _Quadratic:
     def _add(self, row: int, column: int, cost: Tensor) -> None:
         known = self._found.get((row, column))
         self._found[row, column] = cost if known is None else known + cost
+
+
+def _product(one: Float[Tensor, "*batch R"], other: Float[Tensor, "*batch R"]) -> Float[Tensor, "*batch"]:
+    """The scalar product of the last dimension; a sum over R = 1 entries would copy them."""
+    products = one * other
+    return products.squeeze(-1) if products.shape[-1] == 1 else products.sum(-1)
 
 
 def _dynamics(
