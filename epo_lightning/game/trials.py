@@ -57,34 +57,42 @@ def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequ
         others: further trial arguments.
         takes: what the function takes and returns, in words.
     """
-    elementwise, leading = len(moving) == 1, (SHAPE[0], _FEW)
     moving, others = ([argument[:, :_FEW] for argument in arguments] for arguments in (moving, others))
-    try:
-        given = [argument.clone() for argument in (*moving, *others)]
+    errors = []
+    for dtype in (torch.float64, torch.float32):  # a function may hold parameters of single precision
+        try:
+            return _flaw(function, [m.to(dtype) for m in moving], [other.to(dtype) for other in others], takes)
+        except Exception as error:
+            errors.append(f"{type(error).__name__}: {error}")
+    return f"fails on trial arguments: {errors[0]}. {takes}"
+
+
+def _flaw(function: Callable[..., Tensor], moving: list[Tensor], others: list[Tensor], takes: str) -> str | None:
+    elementwise = len(moving) == 1
+    given = [argument.clone() for argument in (*moving, *others)]
+    with torch.no_grad():
+        value = function(*given)
+    if any(not torch.equal(now, before) for now, before in zip(given, (*moving, *others), strict=True)):
+        return "changes its arguments in place: they are the trajectory itself. Write x = x - 1 instead of x -= 1"
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        kind = f"tensor of {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
+        return f"returns a {kind}, and not a tensor of floating-point numbers. {takes}"
+    if (value.shape != moving[0].shape) if elementwise else (value.dim() != 3 or value.shape[:2] != (SHAPE[0], _FEW)):
+        shapes = " and ".join(str(list(argument.shape)) for argument in (*moving, *others))
+        return f"returns the shape {list(value.shape)} for arguments of the shapes {shapes}. {takes}"
+    if elementwise:
         with torch.no_grad():
-            value = function(*given)
-        if any(not torch.equal(now, before) for now, before in zip(given, (*moving, *others), strict=True)):
-            return "changes its arguments in place: they are the trajectory itself. Write x = x - 1 instead of x -= 1"
-        if not isinstance(value, Tensor) or not value.is_floating_point():
-            kind = f"tensor of {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
-            return f"returns a {kind}, and not a tensor of floating-point numbers. {takes}"
-        if (value.shape != moving[0].shape) if elementwise else (value.dim() != 3 or value.shape[:2] != leading):
-            shapes = " and ".join(str(list(argument.shape)) for argument in (*moving, *others))
-            return f"returns the shape {list(value.shape)} for arguments of the shapes {shapes}. {takes}"
-        if elementwise:
-            with torch.no_grad():
-                backwards = function(moving[0].flip(-1), *others).flip(-1)
-            if not torch.allclose(backwards, value, rtol=1e-9, atol=1e-9, equal_nan=True):
-                return f"is not elementwise: a value depends on those of other steps. {takes}"
-        leaves = [argument.clone().requires_grad_() for argument in moving]
-        with torch.enable_grad():
-            found = function(*leaves, *(argument.clone() for argument in others))
-        if not found.requires_grad:
-            return "has no derivative by its arguments, so no solver can act on it: use differentiable operations"
-        weights = torch.rand(value.shape, generator=torch.Generator().manual_seed(2), dtype=value.dtype, device="cpu")
-        slopes = torch.autograd.grad(found, leaves, weights, allow_unused=True)
-    except Exception as error:
-        return f"fails on trial arguments: {type(error).__name__}: {error}. {takes}"
-    if value.max() > value.min() and all(slope is None or not slope.any() for slope in slopes):
+            backwards = function(moving[0].flip(-1), *others).flip(-1)
+        tolerance = torch.finfo(value.dtype).eps ** 0.5
+        if not torch.allclose(backwards, value, rtol=tolerance, atol=tolerance, equal_nan=True):
+            return f"is not elementwise: a value depends on those of other steps. {takes}"
+    leaves = [argument.clone().requires_grad_() for argument in moving]
+    with torch.enable_grad():
+        found = function(*leaves, *(argument.clone() for argument in others))
+    if not found.requires_grad:
+        return "has no derivative by its arguments, so no solver can act on it: use differentiable operations"
+    weights = torch.rand(value.shape, generator=torch.Generator().manual_seed(2), dtype=value.dtype, device="cpu")
+    slopes = torch.autograd.grad(found, leaves, weights, allow_unused=True)
+    if value.unique().numel() > 1 and all(slope is None or not slope.any() for slope in slopes):
         return "has a derivative of zero everywhere, so no solver can act on it: comparisons and rounding have no other"
     return None

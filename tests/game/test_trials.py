@@ -110,9 +110,11 @@ def test_functions_that_work_are_accepted():
     own_feature("never")(lambda states, controls: (controls[..., 0] - 1e6).relu())
     own_feature("last")(lambda states, controls: states[..., -1:, SPEED])
     own_feature("root", Source.SPEED)(lambda speed: speed.sqrt())
+    network = torch.nn.Linear(4, 3)
+    own_feature("learned")(lambda states, controls: network(states).flatten(-2))
     own_feature("limit", Source.CONTROL)(lambda control: (control - 2.0).relu())
     pair_feature("soft", Source.DISTANCE, margin=True)(lambda distance, reach: torch.exp(reach - distance))
-    FeatureEnergy(["never", "last", "root", "limit"], ["soft", "proximity"])
+    FeatureEnergy(["never", "last", "root", "learned", "limit"], ["soft", "proximity"])
 
 
 def test_built_in_features_have_no_flaw():
