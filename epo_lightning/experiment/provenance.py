@@ -41,16 +41,19 @@ def versions() -> dict[str, str | None]:
 def code() -> str:
     """Hash of the Python files on which results depend, as they were when a process first asked for it.
 
-    They are those of this package without :data:`READERS`, and those beside the modules of other packages that register
-    parts.
+    They are those of this package without :data:`READERS`, and those of other packages that register parts: a module of a
+    package with all files beside it, and a module of its own alone.
     """
     files = {f"{path.relative_to(PACKAGE)}": path for path in sorted(PACKAGE.rglob("*.py"))}
     files = {name: path for name, path in files.items() if Path(name).parts[0] not in READERS}
     for entry in entry_points(group="epo_lightning.parts"):
-        found = find_spec(entry.module)
+        found = None
+        with contextlib.suppress(ImportError):  # an error of its own when the part is looked up
+            found = find_spec(entry.module)
         if found is not None and found.origin is not None:
-            home = Path(found.origin).parent
-            files |= {f"{entry.module}: {path.relative_to(home)}": path for path in sorted(home.rglob("*.py"))}
+            file = Path(found.origin)
+            beside = sorted(file.parent.rglob("*.py")) if found.parent else [file]
+            files |= {f"{entry.module}: {path.relative_to(file.parent)}": path for path in beside}
     total = hashlib.sha256()
     for name, path in files.items():
         total.update(f"{name}\n".encode() + hashlib.sha256(path.read_bytes()).digest())

@@ -278,14 +278,17 @@ def test_the_hash_of_the_code_is_that_of_the_files_on_which_results_depend(
     (other / "parts.py").write_text("x = 1\n")
     monkeypatch.syspath_prepend(str(tmp_path / "elsewhere"))
     monkeypatch.setattr(provenance, "PACKAGE", package)
-    found = EntryPoint("third", "third.parts", "epo_lightning.parts")
-    monkeypatch.setattr(provenance, "entry_points", lambda group: [found])
+    (tmp_path / "elsewhere" / "single.py").write_text("x = 1\n")
+    names = ("third.parts", "single", "missing.parts")
+    found = [EntryPoint(name, name, "epo_lightning.parts") for name in names]
+    monkeypatch.setattr(provenance, "entry_points", lambda group: found)
     hashes = [provenance.code.__wrapped__()]
-    for file in (package / "backbones" / "mine.py", other / "parts.py"):
+    for file in (package / "backbones" / "mine.py", other / "parts.py", tmp_path / "elsewhere" / "single.py"):
         file.write_text("x = 2\n")
         hashes.append(provenance.code.__wrapped__())
-    assert len(set(hashes)) == 3
+    assert len(set(hashes)) == 4
     (package / "report" / "page.py").write_text("x = 2\n")
+    (tmp_path / "elsewhere" / "unrelated.py").touch()
     (package / "README.md").write_text("words")
     assert provenance.code.__wrapped__() == hashes[-1]
 
