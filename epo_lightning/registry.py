@@ -15,7 +15,8 @@ from __future__ import annotations
 import difflib
 import inspect
 import pkgutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -58,8 +59,8 @@ def register(group: str, name: str) -> Callable[[Part], Part]:
 
     def add(part: Part) -> Part:
         known = _PARTS.setdefault(group, {})
-        taken = known.setdefault(name, part)
-        if (taken.__module__, taken.__qualname__) != (part.__module__, part.__qualname__):
+        taken = known.get(name, part)
+        if taken is not part and _origin(taken) != _origin(part):
             raise ConfigError(
                 f"two parts of the group {group!r} are called {name!r}, in {place(taken)} and {place(part)}: rename one"
             )
@@ -88,19 +89,24 @@ _OF_AN_EXTRA = "epo_lightning.solvers.gauss_newton.fused_kernel."
 """Modules that import the package of an extra at once. They register no part, and are not imported by a look-up."""
 
 
-def _import(module: str) -> None:
-    """Import a module that may register parts.
+def _origin(part: Callable[..., Any]) -> tuple[Any, ...]:
+    """Module and name of a part; what has no name, as the result of ``functools.partial``, is a part of its own."""
+    return getattr(part, "__module__", None), getattr(part, "__qualname__", id(part))
+
+
+@contextmanager
+def _importing(module: str) -> Iterator[None]:
+    """Context of the import of a module that may register parts.
 
     Raises:
-        ConfigError: it imports a package that is not installed.
+        ConfigError: it imports something that does not exist.
     """
     try:
-        import_module(module)
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"{module.replace('.', '/')}.py cannot be imported, and all parts in its folder with it: {error}. Install the "
-            "package, or import it inside the function that needs it"
-        ) from error
+        yield
+    except ImportError as error:
+        ours = (error.name or "").startswith("epo_lightning")
+        advice = "check the spelling" if ours else "install the package, or import it inside the function that needs it"
+        raise ConfigError(f"the module {module} cannot be imported, and no part is found: {error}; {advice}") from error
 
 
 @cache
@@ -110,9 +116,11 @@ def _load(group: str) -> None:
         home = import_module(f"epo_lightning.{_HOMES[group]}")
         for module in pkgutil.walk_packages(getattr(home, "__path__", []), f"{home.__name__}."):
             if not module.name.startswith(_OF_AN_EXTRA):
-                _import(module.name)
+                with _importing(module.name):
+                    import_module(module.name)
     for entry in entry_points(group="epo_lightning.parts"):
-        entry.load()
+        with _importing(entry.value):
+            entry.load()
 
 
 def parts(group: str) -> Mapping[str, Callable[..., Any]]:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 
+@functools.cache
 def installed() -> bool:
     """Whether Warp is installed."""
     return importlib.util.find_spec("warp") is not None

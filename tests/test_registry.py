@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
+from functools import partial
+from importlib import import_module
 
 import pytest
 
@@ -70,9 +70,24 @@ def test_unknown_parts_are_refused_with_the_place_of_new_ones(group: str, name: 
         lookup(group, name)
 
 
-def test_a_part_whose_file_needs_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "broken_part.py").write_text("import no_such_package\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "broken_part", raising=False)
-    with pytest.raises(ConfigError, match=r"broken_part.py cannot be imported, .*No module named 'no_such_package'"):
-        registry._import("broken_part")
+def test_an_import_that_fails_is_named_with_its_module() -> None:
+    with (
+        pytest.raises(
+            ConfigError, match=r"the module mine.parts cannot be .*No module named 'no_such_package'; install"
+        ),
+        registry._importing("mine.parts"),
+    ):
+        import_module("no_such_package")
+    with (
+        pytest.raises(ConfigError, match=r"No module named 'epo_lightning.encoder'; check the spelling"),
+        registry._importing("mine.parts"),
+    ):
+        import_module("epo_lightning.encoder")
+
+
+def test_parts_without_a_name_of_their_own_can_be_registered() -> None:
+    small = partial(part)
+    register("backbone", "small")(small)
+    assert lookup("backbone", "small") is small
+    with pytest.raises(ConfigError, match="two parts of the group 'backbone' are called 'small'"):
+        register("backbone", "small")(partial(part))

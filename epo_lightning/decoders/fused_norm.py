@@ -24,7 +24,7 @@ THREADS = 128
 class FusedNormalise(torch.autograd.Function):
     """Batch normalisation with the statistics of the rows that are present; the result of absent rows is the bias.
 
-    The running statistics are updated as by ``nn.BatchNorm1d``.
+    The running statistics are updated as by ``nn.BatchNorm1d``; without any present row they stay.
     """
 
     @staticmethod
@@ -98,7 +98,8 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
             if present[r] != wp.uint8(0):
                 counted += T(1.0)
                 total += rows[r, f]
-        number = wp.max(in_block(counted), T(1.0))
+        found = in_block(counted)
+        number = wp.max(found, T(1.0))
         middle = in_block(total) / number
         squares = T(0.0)
         for r in range(lane, rows.shape[0], wp.block_dim()):
@@ -115,9 +116,10 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
             mean[f] = middle
             scale[f] = factor
             count[f] = number
-            variance = square / wp.max(number - T(1.0), T(1.0))
-            running_mean[f] = running_mean[f] + momentum * (middle - running_mean[f])
-            running_var[f] = running_var[f] + momentum * (variance - running_var[f])
+            if found > T(0.0):
+                variance = square / wp.max(number - T(1.0), T(1.0))
+                running_mean[f] = running_mean[f] + momentum * (middle - running_mean[f])
+                running_var[f] = running_var[f] + momentum * (variance - running_var[f])
             if f == 0:
                 batches[0] = batches[0] + wp.int64(1)
 

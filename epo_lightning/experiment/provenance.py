@@ -6,7 +6,7 @@ import contextlib
 import functools
 import hashlib
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -41,23 +41,32 @@ def versions() -> dict[str, str | None]:
 def code() -> str:
     """Hash of the Python files on which results depend, as they were when a process first asked for it.
 
-    They are those of this package without :data:`READERS`, and those of other packages that register parts: a module of a
-    package with all files beside it, and a module of its own alone.
+    They are those of this package without :data:`READERS`, and those of the packages and modules that register parts.
     """
-    files = {f"{path.relative_to(PACKAGE)}": path for path in sorted(PACKAGE.rglob("*.py"))}
-    files = {name: path for name, path in files.items() if Path(name).parts[0] not in READERS}
+    files = {name: path for name, path in _python_files(PACKAGE) if Path(name).parts[0] not in READERS}
     for entry in entry_points(group="epo_lightning.parts"):
-        found = None
-        with contextlib.suppress(ImportError):  # an error of its own when the part is looked up
-            found = find_spec(entry.module)
-        if found is not None and found.origin is not None:
-            file = Path(found.origin)
-            beside = sorted(file.parent.rglob("*.py")) if found.parent else [file]
-            files |= {f"{entry.module}: {path.relative_to(file.parent)}": path for path in beside}
+        top = entry.module.partition(".")[0]
+        with contextlib.suppress(ImportError, ValueError):  # what is missing has an error when its part is looked up
+            found = find_spec(top)
+            if found is None:
+                continue
+            if found.submodule_search_locations is None:
+                files[top] = Path(found.origin or "")
+            for folder in found.submodule_search_locations or ():
+                files |= {f"{top}: {name}": path for name, path in _python_files(Path(folder))}
     total = hashlib.sha256()
     for name, path in files.items():
-        total.update(f"{name}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
+        if path.is_file():  # locks of editors are links without a target
+            total.update(f"{name}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
     return total.hexdigest()[:16]
+
+
+def _python_files(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Python files in and below a folder with their relative paths, in their order; hidden ones are left out."""
+    for path in sorted(folder.rglob("*.py")):
+        name = path.relative_to(folder)
+        if not any(part.startswith(".") for part in name.parts):
+            yield str(name), path
 
 
 def of_other_code(record: Mapping[str, Any]) -> bool:

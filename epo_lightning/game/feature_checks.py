@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -126,7 +127,7 @@ def _advice(key: str, name: str) -> str:
     """What to do about an unknown name in ``energy.own`` or ``energy.pair``."""
     other = "pair" if key == "own" else "own"
     if name in _FEATURES[other]:
-        return f"the {other} features have it, so it belongs into energy.{other}"
+        return f"the {other} features have it, so it belongs in energy.{other}"
     known = nearest(name, _FEATURES[key])
     new = f'. A new one has @{key}_feature("{name}") above its function, in a file of epo_lightning/game'
     return known if known.startswith("did you mean") else known + new
@@ -173,7 +174,15 @@ def refuse_flaws(kind: str, name: str, feature: OwnFeature | PairFeature) -> Non
     """
     if name not in BUILT_IN and feature.flaw is not None:
         raise ConfigError(f"{kind} feature {name!r} ({place(feature.function)}) {feature.flaw}")
-    costs = feature.asymmetry if isinstance(feature, PairFeature) else None
+    costs = None
+    try:
+        costs = feature.asymmetry if isinstance(feature, PairFeature) else None
+    except (RuntimeError, ValueError) as error:
+        warnings.warn(
+            f"whether the pair feature {name!r} ({place(feature.function)}) is symmetric could not be tried: "
+            f"{type(error).__name__}: {error}. An asymmetric one has no potential, and its energy no equilibria",
+            stacklevel=2,
+        )
     if costs is not None:
         raise ConfigError(
             f"pair feature {name!r} is not symmetric: for two trial agents 1/2 |r|^2 is {costs[0]:.4g}, and {costs[1]:.4g} "

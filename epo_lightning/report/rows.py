@@ -108,12 +108,12 @@ class Row:
         seeds: dict[str, list[str]] = {}
         for run in self.runs:
             seeds.setdefault(run.code, []).append(str(run.seed))
-        if len(seeds) < 2 or "" in seeds:
+        if len([code for code in seeds if code]) < 2:
             return ""
         groups = "; ".join(", ".join(same) for same in seeds.values())
         return (
-            f"{self.name} ({self.runs[0].data}) mixes runs of different code (seeds {groups}): its mean is that of no "
-            "method. Train them all by the present code, in another folder (runs=<folder>)"
+            f"{self.name} ({self.runs[0].data}) mixes runs of different code (seeds {groups}), which may not be comparable. "
+            "Train all of them with the present code, in another folder (runs=<folder>)"
         )
 
     @property

@@ -289,6 +289,7 @@ def test_the_hash_of_the_code_is_that_of_the_files_on_which_results_depend(
     assert len(set(hashes)) == 4
     (package / "report" / "page.py").write_text("x = 2\n")
     (tmp_path / "elsewhere" / "unrelated.py").touch()
+    (package / "backbones" / ".#mine.py").symlink_to("me@host.123")  # a lock of Emacs
     (package / "README.md").write_text("words")
     assert provenance.code.__wrapped__() == hashes[-1]
 

@@ -40,16 +40,15 @@ OF_TRAJECTORIES = {
     ),
     "one for each control": (lambda states, controls: controls, r"returns the shape \[4, 3, 40, 2\]"),
     "no batch": (lambda states, controls: states[0, 0], r"returns the shape \[40, 4\]"),
-    "comparison": (lambda states, controls: (controls[..., 0] > 0.1).float(), "has no derivative"),
-    "detached": (lambda states, controls: controls[..., 0].detach(), "has no derivative"),
-    "constant": (lambda states, controls: torch.ones_like(controls[..., 0]), "has no derivative"),
+    "comparison": (lambda states, controls: (controls[..., 0] > 0.1).float(), "has a derivative of zero everywhere"),
+    "detached": (lambda states, controls: controls[..., 0].detach(), "has a derivative of zero everywhere"),
+    "of all agents": (
+        lambda states, controls: controls[..., 0] - controls[..., 0].mean(1, keepdim=True),
+        "is not a func",
+    ),
     "rounded": (lambda states, controls: controls[..., 0].round(), "has a derivative of zero everywhere"),
     "whole": (lambda states, controls: controls[..., 0].long(), "returns a tensor of torch.int64"),
     "two": (lambda states, controls: (states[..., 0], controls[..., 0]), "returns a tuple"),
-    "NumPy": (
-        lambda states, controls: torch.as_tensor(controls[..., 0].numpy()),
-        "fails on trial arguments: RuntimeError",
-    ),
     "one argument": (
         lambda states: states[..., 0],
         r"fails on trial arguments: TypeError.*takes states \[\.\., K, 4\] and",
@@ -59,6 +58,9 @@ OF_SIGNALS = {
     "in place": (slowed_speed, "changes its arguments in place"),
     "differences": (lambda speed: speed.diff(dim=-1), r"returns the shape \[4, 3, 39\].*\[\.\., K\]"),
     "sums": (lambda speed: speed.cumsum(-1), "is not elementwise"),
+    "fluctuation": (lambda speed: speed - speed.mean(-1, keepdim=True), "is not elementwise"),
+    "share": (lambda speed: speed.softmax(-1), "is not elementwise"),
+    "of all agents": (lambda speed: speed - speed.mean(-2, keepdim=True), "is not elementwise"),
     "two arguments": (lambda states, controls: states[..., 0], "fails on trial arguments: TypeError.*takes one signal"),
 }
 OF_PAIRS = {
@@ -112,9 +114,42 @@ def test_functions_that_work_are_accepted():
     own_feature("root", Source.SPEED)(lambda speed: speed.sqrt())
     network = torch.nn.Linear(4, 3)
     own_feature("learned")(lambda states, controls: network(states).flatten(-2))
+    own_feature("fading", Source.SPEED)(lambda speed: 0.9 ** torch.arange(speed.shape[-1]) * (speed - 3.0).relu())
+    own_feature("empty")(lambda states, controls: states[..., 40:, SPEED])
+    own_feature("random", Source.SPEED)(lambda speed: speed + torch.randn_like(speed))
     own_feature("limit", Source.CONTROL)(lambda control: (control - 2.0).relu())
     pair_feature("soft", Source.DISTANCE, margin=True)(lambda distance, reach: torch.exp(reach - distance))
-    FeatureEnergy(["never", "last", "root", "learned", "limit"], ["soft", "proximity"])
+    before = torch.get_rng_state()
+    own = ["never", "last", "root", "learned", "fading", "empty", "random", "limit"]
+    with torch.inference_mode():
+        FeatureEnergy(own, ["soft", "proximity"])
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda states, controls: torch.linspace(0.0, 1.0, 20) * controls[..., 0],
+        lambda states, controls: controls[..., 0] * torch.ones(1, device="meta"),
+        lambda states, controls: torch.as_tensor(controls[..., 0].numpy()),
+    ],
+)
+def test_functions_that_may_work_elsewhere_have_a_warning_with_their_place(function):
+    """They are made for another number of steps or device."""
+    own_feature("elsewhere")(function)
+    with pytest.warns(
+        UserWarning, match=r"\(.*test_trials.py:\d+\) fails on trial arguments: RuntimeError.*This does not"
+    ):
+        FeatureEnergy(["elsewhere"])
+
+
+def test_the_symmetry_of_functions_that_fail_is_not_known():
+    network = torch.nn.Linear(8, 3)
+    pair_feature("learned pair")(lambda first, second: network(torch.cat((first, second), -1)).flatten(-2))
+    with pytest.warns(
+        UserWarning, match=r"whether the pair feature 'learned pair' .* is symmetric could not be tried: Runt"
+    ):
+        FeatureEnergy([], ["learned pair"])
 
 
 def test_built_in_features_have_no_flaw():
@@ -123,8 +158,8 @@ def test_built_in_features_have_no_flaw():
 
 def test_features_in_the_other_list_and_new_ones_are_explained():
     for own, pair, words in (
-        (["proximity"], [], r"'proximity' in energy\.own: the pair features have it, so it belongs into energy\.pair"),
-        (["acc"], ["acc"], r"'acc' in energy\.pair: the own features have it, so it belongs into energy\.own"),
+        (["proximity"], [], r"'proximity' in energy\.own: the pair features have it, so it belongs in energy\.pair"),
+        (["acc"], ["acc"], r"'acc' in energy\.pair: the own features have it, so it belongs in energy\.own"),
     ):
         with pytest.raises(ConfigError, match=words):
             FeatureEnergy(own, pair)

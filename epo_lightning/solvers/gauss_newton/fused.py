@@ -295,8 +295,8 @@ def _stacked(tensors: list[Tensor]) -> Tensor:
 def _point(structure: Any, **tensors: Tensor | None) -> None:
     """Point arrays of a structure of Warp to the memory of contiguous tensors, whose owner keeps them.
 
-    Tensors that may be larger than these (iterates, factors,
-    memory) are cut short: the kernels find their parts by pointers.
+    Tensors that may be larger than Warp's arrays (iterates, factors, memory) are cut short: the kernels find their parts by
+    pointers.
     """
     fields = structure.__ctype__()
     for name, tensor in tensors.items():

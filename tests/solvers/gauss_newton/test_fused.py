@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib.util
 
 import pytest
 import torch
@@ -141,7 +140,7 @@ def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
         fused.solve(FeatureEnergy(["acc"]), scene, game, 1, 1.0, torch.ones(2, 2), exact=True)
     with pytest.raises(ConfigError, match=r"solver\.backend=warp has no Newton steps: set solver\.newton_steps=0"):
         LevenbergMarquardt(backend="warp", adaptive=True, newton_steps=2)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(fused, "installed", lambda: False)
     with pytest.raises(ValueError, match=r"the fused kernels need NVIDIA Warp: pip install 'epo_lightning\[gpu\]'"):
         choose_backend("warp", FeatureEnergy(["acc"]), scene, game)
 
