@@ -145,7 +145,7 @@ def lookup(group: str, name: str) -> Callable[..., Any]:
 
 
 def _home(group: str) -> str:
-    """Where parts of a group are found, in words."""
+    """Place of a group's parts, in words."""
     home = import_module(f"epo_lightning.{_HOMES[group]}")
     return (
         f"a file of epo_lightning/{_HOMES[group]}" if hasattr(home, "__path__") else f"epo_lightning/{_HOMES[group]}.py"

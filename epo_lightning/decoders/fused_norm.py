@@ -1,7 +1,7 @@
 """Batch normalisation of the rows that are present as one kernel of a GPU, and its derivative as another one.
 
-In PyTorch's operations it takes 28 launches, and for the few rows of a batch a GPU's time is that of launches. The kernels
-are written in NVIDIA Warp; the same source is compiled for CPUs, where it is meant for tests.
+PyTorch takes 32 operations for both, and for the few rows of a batch a GPU's time is that of launches. The kernels are
+written in NVIDIA Warp; the same source is compiled for CPUs, where it is meant for tests.
 """
 
 # Warp reads annotations as values: this module does not postpone them.

@@ -124,7 +124,7 @@ def check_features(own: Any, pair: Any) -> None:
 
 
 def _advice(key: str, name: str) -> str:
-    """What to do about an unknown name in ``energy.own`` or ``energy.pair``."""
+    """Advice on an unknown name in ``energy.own`` or ``energy.pair``."""
     other = "pair" if key == "own" else "own"
     if name in _FEATURES[other]:
         return f"the {other} features have it, so it belongs in energy.{other}"

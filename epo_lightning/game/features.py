@@ -109,7 +109,7 @@ class OwnFeature:
 
     @cached_property
     def flaw(self) -> str | None:
-        """What makes the function useless as a feature (:mod:`~epo_lightning.game.trials`); None where nothing is wrong."""
+        """Reason why the function is of no use (:mod:`~epo_lightning.game.trials`); None where nothing is wrong."""
         if self.function is None:
             return None
         if self.declared:
@@ -152,7 +152,7 @@ class PairFeature:
 
     @cached_property
     def flaw(self) -> str | None:
-        """What makes the function useless as a feature (:mod:`~epo_lightning.game.trials`); None where nothing is wrong."""
+        """Reason why the function is of no use (:mod:`~epo_lightning.game.trials`); None where nothing is wrong."""
         states, sizes = zip(*trials.agents(), strict=True)
         margin = [sizes[0][..., 0]] if self.margin else []
         if self.declared:

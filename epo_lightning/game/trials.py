@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -54,7 +55,7 @@ def numbers(*shape: int) -> Float[Tensor, "*batch K *shape"]:
 
 @torch.inference_mode(False)
 def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequence[Tensor], takes: str) -> str | None:
-    """What makes a function useless as a feature, as the end of a sentence about it; None where nothing is wrong.
+    """Reason why a function is of no use as a feature, as the end of a sentence about it; None where nothing is wrong.
 
     Warns of a function that stops at the trial arguments with a RuntimeError or ValueError: it may be made for another
     number of steps, another device or other values.
@@ -86,15 +87,16 @@ def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequ
 
 
 def _flaw(function: Callable[..., Tensor], moving: list[Tensor], others: list[Tensor], takes: str) -> str | None:
-    def call(*arguments: Tensor) -> Tensor:
+    """Reason as :func:`flaw` gives it; errors of the function are raised."""
+
+    def call(*arguments: Tensor) -> Any:  # a wrong function may return anything
         torch.manual_seed(0)  # a function that draws numbers draws the same ones
-        return function(*arguments, *others)
+        return function(*arguments)
 
     elementwise = len(moving) == 1
     given = [argument.clone() for argument in (*moving, *others)]
     with torch.no_grad():
-        torch.manual_seed(0)
-        value = function(*given)
+        value = call(*given)
     if any(not torch.equal(now, before) for now, before in zip(given, (*moving, *others), strict=True)):
         return "changes its arguments in place: they are the trajectory itself. Write x = x - 1 instead of x -= 1"
     if not isinstance(value, Tensor) or not value.is_floating_point():
@@ -108,7 +110,7 @@ def _flaw(function: Callable[..., Tensor], moving: list[Tensor], others: list[Te
     for argument in changed:
         argument[0, 0, argument.shape[2] // 2] += 1.0
     with torch.no_grad():
-        differs = ~torch.isclose(call(*changed), value, rtol=1e-5, atol=1e-5, equal_nan=True)
+        differs = ~torch.isclose(call(*changed, *others), value, rtol=1e-5, atol=1e-5, equal_nan=True)
     differs[0, 0, value.shape[2] // 2 if elementwise else slice(None)] = False
     if differs.any():
         what = (
@@ -117,6 +119,7 @@ def _flaw(function: Callable[..., Tensor], moving: list[Tensor], others: list[Te
         return f"is not {what}. {takes}"
     drawn = torch.Generator().manual_seed(2)
     tangents = tuple(torch.rand(m.shape, generator=drawn, dtype=m.dtype, device="cpu") for m in moving)
-    if value.unique().numel() > 1 and not torch.func.jvp(call, tuple(moving), tangents)[1].any():
+    slope = torch.func.jvp(lambda *arguments: call(*arguments, *others), tuple(moving), tangents)[1]
+    if value.unique().numel() > 1 and not slope.any():
         return "has a derivative of zero everywhere, so no solver can act on it: comparisons and rounding have no other"
     return None

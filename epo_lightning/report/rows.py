@@ -103,7 +103,7 @@ class Row:
         return sorted({run.git_commit for run in self.runs})
 
     @property
-    def mixture(self) -> str:
+    def mixed_code(self) -> str:
         """A note on runs that were trained by different code; empty if there are none, or if it was not recorded."""
         seeds: dict[str, list[str]] = {}
         for run in self.runs:

@@ -133,8 +133,8 @@ def write_report(
     worth, compared = ([comparison_sheet(entry) for entry in entries] for entries in (of_game, comparisons))
     best, hint = _best(report.evaluated)
     settings = [settings_sheet(best)] if best else []
-    mixtures = [row.mixture for row in distinct(tables) if row.mixture]
-    notes = [*mixtures, *notes, *damaged, *([hint] if hint else [])]
+    mixed = [row.mixed_code for row in distinct(tables) if row.mixed_code]
+    notes = [*mixed, *notes, *damaged, *([hint] if hint else [])]
     made, charts = how_made(tables, timings), charts_of(tables, timings)
     costs = cost_sheets(tables, timings)
     elsewhere = transfers(report.runs)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from games import random_scene
 
+from epo_lightning import registry
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
@@ -42,7 +43,9 @@ def test_features_of_another_shape(kind: str) -> None:
         Mine()(random_scene(3, 2))
 
 
-def test_a_backbone_without_a_width() -> None:
+def test_a_backbone_without_a_width(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(registry._PARTS, "backbone", dict(registry.parts("backbone")))  # it stays in this test
+
     @register("backbone", "without width")
     class Mine(Backbone):
         def __init__(self) -> None:

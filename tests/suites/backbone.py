@@ -17,6 +17,7 @@ PADDING: dict[str, tuple[dict[str, int], str]] = {
     "unobserved steps": ({"steps": 4}, "scene.history_mask"),
     "absent lanes": ({"lanes": 2}, "scene.lane_mask"),
     "absent vectors of lanes": ({"vectors": 3}, "scene.lane_mask"),
+    "all of these": ({"agents": 3, "steps": 4, "lanes": 2, "vectors": 3}, "a mask"),
 }
 """What is added to a scene, and the mask that leaves it out."""
 
