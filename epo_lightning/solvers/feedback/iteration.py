@@ -27,12 +27,13 @@ from epo_lightning.solvers.feedback.anderson import Anderson
 from epo_lightning.solvers.feedback.lq_game import LQGame, Policy
 from epo_lightning.solvers.feedback.stages import lq_game
 
-_LARGEST_MOVE = 1.5
+LARGEST_MOVE = 1.5
 """Largest change of a state in one iteration [m, rad, m/s], as in GameInference.jl (Peters, 2020)."""
-_HALVINGS = 20
-_SHORTEST = 0.5
+HALVINGS = 20
+"""Largest number of times that a step is halved."""
+SHORTEST = 0.5
 """Step length of a game whose changes do not become smaller. Shorter ones creep."""
-_REMEMBERED = 3
+REMEMBERED = 3
 """Number of trajectories of Anderson acceleration."""
 
 
@@ -107,7 +108,7 @@ def iterate(
     status = torch.full((len(controls),), int(Status.DAMPED), device=controls.device)
     length = controls.new_ones(len(controls))
     before = torch.full_like(length, torch.inf)
-    memory = Anderson(len(controls), _REMEMBERED, controls[0].numel())
+    memory = Anderson(len(controls), REMEMBERED, controls[0].numel())
     for _ in range(iterations):
         going = (status == Status.DAMPED).nonzero()[:, 0]
         if not len(going):
@@ -118,7 +119,7 @@ def iterate(
         status[going[~step.usable]] = int(Status.STOPPED)
         # Policies that answer each other may oscillate: acceleration begins anew, and steps without it are shorter.
         slower = going[~(step.wanted < before[going])]
-        length[slower] = (0.5 * length[slower]).clamp_min(_SHORTEST)
+        length[slower] = (0.5 * length[slower]).clamp_min(SHORTEST)
         memory.forget(slower)
         before[going] = step.wanted
         flat, deviations = controls[going].flatten(1), step.deviations.flatten(1)
@@ -149,10 +150,10 @@ class _Step:
 def _step(game: FeedbackGame, states: Tensor, controls: Tensor, length: Float[Tensor, " S"]) -> _Step:
     """The step that the policies of the LQ games suggest, halved until it changes no state by too much."""
     policy = game.linearised(states, controls).equilibrium()
-    for _ in range(_HALVINGS):
+    for _ in range(HALVINGS):
         trial, chosen = game.follow(states, controls, policy, length)
         change = game.change(states, trial)
-        far = ~(change <= _LARGEST_MOVE)
+        far = ~(change <= LARGEST_MOVE)
         if not far.any():
             break
         length = torch.where(far, 0.5 * length, length)
@@ -168,5 +169,5 @@ def _guarded(
 ) -> tuple[Float[Tensor, "S 1 N K 4"], Float[Tensor, "S 1 N K 2"]]:
     """The trajectories of guessed controls, and those of the step where these are too far."""
     guessed = game.states(guess)
-    near = (game.change(states, guessed) <= _LARGEST_MOVE)[:, None, None, None, None]
+    near = (game.change(states, guessed) <= LARGEST_MOVE)[:, None, None, None, None]
     return torch.where(near, guessed, step.states), torch.where(near, guess, step.controls)

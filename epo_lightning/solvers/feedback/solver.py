@@ -16,8 +16,8 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
-from epo_lightning.solvers.feedback.derivative import attach
-from epo_lightning.solvers.feedback.iteration import FeedbackGame, iterate
+from epo_lightning.solvers.feedback import derivative, iteration, kernel
+from epo_lightning.solvers.feedback.iteration import FeedbackGame
 from epo_lightning.solvers.gauss_newton.both_sides import BothSides
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.solvers.general import descent
@@ -30,6 +30,7 @@ class ToFeedback(Minimiser):
     Attributes:
         iterations, tolerance, regularisation, terms: those of :class:`Feedback`.
         open_loop: the steps to the open-loop equilibrium; None to begin at the initial strategies themselves.
+        backend: ``pytorch``, or another one for the compiled kernel, where it knows all features.
     """
 
     needs_from_energy = frozenset({FEATURES, STAGES})
@@ -41,6 +42,7 @@ class ToFeedback(Minimiser):
     regularisation: float
     terms: int
     open_loop: LevenbergMarquardt | None = None
+    backend: str = "auto"
 
     def near_minimum(self) -> ToFeedback:
         """The iterations without the steps to the open-loop equilibrium."""
@@ -63,6 +65,7 @@ class ToFeedback(Minimiser):
         if self.open_loop is not None:
             start = self.open_loop(energy, scene, parameters).controls
         game = self._game(energy, scene, parameters)
+        iterate = kernel.iterate if self._compiled(game) else iteration.iterate
         controls, status = iterate(game, _on_host(start), self.iterations, self.tolerance)
         ended = dataclasses.replace(parameters, initial_controls=controls.to(start))
         found = LevenbergMarquardt(steps=0)(energy, scene, ended)
@@ -89,12 +92,17 @@ class ToFeedback(Minimiser):
                 "solver.iterations, or begin with other weights (docs/troubleshooting.md)",
                 stacklevel=2,
             )
-        controls = attach(self._game(energy, scene, parameters), _on_host(solution.controls), solved, self.terms)
+        game = self._game(energy, scene, parameters)
+        attach = kernel.attach if self._compiled(game) else derivative.attach
+        controls = attach(game, _on_host(solution.controls), solved, self.terms)
         return controls.to(solution.controls), solution.status
 
     def _game(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> FeedbackGame:
         scene = dataclasses.replace(scene, future=None, future_mask=None, lanes=None, lane_mask=None)  # not used
         return FeedbackGame(energy, scene.map(_on_host), parameters.map(_on_host), self.regularisation)
+
+    def _compiled(self, game: FeedbackGame) -> bool:
+        return self.backend != "pytorch" and kernel.obstacle(game) is None
 
 
 def _checked(energy: Energy) -> FeatureEnergy:
@@ -152,7 +160,7 @@ class Feedback(BothSides):
 
     def descent(self) -> ToFeedback:
         """The steps from each initial strategy to the feedback equilibrium of its side."""
-        return ToFeedback(self.iterations, self.tolerance, self.regularisation, self.terms, self.open_loop())
+        return ToFeedback(self.iterations, self.tolerance, self.regularisation, self.terms, self.open_loop(), self.backend)
 
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """Open-loop equilibria on both sides, and the feedback equilibria near them.

@@ -16,7 +16,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -27,17 +26,9 @@ from torch.autograd.function import once_differentiable
 from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
+from epo_lightning.solvers.gauss_newton.game_arrays import GameArrays, as_type
 from epo_lightning.solvers.gauss_newton.kernel import interface
-from epo_lightning.solvers.gauss_newton.kernel.interface import (
-    MOST_AGENTS,
-    OWN,
-    PAIR,
-    SIGNALS,
-    Address,
-    EpoGame,
-    EpoGradients,
-    EpoRun,
-)
+from epo_lightning.solvers.gauss_newton.kernel.interface import MOST_AGENTS, OWN, PAIR, Address, EpoRun
 from epo_lightning.solvers.general import descent
 
 
@@ -207,81 +198,11 @@ class _Call:
         self.controls, self.steps, self.keep_iterates = controls, steps, keep_iterates
         self.exact, self.adaptive = exact, adaptive
         self.doubles = controls.dtype == torch.float64
-        weights = parameters.own_weights
-        if _has_gaps(energy, scene):  # the weight of a line that does not exist is zero
-            weights = {**weights, "lane": energy.own_weight(scene, parameters, "lane")}
-        self.own = [_as(controls.dtype, weights[name]) for name in energy.own]
-        self.pair = [_as(controls.dtype, parameters.pair_weights[name]) for name in energy.pair]
-        self.margins = [_as(controls.dtype, parameters.margins[name]) for name in energy.decoded_margins]
-        self.goals = [_as(controls.dtype, parameters.goals)] if energy.needs_goals else []  # type: ignore[arg-type]
-        headed = energy.needs_goal_headings
-        self.headings = [_as(controls.dtype, parameters.goal_headings)] if headed else []  # type: ignore[arg-type]
-        referring = energy.needs_reference_controls
-        self.references = [_as(controls.dtype, parameters.reference_controls)] if referring else []  # type: ignore[arg-type]
-        self.inputs = (*self.own, *self.pair, *self.margins, *self.goals, *self.headings, *self.references)
-        self.slots = [OWN.index(name) for name in energy.own]
-        self.pair_slots = [PAIR.index(name) for name in energy.pair]
-        self.margin_slots = [PAIR.index(name) for name in energy.decoded_margins]
+        self.description = GameArrays(energy, scene, parameters, controls)
+        self.inputs, self.kept = self.description.inputs, self.description.kept
         self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs))
         self.tape = _Tape()
-        self._describe(energy, scene, parameters)
         self._reserve(step_size, damping)
-
-    def _describe(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> None:
-        """Fill the kernel's description of the games: sizes, bounds, addresses and strides of its tensors."""
-        batch, modes, agents, horizon, _ = self.controls.shape
-        like = self.controls.dtype
-        kept: list[Tensor] = []
-
-        def hold(tensor: Tensor) -> Tensor:
-            # The kernel gets the address alone: the tensor has to live as long as this call.
-            kept.append(tensor)
-            return tensor
-
-        game = self.game = EpoGame(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt, lane_slides=energy.lane_slides)
-        game.pair_stride = min(energy.pair_stride, horizon + 1)
-        for index, name in enumerate(SIGNALS):
-            if not isinstance(bound := energy.bounds.get(name, {}), Mapping):
-                game.bounds[index][:] = bound
-        initial = _as(like, scene.current)
-        initial = hold(initial if initial.stride(-1) == 1 else initial.contiguous())
-        game.initial, (game.initial_b, game.initial_n) = initial.data_ptr(), initial.stride()[:2]
-        game.present = hold(scene.agent_mask.contiguous()).data_ptr()
-        if scene.size is not None:
-            game.size = hold(_as(like, scene.size).contiguous()).data_ptr()
-        for slot, weight in zip(self.slots, self.own, strict=True):
-            game.own[slot], game.own_strides[slot][:] = weight.data_ptr(), weight.stride()
-        if agents > 1:
-            for slot, weight in zip(self.pair_slots, self.pair, strict=True):
-                game.pair[slot], game.pair_strides[slot][:] = weight.data_ptr(), weight.stride()
-            margins = dict(zip(self.margin_slots, self.margins, strict=True))
-            for name in energy.margins.keys() & set(energy.pair):
-                fixed = hold(self.controls.new_tensor(energy.margins[name]))
-                margins[PAIR.index(name)] = fixed.expand(batch, modes, agents * (agents - 1) // 2)
-            for slot, margin in margins.items():
-                game.margins[slot], game.margin_strides[slot][:] = margin.data_ptr(), margin.stride()
-        if self.goals:
-            game.goals = self.goals[0].data_ptr()
-            game.goals_b, game.goals_m, game.goals_n, game.goals_x = self.goals[0].stride()
-        if self.headings:
-            game.goal_headings, game.goal_heading_strides[:] = self.headings[0].data_ptr(), self.headings[0].stride()
-        if self.references:
-            game.reference_controls = hold(self.references[0].contiguous()).data_ptr()
-        if scene.game_steps is not None:
-            game.ends = hold(_as(torch.int64, scene.game_steps).contiguous()).data_ptr()
-        if "lane" in energy.own:
-            assert scene.references is not None
-            assert parameters.reference is not None
-            references = _as(like, scene.references)
-            if _has_gaps(energy, scene):
-                references = torch.where(scene.reference_mask[..., None, None], references, 0.0)  # type: ignore[index]
-            game.references = hold(references.contiguous()).data_ptr()
-            game.reference = hold(_as(torch.int64, parameters.reference).contiguous()).data_ptr()
-            game.lines, game.points = scene.references.shape[2:4]
-        if "velref" in energy.own:
-            assert scene.reference_speed is not None
-            game.reference_speed = hold(_as(like, scene.reference_speed).contiguous()).data_ptr()
-        self.kept = kept
 
     def _reserve(self, step_size: float, damping: Tensor) -> None:
         """Allocate what the kernel writes: results, and iterates and directions of all steps if they are recorded."""
@@ -293,7 +214,7 @@ class _Call:
         self.states: Tensor | None = controls.new_empty((*shape[:-1], 4))
         self.initial_energy, self.energy, self.gradient_norm = controls.new_empty((3, *shape[:2])).unbind(0)
         self.status = torch.empty(shape[:2], dtype=torch.int64)
-        self.damping = _as(controls.dtype, damping).clone(memory_format=torch.contiguous_format)
+        self.damping = as_type(controls.dtype, damping).clone(memory_format=torch.contiguous_format)
         by_agent = damping.dim() == 3
         self.start = controls.detach().contiguous()
         self.arguments = EpoRun(
@@ -323,46 +244,21 @@ class _Call:
             MemoryError: the library could not allocate its memory.
         """
         tape = self.tape.address
-        interface.check(interface.library().epo_solve(self.doubles, self.game, self.arguments, self.threads, tape))
+        interface.check(interface.library().epo_solve(self.doubles, self.description.game, self.arguments, self.threads, tape))
 
     def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor | None]:
         """Gradients by ``inputs``, for cotangents of the final controls, of all iterates and of the states.
 
         ``controls`` is overwritten: on return it holds the gradient by the initial controls.
         """
-        batch, modes, agents = self.controls.shape[:3]
-        new = self.controls.new_zeros
-        own = new((len(self.own), batch, modes, agents))
-        shared = (batch, modes, agents * (agents - 1) // 2)
-        pair, margins = new((len(self.pair), *shared)), new((len(self.margins), *shared))
-        goals = [new((batch, modes, agents, 2)) for _ in self.goals]
-        headings = [new((batch, modes, agents)) for _ in self.headings]
-        references = [new(self.controls.shape) for _ in self.references]
-        gradients = EpoGradients(controls=controls.data_ptr())
+        gradients, found = self.description.new_gradients()
+        gradients.controls = controls.data_ptr()
         if iterates is not None:
             gradients.iterates = iterates.data_ptr()
         if states is not None:
             gradients.states = states.data_ptr()
-        for slot, gradient in zip(self.slots, own, strict=True):
-            gradients.own[slot] = gradient.data_ptr()
-        for slot, gradient in zip(self.pair_slots, pair, strict=True):
-            gradients.pair[slot] = gradient.data_ptr()
-        for slot, gradient in zip(self.margin_slots, margins, strict=True):
-            gradients.margins[slot] = gradient.data_ptr()
-        for gradient in goals:
-            gradients.goals = gradient.data_ptr()
-        for gradient in headings:
-            gradients.goal_headings = gradient.data_ptr()
-        for gradient in references:
-            gradients.reference_controls = gradient.data_ptr()
-
-        interface.check(interface.library().epo_differentiate(self.tape.address, self.game, self.arguments, gradients))
-        return [*own.unbind(0), *pair.unbind(0), *margins.unbind(0), *goals, *headings, *references]
-
-
-def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:
-    """Whether some reference lines are masked out."""
-    return "lane" in energy.own and scene.reference_mask is not None and not scene.reference_mask.all()
+        interface.check(interface.library().epo_differentiate(self.tape.address, self.description.game, self.arguments, gradients))
+        return found
 
 
 class _Steps(torch.autograd.Function):
@@ -426,8 +322,3 @@ class _Minimum(torch.autograd.Function):
 def _definite(call: _Call) -> Tensor:
     """STOPPED for problems whose matrix was not positive definite without damping."""
     return torch.where(call.status == Status.SOLVED, Status.SOLVED, Status.STOPPED)
-
-
-def _as(dtype: torch.dtype, tensor: Tensor) -> Tensor:
-    # `to` takes a microsecond even if the type is right already, and there are twenty tensors.
-    return tensor if tensor.dtype == dtype else tensor.to(dtype)

@@ -125,7 +125,7 @@ def test_acceleration_reaches_the_same_equilibria_in_fewer_games(monkeypatch: py
     def solve(memory: type[Anderson]) -> torch.Tensor:
         counted.append(0)
         monkeypatch.setattr(iteration, "Anderson", memory)
-        found = Feedback(**EXACT)(ENERGY, scene, game)
+        found = Feedback(**EXACT, backend="pytorch")(ENERGY, scene, game)
         assert (found.status == Status.SOLVED).all()
         return found.states
 

@@ -182,5 +182,17 @@ int64_t epo_lq_follow(const EpoPolicies* policies, int64_t threads) {
     return in_ranges(policies->S, threads, [&](int64_t first, int64_t last) { chosen->lq_follow(policies, first, last); });
 }
 
+/// Solves driving games for feedback equilibria. Returns as the functions above, and so does the next one.
+int64_t epo_feedback(const EpoGame* game, const EpoFeedback* run, int64_t threads) {
+    return in_ranges(game->B * game->M, threads, [&](int64_t first, int64_t last) { chosen->feedback(game, run, first, last); });
+}
+
+/// The derivative of solutions of `epo_feedback`. `gradients->controls` is the cotangent, which is read.
+int64_t epo_feedback_pull_back(const EpoGame* game, const EpoFeedback* run, const EpoGradients* gradients, int64_t threads) {
+    return in_ranges(game->B * game->M, threads, [&](int64_t first, int64_t last) {
+        chosen->feedback_pull_back(game, run, gradients, first, last);
+    });
+}
+
 void epo_release(void* tape) { delete static_cast<Handle*>(tape); }
 }

@@ -121,6 +121,16 @@ struct EpoLQGradients {
     double *A, *B, *own_cost, *pair_cost, *effort, *push;  // as in EpoLQGames
 };
 
+/// Iterated LQ games of B * M driving games, in double precision, and the derivative of their solutions; see `solvers/feedback`.
+struct EpoFeedback {
+    int64_t iterations, remembered, halvings;  // largest numbers of LQ games, of points of the acceleration, and of halved steps
+    int64_t terms;                 // number of steps of GMRES
+    double tolerance, rho;
+    double largest_move, shortest;  // largest change of a state in one iteration; least step length
+    double* controls;              // [B, M, N, K, 2]; the solution overwrites the initial strategies
+    int64_t* status;               // [B, M] of type Status
+};
+
 /// Policies of S games of N agents around given trajectories, and the trajectories that follow them.
 struct EpoPolicies {
     int64_t S, N, K;
@@ -144,5 +154,7 @@ struct EpoLevel {
     void (*lq_equilibria)(const EpoLQGames*, int64_t first, int64_t last);
     void (*lq_pull_back)(const EpoLQGames*, const EpoLQGradients*, int64_t first, int64_t last);
     void (*lq_follow)(const EpoPolicies*, int64_t first, int64_t last);
+    void (*feedback)(const EpoGame*, const EpoFeedback*, int64_t first, int64_t last);
+    void (*feedback_pull_back)(const EpoGame*, const EpoFeedback*, const EpoGradients*, int64_t first, int64_t last);
     int64_t lanes;
 };

@@ -19,6 +19,26 @@ struct Path {
     Vec<T>*heading, *speed, *sine, *cosine, *x, *y;
 };
 
+/// Sums of the changes of an agent's state since the start. The changes are summed on their own and then added to the initial state:
+/// if each small change were added to a large coordinate, most of its digits would be lost to rounding.
+template <class T>
+struct Moved {
+    Vec<T> x{}, y{}, turned{}, faster{};
+
+    /// Writes the sine and cosine at step k of a trajectory, and the state after the step.
+    INLINE void advance(const Path<T>& p, int k, T dt, Vec<T> turn, Vec<T> thrust) {
+        sincos<T>(p.heading[k], p.sine[k], p.cosine[k]);
+        x += dt * p.speed[k] * p.cosine[k];
+        y += dt * p.speed[k] * p.sine[k];
+        turned += dt * turn;
+        faster += dt * thrust;
+        p.x[k + 1] = p.x[0] + x;
+        p.y[k + 1] = p.y[0] + y;
+        p.heading[k + 1] = p.heading[0] + turned;
+        p.speed[k + 1] = p.speed[0] + faster;
+    }
+};
+
 /// Tangent of a trajectory: its derivative along a direction of the controls.
 template <class T>
 struct Tangent {
@@ -57,6 +77,12 @@ struct Model {
         pull += w * slope * excess;
         stiffness += w * slope * slope;
     }
+};
+
+/// Models of the costs of one state of an agent by its position, heading and speed.
+template <class T>
+struct StateModels {
+    Model<T> x, y, heading, speed;
 };
 
 /// Derivative of phi = -<J mu, r + J d> by one signal (the cotangent of the signal). Adding a feature also adds to the gradient by
@@ -176,13 +202,16 @@ struct Games {
     /// The lanes whose games have a step k.
     INLINE Mask<T> has_step(int k) const { return end > splat<T>(T(k)); }
 
-    /// Call at step k of every loop over all steps, which go backwards: sets the weights to zero in lanes whose game has ended
-    /// before, and to their values in the others. All costs of step k and of the state after it, and the rate from step k - 1
-    /// to step k, then vanish after the end of a game.
-    INLINE void enter(int k) const {
-        if (!cut || (k + 1 < K && !any<T>(end == splat<T>(T(k + 1))))) return;
+    /// Sets the weights to zero in lanes whose game has ended before step k, and to their values in the others. All costs of step k and
+    /// of the state after it, and the rate from step k - 1 to step k, then vanish after the end of a game.
+    INLINE void set_weights(int k) const {
         const Mask<T> live = has_step(k);
-        for (int e = 0; e < OWN_COUNT * movers + PAIR_COUNT * pairs; ++e) weight[e] = live ? given[e] : Vec<T>{};
+        for (int e = 0; cut && e < OWN_COUNT * movers + PAIR_COUNT * pairs; ++e) weight[e] = live ? given[e] : Vec<T>{};
+    }
+
+    /// The same, in a loop over all steps that goes backwards.
+    INLINE void enter(int k) const {
+        if (cut && (k + 1 == K || any<T>(end == splat<T>(T(k + 1))))) set_weights(k);
     }
 
     /// Lane `lane` holds the row items[lane * (n + 1)]: the problem, then its agents. Lanes that are not in use repeat the rows
@@ -257,20 +286,8 @@ struct Games {
                 p.heading[0][lane] = start[2];
                 p.speed[0][lane] = start[3];
             }
-            // The changes are summed on their own and then added to the initial state: if each small change were added to a large
-            // coordinate, most of its digits would be lost to rounding.
-            Vec<T> x{}, y{}, turned{}, faster{};
-            for (int k = 0; k < K; ++k) {
-                sincos<T>(p.heading[k], p.sine[k], p.cosine[k]);
-                x += dt * p.speed[k] * p.cosine[k];
-                y += dt * p.speed[k] * p.sine[k];
-                turned += dt * turn[i * K + k];
-                faster += dt * thrust[i * K + k];
-                p.x[k + 1] = p.x[0] + x;
-                p.y[k + 1] = p.y[0] + y;
-                p.heading[k + 1] = p.heading[0] + turned;
-                p.speed[k + 1] = p.speed[0] + faster;
-            }
+            Moved<T> moved;
+            for (int k = 0; k < K; ++k) moved.advance(p, k, dt, turn[i * K + k], thrust[i * K + k]);
             if (state_pairs) sincos<T>(p.heading[K], p.sine[K], p.cosine[K]);
         }
     }
@@ -384,6 +401,24 @@ struct Games {
         if (has(VELREF)) model.add(own(VELREF, i), value - reference_speed[i]);
         if (has(VELB)) model.add_bounded(own(VELB, i), value, game.bounds[BOUND_VEL]);
         return model;
+    }
+
+    /// The costs of a state that an agent has by itself. The nearest point of a reference line is held.
+    INLINE StateModels<T> state_models(int i, int state) const {
+        StateModels<T> models;
+        models.speed = speed_model(i, state);
+        if (has(LANE)) {
+            models.x.add(own(LANE, i), path[i].x[state] - nearest.x[i * (K + 1) + state]);
+            models.y.add(own(LANE, i), path[i].y[state] - nearest.y[i * (K + 1) + state]);
+        }
+        if (has(GOAL) && ends_at(state)) {
+            const Vec<T> weight = final_weight(GOAL, i, state);
+            models.x.add(weight, path[i].x[state] - goal_x[i]);
+            models.y.add(weight, path[i].y[state] - goal_y[i]);
+        }
+        if (has(HEADING) && ends_at(state))
+            models.heading.add(final_weight(HEADING, i, state), path[i].heading[state] - goal_heading[i]);
+        return models;
     }
 
     /// Loads weights, goals and radii, which the features need and a bare rollout does not.

@@ -136,6 +136,17 @@ class EpoPolicies(ctypes.Structure):
     )
 
 
+class EpoFeedback(ctypes.Structure):
+    """The arguments and results of iterated LQ games; fields as in `game.hpp`."""
+
+    _fields_ = (
+        *((name, Integer) for name in ("iterations", "remembered", "halvings", "terms")),
+        *((name, Real) for name in ("tolerance", "rho", "largest_move", "shortest")),
+        ("controls", Address),
+        ("status", Address),
+    )
+
+
 class _Entry(ctypes.Structure):
     _fields_ = (("name", ctypes.c_char_p), ("value", Real))
 
@@ -143,7 +154,7 @@ class _Entry(ctypes.Structure):
 def layout() -> dict[str, float]:
     """Sizes, offsets and constants that this module shares with the kernel, under the names of `layout.hpp`."""
     found: dict[str, float] = {}
-    for structure in (EpoGame, EpoRun, EpoGradients, EpoLQGames, EpoLQGradients, EpoPolicies):
+    for structure in (EpoGame, EpoRun, EpoGradients, EpoLQGames, EpoLQGradients, EpoPolicies, EpoFeedback):
         name = structure.__name__
         found[f"sizeof {name}"] = ctypes.sizeof(structure)
         found |= {f"{name}.{field[0]}": getattr(structure, field[0]).offset for field in structure._fields_}
@@ -214,7 +225,10 @@ def find() -> ctypes.CDLL | str:
     loaded.epo_lq_equilibria.argtypes = (ctypes.POINTER(EpoLQGames), Integer)
     loaded.epo_lq_pull_back.argtypes = (ctypes.POINTER(EpoLQGames), ctypes.POINTER(EpoLQGradients), Integer)
     loaded.epo_lq_follow.argtypes = (ctypes.POINTER(EpoPolicies), Integer)
-    for name in ("solve", "differentiate", "lq_equilibria", "lq_pull_back", "lq_follow", "levels", "built"):
+    loaded.epo_feedback.argtypes = (ctypes.POINTER(EpoGame), ctypes.POINTER(EpoFeedback), Integer)
+    loaded.epo_feedback_pull_back.argtypes = (*loaded.epo_feedback.argtypes[:2], ctypes.POINTER(EpoGradients), Integer)
+    called = ("solve", "differentiate", "lq_equilibria", "lq_pull_back", "lq_follow", "feedback", "feedback_pull_back")
+    for name in (*called, "levels", "built"):
         getattr(loaded, f"epo_{name}").restype = Integer
     loaded.epo_choose.argtypes, loaded.epo_choose.restype = (Integer,), None
     return loaded

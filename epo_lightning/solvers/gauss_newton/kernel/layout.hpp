@@ -17,6 +17,7 @@ struct EpoLayoutEntry {
 
 constexpr EpoLayoutEntry kLayout[] = {
     EPO_SIZE(EpoGame), EPO_SIZE(EpoRun), EPO_SIZE(EpoGradients), EPO_SIZE(EpoLQGames), EPO_SIZE(EpoLQGradients), EPO_SIZE(EpoPolicies),
+    EPO_SIZE(EpoFeedback),
     EPO_FIELD(EpoGame, B), EPO_FIELD(EpoGame, M), EPO_FIELD(EpoGame, N), EPO_FIELD(EpoGame, K),
     EPO_FIELD(EpoGame, lines), EPO_FIELD(EpoGame, points), EPO_FIELD(EpoGame, pair_stride), EPO_FIELD(EpoGame, dt),
     EPO_FIELD(EpoGame, bounds), EPO_FIELD(EpoGame, initial), EPO_FIELD(EpoGame, initial_b), EPO_FIELD(EpoGame, initial_n),
@@ -44,6 +45,10 @@ constexpr EpoLayoutEntry kLayout[] = {
     EPO_FIELD(EpoPolicies, beta), EPO_FIELD(EpoPolicies, start), EPO_FIELD(EpoPolicies, states),
     EPO_FIELD(EpoPolicies, controls), EPO_FIELD(EpoPolicies, gains), EPO_FIELD(EpoPolicies, offsets),
     EPO_FIELD(EpoPolicies, length), EPO_FIELD(EpoPolicies, visited), EPO_FIELD(EpoPolicies, chosen),
+    EPO_FIELD(EpoFeedback, iterations), EPO_FIELD(EpoFeedback, remembered), EPO_FIELD(EpoFeedback, halvings),
+    EPO_FIELD(EpoFeedback, terms), EPO_FIELD(EpoFeedback, tolerance), EPO_FIELD(EpoFeedback, rho),
+    EPO_FIELD(EpoFeedback, largest_move), EPO_FIELD(EpoFeedback, shortest), EPO_FIELD(EpoFeedback, controls),
+    EPO_FIELD(EpoFeedback, status),
     EPO_CONSTANT(GOAL), EPO_CONSTANT(LANE), EPO_CONSTANT(VELREF), EPO_CONSTANT(VEL), EPO_CONSTANT(ACC), EPO_CONSTANT(TURNR),
     EPO_CONSTANT(JERK), EPO_CONSTANT(TURNACC), EPO_CONSTANT(STEER), EPO_CONSTANT(VELB), EPO_CONSTANT(ACCB),
     EPO_CONSTANT(TURNRB), EPO_CONSTANT(JERKB), EPO_CONSTANT(TURNACCB), EPO_CONSTANT(HEADING), EPO_CONSTANT(ACCREF), EPO_CONSTANT(TURNRREF),

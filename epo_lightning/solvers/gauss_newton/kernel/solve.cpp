@@ -9,35 +9,15 @@
 #include <limits>
 #include <memory>
 
+#include "feedback.hpp"
 #include "lq_game.hpp"
+#include "plan.hpp"
 #include "step.hpp"
 
 namespace EPO_LEVEL {
 namespace {
 
 static_assert(kMostAgents == 8 * sizeof(uint64_t), "contacts are a mask of one bit per agent");
-
-/// Numbers of the agents of a group that move, and of the held agents in contact with them.
-struct Size {
-    int movers, held;
-    int agents() const { return movers + held; }
-};
-
-/// Groups of agents in contact by size: rows of a problem, the agents that move, and the held ones, each in ascending order.
-class Plan {
-  public:
-    Plan(int64_t N, bool holds) : stride_(int(N) + 1), rows_((holds ? N : 1) * stride_) {}
-
-    int kinds() const { return int(rows_.size()); }
-    Size size(int kind) const { return {kind % stride_, kind / stride_}; }
-    const std::vector<int32_t>& rows(int kind) const { return rows_[kind]; }
-    std::vector<int32_t>& rows(Size size) { return rows_[size.held * stride_ + size.movers]; }
-    int64_t count(int kind) const { return int64_t(rows_[kind].size()) / (size(kind).agents() + 1); }
-
-  private:
-    int stride_;
-    std::vector<std::vector<int32_t>> rows_;  // by kind
-};
 
 /// Contacts between the agents of W problems: bit j of touching[i * W + lane] is set where i and j overlap. Contacts between two
 /// agents of the mask `held` are not looked for.
@@ -200,37 +180,6 @@ struct Tape {
     int64_t first, last;
     std::vector<StepTape<T>> steps;
 };
-
-/// Calls body(group, index, lanes in use) for every W groups of the same size; `index` counts these calls, from 0 for each size. For up
-/// to 4 agents that move, their number is known at compile time.
-template <class T, class Body>
-void for_each_group(const EpoGame& game, Arena<T>& arena, const Plan& plan, const T* controls, const Body& body) {
-    constexpr int W = Lanes<T>::W;
-    for (int kind = 0; kind < plan.kinds(); ++kind) {
-        const Size size = plan.size(kind);
-        const int64_t count = plan.count(kind);
-        for (int64_t start = 0; start < count; start += W) {
-            const int32_t* rows = plan.rows(kind).data() + start * (size.agents() + 1);
-            const int filled = int(std::min<int64_t>(W, count - start));
-            arena.clear();
-            const auto call = [&](auto known) {
-                constexpr int N = decltype(known)::value;
-                auto group = Group<T, N>(game, arena, Count<N>{size.movers}, size.agents(), rows, filled, controls);
-                body(group, start / W, filled);
-            };
-            switch (size.movers) {
-                case 1: call(std::integral_constant<int, 1>{}); break;
-                case 2: call(std::integral_constant<int, 2>{}); break;
-                case 3: call(std::integral_constant<int, 3>{}); break;
-                case 4: call(std::integral_constant<int, 4>{}); break;
-                default: call(std::integral_constant<int, 0>{});
-            }
-        }
-    }
-}
-
-/// The set of the first lanes, one bit per lane.
-INLINE uint32_t first_lanes(int filled) { return (uint32_t(1) << filled) - 1; }
 
 template <class T>
 INLINE bool finite(T value) {
@@ -559,42 +508,6 @@ void pull_states(const EpoGame& game, Arena<T>& arena, int64_t first, int64_t la
     }
 }
 
-/// Adds the gradients of the games in the lanes whose bit is set in `lanes` to the results of the call.
-template <class T>
-void add_gradients(const Games<T>& games, const ParameterGradients<T>& by, uint32_t lanes, const EpoGradients& gradients) {
-    const EpoGame& game = games.game;
-    const int n = games.n;
-    const int64_t P = game.N * (game.N - 1) / 2;
-    for (int lane = 0; lane < Lanes<T>::W; ++lane) {
-        if (!(lanes >> lane & 1)) continue;
-        int pair = 0;
-        for (int i = 0; i < n; ++i) {
-            const int64_t row = games.row_of(i, lane);
-            for (int f = 0; f < OWN_COUNT; ++f)
-                if (game.own[f]) static_cast<T*>(gradients.own[f])[row] += by.own[f * n + i][lane];
-            if (game.own[GOAL]) {
-                static_cast<T*>(gradients.goals)[2 * row] += by.goal_x[i][lane];
-                static_cast<T*>(gradients.goals)[2 * row + 1] += by.goal_y[i][lane];
-            }
-            if (game.own[HEADING]) static_cast<T*>(gradients.goal_headings)[row] += by.goal_heading[i][lane];
-            for (int64_t k = 0; gradients.reference_controls && k < game.K; ++k) {
-                T* const by_step = static_cast<T*>(gradients.reference_controls) + 2 * (row * game.K + k);
-                by_step[ACCELERATION] += by.reference_thrust[i * game.K + k][lane];
-                by_step[TURN_RATE] += by.reference_turn[i * game.K + k][lane];
-            }
-            for (int j = i + 1; games.coupled && j < n; ++j, ++pair) {
-                const int64_t a = games.agent[i * Lanes<T>::W + lane], c = games.agent[j * Lanes<T>::W + lane];
-                const int64_t entry = games.problem[lane] * P + a * game.N - a * (a + 1) / 2 + c - a - 1;
-                for (int f = 0; f < PAIR_COUNT; ++f) {
-                    if (game.pair[f]) static_cast<T*>(gradients.pair[f])[entry] += by.pair[f * games.pairs + pair][lane];
-                    if (gradients.margins[f])
-                        static_cast<T*>(gradients.margins[f])[entry] += by.margin[f * games.pairs + pair][lane];
-                }
-            }
-        }
-    }
-}
-
 /// The adjoint of `solve`: from the last step to the first.
 template <class T>
 void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& run, const EpoGradients& gradients) {
@@ -629,14 +542,7 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
                 mu_thrust[e] = T(run.step_size) * bar_thrust[e];
             }
             solve_adjoint(group, factors, mu_turn, mu_thrust);
-            const int shared = PAIR_COUNT * group.pairs;
-            const ParameterGradients<T> by{
-                arena.take(OWN_COUNT * n), arena.take(shared), arena.take(shared), arena.take(n), arena.take(n), arena.take(n),
-                arena.take(n * K), arena.take(n * K)};
-            for (int e = 0; e < OWN_COUNT * n; ++e) by.own[e] = Vec<T>{};
-            for (int e = 0; e < n * K; ++e) by.reference_turn[e] = by.reference_thrust[e] = Vec<T>{};
-            for (int e = 0; e < shared; ++e) by.pair[e] = by.margin[e] = Vec<T>{};
-            for (int e = 0; e < n; ++e) by.goal_x[e] = by.goal_y[e] = by.goal_heading[e] = Vec<T>{};
+            const ParameterGradients<T> by(arena, n, K, group.pairs);
             differentiate(group, mu_turn, mu_thrust, d_turn, d_thrust, bar_turn, bar_thrust, by);
             // A step that was not taken passes its cotangent on unchanged.
             uint32_t taken = 0;
@@ -672,6 +578,8 @@ const EpoLevel& level() {
         lq_equilibria,
         lq_pull_back,
         lq_follow,
+        feedback,
+        feedback_pull_back,
         Lanes<float>::W,
     };
     return functions;

@@ -1,6 +1,7 @@
 // One Levenberg-Marquardt step of a group, the factors that it keeps for its adjoint, and that adjoint.
 #pragma once
 
+#include "gradients.hpp"
 #include "group.hpp"
 
 namespace EPO_LEVEL {
@@ -112,33 +113,17 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, bool exact, Vec<T
     const int n = g.count.agents(), m = 2 * n, ld = 3 * m;
     Vec<T> energy{};
     for (int i = 0; i < n; ++i) {
-        const Model<T> speed = g.speed_model(i, state);
-        energy += speed.energy;
-        y[m + 2 * i + 1] += speed.pull;
-        if (P) P[(m + 2 * i + 1) * ld + m + 2 * i + 1] += speed.stiffness;
-        Model<T> in_x, in_y;
-        if (g.has(LANE)) {
-            in_x.add(g.own(LANE, i), g.path[i].x[state] - g.nearest.x[i * (g.K + 1) + state]);
-            in_y.add(g.own(LANE, i), g.path[i].y[state] - g.nearest.y[i * (g.K + 1) + state]);
-        }
-        if (g.has(GOAL) && g.ends_at(state)) {
-            const Vec<T> weight = g.final_weight(GOAL, i, state);
-            in_x.add(weight, g.path[i].x[state] - g.goal_x[i]);
-            in_y.add(weight, g.path[i].y[state] - g.goal_y[i]);
-        }
-        if (g.has(HEADING) && g.ends_at(state)) {
-            Model<T> heading;
-            heading.add(g.final_weight(HEADING, i, state), g.path[i].heading[state] - g.goal_heading[i]);
-            energy += heading.energy;
-            y[m + 2 * i] += heading.pull;
-            if (P) P[(m + 2 * i) * ld + m + 2 * i] += heading.stiffness;
-        }
-        energy += in_x.energy + in_y.energy;
-        y[2 * i] += in_x.pull;
-        y[2 * i + 1] += in_y.pull;
+        const StateModels<T> own = g.state_models(i, state);
+        energy = energy + own.speed.energy + own.heading.energy + (own.x.energy + own.y.energy);
+        y[2 * i] += own.x.pull;
+        y[2 * i + 1] += own.y.pull;
+        y[m + 2 * i] += own.heading.pull;
+        y[m + 2 * i + 1] += own.speed.pull;
         if (P) {
-            P[2 * i * ld + 2 * i] += in_x.stiffness;
-            P[(2 * i + 1) * ld + 2 * i + 1] += in_y.stiffness;
+            P[2 * i * ld + 2 * i] += own.x.stiffness;
+            P[(2 * i + 1) * ld + 2 * i + 1] += own.y.stiffness;
+            P[(m + 2 * i) * ld + m + 2 * i] += own.heading.stiffness;
+            P[(m + 2 * i + 1) * ld + m + 2 * i + 1] += own.speed.stiffness;
         }
         if (P && (exact || g.game.lane_slides) && g.has(LANE)) {  // the nearest point of the line moves with the agent
             const int at = i * (g.K + 1) + state;
@@ -323,14 +308,6 @@ void evaluate(const Group<T, N>& g, Vec<T>& energy, Vec<T>& squared_norm) {
         }
     }
 }
-
-/// Gradients of one group with respect to its parameters.
-template <class T>
-struct ParameterGradients {
-    Vec<T>*own, *pair, *margin;               // [OWN_COUNT, n], [PAIR_COUNT, pairs] twice
-    Vec<T>*goal_x, *goal_y, *goal_heading;    // [n]
-    Vec<T>*reference_turn, *reference_thrust;  // [n, K], only for features of reference controls
-};
 
 /// The part of `differentiate` that belongs to an overlap of discs, at one state: adds to the cotangents `sums` [n, 6] of positions
 /// and to the gradients by the pairs' weights and margins.

@@ -1,0 +1,144 @@
+"""Driving games as the compiled kernel reads them: addresses and strides of their tensors, and arrays for the gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from epo_lightning.forecast import GameParameters
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import Scene
+from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS, EpoGame, EpoGradients
+
+
+class GameArrays:
+    """The tensors of B M games, and the structure with their addresses.
+
+    Attributes:
+        game: the structure. It is valid as long as this object exists.
+        inputs: the tensors by which solutions have derivatives: weights, margins, goals, their headings, and reference
+            controls.
+        kept: all other tensors that the kernel reads.
+    """
+
+    def __init__(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor) -> None:
+        """Collect the tensors, as numbers of the type of ``controls``.
+
+        Args:
+            energy, scene, parameters: the games.
+            controls: any controls [B, M, N, K, 2].
+        """
+        self._controls = controls
+        like = controls.dtype
+        weights = parameters.own_weights
+        if _has_gaps(energy, scene):  # the weight of a line that does not exist is zero
+            weights = {**weights, "lane": energy.own_weight(scene, parameters, "lane")}
+        self._own = [as_type(like, weights[name]) for name in energy.own]
+        self._pair = [as_type(like, parameters.pair_weights[name]) for name in energy.pair]
+        self._margins = [as_type(like, parameters.margins[name]) for name in energy.decoded_margins]
+        self._goals = [as_type(like, parameters.goals)] if energy.needs_goals else []  # type: ignore[arg-type]
+        headed = energy.needs_goal_headings
+        self._headings = [as_type(like, parameters.goal_headings)] if headed else []  # type: ignore[arg-type]
+        referring = energy.needs_reference_controls
+        self._references = [as_type(like, parameters.reference_controls)] if referring else []  # type: ignore[arg-type]
+        self.inputs = (*self._own, *self._pair, *self._margins, *self._goals, *self._headings, *self._references)
+        self._slots = [OWN.index(name) for name in energy.own]
+        self._pair_slots = [PAIR.index(name) for name in energy.pair]
+        self._margin_slots = [PAIR.index(name) for name in energy.decoded_margins]
+        self.kept: list[Tensor] = []
+        self.game = self._describe(energy, scene, parameters)
+
+    def _hold(self, tensor: Tensor) -> Tensor:
+        # The kernel gets the address alone: the tensor has to live as long as this object.
+        self.kept.append(tensor)
+        return tensor
+
+    def _describe(self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> EpoGame:
+        batch, modes, agents, horizon, _ = self._controls.shape
+        like, hold = self._controls.dtype, self._hold
+        game = EpoGame(B=batch, M=modes, N=agents, K=horizon, dt=scene.dt, lane_slides=energy.lane_slides)
+        game.pair_stride = min(energy.pair_stride, horizon + 1)
+        for index, name in enumerate(SIGNALS):
+            if not isinstance(bound := energy.bounds.get(name, {}), Mapping):
+                game.bounds[index][:] = bound
+        initial = as_type(like, scene.current)
+        initial = hold(initial if initial.stride(-1) == 1 else initial.contiguous())
+        game.initial, (game.initial_b, game.initial_n) = initial.data_ptr(), initial.stride()[:2]
+        game.present = hold(scene.agent_mask.contiguous()).data_ptr()
+        if scene.size is not None:
+            game.size = hold(as_type(like, scene.size).contiguous()).data_ptr()
+        for slot, weight in zip(self._slots, self._own, strict=True):
+            game.own[slot], game.own_strides[slot][:] = weight.data_ptr(), weight.stride()
+        if agents > 1:
+            for slot, weight in zip(self._pair_slots, self._pair, strict=True):
+                game.pair[slot], game.pair_strides[slot][:] = weight.data_ptr(), weight.stride()
+            margins = dict(zip(self._margin_slots, self._margins, strict=True))
+            for name in energy.margins.keys() & set(energy.pair):
+                fixed = hold(self._controls.new_tensor(energy.margins[name]))
+                margins[PAIR.index(name)] = fixed.expand(batch, modes, agents * (agents - 1) // 2)
+            for slot, margin in margins.items():
+                game.margins[slot], game.margin_strides[slot][:] = margin.data_ptr(), margin.stride()
+        if self._goals:
+            game.goals = self._goals[0].data_ptr()
+            game.goals_b, game.goals_m, game.goals_n, game.goals_x = self._goals[0].stride()
+        if self._headings:
+            game.goal_headings, game.goal_heading_strides[:] = self._headings[0].data_ptr(), self._headings[0].stride()
+        if self._references:
+            game.reference_controls = hold(self._references[0].contiguous()).data_ptr()
+        if scene.game_steps is not None:
+            game.ends = hold(as_type(torch.int64, scene.game_steps).contiguous()).data_ptr()
+        if "lane" in energy.own:
+            assert scene.references is not None
+            assert parameters.reference is not None
+            references = as_type(like, scene.references)
+            if _has_gaps(energy, scene):
+                references = torch.where(scene.reference_mask[..., None, None], references, 0.0)  # type: ignore[index]
+            game.references = hold(references.contiguous()).data_ptr()
+            game.reference = hold(as_type(torch.int64, parameters.reference).contiguous()).data_ptr()
+            game.lines, game.points = scene.references.shape[2:4]
+        if "velref" in energy.own:
+            assert scene.reference_speed is not None
+            game.reference_speed = hold(as_type(like, scene.reference_speed).contiguous()).data_ptr()
+        return game
+
+    def new_gradients(self) -> tuple[EpoGradients, list[Tensor]]:
+        """A structure with the addresses of new gradients, which are zero, and these gradients in the order of ``inputs``.
+
+        The caller sets the cotangents of the structure.
+        """
+        batch, modes, agents = self._controls.shape[:3]
+        new = self._controls.new_zeros
+        own = new((len(self._own), batch, modes, agents)).unbind(0)
+        shared = (batch, modes, agents * (agents - 1) // 2)
+        pair, margins = new((len(self._pair), *shared)).unbind(0), new((len(self._margins), *shared)).unbind(0)
+        goals = [new((batch, modes, agents, 2)) for _ in self._goals]
+        headings = [new((batch, modes, agents)) for _ in self._headings]
+        references = [new(self._controls.shape) for _ in self._references]
+        gradients = EpoGradients()
+        for slots, addresses, tensors in (
+            (self._slots, gradients.own, own),
+            (self._pair_slots, gradients.pair, pair),
+            (self._margin_slots, gradients.margins, margins),
+        ):
+            for slot, tensor in zip(slots, tensors, strict=True):
+                addresses[slot] = tensor.data_ptr()
+        for tensor in goals:
+            gradients.goals = tensor.data_ptr()
+        for tensor in headings:
+            gradients.goal_headings = tensor.data_ptr()
+        for tensor in references:
+            gradients.reference_controls = tensor.data_ptr()
+        return gradients, [*own, *pair, *margins, *goals, *headings, *references]
+
+
+def as_type(dtype: torch.dtype, tensor: Tensor) -> Tensor:
+    """The tensor as numbers of a type."""
+    # `to` takes a microsecond even if the type is right already, and there are twenty tensors.
+    return tensor if tensor.dtype == dtype else tensor.to(dtype)
+
+
+def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:
+    """Whether some reference lines are masked out."""
+    return "lane" in energy.own and scene.reference_mask is not None and not scene.reference_mask.all()
