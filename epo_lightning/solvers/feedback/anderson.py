@@ -11,6 +11,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+DEPENDENT = 1e-12
+"""Part of a column, relative to its norm, from which on it is independent of other columns."""
+
 
 class Anderson:
     """The last points of S iterations, and their deviations."""
@@ -52,11 +55,23 @@ class Anderson:
 
 
 def least_squares(columns: Float[Tensor, "R D H"], wanted: Float[Tensor, "R D"]) -> Float[Tensor, "R H"]:
-    """The smallest x with the least |columns x - wanted|; columns may be zero or depend on each other.
+    """The x with the least |columns x - wanted|, by Gram-Schmidt.
 
-    It is NaN where a column or ``wanted`` is not finite, which LAPACK would refuse for all rows.
+    A column that depends on those before it has a share of zero. Rows with values that are not finite do not change others.
     """
-    finite = columns.isfinite().flatten(1).all(-1) & wanted.isfinite().all(-1)
-    known = torch.where(finite[:, None, None], columns, 0.0), torch.where(finite[:, None], wanted, 0.0)[..., None]
-    solution = torch.linalg.lstsq(*known, driver="gelsd").solution[..., 0]
-    return torch.where(finite[:, None], solution, torch.nan)
+    rest = columns.mT
+    whole = rest.square().sum(-1)
+    along, triangle, inverse = [], [], []
+    for c in range(rest.shape[1]):
+        norm = rest[:, 0].square().sum(-1)
+        independent = norm > DEPENDENT**2 * whole[:, c]
+        inverse.append(torch.where(independent, norm.rsqrt(), 0.0))
+        direction = torch.where(independent[:, None], rest[:, 0] * inverse[c][:, None], 0.0)
+        along.append((direction * wanted).sum(-1))
+        wanted = wanted - along[c][:, None] * direction
+        triangle.append((rest[:, 1:] @ direction[..., None])[..., 0])
+        rest = rest[:, 1:] - triangle[c][..., None] * direction[:, None]
+    shares = wanted.new_zeros(len(wanted), len(along))
+    for c in reversed(range(len(along))):
+        shares[:, c] = (along[c] - (triangle[c] * shares[:, c + 1 :]).sum(-1)) * inverse[c]
+    return shares

@@ -13,7 +13,7 @@ namespace {
 
 using namespace lq;
 
-constexpr double kDependent = 1e-12;  // the part of a column, relative to its norm, from which on it is independent of others
+constexpr double kDependent = 1e-12;  // part of a column, relative to its norm, from which on it is independent of other columns
 
 /// The plan for all problems first .. last for which wanted(problem) is true: a row for each, with its present agents.
 template <class Wanted>
@@ -61,8 +61,8 @@ INLINE void subtract(V* from, V factor, const V* vector, int length) {
     for (int e = 0; e < length; ++e) from[e] -= factor * vector[e];
 }
 
-/// Writes the x that minimises |columns x - wanted|^2 to `shares`, by Gram-Schmidt. A column that depends on those before it, or is not
-/// finite, has no share. `columns` and `wanted` are overwritten.
+/// Writes the x that minimises |columns x - wanted|^2 to `shares`, by Gram-Schmidt. A column that depends on those before it has a
+/// share of zero. `columns` and `wanted` are overwritten.
 void least_squares(Arena<double>& arena, const std::vector<V*>& columns, V* wanted, int length, V* shares) {
     const int count = int(columns.size());
     V *R = arena.take(count * count), *inverse = arena.take(count);

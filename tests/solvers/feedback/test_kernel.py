@@ -1,0 +1,158 @@
+"""The compiled iteration of LQ games and its derivative: against the same in PyTorch, on random games."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import ModuleType
+
+import pytest
+import torch
+from games import leaves_of, random_game, random_scene
+
+from epo_lightning.forecast import Status
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.solvers.feedback import derivative, iteration, kernel
+from epo_lightning.solvers.feedback.iteration import FeedbackGame
+from epo_lightning.solvers.gauss_newton.kernel import interface
+
+OWN = ("goal", "heading", "velref", "vel", "acc", "turnr", "velb", "accb", "turnrb")
+BOUNDS = {"vel": [-0.05, 0.6], "acc": [-0.3, 0.3], "turnr": [-0.2, 0.2]}
+HORIZON = 9
+RHO = 5.0
+ENERGIES = {
+    "rpi": {"own": OWN, "pair": ("clearance",), "margins": {"clearance": 0.5}},
+    "decoded margins": {"own": OWN, "pair": ("proximity", "clearance")},
+    "lines": {"own": ("goal", "lane", "acc"), "pair": ("proximity",)},
+    "lines that slide": {"own": ("lane", "acc"), "pair": ("proximity",), "lane_slides": True},
+    "reference controls": {"own": ("accref", "turnrref"), "pair": ("proximity",)},
+    "vehicles": {"own": ("goal", "acc"), "pair": ("circles", "headway", "longitudinal", "lateral", "time_to_conflict")},
+    "every second step": {"own": OWN, "pair": ("proximity", "lateral"), "pair_stride": 2},
+    "no pairs": {"own": OWN, "pair": ()},
+    "pairs alone": {"own": (), "pair": ("proximity",)},
+}
+
+
+def random_feedback_game(name: str = "rpi", agents: int = 3, scenes: int = 5, modes: int = 2) -> FeedbackGame:
+    """Games near each other, with absent agents and early ends in some scenes."""
+    torch.manual_seed(0)
+    energy = FeatureEnergy(bounds=BOUNDS, **ENERGIES[name])
+    scene = random_scene(scenes, agents, history=2, horizon=HORIZON, size=2.0, dtype=torch.double)
+    mask = torch.ones(scenes, agents, dtype=torch.bool)
+    mask[1, 0] = mask[2, -1] = False
+    ends = torch.tensor([HORIZON, 6, 1, HORIZON, 4])[:scenes]
+    scene = dataclasses.replace(scene, agent_mask=mask, game_steps=ends)
+    scene.history[1, 0] = torch.nan  # of an absent agent
+    game = random_game(scene, modes, HORIZON, own=energy.own, pair=energy.pair)
+    return FeedbackGame(energy, scene, game, RHO)
+
+
+def controls_of(game: FeedbackGame) -> torch.Tensor:
+    """Small controls, zero for absent agents."""
+    return 0.1 * game.parameters.initial_controls * game.scene.agent_mask[:, None, :, None, None]
+
+
+@pytest.mark.parametrize("agents", [1, 2, 3, 5])
+@pytest.mark.parametrize("name", ENERGIES)
+def test_iterations_are_those_of_pytorch(name: str, agents: int) -> None:
+    game = random_feedback_game(name, agents)
+    for iterations in (1, 2, 6):
+        controls, status = kernel.iterate(game, controls_of(game), iterations, 1e-3)
+        wanted, wanted_status = iteration.iterate(game, controls_of(game), iterations, 1e-3)
+        assert torch.equal(status, wanted_status)
+        torch.testing.assert_close(controls, wanted, rtol=1e-7, atol=1e-7)
+
+
+def gradients(module: ModuleType, game: FeedbackGame) -> list[torch.Tensor]:
+    """The derivative by all parameters at controls that need not be a solution, as if they were one."""
+    leaves = leaves_of(game.parameters)
+    controls = controls_of(game)
+    cotangent = torch.randn(controls.shape, generator=torch.Generator().manual_seed(1), dtype=torch.double)
+    cotangent[0, 0] = 0.0  # of a mode without a loss
+    solved = torch.ones(controls.shape[:2], dtype=torch.bool)
+    solved[-1, -1] = False
+    module.attach(dataclasses.replace(game, parameters=leaves), controls, solved, 4).backward(cotangent)
+    found = [leaf for leaf in leaves.tensors() if leaf.requires_grad]
+    return [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in found]
+
+
+@pytest.mark.parametrize("agents", [1, 2, 3, 5])
+@pytest.mark.parametrize("name", ENERGIES)
+def test_derivatives_are_those_of_pytorch(name: str, agents: int) -> None:
+    game = random_feedback_game(name, agents)
+    found, wanted = gradients(kernel, game), gradients(derivative, game)
+    assert any(gradient.any() for gradient in found) or (name, agents) == ("pairs alone", 1)
+    for ours, theirs in zip(found, wanted, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-7, atol=1e-9 * float(theirs.abs().sum()))
+
+
+def test_results_do_not_depend_on_threads_and_neighbours() -> None:
+    game = random_feedback_game(scenes=5)
+    many = game.one_by_one(2)[torch.arange(10).repeat(7)]
+    controls = controls_of(many)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        found, status = kernel.iterate(many, controls, 6, 1e-3)
+    finally:
+        torch.set_num_threads(before)
+    for row in range(10):
+        alone, its_status = kernel.iterate(many[torch.tensor([row])], controls[[row]], 6, 1e-3)
+        for copy in range(row, 70, 10):
+            assert torch.equal(found[copy], alone[0])
+            assert torch.equal(status[copy], its_status[0])
+
+
+def test_all_levels_of_instructions_agree() -> None:
+    game = random_feedback_game()
+    library, results = interface.library(), []
+    levels = library.epo_levels()
+    try:
+        for level in range(levels):
+            library.epo_choose(level)
+            controls, _ = kernel.iterate(game, controls_of(game), 4, 1e-3)
+            results.append((controls, torch.cat([found.flatten() for found in gradients(kernel, game)])))
+    finally:
+        library.epo_choose(levels - 1)
+    for controls, gradient in results:
+        torch.testing.assert_close(controls, results[0][0], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(gradient, results[0][1], rtol=1e-7, atol=1e-7)
+
+
+def test_scenes_without_agents_are_solved() -> None:
+    game = random_feedback_game(scenes=3)
+    game.scene.agent_mask[0] = False
+    controls, status = kernel.iterate(game, controls_of(game), 3, 1e-12)
+    assert (status[0] == Status.SOLVED).all()
+    assert not controls[0].any()
+    assert (status[1:] != Status.SOLVED).any()
+
+
+def test_a_game_that_is_not_finite_stops_alone() -> None:
+    game = random_feedback_game(agents=2)
+    wanted, _ = kernel.iterate(game, controls_of(game), 4, 1e-3)
+    game.parameters.own_weights["vel"][3, 1, 0] = torch.nan
+    controls, status = kernel.iterate(game, controls_of(game), 4, 1e-3)
+    assert status[3, 1] == Status.STOPPED
+    assert torch.equal(controls[3, 1], controls_of(game)[3, 1])
+    assert torch.equal(controls[:3], wanted[:3])
+
+
+def test_changed_parameters_are_noticed_before_the_backward_pass() -> None:
+    game = random_feedback_game()
+    leaves = leaves_of(game.parameters)
+    weights = {name: weight * 1.0 for name, weight in leaves.own_weights.items()}
+    moved = dataclasses.replace(game, parameters=dataclasses.replace(leaves, own_weights=weights))
+    controls = kernel.attach(moved, controls_of(game), torch.ones(5, 2, dtype=torch.bool), 2)
+    weights["vel"].mul_(2.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        controls.sum().backward()
+
+
+@pytest.mark.parametrize("reason", ["heun", "kinds"])
+def test_other_games_are_iterated_in_pytorch(reason: str) -> None:
+    game = random_feedback_game()
+    by_kind = {**BOUNDS, "vel": {"default": [-0.05, 0.6]}}
+    changes = {"dynamics": Unicycle("heun")} if reason == "heun" else {"bounds": by_kind}
+    assert kernel.obstacle(game) is None
+    assert kernel.obstacle(dataclasses.replace(game, energy=dataclasses.replace(game.energy, **changes))) is not None
