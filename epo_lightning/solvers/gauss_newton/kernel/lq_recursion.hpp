@@ -38,11 +38,11 @@ struct View {
     View transposed() const { return {at, column, row}; }
 };
 
-template <int R, int S>
+template <int R, int S, bool FRESH>
 INLINE void add_tile(V* to, int stride, View a, View b, int depth) {
     V sum[R][S];
     for (int i = 0; i < R; ++i)
-        for (int j = 0; j < S; ++j) sum[i][j] = to[i * stride + j];
+        for (int j = 0; j < S; ++j) sum[i][j] = FRESH ? V{} : to[i * stride + j];
     for (int k = 0; k < depth; ++k)
         for (int i = 0; i < R; ++i)
             for (int j = 0; j < S; ++j) sum[i][j] += a.at[i * a.row + k * a.column] * b.at[k * b.row + j * b.column];
@@ -50,15 +50,24 @@ INLINE void add_tile(V* to, int stride, View a, View b, int depth) {
         for (int j = 0; j < S; ++j) to[i * stride + j] = sum[i][j];
 }
 
-/// Adds a b to the matrix `to`, whose rows are `stride` apart and even in number.
+/// Adds a b to the matrix `to`, whose rows are `stride` apart and even in number; with FRESH, its old values count as zero. Eight sums
+/// at a time hide the latency of one.
+template <bool FRESH = false>
 INLINE void add_product(V* to, int stride, int rows, int columns, View a, View b, int depth) {
-    for (int i = 0; i < rows; i += 2) {
-        const View left{a.at + i * a.row, a.row, a.column};
-        int j = 0;
-        for (; j + 4 <= columns; j += 4) add_tile<2, 4>(to + i * stride + j, stride, left, {b.at + j * b.column, b.row, b.column}, depth);
-        for (int rest = columns % 4; rest > 0; --rest, ++j)
-            add_tile<2, 1>(to + i * stride + j, stride, left, {b.at + j * b.column, b.row, b.column}, depth);
+    const int whole = columns / 4 * 4;
+    for (int i = 0; i < rows; i += 2)
+        for (int j = 0; j < whole; j += 4)
+            add_tile<2, 4, FRESH>(to + i * stride + j, stride, {a.at + i * a.row, a.row, a.column}, {b.at + j * b.column, b.row, b.column}, depth);
+    for (int j = whole; j < columns; ++j) {
+        const View right{b.at + j * b.column, b.row, b.column};
+        int i = 0;
+        for (; i + 8 <= rows; i += 8) add_tile<8, 1, FRESH>(to + i * stride + j, stride, {a.at + i * a.row, a.row, a.column}, right, depth);
+        for (; i < rows; i += 2) add_tile<2, 1, FRESH>(to + i * stride + j, stride, {a.at + i * a.row, a.row, a.column}, right, depth);
     }
+}
+
+INLINE void set_product(V* to, int stride, int rows, int columns, View a, View b, int depth) {
+    add_product<true>(to, stride, rows, columns, a, b, depth);
 }
 
 INLINE void clear(V* values, int count) {
@@ -110,9 +119,8 @@ INLINE void add_costs(const Sizes<N>& size, const Stage<N>& stage, V* value) {
 template <int N>
 INLINE void find_slopes(const Sizes<N>& size, const Stage<N>& stage, const V* value, V* slope) {
     const int n = size.states(), width = size.width();
-    clear(slope, size.controls() * width);
     for (int i = 0; i < size.agents(); ++i)
-        add_product(
+        set_product(
             slope + kControl * i * width, width, kControl, width, View{stage.B + 8 * i, kControl, 1}.transposed(),
             {value + (i * n + kState * i) * width, width, 1}, kState);
 }
@@ -121,12 +129,10 @@ INLINE void find_slopes(const Sizes<N>& size, const Stage<N>& stage, const V* va
 template <int N>
 INLINE void stationarity(const Sizes<N>& size, const Stage<N>& stage, double rho, const V* slope, V* matrix, V* right) {
     const int agents = size.agents(), n = size.states(), m = size.controls(), width = size.width();
-    clear(matrix, m * m);
-    clear(right, m * width);
     for (int j = 0; j < agents; ++j) {
         const View by_states{slope + kState * j, width, 1};
-        add_product(matrix + kControl * j, m, m, kControl, by_states, {stage.B + 8 * j, kControl, 1}, kState);
-        add_product(right + kState * j, width, m, kState, by_states, {stage.A + 16 * j, kState, 1}, kState);
+        set_product(matrix + kControl * j, m, m, kControl, by_states, {stage.B + 8 * j, kControl, 1}, kState);
+        set_product(right + kState * j, width, m, kState, by_states, {stage.A + 16 * j, kState, 1}, kState);
     }
     for (int i = 0; i < agents; ++i)
         for (int r = 0; r < kControl; ++r) {
@@ -178,29 +184,25 @@ INLINE M solve(int m, int width, V* matrix, V* right) {
 template <int N>
 INLINE void close(const Sizes<N>& size, const Stage<N>& stage, const V* policy, V* closed) {
     const int width = size.width();
-    clear(closed, size.states() * width);
     for (int i = 0; i < size.agents(); ++i) {
+        V* const rows = closed + kState * i * width;
+        set_product(rows, width, kState, width, {stage.B + 8 * i, kControl, 1}, {policy + kControl * i * width, width, 1}, kControl);
         for (int a = 0; a < kState; ++a)
-            for (int b = 0; b < kState; ++b) closed[(kState * i + a) * width + kState * i + b] = stage.A[16 * i + kState * a + b];
-        add_product(
-            closed + kState * i * width, width, kState, width, {stage.B + 8 * i, kControl, 1},
-            {policy + kControl * i * width, width, 1}, kControl);
+            for (int b = 0; b < kState; ++b) rows[a * width + kState * i + b] += stage.A[16 * i + kState * a + b];
     }
 }
 
 /// [V F | V B f + v], the gradient of a cost-to-go at the next state, as a function of the state.
 INLINE void carry(int n, const V* value, const V* closed, V* ahead) {
     const int width = n + 1;
-    clear(ahead, n * width);
-    for (int a = 0; a < n; ++a) ahead[a * width + n] = value[a * width + n];
-    add_product(ahead, width, n, width, {value, width, 1}, {closed, width, 1}, n);
+    set_product(ahead, width, n, width, {value, width, 1}, {closed, width, 1}, n);
+    for (int a = 0; a < n; ++a) ahead[a * width + n] += value[a * width + n];
 }
 
-/// R_i [G_i | f_i] + [0 | r_i], the gradient of an agent's cost by its controls [2, n + 1].
+/// Adds R_i [G_i | f_i] + [0 | r_i], the gradient of an agent's cost by its controls [2, n + 1].
 INLINE void spend(int n, const V* effort, const V* push, const V* own, V* spent) {
     const int width = n + 1;
-    clear(spent, kControl * width);
-    for (int r = 0; r < kControl; ++r) spent[r * width + n] = push[r];
+    for (int r = 0; r < kControl; ++r) spent[r * width + n] += push[r];
     add_product(spent, width, kControl, width, {effort, kControl, 1}, {own, width, 1}, kControl);
 }
 
@@ -211,11 +213,9 @@ INLINE void cost_to_go(
     const int n = size.states(), m = size.controls(), width = size.width();
     V* own = spent + kControl * i * width;
     carry(n, value, closed, ahead);
-    clear(spent, m * width);
+    for (int e = 0; e < m * width; ++e) spent[e] = rho * policy[e];
     spend(n, stage.effort + 4 * i, stage.push + 2 * i, policy + kControl * i * width, own);
-    for (int e = 0; e < m * width; ++e) spent[e] += rho * policy[e];
-    clear(value, n * width);
-    add_product(value, width, n, width, View{closed, width, 1}.transposed(), {ahead, width, 1}, n);
+    set_product(value, width, n, width, View{closed, width, 1}.transposed(), {ahead, width, 1}, n);
     add_product(value, width, n, width, View{policy, width, 1}.transposed(), {spent, width, 1}, m);
 }
 
@@ -286,35 +286,30 @@ INLINE void pull_back_stage(
             s.by_values[e] += of[e];
         }
         carry(n, ahead_value, s.closed, s.ahead);
-        clear(s.ahead_bar, all);
-        add_product(s.ahead_bar, width, n, width, closed, by_value, n);
+        set_product(s.ahead_bar, width, n, width, closed, by_value, n);
         add_product(s.closed_bar, width, n, n, {s.ahead, width, 1}, by_value.transposed(), width);
-        clear(of, all);
-        add_product(of, width, n, n, {s.ahead_bar, width, 1}, closed.transposed(), width);
+        set_product(of, width, n, n, {s.ahead_bar, width, 1}, closed.transposed(), width);
         for (int a = 0; a < n; ++a) of[a * width + n] = s.ahead_bar[a * width + n];
         add_product(s.closed_bar, width, n, width, View{ahead_value, width, 1}.transposed(), {s.ahead_bar, width, 1}, n);
         const V* own = s.policy + kControl * i * width;
         V* own_bar = s.policy_bar + kControl * i * width;
+        clear(s.spent, kControl * width);
         spend(n, stage.effort + 4 * i, stage.push + 2 * i, own, s.spent);
-        clear(s.spent_bar, kControl * width);
-        add_product(s.spent_bar, width, kControl, width, {own, width, 1}, by_value, n);
+        set_product(s.spent_bar, width, kControl, width, {own, width, 1}, by_value, n);
         for (int r = 0; r < kControl; ++r) bar.push[2 * i + r] = s.spent_bar[r * width + n];
-        clear(bar.effort + 4 * i, 4);
-        add_product(bar.effort + 4 * i, kControl, kControl, kControl, {s.spent_bar, width, 1}, View{own, width, 1}.transposed(), width);
+        set_product(bar.effort + 4 * i, kControl, kControl, kControl, {s.spent_bar, width, 1}, View{own, width, 1}.transposed(), width);
         add_product(own_bar, width, kControl, width, View{stage.effort + 4 * i, kControl, 1}.transposed(), {s.spent_bar, width, 1}, kControl);
         add_product(own_bar, width, kControl, n, {s.spent, width, 1}, by_value.transposed(), width);
     }
-    clear(s.right_bar, m * width);
+    set_product(s.right_bar, width, m, width, policy, by_values, n);
     add_product(s.right_bar, width, m, n, policy, by_values.transposed(), width);
-    add_product(s.right_bar, width, m, width, policy, by_values, n);
     for (int e = 0; e < m * width; ++e) s.policy_bar[e] += rho * s.right_bar[e];
     // [F | B f] = [A | 0] + B [G | f].
     for (int i = 0; i < agents; ++i) {
         const View rows{s.closed_bar + kState * i * width, width, 1};
         for (int a = 0; a < kState; ++a)
             for (int b = 0; b < kState; ++b) bar.A[16 * i + kState * a + b] = rows.at[a * width + kState * i + b];
-        clear(bar.B + 8 * i, 8);
-        add_product(
+        set_product(
             bar.B + 8 * i, kControl, kState, kControl, rows, View{s.policy + kControl * i * width, width, 1}.transposed(), width);
         add_product(
             s.policy_bar + kControl * i * width, width, kControl, width, View{stage.B + 8 * i, kControl, 1}.transposed(), rows, kState);
@@ -328,8 +323,7 @@ INLINE void pull_back_stage(
     for (int r = 0; r < m; ++r)
         for (int e = 0; e < width; ++e)
             s.right_bar[r * width + e] = stage.free[r / kControl] ? -s.policy_bar[r * width + e] : V{};
-    clear(s.matrix_bar, m * m);
-    add_product(s.matrix_bar, m, m, m, {s.right_bar, width, 1}, policy.transposed(), width);
+    set_product(s.matrix_bar, m, m, m, {s.right_bar, width, 1}, policy.transposed(), width);
     // matrix = S B + R and -right = S [A | 0] + [0 | s + r], with [S | s] the slopes; `right_bar` is the derivative by -right.
     clear(s.slope_bar, m * width);
     for (int r = 0; r < m; ++r) s.slope_bar[r * width + n] = s.right_bar[r * width + n];
