@@ -116,7 +116,7 @@ asan: $(TESTABLE)
 	EPO_KERNEL=$(CURDIR)/$(KERNEL_FOLDER)/epo_kernel.sanitized.so.1 \
 	LD_PRELOAD="$$(clang++ -print-file-name=libclang_rt.asan-$$(uname -m).so)" \
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
-	$(BIN)/python -m pytest -n 0 tests/solvers/gauss_newton tests/solvers/feedback/test_lq_game.py -k "not too_little_memory"
+	$(BIN)/python -m pytest -n 0 tests/solvers/gauss_newton tests/solvers/feedback -k "not too_little_memory"
 
 lint: $(TESTABLE)
 	$(BIN)/ruff check .

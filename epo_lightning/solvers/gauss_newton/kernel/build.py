@@ -154,7 +154,7 @@ def build(target: Path = LIBRARY, portable: bool = False) -> None:
         compile_ = [*compiler, *options, f"-DEPO_FINGERPRINT={fingerprint()}", *built, "-c"]
         sources = {f"{folder}/dispatch.o": [str(HERE / "dispatch.cpp")]}
         for level, flags in levels.items():
-            for name in ("solve", "lq_game", "feedback"):
+            for name in ("solve", "lq_game", "feedback", "feedback_derivative"):
                 sources[f"{folder}/{level}.{name}.o"] = [*flags, f"-DEPO_LEVEL={level}", str(HERE / f"{name}.cpp")]
         _run([[*compile_, *source, "-o", object_] for object_, source in sources.items()])
         linked = Path(folder) / target.name

@@ -122,7 +122,8 @@ struct TrajectoryBar {
 
 /// The part of `pull_back_expansion` that belongs to an overlap of discs; `bar` is the derivative by the cost [8, 9] of the pair.
 INLINE void pull_back_discs(
-    const Game& g, int feature, int pair, int i, int j, int state, const V* bar, V* first, V* second, const ParameterGradients<double>& by) {
+    const Game& g, int feature, int pair, int i, int j, int state, const V* bar, V* first, V* second,
+    const ParameterGradients<double>& by) {
     const int entry = feature * g.pairs + pair;
     const Contact<double> contact(g.path[i].x[state] - g.path[j].x[state], g.path[i].y[state] - g.path[j].y[state], g.reach[entry]);
     // The loss is w^2 (n' Q n - depth n' q): Q and q are the derivatives by the cost, as a function of the relative position.
@@ -153,7 +154,8 @@ INLINE void pull_back_discs(
 
 /// The part of `pull_back_expansion` that belongs to a pair feature of states; arguments as for `pull_back_discs`.
 NOINLINE inline void pull_back_state_pair(
-    const Game& g, int feature, int pair, int i, int j, int state, const V* bar, V* first, V* second, const ParameterGradients<double>& by) {
+    const Game& g, int feature, int pair, int i, int j, int state, const V* bar, V* first, V* second,
+    const ParameterGradients<double>& by) {
     const int entry = feature * g.pairs + pair;
     const V w = g.pair_weight[entry], squared = w * w;
     PairValue<V> found;
@@ -249,7 +251,8 @@ INLINE void pull_back_expansion(
     }
     for_each_contact(g, state, [&](int feature, int pair, int i, int j) {
         V *first = to.states + (state * agents + i) * kState, *second = to.states + (state * agents + j) * kState;
-        (of_discs(feature) ? pull_back_discs : pull_back_state_pair)(g, feature, pair, i, j, state, bar.pair_cost + 72 * pair, first, second, by);
+        const V* cost = bar.pair_cost + 72 * pair;
+        (of_discs(feature) ? pull_back_discs : pull_back_state_pair)(g, feature, pair, i, j, state, cost, first, second, by);
     });
 }
 

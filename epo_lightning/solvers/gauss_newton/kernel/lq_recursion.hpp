@@ -57,7 +57,8 @@ INLINE void add_product(V* to, int stride, int rows, int columns, View a, View b
     const int whole = columns / 4 * 4;
     for (int i = 0; i < rows; i += 2)
         for (int j = 0; j < whole; j += 4)
-            add_tile<2, 4, FRESH>(to + i * stride + j, stride, {a.at + i * a.row, a.row, a.column}, {b.at + j * b.column, b.row, b.column}, depth);
+            add_tile<2, 4, FRESH>(
+                to + i * stride + j, stride, {a.at + i * a.row, a.row, a.column}, {b.at + j * b.column, b.row, b.column}, depth);
     for (int j = whole; j < columns; ++j) {
         const View right{b.at + j * b.column, b.row, b.column};
         int i = 0;
