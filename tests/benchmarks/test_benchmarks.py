@@ -201,9 +201,11 @@ def test_feedback_games_are_measured(capsys, tmp_path):
     text = capsys.readouterr().out
     assert re.findall(r"^\S+ times", text, re.MULTILINE) == ["1 times", "0.3 times"]
     games = {
-        title: float(number) for title, number in re.findall(r"^(w.*?) +solved .* (\S+) LQ games", text, re.MULTILINE)
+        title: float(number) for title, number in re.findall(r"^(\S.*?) +solved .* (\S+) LQ games", text, re.MULTILINE)
     }
-    assert games["with acceleration"] <= games["without"]
+    assert games["in PyTorch"] <= games["without acceleration"]
+    times = [float(number) for number in re.findall(r"^.*iteration.* solved 2 of 2 +(\S+) ms", text, re.MULTILINE)]
+    assert len(times) == 3
     errors = [float(error) for error in re.findall(r"relative error (\S+),", text)]
     assert len(errors) == 8
     assert errors[3] < 0.01 < errors[0]

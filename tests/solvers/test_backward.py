@@ -79,6 +79,7 @@ def test_an_implicit_derivative_keeps_the_status_of_the_minimiser(status: int) -
         (LevenbergMarquardt(50, adaptive=True, backend="pytorch"), Implicit()),
         (LevenbergMarquardt(50, adaptive=True, backend="compiled"), Implicit()),
         (Feedback(), Implicit()),
+        (Feedback(backend="pytorch"), Implicit()),
     ],
 )
 def test_a_scene_that_changed_before_the_backward_pass_is_noticed(solver: Minimiser, derivative: Backward) -> None:

@@ -28,6 +28,10 @@ class TestFeedback(SolverSuite):
     test_the_gradient_vanishes_at_converged_solutions = None
 
 
+class TestFeedbackInPyTorch(TestFeedback):
+    config = {"name": "feedback", "backend": "pytorch"}
+
+
 class TestBestResponseAtOnce(SolverSuite):
     config = {"name": "best_response", "order": "at_once"}
     converged = {"rounds": 400, "tolerance": 0.0}

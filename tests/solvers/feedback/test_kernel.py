@@ -12,8 +12,10 @@ from games import leaves_of, random_game, random_scene
 from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.feedback import derivative, iteration, kernel
 from epo_lightning.solvers.feedback.iteration import FeedbackGame
+from epo_lightning.solvers.feedback.solver import Feedback
 from epo_lightning.solvers.gauss_newton.kernel import interface
 
 OWN = ("goal", "heading", "velref", "vel", "acc", "turnr", "velb", "accb", "turnrb")
@@ -149,10 +151,26 @@ def test_changed_parameters_are_noticed_before_the_backward_pass() -> None:
         controls.sum().backward()
 
 
-@pytest.mark.parametrize("reason", ["heun", "kinds"])
-def test_other_games_are_iterated_in_pytorch(reason: str) -> None:
-    game = random_feedback_game()
-    by_kind = {**BOUNDS, "vel": {"default": [-0.05, 0.6]}}
-    changes = {"dynamics": Unicycle("heun")} if reason == "heun" else {"bounds": by_kind}
-    assert kernel.obstacle(game) is None
-    assert kernel.obstacle(dataclasses.replace(game, energy=dataclasses.replace(game.energy, **changes))) is not None
+@pytest.mark.filterwarnings("ignore:the compiled layer integrates by euler")
+@pytest.mark.parametrize("reason", ["backend", "integrator"])
+def test_other_games_are_iterated_in_pytorch(reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    game, solver = random_feedback_game(), Feedback(iterations=2)
+    energy = game.energy
+    if reason == "backend":
+        solver = dataclasses.replace(solver, backend="pytorch")
+    else:
+        energy = dataclasses.replace(energy, dynamics=Unicycle("heun"))
+    used: list[ModuleType] = []
+    for module, name in ((kernel, "iterate"), (iteration, "iterate"), (kernel, "attach"), (derivative, "attach")):
+
+        def watched(*arguments: object, module: ModuleType = module, true: object = getattr(module, name)) -> object:
+            used.append(module)
+            return true(*arguments)
+
+        monkeypatch.setattr(module, name, watched)
+    leaves = leaves_of(game.parameters)
+    Implicit()(solver, game.energy, game.scene, leaves)
+    assert used == ([iteration, derivative] if reason == "backend" else [kernel, kernel])
+    used.clear()
+    Implicit()(solver, energy, game.scene, leaves)
+    assert used == [iteration, derivative]
