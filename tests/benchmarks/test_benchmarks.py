@@ -31,6 +31,7 @@ from benchmarks import (
     feedback_games,
     figures,
     forecast_speed,
+    forecast_time,
     generation,
     hard_constraints,
     label_noise,
@@ -143,6 +144,22 @@ def test_whole_training_steps_are_compared_without_and_with_a_graph(tmp_path, mo
     lines = list(training_step.whole_steps([*words, "solver.adaptive=true"], torch.device("cpu"), 1))
     assert len(lines) == 3
     assert "from a CUDA graph: trainer.graph=true with solver.backend=auto" in lines[2]
+
+
+def test_other_rows_are_timed_and_need_data(tmp_path):
+    assert "epo generate" in refused(training_step.main, "--rows", "v_lstm_epo_feedback", f"data.root={tmp_path}")
+    assert "v_lstm_epo_feetback" in refused(training_step.main, "--rows", "v_lstm,v_lstm_epo_feetback")
+
+
+def test_forecasts_of_shipped_forecasters_are_timed(capsys):
+    forecast_time.main(["rpi/v_lstm_sc", "rpi/v_lstm_epo", "--rounds", "1"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["rpi/v_lstm_sc", "rpi/v_lstm_epo"]
+    for line in lines:
+        one, most, batch = (float(number) for number in re.findall(r"([\d.]+) ms", line))
+        assert 0 < one <= most
+        assert batch > 0
+    assert "rpi/v_lstm_epo_game_refined" in refused(forecast_time.main, "rpi/v_lstm")
 
 
 def test_a_training_step_refuses_what_epo_train_refuses():
