@@ -21,6 +21,11 @@ SHAPE = (4, 64)
 _FEW = 3
 """Trial agents of the second leading dimension that are enough to find a flaw."""
 _STEPS, _DT, _LARGEST = 40, 0.1, 10.0
+_APART = 1e-6
+"""Distance between the arguments of a difference quotient."""
+_WRONG = 0.05
+"""Share of the trial values that may have another derivative than their difference quotient: kinks and steps are between
+some of them."""
 
 
 @cache
@@ -58,7 +63,8 @@ def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequ
     """Reason why a function is of no use as a feature, as the end of a sentence about it; None where nothing is wrong.
 
     Warns of a function that stops at the trial arguments with a RuntimeError or ValueError: it may be made for another
-    number of steps, another device or other values.
+    number of steps, another device or other values. Warns of one whose derivative is not that of its values, which may be
+    intended.
 
     Args:
         function: the function.
@@ -71,10 +77,22 @@ def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequ
     errors: list[Exception] = []
     with torch.random.fork_rng(devices=[]):
         for dtype in (torch.float64, torch.float32):  # a function may hold parameters of single precision
+            arguments = [m.to(dtype) for m in moving], [other.to(dtype) for other in others]
             try:
-                return _flaw(function, [m.to(dtype) for m in moving], [other.to(dtype) for other in others], takes)
+                reason = _flaw(function, *arguments, takes)
+                share = 0.0 if reason or dtype == torch.float32 else _detached(function, *arguments)
             except Exception as error:
                 errors.append(error)
+                continue
+            if share > _WRONG:
+                warnings.warn(
+                    f"the function of a feature ({place(function)}) has another derivative than its values, at "
+                    f"{share:.0%} of the trial arguments: a part of it is detached, by detach(), item(), float() or "
+                    "torch.no_grad(). Solvers follow the derivative, so their solutions are no minima of the energy. Leave "
+                    "it so only if this is intended",
+                    stacklevel=2,
+                )
+            return reason
     fails = f"fails on trial arguments: {type(errors[0]).__name__}: {errors[0]}"
     if not isinstance(errors[0], RuntimeError | ValueError):
         return f"{fails}. {takes}"
@@ -123,3 +141,24 @@ def _flaw(function: Callable[..., Tensor], moving: list[Tensor], others: list[Te
     if value.unique().numel() > 1 and not slope.any():
         return "has a derivative of zero everywhere, so no solver can act on it: comparisons and rounding have no other"
     return None
+
+
+def _detached(function: Callable[..., Tensor], moving: list[Tensor], others: list[Tensor]) -> float:
+    """Share of the values of a function whose difference quotient along one direction is not their derivative."""
+
+    def call(*arguments: Tensor) -> Tensor:
+        torch.manual_seed(0)
+        return function(*arguments, *others)
+
+    drawn = torch.Generator().manual_seed(3)
+    tangents = [torch.rand(m.shape, generator=drawn, dtype=m.dtype, device="cpu") for m in moving]
+    value, slope = torch.func.jvp(call, tuple(moving), tuple(tangents))
+    with torch.no_grad():
+        ahead, behind = (
+            call(*(m + step * tangent for m, tangent in zip(moving, tangents, strict=True)))
+            for step in (_APART / 2, -_APART / 2)
+        )
+    quotient = (ahead - behind) / _APART
+    known = quotient.isfinite() & slope.isfinite()
+    allowed = 1e-3 * (quotient.abs() + slope.abs()) + 1e-6 * (1.0 + value.abs())
+    return float((((quotient - slope).abs() > allowed) & known).sum() / known.sum().clamp_min(1))

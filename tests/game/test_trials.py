@@ -185,3 +185,24 @@ def test_two_features_of_one_name_are_named_with_their_places():
             ConfigError, match=r"features are called 'mine', in .*test_trials.py:\d+ and .*:\d+: rename"
         ):
             register("mine")(elsewhere)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda states, controls: controls[..., 0] * states[..., SPEED].detach(),
+        lambda states, controls: controls[..., 0] / float(controls.detach().abs().max()) + controls.detach()[..., 1],
+    ],
+)
+def test_features_with_a_detached_part_have_a_warning(function) -> None:
+    own_feature("partly")(function)
+    with pytest.warns(UserWarning, match=r"test_trials\.py:\d+.* has another derivative than its values, at \d+% of the"):
+        FeatureEnergy(own=["partly"], pair=[])
+
+
+def test_features_with_kinks_and_steps_have_no_warning(recwarn: pytest.WarningsRecorder) -> None:
+    own_feature("kinks")(lambda states, controls: (controls[..., 0].abs() - 3.0).relu() + controls[..., 1].round())
+    FeatureEnergy(own=["kinks"], pair=[])
+    for name, feature in {**OWN_FEATURES, **PAIR_FEATURES}.items():
+        assert feature.flaw is None, name
+    assert not [warning for warning in recwarn if "derivative" in str(warning.message)]
