@@ -5,9 +5,9 @@
 
 The games have their true weights, and 0.3 times these, which make the iteration slower; overrides are those of `epo train`.
 Solutions are compared with exact ones, which have a tolerance of 1e-9 and up to 400 LQ games, and derivatives with those of
-60 steps of GMRES. Times of the iteration alone are those from the same open-loop equilibria to a tolerance of a millimetre, in
-the compiled kernel, in PyTorch, and by the generator of RPI (compiled by Numba, one game at a time), which is the peer. The loss is the SADE of the mode that is closest to the executed future; its derivative is by all weights
-and goals.
+60 steps of GMRES. The loss is the SADE of the mode that is closest to the executed future; its derivative is by all weights
+and goals. Times of the iteration alone are those from the same open-loop equilibria to a tolerance of a millimetre, in the
+compiled kernel, in PyTorch, and by the generator of RPI (compiled by Numba, one game at a time), which is the peer.
 """
 
 from __future__ import annotations

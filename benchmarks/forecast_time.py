@@ -1,7 +1,7 @@
 """Time of a forecast by the forecasters that ship with the package: ``python -m benchmarks.forecast_time [NAME ...]``.
 
-Each forecasts its example scenes, one at a time and all at once; a forecast has network, calibration and solver. Times are CPU
-times of one thread, over rounds in which the forecasters take turns.
+Each forecasts its example scenes, one at a time and all at once; a forecast has network, calibration and solver. Times are
+CPU times of one thread, over rounds in which the forecasters take turns.
 """
 
 from __future__ import annotations

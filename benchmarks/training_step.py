@@ -1,8 +1,8 @@
 """Time of a training step by stage: ``python -m benchmarks.training_step [--device cuda] [--rows ROW,ROW] [override ...]``.
 
-It measures the forecasters of the paper's RPI experiments, or those of other rows of ``conf/experiment/rpi``, on batches of 32
-scenes, composed as by `epo train` but without Lightning's own bookkeeping. Overrides are those of `epo train`, for example ``solver.backend=pytorch``. On a GPU, the last
-lines are the time of whole steps, also from a CUDA graph (``trainer.graph``).
+It measures the forecasters of the paper's RPI experiments, or those of other rows of ``conf/experiment/rpi``, on batches of
+32 scenes, composed as by `epo train` but without Lightning's own bookkeeping. Overrides are those of `epo train`, such as
+``solver.backend=pytorch``. On a GPU, the last lines are the time of whole steps, also from a CUDA graph (``trainer.graph``).
 """
 
 from __future__ import annotations

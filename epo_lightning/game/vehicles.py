@@ -60,9 +60,7 @@ def headway(first: Tensor, second: Tensor, first_size: Tensor, second_size: Tens
     """Missing distance [m] of an agent to the one ahead of it, [.., K] for states [.., K, 4]."""
     along, across, cosine = _common_axis(first, second)
     length, width = _half_sums(first_size, second_size)
-    behind = (0.5 - 0.5 * along / length.clamp_min(LEAST_SIZE)).clamp(
-        0.0, 1.0
-    )  # 1 where the first agent is the rear one
+    behind = _within(0.5 - 0.5 * along / length.clamp_min(LEAST_SIZE), 1.0)  # 1 where the first agent is the rear one
     rear = behind * first[..., SPEED] + (1.0 - behind) * second[..., SPEED]
     return torch.relu(cosine) * _window(across, width) * torch.relu(length + margin + TIME_GAP * rear - along.abs())
 
@@ -71,8 +69,7 @@ def time_to_conflict(first: Tensor, second: Tensor, first_size: Tensor, second_s
     """Overlap [m] at the closest approach, less the later it is, [.., K] for states [.., K, 4]."""
     offset = first[..., :2] - second[..., :2]
     velocity = first[..., SPEED, None] * _direction(first) - second[..., SPEED, None] * _direction(second)
-    time = -(offset * velocity).sum(-1) / (velocity.square().sum(-1) + SLOW)
-    time = time.clamp(0.0, CONFLICT_TIME)
+    time = _within(-(offset * velocity).sum(-1) / (velocity.square().sum(-1) + SLOW), CONFLICT_TIME)
     distance = length_of(offset + time[..., None] * velocity)
     _, width = _half_sums(first_size, second_size)
     return (1.0 - time / CONFLICT_TIME) * torch.relu(width + margin - distance)
@@ -80,6 +77,11 @@ def time_to_conflict(first: Tensor, second: Tensor, first_size: Tensor, second_s
 
 def _direction(states: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 2"]:
     return torch.stack((states[..., HEADING].cos(), states[..., HEADING].sin()), -1)
+
+
+def _within(value: Tensor, limit: float) -> Tensor:
+    """The nearest number from 0 to a limit. There its derivative is zero, as in the kernels, and that of ``clamp`` one."""
+    return torch.where((value > 0.0) & (value < limit), value, value.detach().clamp(0.0, limit))
 
 
 def _half_sums(first: Float[Tensor, "*batch 2"], second: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:

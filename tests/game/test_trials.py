@@ -196,7 +196,9 @@ def test_two_features_of_one_name_are_named_with_their_places():
 )
 def test_features_with_a_detached_part_have_a_warning(function) -> None:
     own_feature("partly")(function)
-    with pytest.warns(UserWarning, match=r"test_trials\.py:\d+.* has another derivative than its values, at \d+% of the"):
+    with pytest.warns(
+        UserWarning, match=r"test_trials\.py:\d+.* has another derivative than its values, at \d+% of the"
+    ):
         FeatureEnergy(own=["partly"], pair=[])
 
 

@@ -29,8 +29,8 @@ from epo_lightning.solvers.feedback.stages import lq_game
 
 LARGEST_MOVE = 1.5
 """Largest change of a state in one iteration [m, rad, m/s], as in GameInference.jl (Peters, 2020)."""
-HALVINGS = 20
-"""Largest number of times that a step is halved."""
+TRIALS = 20
+"""Largest number of step lengths that are tried."""
 SHORTEST = 0.5
 """Step length of a game whose changes do not become smaller. Shorter ones creep."""
 REMEMBERED = 3
@@ -150,7 +150,7 @@ class _Step:
 def _step(game: FeedbackGame, states: Tensor, controls: Tensor, length: Float[Tensor, " S"]) -> _Step:
     """The step that the policies of the LQ games suggest, halved until it changes no state by too much."""
     policy = game.linearised(states, controls).equilibrium()
-    for _ in range(HALVINGS):
+    for _ in range(TRIALS):
         trial, chosen = game.follow(states, controls, policy, length)
         change = game.change(states, trial)
         far = ~(change <= LARGEST_MOVE)

@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning.forecast import Status
-from epo_lightning.solvers.feedback.iteration import HALVINGS, LARGEST_MOVE, REMEMBERED, SHORTEST, FeedbackGame
+from epo_lightning.solvers.feedback.anderson import DEPENDENT
+from epo_lightning.solvers.feedback.iteration import LARGEST_MOVE, REMEMBERED, SHORTEST, TRIALS, FeedbackGame
 from epo_lightning.solvers.gauss_newton import compiled
 from epo_lightning.solvers.gauss_newton.game_arrays import GameArrays
 from epo_lightning.solvers.gauss_newton.kernel import interface
@@ -33,8 +34,10 @@ def iterate(
     """The controls and the status of :func:`.iteration.iterate`.
 
     Raises:
+        ValueError: controls that are not of double precision on the CPU, or parameters of another shape.
         MemoryError: there is not enough memory.
     """
+    _check(controls)
     arrays = GameArrays(game.energy, game.scene, game.parameters, controls)
     found = controls.clone(memory_format=torch.contiguous_format)
     status = torch.empty(controls.shape[:2], dtype=torch.int64)
@@ -46,7 +49,12 @@ def iterate(
 def attach(
     game: FeedbackGame, controls: Float[Tensor, "B M N K 2"], solved: Bool[Tensor, "B M"], terms: int
 ) -> Float[Tensor, "B M N K 2"]:
-    """The controls of a solution with the derivative of :func:`.derivative.attach`."""
+    """The controls of a solution with the derivative of :func:`.derivative.attach`.
+
+    Raises:
+        ValueError: as :func:`iterate`. The backward pass raises MemoryError if there is not enough memory.
+    """
+    _check(controls)
     arrays = GameArrays(game.energy, game.scene, game.parameters, controls)
     return _Attach.apply(game, arrays, solved, terms, controls, *arrays.inputs)
 
@@ -76,14 +84,22 @@ class _Attach(torch.autograd.Function):
         return None, None, None, None, None, *found
 
 
+def _check(controls: Tensor) -> None:
+    if controls.dtype != torch.double or controls.device.type != "cpu":
+        raise ValueError(
+            f"the kernel iterates controls of double precision on the CPU, not {controls.dtype} on {controls.device}"
+        )
+
+
 def _arguments(game: FeedbackGame, controls: Tensor, status: Tensor, **settings: float) -> EpoFeedback:
     """The arguments of a call, with the addresses of tensors that have to live as long as it."""
     return EpoFeedback(
         rho=game.rho,
         remembered=REMEMBERED,
-        halvings=HALVINGS,
+        trials=TRIALS,
         largest_move=LARGEST_MOVE,
         shortest=SHORTEST,
+        dependent=DEPENDENT,
         controls=controls.data_ptr(),
         status=status.data_ptr(),
         **settings,

@@ -30,7 +30,7 @@ class ToFeedback(Minimiser):
     Attributes:
         iterations, tolerance, regularisation, terms: those of :class:`Feedback`.
         open_loop: the steps to the open-loop equilibrium; None to begin at the initial strategies themselves.
-        backend: ``pytorch``, or another one for the compiled kernel, where it knows all features.
+        backend: ``pytorch``, or another one for the compiled kernel where it can solve the game (:func:`.kernel.obstacle`).
     """
 
     needs_from_energy = frozenset({FEATURES, STAGES})
@@ -92,7 +92,7 @@ class ToFeedback(Minimiser):
                 "solver.iterations, or begin with other weights (docs/troubleshooting.md)",
                 stacklevel=2,
             )
-        game = self._game(energy, scene, parameters)
+        game = self._game(energy, scene, parameters.for_every_mode(solution.controls.shape[1]))
         attach = kernel.attach if self._compiled(game) else derivative.attach
         controls = attach(game, _on_host(solution.controls), solved, self.terms)
         return controls.to(solution.controls), solution.status
@@ -160,7 +160,9 @@ class Feedback(BothSides):
 
     def descent(self) -> ToFeedback:
         """The steps from each initial strategy to the feedback equilibrium of its side."""
-        return ToFeedback(self.iterations, self.tolerance, self.regularisation, self.terms, self.open_loop(), self.backend)
+        return ToFeedback(
+            self.iterations, self.tolerance, self.regularisation, self.terms, self.open_loop(), self.backend
+        )
 
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """Open-loop equilibria on both sides, and the feedback equilibria near them.

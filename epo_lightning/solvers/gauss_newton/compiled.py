@@ -198,8 +198,8 @@ class _Call:
         self.controls, self.steps, self.keep_iterates = controls, steps, keep_iterates
         self.exact, self.adaptive = exact, adaptive
         self.doubles = controls.dtype == torch.float64
-        self.description = GameArrays(energy, scene, parameters, controls)
-        self.inputs, self.kept = self.description.inputs, self.description.kept
+        self.arrays = GameArrays(energy, scene, parameters, controls)
+        self.game, self.inputs, self.kept = self.arrays.game, self.arrays.inputs, self.arrays.kept
         self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs))
         self.tape = _Tape()
         self._reserve(step_size, damping)
@@ -243,21 +243,22 @@ class _Call:
         Raises:
             MemoryError: the library could not allocate its memory.
         """
-        tape = self.tape.address
-        interface.check(interface.library().epo_solve(self.doubles, self.description.game, self.arguments, self.threads, tape))
+        arguments = (self.doubles, self.game, self.arguments, self.threads, self.tape.address)
+        interface.check(interface.library().epo_solve(*arguments))
 
     def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor | None]:
         """Gradients by ``inputs``, for cotangents of the final controls, of all iterates and of the states.
 
         ``controls`` is overwritten: on return it holds the gradient by the initial controls.
         """
-        gradients, found = self.description.new_gradients()
+        gradients, found = self.arrays.new_gradients()
         gradients.controls = controls.data_ptr()
         if iterates is not None:
             gradients.iterates = iterates.data_ptr()
         if states is not None:
             gradients.states = states.data_ptr()
-        interface.check(interface.library().epo_differentiate(self.tape.address, self.description.game, self.arguments, gradients))
+        arguments = (self.tape.address, self.game, self.arguments, gradients)
+        interface.check(interface.library().epo_differentiate(*arguments))
         return found
 
 

@@ -29,6 +29,9 @@ class GameArrays:
         Args:
             energy, scene, parameters: the games.
             controls: any controls [B, M, N, K, 2].
+
+        Raises:
+            ValueError: parameters that are not those of B scenes and M modes.
         """
         self._controls = controls
         like = controls.dtype
@@ -44,6 +47,9 @@ class GameArrays:
         referring = energy.needs_reference_controls
         self._references = [as_type(like, parameters.reference_controls)] if referring else []  # type: ignore[arg-type]
         self.inputs = (*self._own, *self._pair, *self._margins, *self._goals, *self._headings, *self._references)
+        wrong = [list(tensor.shape) for tensor in self.inputs if tensor.shape[:2] != controls.shape[:2]]
+        if wrong:
+            raise ValueError(f"parameters of the shape {wrong[0]} for controls of the shape {list(controls.shape)}")
         self._slots = [OWN.index(name) for name in energy.own]
         self._pair_slots = [PAIR.index(name) for name in energy.pair]
         self._margin_slots = [PAIR.index(name) for name in energy.decoded_margins]

@@ -20,12 +20,7 @@ struct Trajectory {
 
     explicit Trajectory(const Game& g) : turn(g.arena.take(g.n * g.K)), thrust(g.arena.take(g.n * g.K)) {
         for (int i = 0; i < g.n; ++i) path.push_back(g.new_path());
-        for (int i = 0; i < g.n; ++i) {
-            path[i].x[0] = g.path[i].x[0];
-            path[i].y[0] = g.path[i].y[0];
-            path[i].heading[0] = g.path[i].heading[0];
-            path[i].speed[0] = g.path[i].speed[0];
-        }
+        g.start(path);
     }
 
     V& control(int i, int K, int k, int channel) const { return (channel ? turn : thrust)[i * K + k]; }
@@ -59,14 +54,6 @@ NOINLINE void follow(const Game& g, const Sizes<N>& size, const V* policies, V l
     }
 }
 
-/// The trajectories of the controls of `to`.
-NOINLINE void roll(const Game& g, const Trajectory& to) {
-    for (int i = 0; i < g.n; ++i) {
-        Moved<double> moved;
-        for (int k = 0; k < g.K; ++k) moved.advance(to.path[i], k, g.dt, to.turn[i * g.K + k], to.thrust[i * g.K + k]);
-    }
-}
-
 /// The largest change of a state up to the end of a game; NaN where a change is.
 NOINLINE V change_of(const Game& g, const Trajectory& other) {
     V largest{};
@@ -97,7 +84,8 @@ class Iteration {
     void solve() {
         for (int64_t problem = first_; problem < last_; ++problem) {
             const uint8_t* present = game_.present + problem / game_.M * game_.N;
-            run_.status[problem] = std::find(present, present + game_.N, 1) == present + game_.N ? SOLVED : DAMPED;
+            const bool empty = std::count(present, present + game_.N, 0) == game_.N;
+            run_.status[problem] = !valid<double>(game_, problem) ? STOPPED : empty ? SOLVED : DAMPED;
         }
         for (int64_t number = 0; number < run_.iterations; ++number) {
             const Plan plan = plan_of(game_, first_, last_, [&](int64_t problem) { return run_.status[problem] == DAMPED; });
@@ -123,7 +111,7 @@ class Iteration {
         const Trajectory trial(g), next(g);
         V taken = length, change;
         M far{};
-        for (int64_t halving = 0; halving < run_.halvings; ++halving) {
+        for (int64_t attempt = 0; attempt < run_.trials; ++attempt) {
             taken = far ? 0.5 * taken : taken;
             follow(g, size, policies, taken, trial);
             change = change_of(g, trial);
@@ -143,7 +131,7 @@ class Iteration {
             thrust[e] = usable ? (trial.thrust[e] - g.thrust[e]) / taken : V{};
         }
         accelerate(g, slot, turned, next);
-        roll(g, next);
+        g.roll(next.turn, next.thrust, next.path);
         const M near = change_of(g, next) <= run_.largest_move;
         const auto choose = [&](V guessed, V stepped, V given) { return near ? guessed : (usable ? stepped : given); };
         for (int e = 0; e < cells; ++e) {
@@ -185,7 +173,7 @@ class Iteration {
                 by_deviations.back()[e] = columns.back()[e] = known ? deviations[e] - by_deviations.back()[e] : V{};
             }
         }
-        least_squares(g.arena, columns, wanted, 2 * cells, shares);
+        least_squares(g.arena, run_.dependent, columns, wanted, 2 * cells, shares);
         for (int e = 0; e < 2 * cells; ++e) {
             V guess = (e < cells ? g.turn[e] : g.thrust[e - cells]) + deviations[e];
             for (int h = 0; h < remembered; ++h) guess -= (by_points[h][e] + by_deviations[h][e]) * shares[h];

@@ -17,10 +17,10 @@ template <int N>
 class Derivative {
   public:
     Derivative(const Game& g, const Sizes<N>& size, double rho)
-        : g_(g), size_(size), rho_(rho), all_(size.agents() * size.states() * size.width()),
-          policies_(g.arena.take(g.K * size.controls() * size.width())), values_(g.arena.take(std::size_t(g.K) * all_)),
-          value_bar_(g.arena.take(all_)), offsets_(g.arena.take(cells())), state_bar_(g.arena.take(2 * size.states())),
-          states_(g.arena.take((g.K + 1) * size.states())), stage_(g.arena, size), bar_(g.arena, size),
+        : g_(g), size_(size), rho_(rho), value_size_(size.agents() * size.states() * size.width()),
+          policies_(g.arena.take(g.K * size.controls() * size.width())), values_(g.arena.take(std::size_t(g.K) * value_size_)),
+          value_bar_(g.arena.take(value_size_)), offsets_(g.arena.take(cells())), state_bar_(g.arena.take(size.states())), before_(g.arena.take(size.states())),
+          states_bar_(g.arena.take((g.K + 1) * size.states())), stage_(g.arena, size), bar_(g.arena, size),
           scratch_(g.arena, size.states(), size.controls()) {
         unique_ = find_policies<N>(g, size, rho, policies_, values_);
     }
@@ -36,16 +36,16 @@ class Derivative {
         clear(state_bar_, n);
         for (int k = K - 1; k >= 0; --k) {
             expand(g_, size_, rho_, k, stage_);
-            pull_back_controls(size_, stage_, policy(k), state_bar_, state_bar_ + n, offsets_ + k * m);
+            pull_back_controls(size_, stage_, policy(k), state_bar_, before_, offsets_ + k * m);
         }
-        clear(value_bar_, all_);
-        clear(states_, (K + 1) * n);
+        clear(value_bar_, value_size_);
+        clear(states_bar_, (K + 1) * n);
         clear(by_controls, cells());
-        const TrajectoryBar to{states_, by_controls};
+        const TrajectoryBar to{states_bar_, by_controls};
         for (int k = 0; k < K; ++k) {
             expand(g_, size_, rho_, k, stage_);
             std::copy(policy(k), policy(k) + m * size_.width(), scratch_.policy);
-            pull_back_stage(size_, stage_, rho_, values_ + std::size_t(k) * all_, offsets_ + k * m, value_bar_, bar_, scratch_);
+            pull_back_stage(size_, stage_, rho_, values_ + std::size_t(k) * value_size_, offsets_ + k * m, value_bar_, bar_, scratch_);
             pull_back_expansion(g_, size_, k, bar_, to, by);
         }
         pull_back_rollout(g_, to);
@@ -57,8 +57,8 @@ class Derivative {
     const Game& g_;
     const Sizes<N>& size_;
     const double rho_;
-    const int all_;
-    V *policies_, *values_, *value_bar_, *offsets_, *state_bar_, *states_;
+    const int value_size_;
+    V *policies_, *values_, *value_bar_, *offsets_, *state_bar_, *before_, *states_bar_;
     Stage<N> stage_, bar_;
     Scratch scratch_;
     M unique_;
@@ -66,8 +66,8 @@ class Derivative {
 
 /// Overwrites a cotangent v [K, m] by the solution y of -D_u' y = v (GMRES).
 template <int N>
-void solve_fixed_point(Derivative<N>& derivative, const Game& g, int terms, V* cotangent) {
-    const int length = derivative.cells();
+void solve_fixed_point(Derivative<N>& derivative, const Game& g, const EpoFeedback& run, V* cotangent) {
+    const int length = derivative.cells(), terms = int(run.terms);
     const ParameterGradients<double> unused(g.arena, g.n, g.K, g.pairs);
     std::vector<V*> basis, images;
     V* const shares = g.arena.take(terms);
@@ -86,7 +86,7 @@ void solve_fixed_point(Derivative<N>& derivative, const Game& g, int terms, V* c
         derivative.pull_back(basis[t], next, unused);
         for (int e = 0; e < length; ++e) images[t][e] = next[e] = -next[e];
     }
-    least_squares(g.arena, images, cotangent, length, shares);
+    least_squares(g.arena, run.dependent, images, cotangent, length, shares);
     for (int e = 0; e < length; ++e) {
         V sum{};
         for (int t = 0; t < terms; ++t) sum += basis[t][e] * shares[t];
@@ -115,7 +115,7 @@ void feedback_pull_back(const EpoGame* game, const EpoFeedback* run, const EpoGr
                     const V entry = given[(channel ? 0 : n * K) + i * K + k];
                     wanted[(k * n + i) * kControl + channel] = g.cut ? (g.has_step(k) ? entry : V{}) : entry;
                 }
-        solve_fixed_point(derivative, g, int(run->terms), wanted);
+        solve_fixed_point(derivative, g, *run, wanted);
         const ParameterGradients<double> by(arena, n, K, g.pairs);
         derivative.pull_back(wanted, unused, by);
         uint32_t regular = 0;

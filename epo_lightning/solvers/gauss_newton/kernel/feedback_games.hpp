@@ -7,20 +7,19 @@
 
 #include "feedback_stage.hpp"
 #include "plan.hpp"
+#include "validity.hpp"
 
 namespace EPO_LEVEL {
 namespace lq {
 
-constexpr double kDependent = 1e-12;  // part of a column, relative to its norm, from which on it is independent of other columns
-
-/// The plan for all problems first .. last for which wanted(problem) is true: a row for each, with its present agents.
+/// The plan for the valid problems first .. last for which wanted(problem) is true: a row for each, with its present agents.
 template <class Wanted>
 Plan plan_of(const EpoGame& game, int64_t first, int64_t last, const Wanted& wanted) {
     Plan plan(game.N, false);
     for (int64_t problem = first; problem < last; ++problem) {
-        if (!wanted(problem)) continue;
+        if (!wanted(problem) || !valid<double>(game, problem)) continue;
         const uint8_t* present = game.present + problem / game.M * game.N;
-        auto& rows = plan.rows({int(std::count_if(present, present + game.N, [](uint8_t one) { return one != 0; })), 0});
+        auto& rows = plan.rows({int(game.N - std::count(present, present + game.N, 0)), 0});
         rows.push_back(int32_t(problem));
         for (int64_t i = 0; i < game.N; ++i)
             if (present[i]) rows.push_back(int32_t(i));
@@ -60,9 +59,10 @@ INLINE void subtract(V* from, V factor, const V* vector, int length) {
     for (int e = 0; e < length; ++e) from[e] -= factor * vector[e];
 }
 
-/// Writes the x that minimises |columns x - wanted|^2 to `shares`, by Gram-Schmidt. A column that depends on those before it has a
-/// share of zero. `columns` and `wanted` are overwritten.
-inline void least_squares(Arena<double>& arena, const std::vector<V*>& columns, V* wanted, int length, V* shares) {
+/// Writes the x that minimises |columns x - wanted|^2 to `shares`, by Gram-Schmidt. A column that depends on those before it, but for a
+/// part of `dependent` of its norm, has a share of zero. `columns` and `wanted` are overwritten.
+inline void least_squares(
+    Arena<double>& arena, double dependent, const std::vector<V*>& columns, V* wanted, int length, V* shares) {
     const int count = int(columns.size());
     V *R = arena.take(count * count), *inverse = arena.take(count);
     for (int c = 0; c < count; ++c) {
@@ -73,7 +73,7 @@ inline void least_squares(Arena<double>& arena, const std::vector<V*>& columns, 
             subtract(column, R[d * count + c], columns[d], length);
         }
         const V rest = dot(column, column, length);
-        const M independent = rest > kDependent * kDependent * whole;
+        const M independent = rest > dependent * dependent * whole;
         inverse[c] = independent ? 1.0 / root<double>(rest) : V{};
         for (int e = 0; e < length; ++e) column[e] = independent ? column[e] * inverse[c] : V{};
         shares[c] = dot(column, wanted, length);

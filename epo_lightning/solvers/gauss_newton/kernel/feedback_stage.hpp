@@ -127,7 +127,7 @@ INLINE void pull_back_discs(
     const int entry = feature * g.pairs + pair;
     const Contact<double> contact(g.path[i].x[state] - g.path[j].x[state], g.path[i].y[state] - g.path[j].y[state], g.reach[entry]);
     // The loss is w^2 (n' Q n - depth n' q): Q and q are the derivatives by the cost, as a function of the relative position.
-    const V n[2] = {contact.x, contact.y}, depth = contact.depth, w = g.pair_weight[entry], squared = w * w;
+    const V n[2] = {contact.x, contact.y}, depth = contact.depth, w = contact.active ? g.pair_weight[entry] : V{}, squared = w * w;
     V q[2], turned[2], both{}, along{};  // turned = (Q + Q') n - depth q
     for (int a = 0; a < 2; ++a) {
         q[a] = bar[9 * a + 8] - bar[9 * (4 + a) + 8];
@@ -157,9 +157,9 @@ NOINLINE inline void pull_back_state_pair(
     const Game& g, int feature, int pair, int i, int j, int state, const V* bar, V* first, V* second,
     const ParameterGradients<double>& by) {
     const int entry = feature * g.pairs + pair;
-    const V w = g.pair_weight[entry], squared = w * w;
     PairValue<V> found;
     evaluate_pair<double, V>(feature, g.body(i, state), g.body(j, state), g.margin[entry], found);
+    const V w = found.value != 0 ? g.pair_weight[entry] : V{}, squared = w * w;
     // The loss is w^2 (d' Q d + f d' q) with the feature f and its gradient d. Its derivative by d is w^2 times `along`.
     V along[8], both{}, pull{};
     for (int a = 0; a < 8; ++a) {
@@ -184,8 +184,8 @@ NOINLINE inline void pull_back_state_pair(
     by.pair[entry] += 2.0 * w * (both + found.value * pull);
 }
 
-/// Adds the derivative of a loss by the stage of step k, `bar`, to those by the trajectories and by the parameters. `expand` has to be
-/// called for the step before, because it sets the weights.
+/// Adds the derivative of a loss by the stage of step k, `bar`, to those by the trajectories and by the parameters. Call
+/// `expand` for the same step first: it sets the weights.
 template <int N>
 INLINE void pull_back_expansion(
     const Game& g, const Sizes<N>& size, int k, const Stage<N>& bar, const TrajectoryBar& to, const ParameterGradients<double>& by) {

@@ -88,7 +88,7 @@ struct EpoRun {
 };
 
 /// Cotangents that the adjoint reads, and gradients that it writes. `controls` is the cotangent of u_S on entry and that of u_0 on
-/// return.
+/// return; the derivative of feedback equilibria does not change it.
 struct EpoGradients {
     void* controls;            // [B, M, N, K, 2]
     const void* iterates;      // [S + 1, B, M, N, K, 2] further cotangents of u_0 .. u_S, or null
@@ -121,14 +121,16 @@ struct EpoLQGradients {
     double *A, *B, *own_cost, *pair_cost, *effort, *push;  // as in EpoLQGames
 };
 
-/// Iterated LQ games of B * M driving games, in double precision, and the derivative of their solutions; see `solvers/feedback`.
+/// Iterated LQ games of B * M driving games, in double precision, and the derivative of their solutions; see `solvers/feedback`. The
+/// derivative reads controls and status as the iteration has left them, and does not change them.
 struct EpoFeedback {
-    int64_t iterations, remembered, halvings;  // largest numbers of LQ games, of points of the acceleration, and of halved steps
+    int64_t iterations, remembered, trials;  // largest numbers of LQ games, of points of the acceleration, and of tried step lengths
     int64_t terms;                 // number of steps of GMRES
     double tolerance, rho;
     double largest_move, shortest;  // largest change of a state in one iteration; least step length
+    double dependent;              // part of a column, relative to its norm, up to which it depends on others
     double* controls;              // [B, M, N, K, 2]; the solution overwrites the initial strategies
-    int64_t* status;               // [B, M] of type Status
+    int64_t* status;               // [B, M]: SOLVED if the iteration has ended, DAMPED if not, STOPPED if it was not possible
 };
 
 /// Policies of S games of N agents around given trajectories, and the trajectories that follow them.

@@ -232,7 +232,9 @@ struct Games {
         thrust = arena.take(n * K);
         load(n, controls, turn, thrust);
         for (int i = 0; i < n; ++i) path.push_back(new_path());
-        roll();
+        start(path);
+        roll(turn, thrust, path);
+        for (int i = 0; state_pairs && i < n; ++i) sincos<T>(path[i].heading[K], path[i].sine[K], path[i].cosine[K]);
     }
 
     /// Read the first agents of [B, M, N, K, 2] into [agents, K] vectors.
@@ -276,19 +278,25 @@ struct Games {
         return {turns, thrusts, arena.take(steps), arena.take(steps), arena.take(steps), arena.take(steps)};
     }
 
-    NOINLINE void roll() {
+    /// Writes the states of all paths from the initial ones on, and the sines and cosines before the last state.
+    NOINLINE void roll(const Vec<T>* turns, const Vec<T>* thrusts, const std::vector<Path<T>>& paths) const {
         for (int i = 0; i < n; ++i) {
-            Path<T>& p = path[i];
-            for (int lane = 0; lane < W; ++lane) {
-                const T* start = static_cast<const T*>(game.initial) + scene[lane] * game.initial_b + agent[i * W + lane] * game.initial_n;
-                p.x[0][lane] = start[0];
-                p.y[0][lane] = start[1];
-                p.heading[0][lane] = start[2];
-                p.speed[0][lane] = start[3];
-            }
             Moved<T> moved;
-            for (int k = 0; k < K; ++k) moved.advance(p, k, dt, turn[i * K + k], thrust[i * K + k]);
-            if (state_pairs) sincos<T>(p.heading[K], p.sine[K], p.cosine[K]);
+            for (int k = 0; k < K; ++k) moved.advance(paths[i], k, dt, turns[i * K + k], thrusts[i * K + k]);
+        }
+    }
+
+    /// Writes the initial states of all paths.
+    NOINLINE void start(const std::vector<Path<T>>& paths) const {
+        for (int i = 0; i < n; ++i) {
+            const Path<T>& p = paths[i];
+            for (int lane = 0; lane < W; ++lane) {
+                const T* initial = static_cast<const T*>(game.initial) + scene[lane] * game.initial_b + agent[i * W + lane] * game.initial_n;
+                p.x[0][lane] = initial[0];
+                p.y[0][lane] = initial[1];
+                p.heading[0][lane] = initial[2];
+                p.speed[0][lane] = initial[3];
+            }
         }
     }
 

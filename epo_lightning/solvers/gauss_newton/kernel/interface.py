@@ -140,8 +140,8 @@ class EpoFeedback(ctypes.Structure):
     """The arguments and results of iterated LQ games; fields as in `game.hpp`."""
 
     _fields_ = (
-        *((name, Integer) for name in ("iterations", "remembered", "halvings", "terms")),
-        *((name, Real) for name in ("tolerance", "rho", "largest_move", "shortest")),
+        *((name, Integer) for name in ("iterations", "remembered", "trials", "terms")),
+        *((name, Real) for name in ("tolerance", "rho", "largest_move", "shortest", "dependent")),
         ("controls", Address),
         ("status", Address),
     )

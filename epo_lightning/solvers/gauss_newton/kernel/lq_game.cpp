@@ -23,7 +23,6 @@ struct Block : Sizes<N> {
         for (int lane = 0; lane < W; ++lane) game[lane] = start + std::min(lane, filled - 1);
     }
 
-
     /// Row `row` of the `rows` rows that every game has in an array.
     INLINE void read(const double* from, int64_t rows, int64_t row, int length, V* to) const {
         const double* lanes[W];
@@ -105,7 +104,7 @@ NOINLINE void pull_back(const EpoLQGames& games, const EpoLQGradients& gradients
     Stage<N> stage(arena, block), bar(arena, block);
     const Work work(arena, block);
     Scratch s(arena, n, m);
-    V *values = arena.take(K * all), *value = arena.take(all), *bars = arena.take(K * m), *state_bar = arena.take(n), *before = arena.take(n);
+    V *values = arena.take(std::size_t(K) * all), *value = arena.take(all), *bars = arena.take(K * m), *state_bar = arena.take(n), *before = arena.take(n);
     M unique;
     for (int lane = 0; lane < W; ++lane) unique[lane] = games.unique[block.game[lane]] ? -1 : 0;
     clear(value, all);
@@ -114,7 +113,7 @@ NOINLINE void pull_back(const EpoLQGames& games, const EpoLQGradients& gradients
         read_stage(games, block, k, stage);
         read_policy(games, block, k, s.read, s.policy);
         add_costs(block, stage, value);
-        std::copy(value, value + all, values + k * all);
+        std::copy(value, value + all, values + std::size_t(k) * all);
         step_back(block, stage, games.rho, s.policy, work, value);
         block.read(gradients.controls, K, k, m, bars + k * m);
         pull_back_controls(block, stage, s.policy, state_bar, before, bars + k * m);
@@ -123,7 +122,7 @@ NOINLINE void pull_back(const EpoLQGames& games, const EpoLQGradients& gradients
     for (int k = 0; k < K; ++k) {
         read_stage(games, block, k, stage);
         read_policy(games, block, k, s.read, s.policy);
-        pull_back_stage(block, stage, games.rho, values + k * all, bars + k * m, value, bar, s);
+        pull_back_stage(block, stage, games.rho, values + std::size_t(k) * all, bars + k * m, value, bar, s);
         const auto write = [&](const V* from, int64_t rows, int64_t row, int length, double* to) {
             block.write([&](int e) { return unique ? from[e] : V{}; }, rows, row, length, to);
         };
