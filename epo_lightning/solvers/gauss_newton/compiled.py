@@ -246,7 +246,7 @@ class _Call:
         arguments = (self.doubles, self.game, self.arguments, self.threads, self.tape.address)
         interface.check(interface.library().epo_solve(*arguments))
 
-    def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor | None]:
+    def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor]:
         """Gradients by ``inputs``, for cotangents of the final controls, of all iterates and of the states.
 
         ``controls`` is overwritten: on return it holds the gradient by the initial controls.
