@@ -5,7 +5,7 @@ In every iteration the LQ game around the trajectory is solved, and the agents f
 Anderson acceleration saves a part of the LQ games: it guesses a better next trajectory. Where a guess is too far away, the
 agents follow the policies with their offsets multiplied by a step length. The iteration ends after a trajectory from which
 the policies deviate by less than a tolerance; the next one, which is nearly always closer to the equilibrium, is the
-solution.
+solution. This is the version for all energies; :mod:`~epo_lightning.solvers.feedback.kernel` does the same in C++.
 """
 
 from __future__ import annotations
