@@ -146,7 +146,7 @@ def race(solver: Feedback, games: Games) -> None:
 
 
 def generated(games: Games, start: Tensor) -> Tensor:
-    """Whether the generator solves the game of each record; it ends at its game's end."""
+    """Whether the generator solves the game of each record, over the steps of that game."""
     scene, settings = games.records.scene, generator.SETTINGS["feedback_converged"]
     assert scene.game_steps is not None
     assert games.parameters.goals is not None

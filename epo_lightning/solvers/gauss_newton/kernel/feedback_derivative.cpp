@@ -19,8 +19,8 @@ class Derivative {
     Derivative(const Game& g, const Sizes<N>& size, double rho)
         : g_(g), size_(size), rho_(rho), value_size_(size.agents() * size.states() * size.width()),
           policies_(g.arena.take(g.K * size.controls() * size.width())), values_(g.arena.take(std::size_t(g.K) * value_size_)),
-          value_bar_(g.arena.take(value_size_)), offsets_(g.arena.take(cells())), state_bar_(g.arena.take(size.states())), before_(g.arena.take(size.states())),
-          states_bar_(g.arena.take((g.K + 1) * size.states())), stage_(g.arena, size), bar_(g.arena, size),
+          value_bar_(g.arena.take(value_size_)), offsets_(g.arena.take(cells())), state_bar_(g.arena.take(size.states())),
+          before_(g.arena.take(size.states())), states_bar_(g.arena.take((g.K + 1) * size.states())), stage_(g.arena, size), bar_(g.arena, size),
           scratch_(g.arena, size.states(), size.controls()) {
         unique_ = find_policies<N>(g, size, rho, policies_, values_);
     }
@@ -102,7 +102,7 @@ void feedback_pull_back(const EpoGame* game, const EpoFeedback* run, const EpoGr
     Arena<double> arena;
     const Plan plan = plan_of(*game, first, last, [&](int64_t problem) {
         const double* of = cotangent + problem * row;
-        return run->status[problem] == SOLVED && std::any_of(of, of + row, [](double entry) { return entry != 0; });
+        return run->status[problem] == SOLVED && valid<double>(*game, problem) && std::any_of(of, of + row, [](double entry) { return entry != 0; });
     });
     for_each_game(*game, arena, plan, run->controls, [&](const Game& g, const auto& size, int filled) {
         Derivative derivative(g, size, run->rho);

@@ -12,12 +12,12 @@
 namespace EPO_LEVEL {
 namespace lq {
 
-/// The plan for the valid problems first .. last for which wanted(problem) is true: a row for each, with its present agents.
+/// The plan for the problems first .. last for which wanted(problem) is true: a row for each, with its present agents.
 template <class Wanted>
 Plan plan_of(const EpoGame& game, int64_t first, int64_t last, const Wanted& wanted) {
     Plan plan(game.N, false);
     for (int64_t problem = first; problem < last; ++problem) {
-        if (!wanted(problem) || !valid<double>(game, problem)) continue;
+        if (!wanted(problem)) continue;
         const uint8_t* present = game.present + problem / game.M * game.N;
         auto& rows = plan.rows({int(game.N - std::count(present, present + game.N, 0)), 0});
         rows.push_back(int32_t(problem));

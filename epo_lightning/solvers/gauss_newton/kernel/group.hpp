@@ -291,7 +291,8 @@ struct Games {
         for (int i = 0; i < n; ++i) {
             const Path<T>& p = paths[i];
             for (int lane = 0; lane < W; ++lane) {
-                const T* initial = static_cast<const T*>(game.initial) + scene[lane] * game.initial_b + agent[i * W + lane] * game.initial_n;
+                const T* initial =
+                    static_cast<const T*>(game.initial) + scene[lane] * game.initial_b + agent[i * W + lane] * game.initial_n;
                 p.x[0][lane] = initial[0];
                 p.y[0][lane] = initial[1];
                 p.heading[0][lane] = initial[2];

@@ -104,7 +104,8 @@ NOINLINE void pull_back(const EpoLQGames& games, const EpoLQGradients& gradients
     Stage<N> stage(arena, block), bar(arena, block);
     const Work work(arena, block);
     Scratch s(arena, n, m);
-    V *values = arena.take(std::size_t(K) * all), *value = arena.take(all), *bars = arena.take(K * m), *state_bar = arena.take(n), *before = arena.take(n);
+    V *values = arena.take(std::size_t(K) * all), *value = arena.take(all), *bars = arena.take(K * m);
+    V *state_bar = arena.take(n), *before = arena.take(n);
     M unique;
     for (int lane = 0; lane < W; ++lane) unique[lane] = games.unique[block.game[lane]] ? -1 : 0;
     clear(value, all);

@@ -67,6 +67,7 @@ INLINE void add_product(V* to, int stride, int rows, int columns, View a, View b
     }
 }
 
+/// Overwrites the matrix `to` by a b.
 INLINE void set_product(V* to, int stride, int rows, int columns, View a, View b, int depth) {
     add_product<true>(to, stride, rows, columns, a, b, depth);
 }

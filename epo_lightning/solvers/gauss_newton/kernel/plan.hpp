@@ -14,7 +14,8 @@ struct Size {
     int agents() const { return movers + held; }
 };
 
-/// Groups of agents by size, those in contact or all of a problem: rows of a problem, the agents that move, and the held ones, each in ascending order.
+/// Groups of agents by size: agents in contact, or all of a problem. A row is a problem, its agents that move, and the held ones, each
+/// in ascending order.
 class Plan {
   public:
     Plan(int64_t N, bool holds) : stride_(int(N) + 1), rows_((holds ? N : 1) * stride_) {}
