@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 from epo_lightning.registry import ConfigError, check_keys, lookup, nearest
@@ -97,11 +97,21 @@ def check_part(group: str, values: Any, supplied: Sequence[str] = ()) -> None:
         raise ConfigError(f"{group} must be a mapping with a name, not {values!r}")
     check_keys(group, values, supplied)
     part = lookup(group, values["name"])
-    function = part.__init__ if isinstance(part, type) else part  # type: ignore[misc]
     try:
-        hints = typing.get_type_hints(function)
-    except (NameError, TypeError, SyntaxError):  # annotations that exist for type checkers only, or spell tensor shapes
+        hints = hints_of(part)
+    except (NameError, TypeError, SyntaxError):  # annotations of a user's part that exist for type checkers only
         return
     for key, value in values.items():
         if key in hints and not fits(value, hints[key]):
             raise ConfigError(f"{group}.{key} must be {describe(hints[key])}, not {value!r}")
+
+
+def hints_of(part: Callable[..., Any]) -> dict[str, Any]:
+    """The types of the settings of a part.
+
+    Those of a dataclass are read from its fields: its generated constructor resolves inherited annotations in the wrong
+    module.
+    """
+    if isinstance(part, type) and not dataclasses.is_dataclass(part):
+        part = part.__init__  # type: ignore[misc]
+    return typing.get_type_hints(part)

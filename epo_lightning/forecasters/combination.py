@@ -31,9 +31,9 @@ KINDS = ("energy", "solver", "backward", "objective")
 
 @dataclass(frozen=True)
 class Combination:
-    """One part of each of the four kinds: instances, or only their classes, because declarations are class attributes.
+    """One part of each of the four kinds. An energy or objective may be a class, whose declarations are class attributes.
 
-    Only an energy of features may offer more than its class does, which depends on its features.
+    What an energy of features offers and what a solver provides can depend on their settings.
 
     Attributes:
         names: registered names of the parts, by kind; for messages.
@@ -70,7 +70,7 @@ class Combination:
             (objective, self.objective.needs_from_solver),
         ):
             if needed and not needed & self.solver.provides:  # one of them is enough
-                return f"{part} needs {_or(needed)}, and {solver} provides {_or(self.solver.provides)}"
+                return f"{part} needs {_or(needed)}, and {solver} provides {_or(self.solver.provides)} with its settings"
         if self.objective.through_solution and not self.backward.teaches:
             return f"{objective} learns through the solution, which has no derivative with {backward}"
         if self.backward.teaches and not self.objective.through_solution:
@@ -83,9 +83,8 @@ class Combination:
         for kind in KINDS:
             for name, part in parts(kind).items():
                 if name != self.names[kind]:
-                    # `needs_from_energy` of a derivative depends on its settings, so an instance is made; all settings
-                    # have defaults. All other parts declare their needs as attributes of their classes.
-                    changed = part() if kind == "backward" else part
+                    # The settings of solvers and derivatives all have defaults.
+                    changed = part() if kind in ("solver", "backward") else part
                     word = f"an energy named {name}" if kind == "energy" else f"{kind}={name}"
                     yield word, replace(self, **{kind: changed}, names={**self.names, kind: name})
 

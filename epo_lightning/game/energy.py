@@ -3,14 +3,14 @@
     E(u; o) = sum_i E_i(u_i; o) + sum_{i<j} E_ij(u_i, u_j; o)
 
 Agent i's own objective is J_i = E_i + sum_j E_ij. Pair terms are symmetric, so a change of u_i alone changes J_i and E
-by the same amount: a minimum of E is a Nash equilibrium (Theorem 1). All methods of the paper's Table 1 use an energy
-through these terms only.
+by the same amount: a minimum of E is a Nash equilibrium (Theorem 1). General solvers use an energy through these terms
+only. The layer knows the features of :class:`~epo_lightning.game.feature_energy.FeatureEnergy` and their derivatives.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, ClassVar
 
 import torch

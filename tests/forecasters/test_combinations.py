@@ -109,6 +109,17 @@ def test_every_combination_takes_a_step_or_is_refused(energy: str, solver: str) 
         assert not torch.equal(forecaster(scene).states, before), chosen
 
 
+@pytest.mark.parametrize("backward", ["unrolled", "truncated"])
+def test_newton_steps_are_not_differentiated_through_steps(backward: str) -> None:
+    chosen = {"energy": "rpi", "solver": "game", "backward": backward, "objective": "imitation"}
+    with pytest.raises(
+        ConfigError,
+        match=r"levenberg_marquardt provides solutions with an implicit derivative with its .*"
+        r"backward=implicit",
+    ):
+        build_forecaster(configuration(chosen))
+
+
 def options_of(kinds: tuple[str, ...]) -> itertools.product:
     return itertools.product(*(OPTIONS[kind] for kind in kinds))
 

@@ -39,7 +39,7 @@ DESCENTS = {compiled.solve: compiled.descend, hosted.solve: hosted.descend}
 BACKENDS = ("auto", "pytorch", "compiled", "host", "warp")
 LARGEST_DAMPING = 1e30
 _FAR, _NEAR = 5, 15
-"""Numbers of Gauss-Newton and of Newton steps that lead to a minimum: the former bring a far start near it."""
+"""Numbers of Gauss-Newton and of Newton steps that lead to a minimum. Newton steps converge only from a start near it."""
 _LIGHT = 1e-2
 """Largest first damping near a minimum: with more of it, the first Newton steps are short."""
 
@@ -68,13 +68,13 @@ class LevenbergMarquardt(Stepwise):
             These decisions have no gradient.
         test_steps: number of steps outside training; None for the same number.
         newton_steps: number of adaptive Newton steps, with the exact Hessian, after the S Gauss-Newton steps. Near a minimum
-            they converge quadratically, and Gauss-Newton steps linearly. They have no derivative: use ``backward=implicit``.
+            they converge quadratically, and Gauss-Newton steps linearly. They have no derivative of their own: use
+            ``backward=implicit`` or ``detached``.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; ``host``, the same kernel for tensors on a GPU, which are
             copied; ``warp``, fused kernels on a GPU; or ``auto``, the choice of :func:`choose_backend`.
     """
 
     needs_from_energy = frozenset({FEATURES})
-    provides = frozenset({PATH, STEPS, STATIONARY})
 
     steps: int = 2
     step_size: float = 0.3
@@ -108,6 +108,11 @@ class LevenbergMarquardt(Stepwise):
                 "compiled, host (on a GPU) or pytorch"
             )
 
+    @property
+    def provides(self) -> frozenset[str]:
+        """A path and steps without Newton steps, and the derivative of a minimum in any case."""
+        return frozenset({STATIONARY} if self.newton_steps else {PATH, STEPS, STATIONARY})
+
     def for_test(self) -> Stepwise:
         """The solver to use outside training."""
         return self if self.test_steps is None else self.with_steps(self.test_steps)
@@ -135,7 +140,7 @@ class LevenbergMarquardt(Stepwise):
         if not self.newton_steps:
             return self.run(energy, scene, parameters, self.steps)[0]
         if torch.is_grad_enabled():
-            raise ValueError("solver.newton_steps have no derivative: use backward=implicit, truncated or detached")
+            raise ValueError("solver.newton_steps have no derivative: use backward=implicit or detached")
         if not self.steps:
             return self.run(energy, scene, parameters, self.newton_steps, exact=True)[0]
         first, damping = self.run(energy, scene, parameters, self.steps)
