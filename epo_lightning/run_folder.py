@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import os
 import secrets
@@ -100,6 +101,13 @@ def write_file(path: Path, content: str | bytes | memoryview) -> None:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write ``content`` as indented JSON with sorted keys, atomically."""
     write_file(path, json.dumps(content, indent=2, sort_keys=True, allow_nan=True) + "\n")
+
+
+def numbered(path: Path) -> Iterator[Path]:
+    """``scores.json``, ``scores-2.json``, ``scores-3.json``, ...: names for files that may not replace each other."""
+    yield path
+    for number in itertools.count(2):
+        yield path.with_stem(f"{path.stem}-{number}")
 
 
 def read_json(path: Path) -> dict[str, Any]:

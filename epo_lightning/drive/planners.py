@@ -159,7 +159,7 @@ class ForecastPlanner:
 
     @torch.no_grad()
     def __call__(self, scene: Scene, previous: Plan | None) -> Plan:
-        scene = first_agents(scene, self.agents).to(torch.float32)
+        scene = self.forecaster.as_input(first_agents(scene, self.agents))
         forecast: JointForecast = self.forecaster(scene)
         states, controls, joint = forecast.states, _controls(forecast, scene), None
         found = states.isfinite().flatten(2).all(2)
@@ -176,7 +176,7 @@ class ForecastPlanner:
     @torch.no_grad()
     def controls_of_all(self, scene: Scene) -> Float[Tensor, "B n K 2"]:
         """Controls of all agents that the forecaster is shown, in the most likely joint mode."""
-        scene = first_agents(scene, self.agents).to(torch.float32)
+        scene = self.forecaster.as_input(first_agents(scene, self.agents))
         forecast: JointForecast = self.forecaster(scene)
         return _controls(forecast, scene)[torch.arange(len(scene.history)), forecast.probabilities.argmax(1)]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from epo_lightning.experiment.truth import TruthTest
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
-from epo_lightning.run_folder import OTHER, RunFolder, discover, read_json, write_json
+from epo_lightning.run_folder import OTHER, RunFolder, discover, numbered, read_json, write_json
 from epo_lightning.schema import read
 
 SECTIONS = ("metrics", "truth")
@@ -170,6 +169,7 @@ def keep_other(run: RunFolder, other: OtherData, which: str, checkpoint: Path, m
     holds the same scores it stays as it is; if it holds others, which another version computed, the name gets a number.
     """
     digest = _digest(checkpoint)
+    stem = f"{OTHER}{other.name}-{other.split}-{other.test[:8]}-{digest[:8]}"
     scored = {
         "data": other.name,
         "split": other.split,
@@ -182,15 +182,7 @@ def keep_other(run: RunFolder, other: OtherData, which: str, checkpoint: Path, m
         **other.about(),
         "metrics": dict(metrics),
     }
-    stem = f"{OTHER}{other.name}-{other.split}-{other.test[:8]}-{digest[:8]}"
-    for number in itertools.count(1):
-        file = run.path / (f"{stem}.json" if number == 1 else f"{stem}-{number}.json")
-        if not _readable(file):
-            write_json(file, scored)
-            return file
-        if _same(read_json(file), scored, ("test", "checkpoint_digest")):
-            return file
-    raise AssertionError("unreachable")
+    return _beside(run, stem, scored, ("test", "checkpoint_digest"))
 
 
 def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
@@ -199,7 +191,8 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
     The scores of the best checkpoint are ``metrics.json`` (``metrics-val.json`` on the validation split). If that file holds
     the same scores already it stays as it is; if they lack scores that older versions did not compute, these are added.
     Scores of another checkpoint, and scores that differ from those in the file, go to
-    ``scores-<split>-<checkpoint>-<digest>.json``, which records the digest of the checkpoint as well as of the data.
+    ``scores-<split>-<checkpoint>-<digest>.json``, which records the digest of the checkpoint as well as of the data. If that
+    file holds others, the name gets a number.
     """
     file = run.metrics_file(scored["split"])
     if scored["checkpoint"] == "best":
@@ -214,10 +207,19 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
                 write_json(file, completed)
             return file
     digest = _digest(checkpoint)
-    other = run.path / f"scores-{scored['split']}-{Path(scored['checkpoint']).stem}-{digest[:8]}.json"
-    if not other.is_file():
-        write_json(other, {**scored, "checkpoint_digest": digest})
-    return other
+    stem = f"scores-{scored['split']}-{Path(scored['checkpoint']).stem}-{digest[:8]}"
+    return _beside(run, stem, {**scored, "checkpoint_digest": digest}, ("data_digest", "checkpoint_digest"))
+
+
+def _beside(run: RunFolder, stem: str, scored: dict[str, Any], keys: Sequence[str]) -> Path:
+    """The file of a stem, with a number if need be, that holds these scores; written if there is none."""
+    for file in numbered(run.path / f"{stem}.json"):
+        if not _readable(file):
+            write_json(file, scored)
+            return file
+        if _same(read_json(file), scored, keys):
+            return file
+    raise AssertionError("unreachable")
 
 
 def _digest(checkpoint: Path) -> str:

@@ -23,6 +23,7 @@ from epo_lightning.experiment.program_files import FORMATS, Format, Run, Tensors
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.forecasters.refined import Refined
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import FIELDS, Scene
@@ -30,7 +31,7 @@ from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarq
 
 OUTPUTS = ("states", "probabilities")
 """Outputs of a program, by name."""
-NOT_READ = ("dt", "future", "future_mask", "subset", "id", "frame", "kind")
+NOT_READ = ("dt", "future", "future_mask", "subset", "id", "frame")
 """Fields of a scene that no forecaster reads."""
 TOLERANCE = 1e-5
 """Largest difference between the outputs of a program and those of its forecaster, divided by values above 1.
@@ -74,7 +75,7 @@ def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Pat
     of_run = settings_of(run)
     forecaster: Forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
     check_exportable(forecaster, of_run.title, form)
-    scenes = scenes_of(run, of_run, settings, forecaster, overrides).scenes
+    scenes = forecaster.as_input(scenes_of(run, of_run, settings, forecaster, overrides).scenes)
     forecast = forecaster.predict(scenes)
     wanted = {name: getattr(forecast, name) for name in OUTPUTS}
     tensors = inputs_of(forecaster, scenes)
@@ -159,7 +160,8 @@ def games_of(forecaster: Forecaster) -> list[EPO | Refined]:
 def inputs_of(forecaster: Forecaster, scenes: Scene) -> Tensors:
     """The tensors of scenes that the forecaster may read, by name."""
     ends = isinstance(forecaster, EPO) and forecaster.game_horizon > forecaster.task.horizon
-    left_out = NOT_READ if ends else (*NOT_READ, "game_steps")
+    kinds = any(isinstance(game.energy, FeatureEnergy) and game.energy.bounded_by_kind for game in games_of(forecaster))
+    left_out = {*NOT_READ, *(() if ends else ("game_steps",)), *(() if kinds else ("kind",))}
     values = {field.name: getattr(scenes, field.name) for field in dataclasses.fields(scenes)}
     return {name: value.clone() for name, value in values.items() if name not in left_out and value is not None}
 

@@ -19,27 +19,25 @@ SAMPLES, WARM_UP = 100, 10
 """Number of measured scenes, as in the paper; and number of forecasts before them, which are not measured (warm-up)."""
 
 
-def measure(run: RunFolder, settings: Settings, forecaster: Any = None) -> dict[str, Any]:
-    """Time joint forecasts of single scenes of the test split, and write the run's ``runtime.json``.
+def measure(run: RunFolder, settings: Settings) -> dict[str, Any]:
+    """Time joint forecasts of single scenes of the test split by the best checkpoint, and write the run's ``runtime.json``.
 
     Nothing but the forecast is timed: the scene is on its device already, and no metric is computed.
 
     Args:
         run: a finished run, trained or not.
         settings: settings of the run.
-        forecaster: forecaster to measure instead of the run's best checkpoint.
 
     Raises:
         ConfigError: the checkpoint or the data is missing or has changed.
     """
     device = _device(settings.trainer.accelerator)
     torch.set_num_threads(settings.trainer.threads)
-    forecaster = forecaster or open_checkpoint(settings, run.checkpoint("best"))
-    forecaster = forecaster.to(device).eval()
+    forecaster = open_checkpoint(settings, run.checkpoint("best")).to(device)
     data = open_data(run, settings)
     split = data.dataset("test")
     # If the split has fewer scenes than SAMPLES, some are measured more than once.
-    scenes = [split[torch.tensor([index % len(split)])].to(device) for index in range(SAMPLES)]
+    scenes = [forecaster.as_input(split[torch.tensor([index % len(split)])]) for index in range(SAMPLES)]
     seconds = []
     with torch.no_grad():
         for number in range(-WARM_UP, SAMPLES):

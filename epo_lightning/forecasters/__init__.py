@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from epo_lightning import pretrained
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.checkpoint import read_checkpoint
@@ -132,7 +134,8 @@ def _given(model: Mapping[str, Any]) -> Forecaster:
             "forecaster, such as forecaster.frozen=runs/highway_sim/v_lstm/short-s0"
         )
     path = Path(frozen).expanduser()
-    return load(path / "checkpoints" / "best.ckpt" if path.is_dir() else frozen)
+    # The precision of the forecaster on top decides for both.
+    return load(path / "checkpoints" / "best.ckpt" if path.is_dir() else frozen).float()
 
 
 def load(checkpoint: str | Path) -> Forecaster:
@@ -148,6 +151,8 @@ def load(checkpoint: str | Path) -> Forecaster:
     checkpoint = pretrained.checkpoint_of(checkpoint) or checkpoint
     content = read_checkpoint(checkpoint)
     forecaster = build_forecaster(content["configuration"])
+    if any(tensor.dtype == torch.double for tensor in content["state_dict"].values()):
+        forecaster = forecaster.double()  # trained with trainer.precision=64-true; loading would round the weights
     try:
         forecaster.load_state_dict(content["state_dict"])
     except RuntimeError as error:

@@ -74,8 +74,7 @@ class Forecaster(LightningModule):
         for module in training:
             module.training = False
         try:
-            reference = next(self.parameters(), torch.zeros(0))
-            scene = scene.to(reference.device).to(reference.dtype)
+            scene = self.as_input(scene)
             forecast = self.explain(scene, self(scene))
         finally:
             for module in training:
@@ -84,6 +83,11 @@ class Forecaster(LightningModule):
         if lost is not None:
             _warn_of_stopped(float(lost.double().mean()) if lost.numel() else 0.0, len(lost))
         return forecast.map(lambda tensor: _blank(tensor, broken)) if broken else forecast
+
+    def as_input(self, scene: Scene) -> Scene:
+        """The scene on the device and in the precision of the parameters; in float32 on the CPU if there are none."""
+        reference = next(self.parameters(), torch.zeros(0))
+        return scene.to(reference.device).to(reference.dtype)
 
     def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
         """The forecast with the energy of every feature added; computed for predictions, not in training."""

@@ -77,13 +77,13 @@ def test_options_of_a_game_need_a_game() -> None:
 
 
 def test_forecasts_without_controls_are_tracked(world: RPIWorld, epo: Forecaster) -> None:
-    class Silent(torch.nn.Module):
+    class Silent(Forecaster):
         def forward(self, scene: Scene) -> JointForecast:
             forecast = epo.predict(scene)
             return JointForecast(forecast.states, forecast.probabilities)
 
     scene = world.observe()
-    plan = ForecastPlanner(Silent())(scene, None)  # type: ignore[arg-type]
+    plan = ForecastPlanner(Silent(epo.task, epo.optimizer))(scene, None)
     torch.testing.assert_close(plan.controls, ForecastPlanner(epo)(scene, None).controls, rtol=0, atol=1e-3)
 
 

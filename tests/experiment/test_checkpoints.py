@@ -111,5 +111,15 @@ def test_scores_are_never_replaced(epo: Epo, refused: Callable[..., str], capsys
         value.mul_(0.5) if value.is_floating_point() else None
     torch.save(weights, run.checkpoint("best"))
     assert epo("evaluate", "run=run") == 0
-    assert len(list(run.path.glob("scores-test-best-*.json"))) == 1
+    (second,) = run.path.glob("scores-test-best-*.json")
+    assert epo("evaluate", "run=run") == 0
+    assert list(run.path.glob("scores-test-best-*.json")) == [second]
+
+    # Scores that differ from those in both files.
+    found = json.loads(second.read_text())
+    second.write_text(json.dumps({**found, "metrics": {name: value + 1 for name, value in found["metrics"].items()}}))
+    assert epo("evaluate", "run=run") == 0
+    third = second.with_stem(f"{second.stem}-2")
+    assert json.loads(third.read_text()) == found
+    assert str(third) in capsys.readouterr().out
     assert run.metrics_file().read_bytes() == first

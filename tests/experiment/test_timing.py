@@ -17,6 +17,7 @@ from epo_lightning.experiment import assembly, timing, verbs
 from epo_lightning.experiment.callbacks import RandomStates
 from epo_lightning.experiment.config.settings import Settings, measures
 from epo_lightning.experiment.timing import SAMPLES, measure
+from epo_lightning.forecasters import Forecaster
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
@@ -62,26 +63,30 @@ def test_recorded_steps_are_those_of_a_forecast(epo: Epo, tmp_path: Path) -> Non
     assert read_json(timed(epo, tmp_path, *words).metrics_file("time"))["steps"] == 3
 
 
-def test_the_time_is_that_of_one_forecast_without_gradients(epo: Epo, tmp_path: Path) -> None:
+def opened_with(
+    monkeypatch: pytest.MonkeyPatch, run: RunFolder, before: Callable[[Forecaster, epo_lightning.Scene], None]
+) -> None:
+    """Have the run's forecaster do something before each forecast."""
+    forecaster = epo_lightning.load(run.checkpoint())
+    forecaster.register_forward_pre_hook(lambda module, inputs: before(module, *inputs))
+    monkeypatch.setattr(timing, "open_checkpoint", lambda *_: forecaster)
+
+
+def test_the_time_is_that_of_one_forecast_without_gradients(
+    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = timed(epo, tmp_path, "experiment=exid/const_vel", "budget=untrained")
 
-    class Slow(torch.nn.Module):
-        """A forecaster that takes five milliseconds longer."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.inner = epo_lightning.load(run.checkpoint())
-
-        def forward(self, scene: epo_lightning.Scene) -> epo_lightning.JointForecast:
-            assert not torch.is_grad_enabled()
-            assert not self.training
-            assert len(scene.history) == 1
-            time.sleep(0.005)
-            return self.inner(scene)
+    def wait(forecaster: Forecaster, scene: epo_lightning.Scene) -> None:
+        assert not torch.is_grad_enabled()
+        assert not forecaster.training
+        assert len(scene.history) == 1
+        time.sleep(0.005)
 
     settings = read(Settings, run.config())
-    assert 0.005 < measure(run, settings, Slow())["seconds"]["median"] < 0.05
     assert measure(run, settings)["seconds"]["median"] < 0.005
+    opened_with(monkeypatch, run, wait)
+    assert 0.005 < measure(run, settings)["seconds"]["median"] < 0.05
 
 
 def test_many_scenes_are_timed_and_none_while_caches_settle(
@@ -90,21 +95,15 @@ def test_many_scenes_are_timed_and_none_while_caches_settle(
     run = timed(epo, tmp_path, "experiment=exid/const_vel", "budget=untrained")
     clock, scenes = [0.0], []
 
-    class Settling(torch.nn.Module):
-        """A forecaster whose first forecasts take seconds, and the others 1, 2, 3 .. ms by a clock of its own."""
+    def settle(_: Forecaster, scene: epo_lightning.Scene) -> None:
+        """The first forecasts take seconds, and the others 1, 2, 3 .. ms by a clock of the test."""
+        scenes.append(tuple(scene.current.flatten().tolist()))
+        counted = len(scenes) - timing.WARM_UP
+        clock[0] += 0.001 * counted if counted > 0 else 9.0
 
-        def __init__(self) -> None:
-            super().__init__()
-            self.inner = epo_lightning.load(run.checkpoint())
-
-        def forward(self, scene: epo_lightning.Scene) -> epo_lightning.JointForecast:
-            scenes.append(tuple(scene.current.flatten().tolist()))
-            counted = len(scenes) - timing.WARM_UP
-            clock[0] += 0.001 * counted if counted > 0 else 9.0
-            return self.inner(scene)
-
+    opened_with(monkeypatch, run, settle)
     monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
-    seconds = measure(run, read(Settings, run.config()), Settling())["seconds"]
+    seconds = measure(run, read(Settings, run.config()))["seconds"]
     assert seconds == pytest.approx({"mean": 0.0505, "median": 0.0505, "p10": 0.0109, "p90": 0.0901})
     assert len(set(scenes)) > 10
 

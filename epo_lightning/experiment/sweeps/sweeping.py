@@ -26,7 +26,7 @@ from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.choices import Choices, read_choices
 from epo_lightning.report.entries import TEXT, WHOLE, check_entries
 from epo_lightning.report.labels import value_text, word
-from epo_lightning.run_folder import RunFolder, read_json
+from epo_lightning.run_folder import RunFolder, numbered, read_json
 from epo_lightning.schema import read
 
 CHOICES = "choices="
@@ -187,7 +187,7 @@ def words_of(name: str, overrides: Sequence[str], extra: Sequence[str]) -> list[
 def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: Choices | None = None) -> list[Job]:
     """All runs of a sweep, each once, after a check of everything that could prevent a run from starting.
 
-    Searching sweeps choose their runs later, and have none here.
+    Searching sweeps choose their runs later, and have none here. A time that was measured with other settings is renamed.
 
     Raises:
         ConfigError: a mistake in a configuration, a folder that holds something else, or data that is missing.
@@ -266,7 +266,8 @@ def _set_aside(run: RunFolder, settings: TrainerSettings) -> None:
         settings.accelerator != "auto" and on_gpu == (settings.accelerator == "cpu")
     ):
         kind = "gpu" if on_gpu else "cpu"
-        file.rename(file.with_name(f"runtime-{kind}-{found['threads']}.json"))
+        names = numbered(file.with_name(f"runtime-{kind}-{found['threads']}.json"))
+        file.rename(next(name for name in names if not name.exists()))
 
 
 def _launch(

@@ -156,11 +156,12 @@ def test_folders_may_have_any_name(epo: Epo, tmp_path: Path, monkeypatch: pytest
 
 def test_times_with_other_thread_counts_are_measured_again(epo: Epo) -> None:
     words = ("sweep", "rpi_main", "data=drawn", "budget=untrained", "seed=0", "experiment=rpi/v_lstm", "score=time")
-    for threads in (1, 2):
+    for threads in (1, 2, 1, 2):
         assert epo(*words, f"trainer.threads={threads}") == 0
         (job,) = the_sweep().jobs
         assert json.loads(job.run.metrics_file("time").read_text())["threads"] == threads
-    assert json.loads((job.run.path / "runtime-cpu-1.json").read_text())["threads"] == 1, "nothing is lost"
+    for name, threads in (("cpu-1", 1), ("cpu-1-2", 1), ("cpu-2", 2)):
+        assert json.loads((job.run.path / f"runtime-{name}.json").read_text())["threads"] == threads, "nothing is lost"
 
 
 def test_a_run_is_done_when_all_measurements_exist(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:

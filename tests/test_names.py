@@ -1,16 +1,18 @@
-"""Annotations can be evaluated: linters do not check their names here, because they would take shapes for names."""
+"""Names in code and annotations exist. Linters do not check this here, because they would take shapes for names."""
 
 from __future__ import annotations
 
 import ast
+import builtins
 import dataclasses
+import dis
 import importlib
 import inspect
 import pkgutil
 import typing
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 import pytest
@@ -33,7 +35,7 @@ def for_type_checkers(module: ModuleType) -> dict[str, Any]:
 
 def annotated(module: ModuleType) -> Iterator[tuple[str, Any]]:
     """Functions, classes and methods of a module."""
-    for name, value in vars(module).items():
+    for name, value in list(vars(module).items()):
         if getattr(value, "__module__", None) != module.__name__ or not (
             inspect.isclass(value) or inspect.isfunction(value)
         ):
@@ -47,20 +49,43 @@ def annotated(module: ModuleType) -> Iterator[tuple[str, Any]]:
                 yield f"{name}.{method}", function
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_annotations_of_a_module_name_what_exists(name: str) -> None:
+def imported(name: str) -> ModuleType:
+    """A module; the test is skipped if it needs a package of an extra that is not installed."""
     try:
-        module = importlib.import_module(name)
+        return importlib.import_module(name)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] == "epo_lightning":
             raise
         pytest.skip(f"{error.name} is not installed")
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_annotations_of_a_module_name_what_exists(name: str) -> None:
+    module = imported(name)
     names = for_type_checkers(module)
     for what, value in annotated(module):
         try:
             typing.get_type_hints(value, localns=names)
         except NameError as error:
             pytest.fail(f"{name}: the annotations of {what}: {error}")
+
+
+def globals_of(code: CodeType) -> Iterator[str]:
+    """Names of globals that a function, and the functions in it, read."""
+    yield from (step.argval for step in dis.get_instructions(code) if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"))
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            yield from globals_of(inner)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_code_of_a_module_reads_what_exists(name: str) -> None:
+    module = imported(name)
+    for what, value in annotated(module):
+        function = inspect.unwrap(value)
+        if inspect.isfunction(function) and function.__module__ == name:
+            missing = {used for used in globals_of(function.__code__) if not hasattr(module, used)}
+            assert not {used for used in missing if not hasattr(builtins, used)}, f"{name}.{what}"
 
 
 @pytest.mark.parametrize(("group", "name"), [(group, name) for group in _HOMES for name in parts(group)])
