@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -13,7 +14,16 @@ Some = TypeVar("Some", bound="Batch")
 
 
 class Batch:
-    """A data class of tensors that share their leading dimension B; they are moved and indexed together."""
+    """A data class of tensors that share their leading dimension B; they are moved and indexed together.
+
+    Subclasses are made with ``repr=False``, so that they are printed as types and shapes, without numbers.
+    """
+
+    def __repr__(self) -> str:
+        """The fields that are there, one per line, with types and shapes of their tensors."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        lines = "\n".join(f"{name}={_described(value)}," for name, value in values.items() if value is not None)
+        return f"{type(self).__name__}(\n{textwrap.indent(lines, '    ')}\n)"
 
     def map(self: Some, function: Callable[[Tensor], Tensor]) -> Some:
         """A copy with ``function`` applied to every tensor, also inside nested mappings, tuples and batches."""
@@ -54,3 +64,14 @@ class Batch:
         if isinstance(index, int):
             index = [index]
         return self.map(lambda tensor: tensor[index])
+
+
+def _described(value: Any) -> str:
+    """Types and shapes of tensors, also of those in mappings and tuples; other values as they are."""
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key!r}: {_described(entry)}' for key, entry in value.items())}}}"
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_described, value))})"
+    return repr(value)

@@ -47,23 +47,27 @@ def main(words: Sequence[str] | None = None) -> None:
         where = f": {error.filename}" if error.filename else ""
         print(f"epo: {error.strerror or error}{where}", file=sys.stderr)
         raise SystemExit(1) from None
-    except KeyboardInterrupt:
-        print(_farewell("interrupted", words), file=sys.stderr)
+    except KeyboardInterrupt as ending:
+        print(_farewell("interrupted", words, ending), file=sys.stderr)
         raise SystemExit(130) from None
     except SystemExit as ending:
         if ending.code == TERMINATED:
-            print(_farewell("terminated", words), file=sys.stderr)
+            print(_farewell("terminated", words, ending), file=sys.stderr)
         raise
 
 
-def _farewell(ended: str, words: Sequence[str]) -> str:
-    """The line that a command prints when a signal ended it: how it ended, and how to continue."""
+def _farewell(ended: str, words: Sequence[str], ending: BaseException) -> str:
+    """The line that a command prints when a signal ended it: how it ended, and how to continue.
+
+    A training notes how, once it has a run folder.
+    """
+    notes = getattr(ending, "__notes__", [])
     if "explore" in words:  # it is ended by Ctrl-C, and has nothing to continue
         return "epo: stopped"
     if "train" in words and {"-m", "--multirun"}.intersection(words):
         return f"epo: {ended}; the same command with existing=continue continues, and skips finished runs"
-    if "train" in words:
-        return f"epo: {ended}; continue the run with `epo train resume=<run folder>`"
+    if "train" in words and notes:
+        return f"epo: {ended}; {'; '.join(notes)}"
     return f"epo: {ended}; no incomplete file was left; the same command continues"
 
 

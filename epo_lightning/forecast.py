@@ -18,7 +18,7 @@ from torch import Tensor
 from epo_lightning.batch import Batch
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GameParameters(Batch):
     """The inferred game of every scene and mode (Section 4.2), p = (w, g), and the strategies at which its solver starts.
 
@@ -82,7 +82,7 @@ class Status(IntEnum):
     is not positive definite."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tables(Batch):
     """Energies of C candidate strategies per agent, and the density p(k) = exp(-E(k)) / Z over joint choices k.
 
@@ -102,7 +102,7 @@ class Tables(Batch):
     log_partition: Float[Tensor, " B"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Constraints(Batch):
     """Hard constraints h <= 0 of a solution, for solvers that have any.
 
@@ -119,7 +119,7 @@ class Constraints(Batch):
     rounds: Int[Tensor, "B M"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Solution(Batch):
     """Joint strategies found by a solver, with their energy and status.
 
@@ -149,7 +149,7 @@ class Solution(Batch):
     constraints: Constraints | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Equilibrium(Batch):
     """Distance of a forecast's most likely joint mode from an open-loop Nash equilibrium of its game.
 
@@ -173,7 +173,7 @@ class Equilibrium(Batch):
     objective: Float[Tensor, "B N"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class JointForecast(Batch):
     """M joint futures of all agents of a scene and their probabilities.
 

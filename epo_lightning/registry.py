@@ -99,14 +99,21 @@ def _importing(module: str) -> Iterator[None]:
     """Context of the import of a module that may register parts.
 
     Raises:
-        ConfigError: it imports something that does not exist.
+        ConfigError: it imports something that does not exist, or fails in another way.
     """
     try:
         yield
+    except ConfigError:
+        raise
     except ImportError as error:
         ours = (error.name or "").startswith("epo_lightning")
         advice = "check the spelling" if ours else "install the package, or import it inside the function that needs it"
         raise ConfigError(f"the module {module} cannot be imported, and no part is found: {error}; {advice}") from error
+    except SyntaxError as error:
+        raise ConfigError(f"{error.filename}:{error.lineno} is not Python: {error.msg}") from error
+    except Exception as error:
+        what = f"{type(error).__name__}: {error}"
+        raise ConfigError(f"the module {module} fails when it is imported: {what}; --traceback shows where") from error
 
 
 @cache

@@ -78,7 +78,7 @@ _LEAST = {"H": (1, "step; the last one is the current state, t0"), "K": (1, "ste
 """Smallest sizes of some dimensions, with the unit that error messages name."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scene(Batch):
     """A batch of B observed scenes: agents' histories and sizes, the map and, in training, the agents' futures.
 

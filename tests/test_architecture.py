@@ -12,6 +12,7 @@ import epo_lightning
 ROOT = Path(epo_lightning.__file__).parent
 FLOORS = {
     "batch": set(),
+    "doubts": {"scene"},
     "scene": {"batch"},
     "forecast": {"batch"},
     "registry": set(),
@@ -39,6 +40,7 @@ FLOORS = {
     "objectives": {"scene", "forecast", "registry", "game", "solvers", "decoders", "losses"},
     "forecasters": {
         "scene",
+        "doubts",
         "forecast",
         "task",
         "objectives",

@@ -83,6 +83,13 @@ def test_an_import_that_fails_is_named_with_its_module() -> None:
         registry._importing("mine.parts"),
     ):
         import_module("epo_lightning.encoder")
+    with pytest.raises(ConfigError, match=r"^mine\.py:2 is not Python: "), registry._importing("mine.parts"):
+        compile("a = 1\nb = = 2", "mine.py", "exec")
+    with (
+        pytest.raises(ConfigError, match=r"mine\.parts fails when it is imported: ZeroDivisionError: .*; --traceback"),
+        registry._importing("mine.parts"),
+    ):
+        raise ZeroDivisionError("division by zero")
 
 
 def test_parts_without_a_name_of_their_own_can_be_registered() -> None:

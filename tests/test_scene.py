@@ -174,3 +174,15 @@ def test_nested_data_classes_are_indexed_with_the_batch():
     assert torch.equal(forecast[2].parameters.goals, goals[2:])
     assert torch.equal(forecast[2].parameters.own_weights["goal"], goals[2:, ..., 0])
     assert torch.equal(forecast[2].parameters.margins["clearance"], goals[2:, ..., 0])
+
+
+def test_batches_are_printed_as_types_and_shapes() -> None:
+    scene = random_scene(3, references=False)
+    text = repr(scene)
+    assert "    history=float32[3, 2, 19, 4],\n    dt=0.1,\n" in text
+    assert "references" not in text, "fields that are not there"
+    weights = {"goal": torch.ones(3, 1, 2)}
+    game = GameParameters(weights, {}, initial_controls=torch.zeros(3, 1, 2, 40, 2))
+    assert "    own_weights={'goal': float32[3, 1, 2]}," in repr(game)
+    nested = repr(JointForecast(torch.zeros(3, 1, 2, 40, 4), torch.ones(3, 1), parameters=game))
+    assert "    parameters=GameParameters(\n        own_weights={'goal': float32[3, 1, 2]},\n" in nested

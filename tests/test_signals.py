@@ -38,12 +38,15 @@ def test_a_stopped_verb_prints_a_message(
     message = capsys.readouterr().err
     assert message.startswith(("epo: terminated; ", "epo: interrupted; "))
     assert message.count("\n") == 1
-    assert ("resume=" in message) == (verb == "train")
+    assert "the same command continues" in message
     assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_stopped_multirun_is_continued_by_itself() -> None:
-    assert "existing=continue" in cli._farewell("terminated", ["train", "-m", "seed=0,1"])
+    ending = SystemExit(143)
+    ending.add_note("`epo train resume=runs/one` continues")
+    assert "existing=continue" in cli._farewell("terminated", ["train", "-m", "seed=0,1"], ending)
+    assert "the same command" in cli._farewell("terminated", ["sweep", "rpi_main"], ending)
 
 
 @pytest.mark.parametrize("error", [AssertionError("Trying to pop empty mode stack"), ConfigError("a"), OSError(5, "b")])

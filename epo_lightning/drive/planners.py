@@ -38,7 +38,7 @@ BRAKING = 2.0
 """Deceleration [m/s^2] of the plan that is followed where there is no earlier plan to fall back to."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Plan(Batch):
     """The planned motion of one agent in B episodes, and the joint future that it belongs to.
 

@@ -196,6 +196,13 @@ class Progress(Callback):
             write_json(self._run.progress_file, content)
 
 
+def style_of(settings: CallbackSettings) -> str:
+    """How progress is shown here: ``bar``, ``lines`` or ``none``."""
+    if settings.progress == "auto":
+        return "bar" if sys.stdout.isatty() else "lines"
+    return settings.progress
+
+
 def run_callbacks(settings: CallbackSettings, run: RunFolder, title: str) -> list[Callback]:
     """The callbacks of a run.
 
@@ -224,9 +231,7 @@ def run_callbacks(settings: CallbackSettings, run: RunFolder, title: str) -> lis
             check_finite=False,
         )
         found.insert(2, stopping)
-    style = settings.progress
-    if style == "auto":
-        style = "bar" if sys.stdout.isatty() else "lines"
+    style = style_of(settings)
     if style in ("bar", "lines"):
         found.append(FirstLine(title, run.path))
     if style == "bar":

@@ -10,10 +10,12 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.callbacks import TQDMProgressBar
 
 from epo_lightning import pretrained
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import assembly, logs
+from epo_lightning.experiment.callbacks import style_of
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
 from epo_lightning.experiment.other_data import OtherData, keys_of, open_other
@@ -70,7 +72,9 @@ def _chosen(settings: EvaluateSettings) -> list[RunFolder]:
         raise ConfigError(f"no finished run in or below {folder} ({len(found)} unfinished): train one with `epo train`")
     for run in found:
         if run not in finished:
-            print(f"{run.path}: left out, not finished (`epo train resume={run.path}`)")
+            failed = run.state == "failed"
+            why = f"failed: {run.record['error']}" if failed else f"not finished (`epo train resume={run.path}`)"
+            print(f"{run.path}: left out, {why}")
     return finished
 
 
@@ -138,6 +142,9 @@ def _test(
     truths: TruthTest | None = None,
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """Scores of a forecaster on the batches of a loader, and the costs of ``truths``."""
+    style = style_of(of_run.callbacks)
+    if style != "none":
+        print(f"scoring {len(loader.dataset)} scenes", flush=True)
     seed_everything(of_run.seed, workers=True, verbose=False)
     machine = machine or of_run.trainer
     torch.set_num_threads(machine.threads)
@@ -150,10 +157,13 @@ def _test(
             plugins=[assembly.Double()] if double else None,
             deterministic=of_run.trainer.deterministic,
             inference_mode=False,  # the layer differentiates its energy also when it only forecasts
-            callbacks=[] if truths is None else [truths],
+            callbacks=[
+                *([] if truths is None else [truths]),
+                *([TQDMProgressBar(refresh_rate=of_run.callbacks.refresh)] if style == "bar" else []),
+            ],
             logger=False,
             enable_checkpointing=False,
-            enable_progress_bar=False,
+            enable_progress_bar=style == "bar",
             enable_model_summary=False,
         )
     with assembly.signals():

@@ -33,6 +33,7 @@ MEANING = {
     "controls": "[B, M, N, K, 2] acceleration [m/s^2], turn rate [rad/s]",
     "initial_states": "[B, M, N, K, 4] where the solver started",
     "goals": "[B, M, N, 2] goals of the inferred game [m]",
+    "headings_at_goals": "[B, M, N] headings wanted at these goals [rad]",
     "reference": "[B, M, N] index of the line in references that an agent follows",
     "history": "[B, N, H, 4] what was observed: x, y [m], heading [rad], speed [m/s]",
     "history_mask": "[B, N, H] which of its steps were observed",
@@ -151,10 +152,13 @@ def _tensors(scenes: Scene, forecast: JointForecast) -> Iterable[tuple[str, Tens
     """Everything in :data:`MEANING` that is there, and the weights of the inferred game by name."""
     game = forecast.parameters
     for name in MEANING:
-        for owner in (forecast, game, scenes):
+        for owner in (forecast, scenes, game):
             if (value := getattr(owner, name, None)) is not None:
                 yield name, value.contiguous()
+                break
     if game is not None:
+        if game.goal_headings is not None:
+            yield "headings_at_goals", game.goal_headings.contiguous()
         for part in ("own_weights", "pair_weights", "margins"):
             for name, value in getattr(game, part).items():
                 yield f"{part}/{name}", value.contiguous()

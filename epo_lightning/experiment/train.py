@@ -74,7 +74,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
         data.setup("fit")  # raises an error for missing data before a run folder is made
     # In a sweep, another process may be training this run: wait until it has finished. Otherwise wait two seconds.
     patience = None if settings.sweep and begun is None else 2.0
-    with run.lock(wait=patience), gpus.placed(settings.trainer) as devices:
+    with run.lock(wait=patience), gpus.placed(settings.trainer) as devices, _continuation(run):
         if run.record_file.is_file():
             refuse_other(run, config, data)
             if not run.finished:
@@ -152,6 +152,16 @@ def fit(
         best={settings.callbacks.monitor: best},
         seconds=round(timer.time_elapsed() if learns else time.monotonic() - started, 3),
     )
+
+
+@contextlib.contextmanager
+def _continuation(run: RunFolder) -> Iterator[None]:
+    """Context in which an interruption says, in a note, how the run continues."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit) as ending:
+        ending.add_note(f"`epo {'evaluate run=' if run.finished else 'train resume='}{run.path}` continues")
+        raise
 
 
 @contextlib.contextmanager
@@ -243,7 +253,13 @@ def _steps_in(path: Path, model: LightningModule) -> int:
     Raises:
         ConfigError: the checkpoint is damaged or belongs to another architecture.
     """
-    content = read_checkpoint(path)
+    try:
+        content = read_checkpoint(path)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error}: a training cannot continue without it. Move the run folder away, and train again; "
+            f"`epo_lightning.load` reads the best epoch, {path.with_name('best.ckpt')}, if it is not damaged as well"
+        ) from error
     shapes = {key: tuple(value.shape) for key, value in content["state_dict"].items()}
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     for key in sorted({*shapes, *expected}):

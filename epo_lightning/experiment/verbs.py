@@ -150,9 +150,17 @@ def _print_trained(run: RunFolder) -> float | None:
     score = f", best {best[0]} {best[1]:.4f}" if best and best[1] is not None else ""
     print(f"{record['title']}, seed {record['seed']}: {record.get('parameters', 0)} parameters{score}")
     asked = measures(run.config().get("score")) or ("test",)
+    for which in ("test", "val"):
+        if which in asked and run.metrics_file(which).is_file():
+            print(f"  {which}: {_headline(read_json(run.metrics_file(which))['metrics'])}")
     scored = all(run.metrics_file(which).is_file() for which in asked)
     print(f"run folder: {run.path}\nnext: epo {f'report runs={run.path}' if scored else f'evaluate run={run.path}'}")
     return best[1] if best else None
+
+
+def _headline(metrics: Mapping[str, float]) -> str:
+    """The most important scores, in one line."""
+    return ", ".join(f"{name} {metrics[name]:.4f}" for name in HEADLINE if name in metrics)
 
 
 def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
@@ -163,8 +171,8 @@ def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
 
     own = settings.data is None
     for run, file, metrics in evaluate(config, overrides):
-        shown = ", ".join(f"{name} {metrics[name]:.4f}" for name in HEADLINE if name in metrics)
-        print(f"{run.path} ({settings.own_split if own else _tested_on(file, settings.data)}): {shown}")
+        where = settings.own_split if own else _tested_on(file, settings.data)
+        print(f"{run.path} ({where}): {_headline(metrics)}")
         if costs := ", ".join(
             f"{column.label} {metrics[column.metric]:.3f}" for column in TRUTH if column.metric in metrics
         ):

@@ -11,6 +11,7 @@ from lightning import LightningModule
 from torch import Tensor, nn
 
 from epo_lightning.decoders.weights import SharedWeights
+from epo_lightning.doubts import doubts
 from epo_lightning.forecast import JointForecast
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.metrics.forecast import COLUMNS, STOPPED, stopped
@@ -53,7 +54,8 @@ class Forecaster(LightningModule):
         """The forecast in evaluation mode, with the energy of every feature (:meth:`explain`).
 
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
-        other scenes of the batch are the same as without it. A warning says how many joint modes violate hard constraints.
+        other scenes of the batch are the same as without it. Warnings say how many joint modes violate hard constraints, and
+        which scenes are probably wrong (:func:`epo_lightning.doubts.doubts`).
 
         Raises:
             TypeError: the argument is not a :class:`Scene`.
@@ -64,10 +66,12 @@ class Forecaster(LightningModule):
         if abs(scene.dt - self.task.dt) > 1e-6:
             raise ValueError(f"the scene has dt = {scene.dt} s, but this forecaster was built for {self.task.dt} s")
         scene.validate_values()
+        for doubt in doubts(scene):
+            warnings.warn(doubt, stacklevel=3)
         broken = (~scene.finite).nonzero().flatten().tolist()
         if broken:
             warnings.warn(
-                f"non-finite numbers in scene(s) {broken} of the batch: their forecasts are NaN", stacklevel=2
+                f"non-finite numbers in scene(s) {broken} of the batch: their forecasts are NaN", stacklevel=3
             )
         # Switching hundreds of modules that are in evaluation mode already would take a tenth of a single scene's forecast.
         training = [module for module in self.modules() if module.training]

@@ -70,7 +70,7 @@ class Combination:
             (objective, self.objective.needs_from_solver),
         ):
             if needed and not needed & self.solver.provides:  # one of them is enough
-                return f"{part} needs {_or(needed)}, and {solver} provides {_or(self.solver.provides)} with its settings"
+                return f"{part} needs {_or(needed)}, and {solver} as it is set provides {_or(self.solver.provides)}"
         if self.objective.through_solution and not self.backward.teaches:
             return f"{objective} learns through the solution, which has no derivative with {backward}"
         if self.backward.teaches and not self.objective.through_solution:

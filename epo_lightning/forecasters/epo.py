@@ -265,8 +265,9 @@ class EPO(Forecaster):
             raise ValueError("the energy follows reference lines, but scene.goal_reference [B, N, G] is None")
         if "goal_headings" in self.energy.needs and goals.headings is None:
             raise ValueError(
-                "the energy has a feature of the headings wanted at goals, but scene.goal_headings [B, N, G] is None: "
-                "leave the feature out of energy.own, or choose data with goal headings"
+                "the energy has a feature of the headings wanted at goals, but scene.goal_headings [B, N, G] is None: give "
+                "the scene a heading [rad] for every goal candidate; or, to train on data without goal headings, leave the "
+                "feature out of energy.own"
             )
         own_weights, (pair_weights, margins) = self.own_weights(z, scene.agent_mask), self._of_pairs(z, scene)
         if orders is not None:

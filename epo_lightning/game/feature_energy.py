@@ -26,7 +26,7 @@ from epo_lightning.game.feature_derivatives import (
     signal_and_change,
     undeclared_change,
 )
-from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, WHEELBASE, OwnFeature, PairFeature
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, TARGETS, WHEELBASE, OwnFeature, PairFeature
 from epo_lightning.game.game_end import residual_mask, until
 from epo_lightning.game.limits import Bound, bounds_of_agents
 from epo_lightning.game.pairs import pair_mask, pairs
@@ -147,19 +147,9 @@ class FeatureEnergy(Energy):
         return [name for name, bound in self.bounds.items() if name in signals and isinstance(bound, Mapping)]
 
     @cached_property
-    def needs_goals(self) -> bool:
-        """Whether a feature needs goals."""
-        return "goals" in self.needs
-
-    @cached_property
-    def needs_goal_headings(self) -> bool:
-        """Whether a feature needs the headings that are wanted at goals."""
-        return "goal_headings" in self.needs
-
-    @cached_property
-    def needs_reference_controls(self) -> bool:
-        """Whether a feature needs reference controls."""
-        return "reference_controls" in self.needs
+    def targets(self) -> Sequence[str]:
+        """The fields of the parameters, of :data:`~.features.TARGETS`, that the features need."""
+        return [name for name in TARGETS if name in self.needs]
 
     @cached_property
     def needs_reach(self) -> bool:

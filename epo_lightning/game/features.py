@@ -42,6 +42,9 @@ from epo_lightning.scene import ACCELERATION, TURN_RATE
 
 Function = TypeVar("Function", bound=Callable[..., Tensor])
 
+TARGETS = ("goals", "goal_headings", "reference_controls")
+"""What features compare trajectories with: fields of the parameters of a game by which, as by weights and margins, its
+solutions are differentiable."""
 WHEELBASE = 0.6
 """Distance between the axles, as a fraction of a vehicle's length."""
 SLOWEST_STEERING = 1.0

@@ -21,6 +21,9 @@ from epo_lightning.report.runs import EvaluatedRun
 CONDITIONS = ("data", "trainer", "callbacks")
 """Sections of the configuration that must be equal for the learned rows of a table; the others are compared by it."""
 
+MANY_MISSED = 0.2
+"""Share of a subset's missed scenes above which a row has a note: rows whose modes are all taught have less than a tenth."""
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -114,6 +117,23 @@ class Row:
         return (
             f"{self.name} ({self.runs[0].data}) mixes runs of different code (seeds {groups}), which may not be comparable. "
             "Train all of them with the present code, in another folder (runs=<folder>)"
+        )
+
+    @property
+    def untaught(self) -> str:
+        """A note on trained runs whose modes miss one of the futures in many scenes; empty if there are none."""
+        seeds = [
+            str(run.seed)
+            for run in self.runs
+            if run.parameters != 0
+            and max((run.metrics[name] for name in run.metrics if name.endswith("/missed")), default=0.0) > MANY_MISSED
+        ]
+        if not seeds:
+            return ""
+        return (
+            f"{self.name} ({self.runs[0].data}): no mode is near one of the futures in more than a fifth of its scenes "
+            f"(score `missed`; seeds {', '.join(seeds)} of {len(self.runs)} runs). A mode may be untaught, and then errors "
+            "say little about the method: docs/concepts.md, Modes, has a remedy"
         )
 
     @property

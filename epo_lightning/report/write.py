@@ -133,8 +133,8 @@ def write_report(
     worth, compared = ([comparison_sheet(entry) for entry in entries] for entries in (of_game, comparisons))
     best, hint = _best(report.evaluated)
     settings = [settings_sheet(best)] if best else []
-    mixed = [row.mixed_code for row in distinct(tables) if row.mixed_code]
-    notes = [*mixed, *notes, *damaged, *([hint] if hint else [])]
+    of_rows = [note for row in distinct(tables) for note in (row.mixed_code, row.untaught) if note]
+    notes = [*of_rows, *notes, *damaged, *([hint] if hint else [])]
     made, charts = how_made(tables, timings), charts_of(tables, timings)
     costs = cost_sheets(tables, timings)
     elsewhere = transfers(report.runs)

@@ -24,6 +24,7 @@ from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.config.sources import options_of
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.identity import identity, row_identity
+from epo_lightning.registry import ConfigError
 from epo_lightning.schema import read
 from epo_lightning.task import Task
 
@@ -111,7 +112,8 @@ def test_data_sets_can_be_built_from_their_configuration(data: str) -> None:
 @pytest.mark.parametrize("backbone", names(CONF / "backbone"))
 @pytest.mark.parametrize("forecaster", [name for name in names(CONF / "forecaster") if name != "refined"])
 def test_backbones_and_forecasters_can_be_built_for_highways(backbone: str, forecaster: str) -> None:
-    words = ["experiment=rpi/v_lstm", "energy=exid", f"backbone={backbone}", f"forecaster={forecaster}"]
+    words = ["experiment=rpi/v_lstm", f"backbone={backbone}", f"forecaster={forecaster}"]
+    words += ["energy=exid"] if forecaster.startswith("epo") else []
     words += ["solver=both_sides", "backward=implicit"] if forecaster == "epo_game" else []
     settings = read(Settings, compose("train", words))
     data = SimpleNamespace(task=Task(20, 0.2, shape="box", candidates=60, map=True))
@@ -236,6 +238,10 @@ MISTAKES = {
     "train forecaster=marginal objective.weights.imitation=2": "write forecaster.loss_weights.imitation=2",
     "train forecaster=scene_consistent objective=laplace": "takes no objective: leave it out",
     "train forecaster=constant_velocity objective.power=2": "takes no objective: leave it out",
+    "train forecaster=marginal energy=exid": "energy=exid has no effect on forecaster=marginal, which takes no energy",
+    "train forecaster=scene_consistent solver.steps=4": "which takes no solver: leave it out",
+    "train -m forecaster=epo,scene_consistent backward=implicit": "takes no backward: leave it out",
+    "train experiment=rpi/v_lstm_epo +energy=exid": "leave out the plus: energy=exid",
     "train -m forecaster=epo,scene_consistent objective.relaxation=0.1": "write forecaster.relaxation=0.1",
     "train objective.power=2 +objective.annealing=0.3": "exclude each other",
     "train forecaster=scene_consistent +forecaster.power=2 +forecaster.annealing=0.3": "exclude each other",
@@ -343,6 +349,44 @@ def test_other_folders_beside_the_tree_are_not_groups() -> None:
         known = {folder.name for folder in CONF.iterdir() if folder.is_dir()} | {"sweeps", "hydra"}
         assert set(groups) <= known
         assert set(options_of(instance, "sweeps")) == set(names(tree() / "sweeps"))
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words", "message"),
+    [
+        (
+            "experiment/mine.yaml",
+            "defaults: [rpi/v_lstm, _self_]",
+            "experiment=mine",
+            "mine.yaml must begin with the line `# @",
+        ),
+        (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, {/backbone: hivt_m}]",
+            "experiment=mine",
+            r"in the defaults list of conf/experiment/mine\.yaml.*`- override /backbone: hivt_m`, with the slash",
+        ),
+        (
+            "experiment/rpi/mine.yaml",
+            "# @package _global_\ndefaults: [/experiment/rpi/v_lstm, {override backbone: hivt_m}]",
+            "experiment=rpi/mine",
+            r"in the defaults list of conf/experiment/rpi/mine\.yaml.*`- override /backbone: <option>`, with the slash",
+        ),
+        (
+            "backbone/mine.yaml",
+            "name: v_lstm\n  width: 3",
+            "backbone=mine",
+            r"backbone/mine\.yaml:2 is not YAML: mapping",
+        ),
+    ],
+)
+def test_mistakes_in_files_of_the_tree_are_named(
+    tmp_path: Path, file: str, content: str, words: str, message: str
+) -> None:
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_text(content)
+    with pytest.raises(ConfigError, match=message):
+        compose("train", [words], [str(tmp_path)])
 
 
 def test_a_file_of_the_tree_is_read_again_when_it_has_changed(tmp_path: Path) -> None:

@@ -99,6 +99,7 @@ def test_a_share_of_the_games_has_whole_games_within_larger_shares_and_only_in_t
         module.setup("fit")
         train = module.dataset("train")
         index = [(rows["history"] == history).flatten(1).all(1).nonzero().item() for history in train.history]
+        assert train[torch.arange(len(train))].id.tolist() == index, "the numbers of the whole data set"
         games = {game[i] for i in index}
         assert len(games) == max(1, 20 * share)
         assert sorted(index) == [i for i in range(50) if game[i] in games]

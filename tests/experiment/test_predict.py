@@ -194,4 +194,4 @@ def test_every_tensor_of_a_scene_and_a_forecast_is_explained() -> None:
         "equilibrium",  # this and the next are measured in tests alone
         "states_without_pairs",
     }
-    assert set(MEANING) == described | {"goals", "reference"}
+    assert set(MEANING) == described | {"goals", "headings_at_goals", "reference"}

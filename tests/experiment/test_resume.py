@@ -95,7 +95,11 @@ def test_a_run_that_had_stopped_early_makes_no_further_step(epo: Epo) -> None:
 
 @pytest.mark.parametrize(("during", "words"), [("test_step", ()), ("validation_step", ("budget=untrained",))])
 def test_a_run_that_is_terminated_while_it_is_measured_ends(
-    epo: Epo, monkeypatch: pytest.MonkeyPatch, during: str, words: tuple[str, ...]
+    epo: Epo,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    during: str,
+    words: tuple[str, ...],
 ) -> None:
     original = getattr(Forecaster, during)
 
@@ -110,6 +114,8 @@ def test_a_run_that_is_terminated_while_it_is_measured_ends(
         patch.setattr(Forecaster, during, terminate)
         assert epo(*words) == 143
     run = RunFolder(Path("parts"))
+    next_command = "evaluate run=parts" if run.finished else "train resume=parts"
+    assert capsys.readouterr().err.endswith(f"epo: terminated; `epo {next_command}` continues\n")
     assert signal.getsignal(signal.SIGTERM) == before
     assert not run.metrics_file().exists()
     assert not run.locked
@@ -117,7 +123,9 @@ def test_a_run_that_is_terminated_while_it_is_measured_ends(
     assert run.metrics_file().exists()
 
 
-def test_a_run_terminated_outside_lightning_loops_ends_at_once(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_terminated_outside_lightning_loops_ends_at_once(
+    epo: Epo, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     original = training._best_score
 
     def terminate(*arguments: object) -> float:
@@ -128,6 +136,7 @@ def test_a_run_terminated_outside_lightning_loops_ends_at_once(epo: Epo, monkeyp
         patch.setattr(training, "_best_score", terminate)
         assert epo(*WORSENING, "run_dir=parts") == 143
     assert RunFolder(Path("parts")).state == "interrupted"
+    assert capsys.readouterr().err.endswith("epo: terminated; `epo train resume=parts` continues\n")
 
 
 def give_to(run: str, accelerator: str) -> None:

@@ -36,8 +36,8 @@ class RPIDataset:
 
     Args:
         records: R records: ``history`` [R, 2, 19, 4], ``goals`` [R, 2, 2], ``goal_headings`` [R, 2],
-            ``states`` [R, 2 modes, 2, 40, 4], ``modes`` [R], the number of modes of a record, and ``game_steps`` [R],
-            the steps from t0 to the end of the game.
+            ``states`` [R, 2 modes, 2, 40, 4], ``modes`` [R], the number of modes of a record, ``game_steps`` [R], the steps
+            from t0 to the end of the game, and, if they are only a part of the data set, ``id`` [R], their numbers in it.
         targets: ``executed``, ``both`` or ``sampled``.
         seed: seed of the random modes of ``sampled``.
     """
@@ -48,6 +48,7 @@ class RPIDataset:
         self.goal_headings, self.game_steps = records["goal_headings"].float(), records["game_steps"]
         self.targets, self.seed = targets, seed
         count = len(self.history)
+        self.ids = records.get("id", torch.arange(count))
         self.record, self.mode = torch.arange(count), torch.zeros(count, dtype=torch.long)
         if targets == "both":
             self.record = torch.repeat_interleave(self.record, self.modes)
@@ -75,7 +76,7 @@ class RPIDataset:
             goal_headings=self.goal_headings[record].unsqueeze(2),
             size=history.new_full((*history.shape[:2], 2), DISC_DIAMETER),
             subset=mode,
-            id=record,
+            id=self.ids[record],
             game_steps=self.game_steps[record],
         )
 
@@ -230,6 +231,7 @@ class RPIData(SceneDataModule):
         if few:
             chosen = in_share(torch.stack((records["game"], records["placement"]), -1), self.games_share)
             records = {name: column[chosen] for name, column in records.items()}
+            records["id"] = chosen.nonzero()[:, 0]
         # Robot and pedestrian want to arrive with the headings with which they start, 0 and phi (`game.py`); `step` is the
         # step of the main game at t0.
         phi = records["phi"]

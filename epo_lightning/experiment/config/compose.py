@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 PACKAGE = Path(__file__).resolve().parents[2]
 TITLED = ("backbone", "forecaster")
 """Parts that titles of experiments name: "V-LSTM + EPO"."""
+OF_GAMES = ("energy", "solver", "backward", "objective")
+"""Parts that forecasters without games do not take. (Their losses are their own.)"""
 
 
 def tree() -> Path:
@@ -93,15 +95,15 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     without the seed. A title from the experiment's file gets the names of backbone and forecaster where they differ from it.
 
     Raises:
-        ConfigError: an interpolation of a key that does not exist, a value that is still missing, or settings of an
-            objective for a forecaster that takes none.
+        ConfigError: an interpolation of a key that does not exist, a value that is still missing, or settings of a
+            part for a forecaster that takes none.
     """
     from hydra.core.global_hydra import GlobalHydra
 
     choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
     values = _plain_values(config)
     if "trainer" in values and "hydra" in config:
-        _check_objective(values, config.hydra.overrides.task)
+        _check_game(values, config.hydra.overrides.task)
     if choices.get("experiment"):
         choices["experiment"] = recorded_name(choices["experiment"], choices.get("data", ""))
         values["experiment"] = choices["experiment"]
@@ -117,29 +119,35 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     return values
 
 
-def _check_objective(values: Mapping[str, Any], overrides: Iterable[str]) -> None:
-    """Refuse settings of ``objective`` for a forecaster that has its own loss and would silently ignore them.
+def _check_game(values: Mapping[str, Any], overrides: Iterable[str]) -> None:
+    """Refuse settings of :data:`OF_GAMES` for a forecaster that takes no such part and would silently ignore them.
 
-    Without this check, a table would have rows "power=1" and "power=2" with equal scores.
+    Without this check, a table would have rows "power=1" and "power=2" with equal scores. The implementation of a solver,
+    ``solver.backend``, may be chosen for all rows of a sweep.
 
     Raises:
-        ConfigError: an override sets or chooses the objective, and the forecaster takes none.
+        ConfigError: an override sets or chooses a part, and the forecaster takes none.
     """
-    given = [word for word in overrides if re.match(r"\+*objective[.=]", word)]
     name = str(_name(values, "forecaster"))
     chosen = parts("forecaster").get(name)
-    if not given or chosen is None or "objective" in (own := inspect.signature(chosen).parameters):
+    if chosen is None:
         return
-    key, _, value = given[0].lstrip("+").removeprefix("objective.").partition("=")
-    section = values["forecaster"]
+    own, section = inspect.signature(chosen).parameters, values["forecaster"]
+    ignored = "|".join(part for part in OF_GAMES if part not in own)
+    settings = re.compile(rf"\+*((?!solver\.backend=)({ignored})[.=].*)")
+    given = [match for word in overrides if (match := settings.fullmatch(word))]
+    if not ignored or not given:
+        return
+    part = given[0].group(2)
+    key, _, value = given[0].group(1).removeprefix("objective.").partition("=")
     known = {"weights": "loss_weights"}.get(key.partition(".")[0], key.partition(".")[0])
-    if known in own:
+    if part == "objective" and known in own:
         place = ".".join(["forecaster", known, *key.split(".")[1:]])
         there = f"write {'' if known in section else '+'}{place}={value}"
     else:
         there = "leave it out"
     raise ConfigError(
-        f"{given[0]} has no effect on forecaster={name}, which takes no objective: {there}; in a sweep over several "
+        f"{given[0].group()} has no effect on forecaster={name}, which takes no {part}: {there}; in a sweep over several "
         "forecasters, give every row its own setting in an experiment file, as conf/experiment/rpi/*_squared.yaml do"
     )
 

@@ -41,7 +41,12 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
     except MissingConfigException as error:
         raise ConfigError(_missing_option(instance, error.missing_cfg_file or "", str(error))) from error
     except (HydraException, OmegaConfBaseException) as error:
+        repeated = re.search(r"Multiple values for ([\w./@]+)\. .*'override [\w./@]+: (\S+)'", str(error))
+        if repeated:
+            raise ConfigError(_override(*repeated.groups(), overrides)) from error
         unknown = re.search(r"Could not (?:override|delete from config\.) +'([\w./@]+)'", str(error))
+        if unknown and (relative := re.fullmatch(r"experiment/(?:[\w-]+/)*([\w-]+)@[\w.-]+", unknown.group(1))):
+            raise ConfigError(_override(relative.group(1), "<option>", overrides)) from error
         if unknown and "Multiple values" not in str(error):
             raise ConfigError(_unknown_key(instance, name, unknown.group(1), overrides)) from error
         raise ConfigError(sentence(error)) from error
@@ -49,6 +54,18 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(sentence(error)) from error
+
+
+def _override(group: str, option: str, overrides: Sequence[str]) -> str:
+    """The error message for a second option of a group, from the command line or from an experiment's file."""
+    if f"+{group}={option}" in overrides:
+        return f"+{group}={option}: {group} has an option already, so leave out the plus: {group}={option}"
+    chosen = [word.partition("=")[2] for word in overrides if word.startswith("experiment=")]
+    file = f"conf/experiment/{chosen[-1]}.yaml" if chosen else "the file that chooses it"
+    return (
+        f"{group} has an option already: in the defaults list of {file}, or of a file that it is based on, write "
+        f"`- override /{group}: {option}`, with the slash"
+    )
 
 
 def _missing_option(instance: Hydra, missing: str, message: str) -> str:

@@ -10,6 +10,9 @@ from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult
 from omegaconf import OmegaConf
+from yaml import YAMLError
+
+from epo_lightning.registry import ConfigError
 
 if TYPE_CHECKING:
     from hydra._internal.hydra import Hydra
@@ -32,10 +35,23 @@ class ParsedOnce(FileConfigSource):
             return super().load_config(config_path)  # raises
         key = (self.provider, self.path, config_path, file.stat().st_mtime_ns)
         if key not in _PARSED:
-            _PARSED[key] = pickle.dumps(super().load_config(config_path))
+            try:
+                loaded = super().load_config(config_path)
+            except YAMLError as error:
+                raise ConfigError(_where(file, error)) from error
+            if config_path.startswith(f"{EXPERIMENTS}/") and loaded.header.get("package") != "_global_":
+                raise ConfigError(f"{file} must begin with the line `# @package _global_`, as every experiment does")
+            _PARSED[key] = pickle.dumps(loaded)
         # Hydra changes what it is given, so that every composition gets a copy.
         result: ConfigResult = pickle.loads(_PARSED[key])
         return result
+
+
+def _where(file: Path, error: YAMLError) -> str:
+    """What is wrong in a file of YAML, and in which line."""
+    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    line = "" if mark is None else f":{mark.line + 1}"
+    return f"{file}{line} is not YAML: {' '.join(str(problem or error).split())}"
 
 
 class TreeSource(ParsedOnce):

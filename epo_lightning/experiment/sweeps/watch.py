@@ -116,12 +116,15 @@ def how_far(job: Job) -> str:
 
 @_or_damaged
 def result(job: Job) -> str:
-    """Summary of a finished run: its best validation score and how long it took, and how long a forecast takes."""
+    """Summary of a finished run: its best validation score, its test score, and how long training and a forecast took."""
     told = []
     if job.measures != ("time",):
         record = job.run.record
         best = next(((key, value) for key, value in record.get("best", {}).items() if value is not None), None)
-        told = [*([f"{best[0]} {best[1]:.4f}"] if best else []), duration(record.get("seconds", 0.0))]
+        told = [f"{best[0]} {best[1]:.4f}"] if best else []
+        if "test" in job.measures:
+            told.append(f"test/minSADE {read_json(job.run.metrics_file('test'))['metrics']['minSADE']:.4f}")
+        told.append(duration(record.get("seconds", 0.0)))
     if "time" in job.measures:
         seconds = read_json(job.run.metrics_file("time"))["seconds"]["median"]
         told.append(f"{1000 * seconds:.1f} ms per forecast")

@@ -138,11 +138,8 @@ class _Call:
         self.own = [parameters.own_weights[name] for name in energy.own]
         self.pair = [parameters.pair_weights[name] for name in energy.pair]
         self.margins = [parameters.margins[name] for name in energy.decoded_margins]
-        goals = parameters.goals if energy.needs_goals else None
-        headings = parameters.goal_headings if energy.needs_goal_headings else None
-        references = parameters.reference_controls if energy.needs_reference_controls else None
-        self.others = {"goals": goals, "headings": headings, "reference_controls": references}
-        self.inputs = (*self.own, *self.pair, *self.margins, *(x for x in self.others.values() if x is not None))
+        self.targets: dict[str, Tensor] = {name: getattr(parameters, name) for name in energy.targets}
+        self.inputs = (*self.own, *self.pair, *self.margins, *self.targets.values())
         self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs))
         coupled = energy.pair if self.shape[2] > 1 else ()
         fixed = [name for name in coupled if name in energy.margins]
@@ -190,9 +187,8 @@ class _Call:
             margins = [*self.margins, *(energy.margin(scene, parameters, name).expand(pairs) for name in fixed)]
             if margins:
                 self._read("margins", _stacked([margin.to(self.dtype) for margin in margins]))
-        for name, tensor in self.others.items():
-            if tensor is not None:
-                self._read(name, tensor)
+        for name, tensor in self.targets.items():
+            self._read(name, tensor)
         if scene.game_steps is not None:
             game.cut = 1
             self._read("ends", scene.game_steps, torch.int64)
@@ -277,14 +273,14 @@ class _Call:
         own = new((max(len(self.own), 1), batch, modes, agents))
         pairs = (batch, modes, agents * (agents - 1) // 2)
         pair, margins = new((len(self.pair), *pairs)), new((len(self.margins) + len(self.pair), *pairs))
-        others = {name: None if tensor is None else new(tensor.shape) for name, tensor in self.others.items()}
+        targets = {name: new(tensor.shape) for name, tensor in self.targets.items()}
         by = self.kernels.Gradients()
-        _point(by, controls=controls, own=own, pair=pair, margins=margins, iterates=iterates, states=states, **others)
+        _point(by, controls=controls, own=own, pair=pair, margins=margins, iterates=iterates, states=states, **targets)
         by.along_iterates, by.along_states = int(iterates is not None), int(states is not None)
         self._launch(self.kernels.differentiate, by)
         count = len(self.own)
         found = [*own[:count].unbind(0), *pair.unbind(0), *margins[: len(self.margins)].unbind(0)]
-        return [*found, *(gradient for gradient in others.values() if gradient is not None)]
+        return [*found, *targets.values()]
 
 
 def _stacked(tensors: list[Tensor]) -> Tensor:

@@ -18,8 +18,7 @@ class GameArrays:
 
     Attributes:
         game: the structure. It is valid as long as this object exists.
-        inputs: the tensors by which solutions have derivatives: weights, margins, goals, their headings, and reference
-            controls.
+        inputs: the tensors by which solutions have derivatives: weights, margins and targets.
         kept: all other tensors that the kernel reads.
     """
 
@@ -41,12 +40,8 @@ class GameArrays:
         self._own = [as_type(like, weights[name]) for name in energy.own]
         self._pair = [as_type(like, parameters.pair_weights[name]) for name in energy.pair]
         self._margins = [as_type(like, parameters.margins[name]) for name in energy.decoded_margins]
-        self._goals = [as_type(like, parameters.goals)] if energy.needs_goals else []  # type: ignore[arg-type]
-        headed = energy.needs_goal_headings
-        self._headings = [as_type(like, parameters.goal_headings)] if headed else []  # type: ignore[arg-type]
-        referring = energy.needs_reference_controls
-        self._references = [as_type(like, parameters.reference_controls)] if referring else []  # type: ignore[arg-type]
-        self.inputs = (*self._own, *self._pair, *self._margins, *self._goals, *self._headings, *self._references)
+        self._targets = {name: as_type(like, getattr(parameters, name)) for name in energy.targets}
+        self.inputs = (*self._own, *self._pair, *self._margins, *self._targets.values())
         wrong = [list(tensor.shape) for tensor in self.inputs if tensor.shape[:2] != controls.shape[:2]]
         if wrong:
             raise ValueError(f"parameters of the shape {wrong[0]} for controls of the shape {list(controls.shape)}")
@@ -86,13 +81,13 @@ class GameArrays:
                 margins[PAIR.index(name)] = fixed.expand(batch, modes, agents * (agents - 1) // 2)
             for slot, margin in margins.items():
                 game.margins[slot], game.margin_strides[slot][:] = margin.data_ptr(), margin.stride()
-        if self._goals:
-            game.goals = self._goals[0].data_ptr()
-            game.goals_b, game.goals_m, game.goals_n, game.goals_x = self._goals[0].stride()
-        if self._headings:
-            game.goal_headings, game.goal_heading_strides[:] = self._headings[0].data_ptr(), self._headings[0].stride()
-        if self._references:
-            game.reference_controls = hold(self._references[0].contiguous()).data_ptr()
+        if (goals := self._targets.get("goals")) is not None:
+            game.goals = goals.data_ptr()
+            game.goals_b, game.goals_m, game.goals_n, game.goals_x = goals.stride()
+        if (headings := self._targets.get("goal_headings")) is not None:
+            game.goal_headings, game.goal_heading_strides[:] = headings.data_ptr(), headings.stride()
+        if (references := self._targets.get("reference_controls")) is not None:
+            game.reference_controls = hold(references.contiguous()).data_ptr()
         if scene.game_steps is not None:
             game.ends = hold(as_type(torch.int64, scene.game_steps).contiguous()).data_ptr()
         if "lane" in energy.own:
@@ -119,9 +114,7 @@ class GameArrays:
         own = new((len(self._own), batch, modes, agents)).unbind(0)
         shared = (batch, modes, agents * (agents - 1) // 2)
         pair, margins = new((len(self._pair), *shared)).unbind(0), new((len(self._margins), *shared)).unbind(0)
-        goals = [new((batch, modes, agents, 2)) for _ in self._goals]
-        headings = [new((batch, modes, agents)) for _ in self._headings]
-        references = [new(self._controls.shape) for _ in self._references]
+        targets = {name: new(tensor.shape) for name, tensor in self._targets.items()}
         gradients = EpoGradients()
         for slots, addresses, tensors in (
             (self._slots, gradients.own, own),
@@ -130,13 +123,9 @@ class GameArrays:
         ):
             for slot, tensor in zip(slots, tensors, strict=True):
                 addresses[slot] = tensor.data_ptr()
-        for tensor in goals:
-            gradients.goals = tensor.data_ptr()
-        for tensor in headings:
-            gradients.goal_headings = tensor.data_ptr()
-        for tensor in references:
-            gradients.reference_controls = tensor.data_ptr()
-        return gradients, [*own, *pair, *margins, *goals, *headings, *references]
+        for name, tensor in targets.items():
+            setattr(gradients, name, tensor.data_ptr())
+        return gradients, [*own, *pair, *margins, *targets.values()]
 
 
 def as_type(dtype: torch.dtype, tensor: Tensor) -> Tensor:

@@ -172,11 +172,9 @@ def _given(energy: FeatureEnergy, parameters: GameParameters) -> GameParameters:
         own_weights={name: parameters.own_weights[name] for name in energy.own},
         pair_weights={name: parameters.pair_weights[name] for name in energy.pair},
         initial_controls=parameters.initial_controls,
-        goals=parameters.goals if energy.needs_goals else None,
         reference=parameters.reference if "reference" in energy.needs else None,
-        goal_headings=parameters.goal_headings if energy.needs_goal_headings else None,
         margins={name: parameters.margins[name] for name in energy.decoded_margins},
-        reference_controls=parameters.reference_controls if energy.needs_reference_controls else None,
+        **{name: getattr(parameters, name) for name in energy.targets},
     )
 
 

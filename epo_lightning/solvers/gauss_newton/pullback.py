@@ -49,7 +49,7 @@ class Gradients:
     goals: Float[Tensor, "S N 2"] | None
     goal_headings: Float[Tensor, "S N"] | None
     margins: dict[str, Float[Tensor, "S P"]]
-    reference_controls: Float[Tensor, "S N 2 K"] | None
+    reference_controls: Float[Tensor, "S N K 2"] | None
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,13 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
     own: dict[str, Tensor] = {}
     goals = headings = None
     referring = "reference_controls" in at.energy.needs
-    references = torch.zeros_like(adjoint) if referring else None
+    references = torch.zeros_like(adjoint).mT if referring else None
     for name, term in model.own.items():
         match term:
             case SignalTerm():
                 along_mu, ahead = _pull_signal(term, changes, sums, dt)
                 if references is not None and term.feature.needs == "reference_controls":
-                    references[:, :, term.feature.channel] += term.weight.square() * along_mu
+                    references[..., term.feature.channel] += term.weight.square() * along_mu
             case SteeringTerm():
                 along_mu, ahead = _pull_steering(model, term, changes, sums)
             case LaneTerm():

@@ -125,35 +125,22 @@ class Game:
         return self.energy.finite(self.scene, self.parameters)
 
     def tensors(self) -> list[Tensor]:
-        """The tensors of a game that have a gradient: weights, margins, and goals, goal headings and reference
-        controls if they are needed."""
+        """The tensors of a game that have a gradient: weights, margins and targets."""
         parameters = self.parameters
         tensors = [parameters.own_weights[name] for name in self.energy.own]
         tensors += [parameters.pair_weights[name] for name in self.energy.pair]
         tensors += [parameters.margins[name] for name in self.energy.decoded_margins]
-        if self.energy.needs_goals:
-            assert parameters.goals is not None
-            tensors.append(parameters.goals)
-        if self.energy.needs_goal_headings:
-            assert parameters.goal_headings is not None
-            tensors.append(parameters.goal_headings)
-        if self.energy.needs_reference_controls:
-            assert parameters.reference_controls is not None
-            tensors.append(parameters.reference_controls)
-        return tensors
+        return tensors + [getattr(parameters, name) for name in self.energy.targets]
 
     def with_tensors(self, tensors: Sequence[Tensor]) -> GameParameters:
         """The game's parameters with these tensors."""
         given = iter(tensors)
-        parameters = self.parameters
         return dataclasses.replace(
-            parameters,
+            self.parameters,
             own_weights={name: next(given) for name in self.energy.own},
             pair_weights={name: next(given) for name in self.energy.pair},
             margins={name: next(given) for name in self.energy.decoded_margins},
-            goals=next(given) if self.energy.needs_goals else parameters.goals,
-            goal_headings=next(given) if self.energy.needs_goal_headings else parameters.goal_headings,
-            reference_controls=next(given) if self.energy.needs_reference_controls else parameters.reference_controls,
+            **{name: next(given) for name in self.energy.targets},
         )
 
     def gradient_of_phi(
@@ -166,12 +153,7 @@ class Game:
         gradients = [found.own.get(name) for name in self.energy.own]
         gradients += [found.pair.get(name) for name in self.energy.pair]
         gradients += [found.margins.get(name) for name in self.energy.decoded_margins]
-        if self.energy.needs_goals:
-            gradients.append(found.goals)
-        if self.energy.needs_goal_headings:
-            gradients.append(found.goal_headings)
-        if found.reference_controls is not None:
-            gradients.append(found.reference_controls.transpose(-1, -2))
+        gradients += [getattr(found, name) for name in self.energy.targets]
         by = [
             torch.zeros_like(tensor) if gradient is None else gradient.reshape(tensor.shape)
             for tensor, gradient in zip(tensors, gradients, strict=True)

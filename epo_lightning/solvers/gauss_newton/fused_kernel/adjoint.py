@@ -260,10 +260,10 @@ def make(
                 slope = excess_slope(g, BOUND_VEL, v)
                 by_speed_of += residual_adjoint(g, at, work, VELB, row, i, k, over, slope, speed1, speed2)
             if own_slot(g, HEADING) >= 0 and state == end:
-                off = path[trace(at, K, TURNED, i) + state] - g.headings[row]
+                off = path[trace(at, K, TURNED, i) + state] - g.goal_headings[row]
                 force = residual_adjoint(g, at, work, HEADING, row, i, k, off, T(1.0), heading1, heading2)
                 by_heading += force
-                by.headings[row] = by.headings[row] - force
+                by.goal_headings[row] = by.goal_headings[row] - force
             for other in range(n):
                 if other != i and pair_count(g) > 0:
                     p = pair_index(wp.min(i, other), wp.max(i, other), A)

@@ -434,7 +434,7 @@ def make(
                         nearest[AHEAD_Y * each + place] = ahead_y
                 if state == end:
                     if own_slot(g, HEADING) >= 0:
-                        off = path[trace(at, K, TURNED, i) + state] - g.headings[row]
+                        off = path[trace(at, K, TURNED, i) + state] - g.goal_headings[row]
                         energy, heading_push, heading_stiffness = add_residual(
                             weight(g, costs, HEADING, i), off, T(1.0), energy, heading_push, heading_stiffness
                         )

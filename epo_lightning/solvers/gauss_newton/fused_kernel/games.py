@@ -97,7 +97,7 @@ def make(
         pair: Array
         margins: Array
         goals: Array
-        headings: Array
+        goal_headings: Array
         references: Array
         speeds: Array
         reference_controls: Array
@@ -148,7 +148,7 @@ def make(
         pair: Array
         margins: Array
         goals: Array
-        headings: Array
+        goal_headings: Array
         reference_controls: Array
 
     @wp.func

@@ -1,0 +1,79 @@
+"""Doubts about scenes: which mistakes are noticed, and that data of all kinds is not doubted."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+
+import pytest
+import torch
+from games import highway_scene
+
+import epo_lightning
+from epo_lightning import Scene, pretrained
+from epo_lightning.doubts import doubts
+from epo_lightning.scene import HEADING, SPEED
+
+
+def walking(**fields: torch.Tensor) -> Scene:
+    """A pedestrian who walks to the left for a second, and a robot that stands."""
+    steps = torch.arange(10) / 10.0
+    history = torch.zeros(1, 2, 10, 4)
+    history[0, 0, :, 0] = -1.5 * steps
+    history[0, 0, :, HEADING], history[0, 0, :, SPEED] = math.pi, 1.5
+    return Scene(history=history, dt=0.1, goal_candidates=torch.zeros(1, 2, 1, 2), **fields)
+
+
+def changed(scene: Scene, entry: int, value: float) -> Scene:
+    history = scene.history.clone()
+    history[:, 0, :, entry] = value
+    return dataclasses.replace(scene, history=history)
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"), [(HEADING, 180.0), (HEADING, 0.0), (SPEED, 0.0), (SPEED, -1.5), (SPEED, 15.0), (0, 0.0)]
+)
+def test_motions_that_contradict_headings_and_speeds_are_doubted(entry: int, value: float) -> None:
+    assert not doubts(walking())
+    (doubt,) = doubts(changed(walking(), entry, value))
+    assert doubt.startswith("in scene(s) [0] agents do not move")
+
+
+def test_reversing_is_not_doubted() -> None:
+    assert not doubts(changed(changed(walking(), HEADING, 0.0), SPEED, -1.5))
+
+
+def test_absent_agents_and_steps_are_not_doubted() -> None:
+    scene = changed(walking(), SPEED, 15.0)
+    assert not doubts(dataclasses.replace(scene, agent_mask=torch.tensor([[False, True]])))
+    seen = torch.zeros(1, 2, 10, dtype=torch.bool)
+    seen[..., -1] = True
+    assert not doubts(dataclasses.replace(scene, history_mask=seen))
+
+
+@pytest.mark.parametrize(("wanted", "doubted"), [(math.pi, False), (-math.pi, True), (0.0, False), (3 * math.pi, True)])
+def test_goal_headings_that_were_wrapped_are_doubted(wanted: float, doubted: bool) -> None:
+    scene = walking(goal_headings=torch.tensor([[[wanted], [0.0]]]))
+    assert ["a goal heading differs" in doubt for doubt in doubts(scene)] == ([True] if doubted else [])
+
+
+@pytest.mark.parametrize("name", pretrained.names())
+def test_shipped_examples_are_not_doubted(name: str) -> None:
+    assert not doubts(pretrained.examples(name))
+
+
+def test_vehicles_on_lanes_are_not_doubted() -> None:
+    torch.manual_seed(0)
+    assert not doubts(highway_scene(50))
+
+
+def test_a_prediction_warns() -> None:
+    name = "rpi/v_lstm_epo"
+    forecaster, scene = epo_lightning.load(name), pretrained.examples(name)
+    wrong = dataclasses.replace(scene, history=scene.history.flip(2))
+    with pytest.warns(UserWarning, match="do not move in the direction of their headings"):
+        forecaster.predict(wrong)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        forecaster.predict(scene)
