@@ -58,7 +58,7 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
 
     data = make_data(settings, overrides)
     dataset = settings.data.get("dataset", "rpi")
-    row = f"{dataset}/v_lstm_epo"
+    row = f"{dataset}/v_lstm_epo" + ("_relaxed" if dataset == "rpi" else "")
     kept = [word for word in overrides if word.startswith(("data=", "data.", "--config-dir="))]
     if dataset in HIGHWAYS or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
         words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]
@@ -98,12 +98,7 @@ def make_data(settings: GenerateSettings, overrides: Sequence[str] = ()) -> Any:
         special["launch"] = launch
     folder = data.generate(workers=settings.workers, progress=settings.progress, **special)
     print(f"\ndata in {folder}, digest {data.digest}")
-    report = data.report()
-    _print_report(report)
-    lines = data.per_recording() if hasattr(data, "per_recording") else []
-    print("\n".join(["", *lines] if lines else []))
-    for name, problem in report.get("skipped", {}).items():
-        print(f"left out: {name}: {problem}")
+    print("\n".join(data.summary()))
     return data
 
 
@@ -236,25 +231,6 @@ def report_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     from epo_lightning.experiment.report import report, report_page
 
     print(f"wrote {report_page(settings) if settings.template else report(settings) / 'index.html'}")
-
-
-def _print_report(report: dict[str, Any], indent: str = "  ") -> None:
-    if "recordings" in report:
-        from epo_lightning.data.recorded import summary
-
-        print("\n".join(summary.by_split(report)))
-        return
-    for key, value in report.items():
-        if isinstance(value, dict):
-            print(f"{indent}{key}")
-            _print_report(value, indent + "  ")
-        elif isinstance(value, float):
-            print(f"{indent}{key:<34} {value:.4g}")
-        elif isinstance(value, list):
-            shown = ", ".join(f"{entry:.4g}" if isinstance(entry, float) else str(entry) for entry in value)
-            print(f"{indent}{key:<34} {shown}")
-        else:
-            print(f"{indent}{key:<34} {value}")
 
 
 RUN: dict[str, Callable[[dict[str, Any], Sequence[str]], Any]] = {

@@ -18,7 +18,6 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks import true_game
 from epo_lightning.data import cache
-from epo_lightning.data.rpi.report import markdown
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.splits import PAPER_SIZES, assign, games_of
 
@@ -181,7 +180,14 @@ def test_the_report_covers_the_set(data, records):
     assert report["motion"]["disc_overlaps"] == 0
     assert report["motion"]["euler_residual"] < 1e-6
     assert 0.05 < report["baselines"]["constant_velocity"]["executed"]["ade"] < 0.3
-    assert "records with two modes" in markdown(report)
+    *lines, place = data.summary()
+    assert lines[1].split()[:3] == [
+        "train",
+        str(report["sizes"]["train"]["records"]),
+        str(report["sizes"]["train"]["samples"]),
+    ]
+    assert f"{report['two_modes']['all']:.0%} of the records" in "\n".join(lines)
+    assert Path(place.removeprefix("  all statistics: ")).is_file()
 
 
 def test_paper_sizes_and_disjoint_hard_split():

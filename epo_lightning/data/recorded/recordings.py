@@ -400,10 +400,6 @@ class RecordedData(SceneDataModule):
         finally:
             shutil.rmtree(columns, ignore_errors=True)
 
-    def per_recording(self) -> list[str]:
-        """Lines of a table of what became of each recording; empty for data sets of older versions."""
-        return summary.per_recording(self.folder)
-
     def report(self) -> dict[str, Any]:
         """The report that was written with the data set.
 
@@ -411,6 +407,16 @@ class RecordedData(SceneDataModule):
             cache.CacheError: the data set is missing, broken or of another configuration.
         """
         return cache.manifest(self.folder, self.command, self.config)["report"]
+
+    def summary(self) -> list[str]:
+        """Lines on what was extracted, for the terminal: by split, by recording, and recordings that were left out.
+
+        Raises:
+            cache.CacheError: as :meth:`report`.
+        """
+        report, recordings = self.report(), summary.per_recording(self.folder)
+        skipped = [f"left out: {name}: {problem}" for name, problem in report.get("skipped", {}).items()]
+        return [*summary.by_split(report), *(["", *recordings] if recordings else []), *skipped]
 
     def open(self, split: str) -> SceneDataset:
         """The scenes of a split; those of validation and test splits have a subset, calm or interactive.

@@ -1,6 +1,6 @@
 """Report about a generated data set: sizes, modes over time, convergence of the solver, and simple baselines.
 
-All numbers are stored in the manifest; :func:`markdown` formats them as tables.
+All numbers are stored in the manifest of the data set.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.rpi.game import DISC_RADIUS, Array, GameConstants, generator
 from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, Records
 
@@ -200,53 +201,16 @@ def _nearest(splits: Mapping[str, Records]) -> dict[str, Any]:
     }
 
 
-def markdown(report: Mapping[str, Any]) -> str:
-    """The report as Markdown tables."""
-    lines = ["| split | records | samples | main games | w |", "|---|---|---|---|---|"]
-    for part, size in report["sizes"].items():
-        weights = report["weights"][part]
-        lines.append(
-            f"| {part} | {size['records']} | {size['samples']} | {size['games']} "
-            f"| {weights[0]:.1f} .. {weights[-1]:.1f} |"
-        )
-    lines += ["", "| records with two modes | share |", "|---|---|"]
-    lines += [f"| {name} | {share:.3f} |" for name, share in report["two_modes"].items()]
-    lines += ["", "| solver | |", "|---|---|"]
-    lines += [f"| {name.replace('_', ' ')} | {_show(value)} |" for name, value in report["solver"].items()]
-    nash, motion, baselines = report["nash"], report["motion"], report["baselines"]
-    lines += ["", "| quantity | " + " | ".join(f"quantile {q}" for q in ("0", "0.5", "0.9", "0.99", "1")) + " |"]
-    lines += ["|---|---|---|---|---|---|"]
-    for name, values in (
-        ("unilateral gradient, executed", nash["executed"]["gradient_max"]),
-        ("unilateral gradient, alternative", nash["alternative"]["gradient_max"]),
-        ("best-response gain, executed", nash["executed"]["gain"]),
-        ("best-response gain, alternative", nash["alternative"]["gain"]),
-        ("smallest distance, executed [m]", motion["distance_executed"]),
-        ("smallest distance, alternative [m]", motion["distance_alternative"]),
-        ("SADE between the modes [m]", motion["sade_between_modes"]),
-        ("test to nearest training record, RMS per step [m]", baselines["nearest_neighbour"]["rms_distance_per_step"]),
-    ):
-        lines.append(f"| {name} | " + " | ".join(_show(value) for value in values.values()) + " |")
-    lines += ["", "| quantity | |", "|---|---|"]
-    for name, value in (
-        (f"share of executed modes with a gain above {GAIN:g}", nash["executed"]["gain_share"]),
-        (f"share of alternative modes with a gain above {GAIN:g}", nash["alternative"]["gain_share"]),
-        ("cost of alternative / executed, median", nash["cost_ratio"].get("0.5")),
-        ("largest difference from the rest of the previous mode (Bellman)", nash["bellman"]["max"]),
-        ("records in which the discs overlap", motion["disc_overlaps"]),
-        ("Euler residual", motion["euler_residual"]),
-        ("acceleration, 99% [m/s^2]", motion["acceleration_99"]),
-        ("jerk, 99% [m/s^3]", motion["jerk_99"]),
-    ):
-        lines.append(f"| {name} | {_show(value)} |")
-    lines += ["", "| test | ADE executed | FDE executed | ADE alternative | FDE alternative |", "|---|---|---|---|---|"]
-    for name in ("constant_velocity", "nearest_neighbour"):
-        rows = [baselines[name][subset].get(key) for subset in ("executed", "alternative") for key in ("ade", "fde")]
-        lines.append(f"| {name.replace('_', ' ')} | " + " | ".join(_show(value) for value in rows) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _show(value: Any) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+def summary(report: Mapping[str, Any]) -> list[str]:
+    """Lines of the most important numbers of a report: sizes of the splits, dropped games, and records with two modes."""
+    lines = [f"  {'':<8}{'records':>10}{'scenes':>10}{'games':>8}   w"]
+    for split in SPLITS:
+        size, weights = report["sizes"][split], report["weights"][split]
+        counts = f"{size['records']:>10}{size['samples']:>10}{size['games']:>8}"
+        lines.append(f"  {split:<8}{counts}   {weights[0]:.0f} to {weights[-1]:.0f}")
+    solver = report["solver"]
+    return [
+        *lines,
+        f"  both sides are equilibria in {report['two_modes']['all']:.0%} of the records, which are two scenes each",
+        f"  {solver['sub_games_dropped']} of {solver['sub_games']} games had no equilibrium that was kept",
+    ]

@@ -218,6 +218,16 @@ class RPIData(SceneDataModule):
         """
         return cache.manifest(self.folder, self.command, self.config)["report"]
 
+    def summary(self) -> list[str]:
+        """Lines on what was made, for the terminal.
+
+        Raises:
+            cache.CacheError: as :meth:`report`.
+        """
+        from epo_lightning.data.rpi.report import summary
+
+        return [*summary(self.report()), f"  all statistics: {self.folder / cache.MANIFEST}"]
+
     def open(self, split: str) -> RPIDataset:
         """The scenes of a split.
 

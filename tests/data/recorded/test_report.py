@@ -83,7 +83,7 @@ def test_a_broken_recording_is_left_out_named_and_never_taken_for_the_whole_fold
     report = module.report()
     assert "the turn is 'broken'; a number was expected" in report["skipped"]["b-4"]
     assert rows(made)["b-4"]["split"] == "left out"
-    assert any("not read: " in line and "b-4" in line for line in module.per_recording())
+    assert any("not read: " in line and "b-4" in line for line in module.summary())
     # Neither the whole folder nor the folder without that file is the same data set.
     (folder / "b-4.road").unlink()
     fewer = data(folder)
@@ -189,7 +189,7 @@ def test_every_recording_has_a_row_whose_windows_add_up(folder):
     for split in ("train", "val", "test"):
         for name in summary.COUNTED:
             assert report[split].get(name, 0) == sum(int(r[name]) for r in found.values() if r["split"] == split)
-    table = module.per_recording()
+    table = summary.per_recording(module.folder)
     assert len(table) == 1 + 9 + 1
     assert any("b-3" in line and "too few agents around: " in line for line in table)
     lines = summary.by_split(report)
