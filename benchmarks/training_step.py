@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from benchmarks.devices import device_name, require
 from benchmarks.measure import positive
 from epo_lightning.experiment import assembly, step_graph
-from epo_lightning.experiment.config.compose import compose
+from epo_lightning.experiment.config.compose import OF_GAMES, compose
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.forecasters import Forecaster
@@ -148,12 +148,13 @@ class Prepared(NamedTuple):
 
 
 def prepare(experiment: str, overrides: Sequence[str], device: torch.device) -> Prepared:
-    """The forecaster of an experiment on a device, in training mode.
+    """The forecaster of an experiment on a device, in training mode; overrides of games are left out for rows without one.
 
     Raises:
         ConfigError: overrides that cannot work.
     """
-    settings = read(Settings, compose("train", [f"experiment=rpi/{experiment}", *overrides]))
+    words = [word for word in overrides if "epo" in experiment or not word.startswith(OF_GAMES)]
+    settings = read(Settings, compose("train", [f"experiment=rpi/{experiment}", *words]))
     data = assembly.build_data(settings.data)
     model = assembly.build_model(settings, data)
     assert isinstance(model, Forecaster)

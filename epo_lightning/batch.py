@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -52,6 +52,16 @@ class Batch:
 
         self.map(collect)
         return found
+
+    @classmethod
+    def concatenated(cls: type[Some], parts: Sequence[Some], dim: int = 0) -> Some:
+        """Batches that have the same fields as one batch: their tensors one after the other along a dimension.
+
+        Raises:
+            ValueError: some have tensors that others lack.
+        """
+        together = zip(*(part.tensors() for part in parts), strict=True)
+        return parts[0].map(lambda _: torch.cat(next(together), dim))
 
     def to(self: Some, target: torch.device | torch.dtype | str) -> Some:
         """A copy on another device, or with its floating-point tensors in another precision."""

@@ -22,6 +22,7 @@ def doubts(scene: Scene) -> list[str]:
             "[m], heading [rad], speed [m/s], oldest first, dt seconds apart"
         )
     if scene.goal_headings is not None:
+        assert scene.goal_mask is not None
         turn = (scene.goal_headings - scene.current[..., None, HEADING]).abs()
         if rows := _scenes((turn > math.pi + 1e-3) & scene.goal_mask & scene.agent_mask[..., None]):
             found.append(

@@ -148,6 +148,18 @@ class Solution(Batch):
     assignment: Int[Tensor, "B M N"] | None = None
     constraints: Constraints | None = None
 
+    def continued_by(self, last: Solution) -> Solution:
+        """This solution after further steps, which begin at its controls and end at ``last``.
+
+        A problem that was STOPPED before and moved in these steps is DAMPED.
+        """
+        return dataclasses.replace(
+            last,
+            initial_energy=self.initial_energy,
+            status=torch.maximum(self.status.clamp_max(Status.DAMPED), last.status),
+            iterates=(*self.iterates, *last.iterates[1:]) if self.iterates and last.iterates else None,
+        )
+
 
 @dataclass(frozen=True, repr=False)
 class Equilibrium(Batch):

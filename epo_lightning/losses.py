@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -101,21 +102,49 @@ def _rounded(distance: Tensor, temperature: float) -> Tensor:
     return torch.where(known, distance * (ratio / (stretched + 1.0)), distance)
 
 
-def checked_power(power: float, annealing: Annealing) -> float:
-    """The exponent of :func:`distances`, for a loss with this annealing.
+class Softness(NamedTuple):
+    """What an imitation loss is at an optimisation step; the defaults are the paper's loss.
+
+    Attributes:
+        power: exponent of :func:`distances`.
+        relaxation: share of the mean over modes (:class:`Relaxation`).
+        temperature: temperature [m] of the soft minimum (:class:`Annealing`); 0 for the minimum.
+    """
+
+    power: float = 1.0
+    relaxation: float = 0.0
+    temperature: float = 0.0
+
+
+@dataclass(frozen=True)
+class ImitationSchedule:
+    """How an imitation loss changes during training.
+
+    Attributes:
+        power: exponent of :func:`distances`.
+        relaxation, annealing: schedules of the share of the mean, and of the temperature.
 
     Raises:
         ValueError: a power below 1, whose gradient has no bound near a distance of zero, or an infinite one; or a power
             other than 1 with annealing, whose temperature is a distance in metres.
     """
-    if not 1 <= power < math.inf:
-        raise ValueError(f"power must be 1 or more, and finite, not {power}")
-    if power != 1 and annealing.temperature > 0:
-        raise ValueError(
-            f"annealing={annealing.temperature:g} and power={power:g} exclude each other: the temperature is a "
-            "distance [m], and errors to a power have another unit; choose one of both"
-        )
-    return power
+
+    power: float
+    relaxation: Relaxation
+    annealing: Annealing
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.power < math.inf:
+            raise ValueError(f"power must be 1 or more, and finite, not {self.power}")
+        if self.power != 1 and self.annealing.temperature > 0:
+            raise ValueError(
+                f"annealing={self.annealing.temperature:g} and power={self.power:g} exclude each other: the temperature is "
+                "a distance [m], and errors to a power have another unit; choose one of both"
+            )
+
+    def at(self, step: int) -> Softness:
+        """The loss at an optimisation step."""
+        return Softness(self.power, self.relaxation.at(step), self.annealing.at(step))
 
 
 def distances(

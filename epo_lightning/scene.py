@@ -219,6 +219,11 @@ class Scene(Batch):
         return self.history[:, :, -1]
 
     @property
+    def current_or_zero(self) -> Float[Tensor, "B N 4"]:
+        """The states at t0; zero for absent agents, whose entries are padding of any value."""
+        return self.current.where(self.agent_mask[..., None], 0.0)
+
+    @property
     def finite(self) -> Bool[Tensor, " B"]:
         """Mask of the scenes whose real entries are all finite; padding is not checked."""
         result = torch.ones(len(self.history), dtype=torch.bool, device=self.history.device)

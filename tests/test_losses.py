@@ -146,10 +146,11 @@ def test_a_very_distant_mode_changes_no_soft_minimum(far):
 
 
 def test_a_power_other_than_one_and_a_temperature_in_metres_exclude_each_other():
-    assert losses.checked_power(1.0, losses.Annealing(0.3)) == 1.0
-    assert losses.checked_power(2.0, losses.Annealing()) == 2.0
+    never = losses.Relaxation()
+    assert losses.ImitationSchedule(1.0, never, losses.Annealing(0.3)).at(0) == (1.0, 0.0, 0.3)
+    assert losses.ImitationSchedule(2.0, never, losses.Annealing()).at(0) == (2.0, 0.0, 0.0)
     with pytest.raises(ValueError, match=r"annealing=0.3 and power=1.05 exclude each other"):
-        losses.checked_power(1.05, losses.Annealing(0.3))
+        losses.ImitationSchedule(1.05, never, losses.Annealing(0.3))
 
 
 def test_modes_at_an_infinite_distance_do_not_count():

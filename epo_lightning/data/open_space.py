@@ -48,7 +48,7 @@ def in_open_space(scene: Scene) -> Scene:
     if scene.future is None:
         raise ValueError("goal candidates reach as far as scene.future [B, N, K, 4], which is None")
     batch, agents = scene.agent_mask.shape
-    current = scene.current.where(scene.agent_mask[..., None], 0.0)
+    current = scene.current_or_zero
     limit = torch.full_like(current[..., SPEED], ACCELERATING)
     if scene.kind is not None:
         limit = limit.masked_fill(scene.kind == KINDS.index("pedestrian"), ON_FOOT)

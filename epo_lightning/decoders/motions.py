@@ -60,7 +60,7 @@ class Motions(nn.Module):
 
     def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B C N K 2"]:
         """Controls of all candidates: acceleration [m/s^2] and turn rate [rad/s]; ``z`` is not read."""
-        return self.controls(scene.current.where(scene.agent_mask[..., None], 0.0), scene.dt)
+        return self.controls(scene.current_or_zero, scene.dt)
 
     def controls(self, current: Float[Tensor, "B N 4"], dt: float) -> Float[Tensor, "B C N K 2"]:
         """Controls of all candidates, for each agent independently of the others.

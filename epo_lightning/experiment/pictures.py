@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -97,12 +96,7 @@ def gather(loader: Iterable[Scene]) -> Scene:
     batches = list(loader)
     if not batches:
         raise ConfigError("the split is empty: there is nothing to forecast")
-
-    def join(name: str) -> Any:
-        values = [getattr(batch, name) for batch in batches]
-        return torch.cat(values) if isinstance(values[0], Tensor) else values[0]
-
-    return Scene(**{entry.name: join(entry.name) for entry in dataclasses.fields(Scene)})
+    return Scene.concatenated(batches)
 
 
 def even(total: int, count: int | None) -> Tensor:
@@ -142,19 +136,4 @@ def pairs(scenes: Scene, count: int) -> tuple[Tensor, Tensor | None]:
 def forecast_of(forecaster: Any, scenes: Scene, batch_size: int = 256) -> JointForecast:
     """The forecasts of many scenes, batch by batch."""
     parts = [forecaster.predict(scenes[slice(i, i + batch_size)]) for i in range(0, len(scenes.history), batch_size)]
-    return _join(parts)
-
-
-def _join(parts: list[Any]) -> Any:
-    """Concatenate equal structures of tensors along their first dimension."""
-    first = parts[0]
-    if isinstance(first, Tensor):
-        return torch.cat(parts)
-    if isinstance(first, Mapping):
-        return {key: _join([part[key] for part in parts]) for key in first}
-    if isinstance(first, tuple):
-        return tuple(_join(list(entries)) for entries in zip(*parts, strict=True))
-    if dataclasses.is_dataclass(first) and not isinstance(first, type):
-        names = [entry.name for entry in dataclasses.fields(first)]
-        return type(first)(**{name: _join([getattr(part, name) for part in parts]) for name in names})
-    return first
+    return JointForecast.concatenated(parts)

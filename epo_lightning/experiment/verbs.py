@@ -147,7 +147,7 @@ def _print_trained(run: RunFolder) -> float | None:
     asked = measures(run.config().get("score")) or ("test",)
     for which in ("test", "val"):
         if which in asked and run.metrics_file(which).is_file():
-            print(f"  {which}: {_headline(read_json(run.metrics_file(which))['metrics'])}")
+            print(f"  {which}: {_headline(read_json(run.metrics_file(which)).get('metrics', {}))}")
     scored = all(run.metrics_file(which).is_file() for which in asked)
     print(f"run folder: {run.path}\nnext: epo {f'report runs={run.path}' if scored else f'evaluate run={run.path}'}")
     return best[1] if best else None

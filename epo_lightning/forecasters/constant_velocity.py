@@ -26,7 +26,7 @@ class ConstantVelocity(Forecaster):
         batch, agents = scene.agent_mask.shape
         controls = scene.history.new_zeros(batch, 1, agents, self.task.horizon, 2)
         return JointForecast(
-            states=self.dynamics.rollout(scene.current[:, None], controls, scene.dt),
+            states=self.dynamics.rollout(scene.current_or_zero[:, None], controls, scene.dt),
             probabilities=scene.history.new_ones(batch, 1),
             controls=controls,
         )

@@ -333,7 +333,7 @@ class EPO(Forecaster):
             choices = orders.order if goals.chosen is None else torch.cat((orders.order.long(), goals.chosen), -1)
             return _without_repeats(orders.log_probability + goals.log_probability, choices)
         assert self.probabilities is not None
-        current = scene.current.where(scene.agent_mask[..., None], 0.0)
+        current = scene.current_or_zero
         positions = solution.states[..., : self.task.horizon, :2]
         return self.probabilities(z, positions, current, scene.agent_mask)
 

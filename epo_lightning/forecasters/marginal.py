@@ -51,13 +51,13 @@ class Marginal(Forecaster):
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
-        self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
-        self.annealing = losses.Annealing(annealing, annealing_steps)
-        self.power = losses.checked_power(power, self.annealing)
+        self.schedule = losses.ImitationSchedule(
+            power, losses.Relaxation(relaxation, relaxation_steps), losses.Annealing(annealing, annealing_steps)
+        )
         self.decoder = Trajectories(backbone.width, modes, task.horizon, task.scale)
 
     def forward(self, scene: Scene) -> JointForecast:
-        current = scene.current.where(scene.agent_mask[..., None], 0.0)
+        current = scene.current_or_zero
         positions, probabilities, logits = self.decoder(self.backbone(scene), current[..., :2])
         states = with_motion(positions, current[:, None].expand(*positions.shape[:3], 4), scene.dt)
         states, probabilities, logits = marginal_to_joint(states, probabilities, logits)
@@ -74,9 +74,9 @@ class Marginal(Forecaster):
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         future, mask = observed_future(scene)
-        distance = losses.distances(forecast.states[..., :2], future, mask, self.power)
-        step = self.global_step
-        imitation, mode = losses.marginal_imitation(distance, mask, self.relaxation.at(step), self.annealing.at(step))
+        power, relaxation, temperature = self.schedule.at(self.global_step)
+        distance = losses.distances(forecast.states[..., :2], future, mask, power)
+        imitation, mode = losses.marginal_imitation(distance, mask, relaxation, temperature)
         assert forecast.agent_log_probabilities is not None
         probability = losses.marginal_probability(forecast.agent_log_probabilities, mode, mask)
         return {

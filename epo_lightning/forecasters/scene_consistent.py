@@ -57,20 +57,19 @@ class SceneConsistent(Forecaster):
         self.backbone = backbone
         self.dynamics = dynamics
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
-        self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
-        self.annealing = losses.Annealing(annealing, annealing_steps)
-        self.power = losses.checked_power(power, self.annealing)
+        self.schedule = losses.ImitationSchedule(
+            power, losses.Relaxation(relaxation, relaxation_steps), losses.Annealing(annealing, annealing_steps)
+        )
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
         self.probabilities = PROBABILITIES[probabilities](backbone.width, modes, task.horizon, task.scale)
 
     def forward(self, scene: Scene) -> JointForecast:
         z = self.backbone(scene)
         controls = self.strategies(z, scene)
-        current = scene.current.where(scene.agent_mask[..., None], 0.0)
+        current = scene.current_or_zero
         states = self.dynamics.rollout(current[:, None], controls, scene.dt)
         logits = self.probabilities(z, states[..., :2], current, scene.agent_mask)
         return JointForecast(states, logits.softmax(1), controls=controls, logits=logits)
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
-        how = self.relaxation.at(self.global_step), self.power, self.annealing.at(self.global_step)
-        return imitation_terms(scene, forecast, self.loss_weights, *how)
+        return imitation_terms(scene, forecast, self.loss_weights, self.schedule.at(self.global_step))

@@ -68,18 +68,15 @@ def at_end(values: Float[Tensor, "*lead B C N K X"], ends: Int[Tensor, " B"] | N
     ]
 
 
-def until(
-    function: Callable[..., Tensor], ends: Int[Tensor, " E"] | None, varying: int = 2
-) -> Callable[..., Float[Tensor, "E *rest R"]]:
+def until(function: Callable[..., Tensor], ends: Int[Tensor, " E"] | None) -> Callable[..., Float[Tensor, "E *rest R"]]:
     """A function of trajectories, evaluated in every game on the steps up to its end only.
 
     Residuals of short games are followed by zeros, because a batch has the number R of residuals of its longest game. Games
     of equal length are evaluated together. The host waits for the lengths.
 
     Args:
-        function: function of ``varying`` tensors [E, .., K, X], and of further tensors [E, ..], to residuals [E, .., R].
+        function: function of two tensors of steps [E, .., K, X], and of further tensors [E, ..], to residuals [E, .., R].
         ends: number of steps of the game in each of the E rows; None for all steps.
-        varying: number of tensors with a dimension of steps.
     """
     if ends is None:
         return function
@@ -89,7 +86,7 @@ def until(
         for length in ends.unique().tolist():
             row = (ends == length).nonzero()[:, 0]
             some = [tensor.index_select(0, row) if len(tensor) == len(ends) else tensor for tensor in given]
-            some[:varying] = [tensor[..., :length, :] for tensor in some[:varying]]
+            some[:2] = [tensor[..., :length, :] for tensor in some[:2]]
             if length:
                 parts.append(function(*some))
                 rows.append(row)

@@ -28,9 +28,9 @@ class Imitation(Objective):
             solution (``truncated``, ``implicit``). If games go on after the forecast, it also compares the initial controls
             after the forecast with those of the solution, because there are no data for them. If orders of agents are
             decoded, ``probability`` is their cross entropy.
-        power: exponent of the distances (:func:`~epo_lightning.losses.distances`).
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
+        power: exponent of the distances (:func:`~epo_lightning.losses.distances`).
     """
 
     term_names = ("imitation", "goal", "probability", "initial")
@@ -47,13 +47,13 @@ class Imitation(Objective):
         annealing_steps: int = 2000,
     ) -> None:
         self.weights = checked_weights(weights, self.term_names)
-        self.relaxation = losses.Relaxation(relaxation, relaxation_steps)
-        self.annealing = losses.Annealing(annealing, annealing_steps)
-        self.power = losses.checked_power(power, self.annealing)
+        self.schedule = losses.ImitationSchedule(
+            power, losses.Relaxation(relaxation, relaxation_steps), losses.Annealing(annealing, annealing_steps)
+        )
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
-        how = self.relaxation.at(step), self.power, self.annealing.at(step)
-        terms = imitation_terms(scene, forecast, self.weights, *how)
+        softness = self.schedule.at(step)
+        terms = imitation_terms(scene, forecast, self.weights, softness)
         if forecast.order_logits is not None and energy.pair_order is not None:
             entropy = order_loss(forecast.order_logits, *energy.pair_order.observed(scene))
             terms["probability"] = (self.weights["probability"], entropy)
@@ -61,7 +61,7 @@ class Imitation(Objective):
         # EPO leaves them out, or detaches them, if the solution already teaches the strategies.
         if starts is not None and starts.requires_grad:
             initial = dataclasses.replace(forecast, states=starts)
-            closest = imitation_terms(scene, initial, self.weights, *how)["imitation"][1]
+            closest = imitation_terms(scene, initial, self.weights, softness)["imitation"][1]
             terms["initial"] = (self.weights["initial"], closest + _difference_ahead(scene, forecast))
         return terms | goal_term(scene, forecast, self.weights["goal"])
 

@@ -38,22 +38,18 @@ def imitation_terms(
     scene: Scene,
     forecast: JointForecast,
     weights: Mapping[str, float],
-    relaxation: float,
-    power: float = 1.0,
-    temperature: float = 0.0,
+    softness: losses.Softness,
 ) -> Terms:
-    """Distance of the closest joint future, and the cross entropy of its probability.
+    """Distance of the closest joint future, and the cross entropy of its probability, which is always that of the closest.
 
     Args:
         scene: the scene with its future.
         forecast: the forecast.
         weights: lambda of ``imitation`` and ``probability``.
-        relaxation, temperature: see :func:`~epo_lightning.losses.scene_imitation`. The probability is always that of the
-            closest mode.
-        power: exponent of the distances.
+        softness: power of the distances, relaxation and temperature.
     """
     future, mask = observed_future(scene)
-    distance = losses.distances(forecast.states[..., :2], future, mask, power)
-    imitation, mode = losses.scene_imitation(distance, mask, relaxation, temperature)
+    distance = losses.distances(forecast.states[..., :2], future, mask, softness.power)
+    imitation, mode = losses.scene_imitation(distance, mask, softness.relaxation, softness.temperature)
     probability = losses.scene_probability(forecast.log_probabilities, mode, mask)
     return {"imitation": (weights["imitation"], imitation), "probability": (weights["probability"], probability)}

@@ -21,8 +21,10 @@ from epo_lightning.report.runs import EvaluatedRun
 CONDITIONS = ("data", "trainer", "callbacks")
 """Sections of the configuration that must be equal for the learned rows of a table; the others are compared by it."""
 
+SIDES = ("executed/missed", "alternative/missed")
+"""Scores of RPI: shares of the scenes in which no mode is near the future on one side."""
 MANY_MISSED = 0.2
-"""Share of a subset's missed scenes above which a row has a note: rows whose modes are all taught have less than a tenth."""
+"""Share above which a row has a note. Rows whose modes are all taught have less than a tenth."""
 
 
 @dataclass(frozen=True)
@@ -121,19 +123,18 @@ class Row:
 
     @property
     def untaught(self) -> str:
-        """A note on trained runs whose modes miss one of the futures in many scenes; empty if there are none."""
+        """A note on trained runs of RPI whose modes miss one of the sides in many scenes; empty if there are none."""
         seeds = [
             str(run.seed)
             for run in self.runs
-            if run.parameters != 0
-            and max((run.metrics[name] for name in run.metrics if name.endswith("/missed")), default=0.0) > MANY_MISSED
+            if run.parameters != 0 and any(run.metrics.get(name, 0.0) > MANY_MISSED for name in SIDES)
         ]
         if not seeds:
             return ""
         return (
-            f"{self.name} ({self.runs[0].data}): no mode is near one of the futures in more than a fifth of its scenes "
-            f"(score `missed`; seeds {', '.join(seeds)} of {len(self.runs)} runs). A mode may be untaught, and then errors "
-            "say little about the method: docs/concepts.md, Modes, has a remedy"
+            f"{self.name} ({self.runs[0].data}): in {len(seeds)} of {len(self.runs)} runs (seed {', '.join(seeds)}) no mode "
+            "is near the future on one of the sides in more than a fifth of the scenes (score `missed`). A mode may be "
+            "untaught, and then errors say little about the method; docs/concepts.md, Modes, has a remedy"
         )
 
     @property

@@ -21,7 +21,7 @@ from typing import ClassVar
 import torch
 
 from epo_lightning.checks import check_whole
-from epo_lightning.forecast import GameParameters, Solution, Status
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
@@ -94,13 +94,7 @@ class Truncated(Backward):
             first, memory = minimiser.run(energy, scene, parameters, minimiser.steps - taught)
         onward = dataclasses.replace(parameters, initial_controls=first.controls)
         last, _ = minimiser.run(energy, scene, onward, taught, memory)
-        return dataclasses.replace(
-            last,
-            initial_energy=first.initial_energy,
-            # A problem that was STOPPED at first but moved later is reported as DAMPED.
-            status=torch.maximum(first.status.clamp_max(Status.DAMPED), last.status),
-            iterates=(*first.iterates, *last.iterates[1:]) if first.iterates and last.iterates else None,
-        )
+        return first.continued_by(last)
 
 
 @register("backward", "implicit")

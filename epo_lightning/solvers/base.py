@@ -31,14 +31,16 @@ class Minimiser(ABC):
 
     Attributes:
         needs_from_energy: properties that the energy must offer (:mod:`epo_lightning.game.energy`).
-        provides: properties of the solution, of :data:`PATH`, :data:`STEPS`, :data:`STATIONARY`, :data:`SAMPLES`,
-            :data:`TABLES`.
         on_host: whether games on a GPU are always copied to the CPU and solved there.
     """
 
     needs_from_energy: ClassVar[frozenset[str]] = frozenset()
-    provides: ClassVar[frozenset[str]] = frozenset()
     on_host: ClassVar[bool] = False
+
+    @property
+    def provides(self) -> frozenset[str]:
+        """Properties of the solution: :data:`PATH`, :data:`STEPS`, :data:`STATIONARY`, :data:`SAMPLES`, :data:`TABLES`."""
+        return frozenset()
 
     @abstractmethod
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:

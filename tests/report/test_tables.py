@@ -542,3 +542,16 @@ def test_a_test_split_beside_a_drawn_one_is_no_cross_validation(tmp_path: Path) 
     tables = build_tables(collect(tmp_path))
     assert {table.data for table in tables} == {"s", "s, test a"}
     assert not over_folds(tables)
+
+
+def test_runs_whose_modes_miss_a_side_are_named(tmp_path: Path) -> None:
+    for seed, share in enumerate((0.45, 0.05, 0.6)):
+        metrics = {**scores(0.1), "executed/missed": 0.0, "alternative/missed": share}
+        make_run(tmp_path / f"one-{seed}", "V-LSTM + EPO", "epo", metrics, seed=seed)
+        taught = {**metrics, "alternative/missed": 0.1}
+        make_run(tmp_path / f"other-{seed}", "V-LSTM + SC", "scene_consistent", taught, seed=seed)
+        elsewhere = {**scores(0.1), "interactive/missed": 0.9}
+        make_run(tmp_path / f"road-{seed}", "VIBES", "epo", elsewhere, seed=seed)
+    rows = rows_of(tmp_path)
+    assert rows["V-LSTM + EPO"].untaught.startswith("V-LSTM + EPO (rpi): in 2 of 3 runs (seed 0, 2) no mode is near")
+    assert rows["V-LSTM + SC"].untaught == rows["VIBES"].untaught == ""

@@ -15,7 +15,7 @@ from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, epoch_generator
 from epo_lightning.data.rpi.game import RECIPE, GameConstants
-from epo_lightning.data.rpi.splits import RULES
+from epo_lightning.data.rpi.splits import PAPER_SIZES, RULES
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import Scene
 from epo_lightning.task import Task
@@ -122,7 +122,7 @@ class RPIData(SceneDataModule):
         placements: int = 39,
         solver: str = "potential",
         split: str = "paper",
-        sizes: Sequence[int] | None = (47822, 6228, 6228),
+        sizes: Sequence[int] | None = PAPER_SIZES,
         targets: str = "both",
         batch_size: int = 32,
         share: float = 1.0,
@@ -187,7 +187,7 @@ class RPIData(SceneDataModule):
         words = [
             f"data.{name}={getattr(self, name)}" for name, value in defaults.items() if getattr(self, name) != value
         ]
-        if self.sizes != [47822, 6228, 6228]:
+        if self.sizes != list(PAPER_SIZES):
             words.append("data.sizes=" + ("null" if self.sizes is None else "[" + ",".join(map(str, self.sizes)) + "]"))
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")

@@ -43,7 +43,7 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
     except (HydraException, OmegaConfBaseException) as error:
         repeated = re.search(r"Multiple values for ([\w./@]+)\. .*'override [\w./@]+: (\S+)'", str(error))
         if repeated:
-            raise ConfigError(_override(*repeated.groups(), overrides)) from error
+            raise ConfigError(_override(repeated.group(1), repeated.group(2), overrides)) from error
         unknown = re.search(r"Could not (?:override|delete from config\.) +'([\w./@]+)'", str(error))
         if unknown and (relative := re.fullmatch(r"experiment/(?:[\w-]+/)*([\w-]+)@[\w.-]+", unknown.group(1))):
             raise ConfigError(_override(relative.group(1), "<option>", overrides)) from error

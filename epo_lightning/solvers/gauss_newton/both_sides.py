@@ -120,21 +120,9 @@ class BothSides(Minimiser):
         first, alone = found.controls.chunk(2, 1)
         gamma = first.new_tensor(self.reflections)[:, None, None, None]
         others = descend(energy, scene, dataclasses.replace(game, initial_controls=alone - gamma * (first - alone)))
-        solution = _chosen(_joined(found.map(lambda tensor: tensor[:, :1]), others), self.modes)
+        solution = _chosen(Solution.concatenated([found.map(lambda tensor: tensor[:, :1]), others], 1), self.modes)
         initial = found.initial_energy[:, :1].expand_as(solution.energy)
         return dataclasses.replace(solution, initial_energy=initial)
-
-
-def _joined(first: Solution, second: Solution) -> Solution:
-    """The modes of both solutions."""
-    return Solution(
-        controls=torch.cat((first.controls, second.controls), 1),
-        states=torch.cat((first.states, second.states), 1),
-        initial_energy=torch.cat((first.initial_energy, second.initial_energy), 1),
-        energy=torch.cat((first.energy, second.energy), 1),
-        gradient_norm=torch.cat((first.gradient_norm, second.gradient_norm), 1),
-        status=torch.cat((first.status, second.status), 1),
-    )
 
 
 def _chosen(found: Solution, modes: int) -> Solution:

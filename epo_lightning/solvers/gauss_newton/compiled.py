@@ -81,9 +81,8 @@ def solve(
 ) -> Solution:
     """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
 
-    The solution is differentiable with respect to weights, margins, goals, their headings, reference controls
-    and initial controls. Problems
-    are shared out among ``threads`` threads, by default ``torch.get_num_threads()``; results do not depend on their number.
+    The solution is differentiable with respect to weights, margins, targets and initial controls. Problems are shared out
+    among ``threads`` threads, by default ``torch.get_num_threads()``; results do not depend on their number.
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact, threads=threads)
     return take_steps(call, parameters.initial_controls)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole, is_number
-from epo_lightning.forecast import GameParameters, Solution, Status
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
@@ -146,13 +146,7 @@ class LevenbergMarquardt(Stepwise):
         first, damping = self.run(energy, scene, parameters, self.steps)
         onward = dataclasses.replace(parameters, initial_controls=first.controls)
         last, _ = self.run(energy, scene, onward, self.newton_steps, damping, exact=True)
-        iterates = (*first.iterates, *last.iterates[1:]) if first.iterates and last.iterates else None
-        return dataclasses.replace(
-            last,
-            initial_energy=first.initial_energy,
-            status=torch.maximum(first.status.clamp_max(Status.DAMPED), last.status),
-            iterates=iterates,
-        )
+        return first.continued_by(last)
 
     def run(
         self,

@@ -48,9 +48,9 @@ def normal_equations(
     """The gradient J^T r and the upper half of H = J^T J + eps I, in double precision.
 
     Both are differentiable with respect to the parameters. Absent agents, and controls after the end of a game, have rows of
-    the unit matrix. For lines, the exact
-    derivative is used (``slide`` of :func:`~epo_lightning.game.feature_derivatives.signal_and_change`), so that motion along
-    a line has no cost. (Solvers hold the nearest point fixed, which changes no solution but would change a density.)
+    the unit matrix. For lines, the exact derivative is used (``slide`` of
+    :func:`~epo_lightning.game.feature_derivatives.signal_and_change`), so that motion along a line has no cost. (Solvers
+    hold the nearest point fixed, which changes no solution but would change a density.)
 
     Args:
         energy, scene, parameters, controls: the game, and where to expand it.
