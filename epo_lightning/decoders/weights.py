@@ -61,33 +61,43 @@ class SharedWeights(nn.Module):
         games: number M of games: one per joint mode, or a single one.
         features: names of the features.
         start: weights before training, as for :class:`OwnWeights`. The weight is start * exp(learned number).
-        of_pairs: whether the features are those of the P pairs instead of the N agents.
     """
 
     start: Tensor
 
-    def __init__(
-        self, games: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0, of_pairs: bool = False
-    ) -> None:
+    def __init__(self, games: int, features: Sequence[str], start: float | Mapping[str, float] = 1.0) -> None:
         super().__init__()
-        self.games, self.features, self.of_pairs = games, tuple(features), of_pairs
+        self.games, self.features = games, tuple(features)
         self.register_buffer("start", torch.tensor(_starts(features, start)), persistent=False)
         self.logarithms = nn.Parameter(torch.zeros(len(self.features)))
 
-    def forward(
-        self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B R"] | None = None
-    ) -> dict[str, Float[Tensor, "B M R"]]:
-        """Weights by feature name, of R = N agents or R = P pairs; ``z`` does not change them.
-
-        Weights of pairs outside of the mask are zero; weights of agents do not depend on it.
-        """
+    def of_rows(self, batch: int, rows: int) -> dict[str, Float[Tensor, "B M R"]]:
+        """Weights by feature name, for R agents or pairs in each of B scenes."""
         weights = (self.start * self.logarithms.exp()).unbind()
+        shape = batch, self.games, rows
+        return {name: weight.expand(shape) for name, weight in zip(self.features, weights, strict=True)}
+
+
+class SharedOwnWeights(SharedWeights):
+    """Shared weights in the place of :class:`OwnWeights`."""
+
+    def forward(self, z: Float[Tensor, "B N D"], mask: Bool[Tensor, "B N"]) -> dict[str, Float[Tensor, "B M N"]]:
+        """Weights by feature name; only the sizes of ``mask`` are read."""
+        return self.of_rows(*mask.shape)
+
+
+class SharedPairWeights(SharedWeights):
+    """Shared weights in the place of :class:`PairWeights`."""
+
+    def forward(
+        self, z: Float[Tensor, "B N D"], chosen: Bool[Tensor, "B P"] | None = None
+    ) -> dict[str, Float[Tensor, "B M P"]]:
+        """Weights by feature name; zero for pairs that are not ``chosen``. Only the sizes of ``z`` are read."""
         agents = z.shape[1]
-        shape = z.shape[0], self.games, agents * (agents - 1) // 2 if self.of_pairs else agents
-        found = {name: weight.expand(shape) for name, weight in zip(self.features, weights, strict=True)}
-        if mask is None or not self.of_pairs:
-            return found
-        return {name: torch.where(mask[:, None], weight, 0.0) for name, weight in found.items()}
+        weights = self.of_rows(len(z), agents * (agents - 1) // 2)
+        if chosen is None:
+            return weights
+        return {name: torch.where(chosen[:, None], weight, 0.0) for name, weight in weights.items()}
 
 
 class PairWeights(nn.Module):

@@ -21,7 +21,7 @@ from epo_lightning.decoders.motions import Motions
 from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
 from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.strategies import InitialStrategies, ZeroStrategies
-from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, SharedWeights
+from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, SharedOwnWeights, SharedPairWeights
 from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.calibration import Calibration
@@ -164,14 +164,14 @@ class EPO(Forecaster):
         start = check_start(own_start, own_names, energy.own)
         ranges = {} if motions is None and initial != "motions" else check_motions(motions)
         # Do not change the order: every module draws its initial weights from the same sequence of random numbers.
-        self.own_weights: OwnWeights | SharedWeights
+        self.own_weights: OwnWeights | SharedOwnWeights
         if own_weights == "shared":
-            self.own_weights = SharedWeights(games, own_names, start)
+            self.own_weights = SharedOwnWeights(games, own_names, start)
         else:
             self.own_weights = OwnWeights(width, games, own_names, start)
-        self.pair_weights: PairWeights | SharedWeights
+        self.pair_weights: PairWeights | SharedPairWeights
         if pair_weights == "shared":
-            self.pair_weights = SharedWeights(games, pair_names, pair_start, of_pairs=True)
+            self.pair_weights = SharedPairWeights(games, pair_names, pair_start)
         else:
             self.pair_weights = PairWeights(width, games, pair_names, pair_start, symmetric_pairs, positive=one_game)
         self.strategies: InitialStrategies | ZeroStrategies | Motions

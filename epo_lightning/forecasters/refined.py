@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from epo_lightning.checks import check_number
 from epo_lightning.decoders.weights import SharedWeights
@@ -83,7 +83,7 @@ class Refined(Forecaster):
         own, pair = energy.weighted
         _check_pair_start(pair_start, pair)
         self.own_weights = SharedWeights(1, own, check_start(own_start, own, energy.own))
-        self.pair_weights = SharedWeights(1, pair, pair_start, of_pairs=True)
+        self.pair_weights = SharedWeights(1, pair, pair_start)
         self.log_inverse_temperature = nn.Parameter(torch.tensor(math.log(inverse_temperature)))
 
     def train(self, mode: bool = True) -> Refined:
@@ -95,13 +95,17 @@ class Refined(Forecaster):
     def forward(self, scene: Scene) -> JointForecast:
         with torch.no_grad():
             given = self.given(scene)
-        weights: dict[str, Tensor] = {**self.own_weights(scene.current), **self.pair_weights(scene.current)}
+        batch, agents = scene.agent_mask.shape
+        own, pair = (
+            self.own_weights.of_rows(batch, agents),
+            self.pair_weights.of_rows(batch, agents * (agents - 1) // 2),
+        )
         return refined(
             given.states,
             given.log_probabilities,
             scene,
             self.energy,
-            weights,
+            {**own, **pair},
             {},
             self.log_inverse_temperature.exp(),
             self.noise,

@@ -122,25 +122,32 @@ class Row:
         )
 
     @property
-    def untaught(self) -> str:
-        """A note on trained runs of RPI whose modes miss one of the sides in many scenes; empty if there are none."""
-        seeds = [
-            str(run.seed)
+    def missing(self) -> list[int]:
+        """Seeds of the trained runs of RPI whose modes miss one of the sides in many scenes."""
+        return [
+            run.seed
             for run in self.runs
             if run.parameters != 0 and any(run.metrics.get(name, 0.0) > MANY_MISSED for name in SIDES)
         ]
-        if not seeds:
-            return ""
-        return (
-            f"{self.name} ({self.runs[0].data}): in {len(seeds)} of {len(self.runs)} runs (seed {', '.join(seeds)}) no mode "
-            "is near the future on one of the sides in more than a fifth of the scenes (score `missed`). A mode may be "
-            "untaught, and then errors say little about the method; docs/concepts.md, Modes, has a remedy"
-        )
 
     @property
     def commands(self) -> list[str]:
         """Commands of its runs, in the order of the seeds."""
         return [run.command for run in self.runs]
+
+
+def untaught(rows: Sequence[Row]) -> str:
+    """A note on rows with runs that may have an untaught mode; empty if there are none."""
+    named = [
+        f"{row.name} ({row.runs[0].data}; {len(row.missing)} of {len(row.runs)} runs)" for row in rows if row.missing
+    ]
+    if not named:
+        return ""
+    return (
+        "No mode is near the future on one of the sides in more than a fifth of the scenes (score `missed`) with "
+        f"{', '.join(named)}. A mode may be untaught, and then errors say little about the method; docs/concepts.md, Modes, "
+        "has a remedy"
+    )
 
 
 def plain_rows(runs: Iterable[EvaluatedRun]) -> list[Row]:

@@ -11,7 +11,7 @@ from games import highway_scene, random_scene
 from suites import HighwaySuite, highway_model, model
 
 from epo_lightning.decoders.gates import AttentionGate, NearestGate, RadiusGate
-from epo_lightning.decoders.weights import Margins, PairWeights, SharedWeights
+from epo_lightning.decoders.weights import Margins, PairWeights, SharedPairWeights
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.forecasters.epo_settings import check_gate
@@ -81,7 +81,7 @@ def test_nothing_is_computed_for_pairs_that_are_left_out():
 
 def test_shared_weights_and_margins_follow_the_choice():
     chosen, z = torch.tensor([[True, False, True]]), torch.randn(1, 3, 8)
-    shared = SharedWeights(2, ("proximity",), 3.0, of_pairs=True)
+    shared = SharedPairWeights(2, ("proximity",), 3.0)
     assert shared(z, chosen)["proximity"].tolist() == [[[3.0, 0.0, 3.0]] * 2]
     margins = Margins(8, 2, ("clearance",), 2.0, 0.5)
     torch.testing.assert_close(margins(z, chosen)["clearance"][..., chosen[0]], margins(z)["clearance"][..., chosen[0]])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from epo_lightning.decoders.trajectories import Trajectories
-from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, SharedWeights
+from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, SharedOwnWeights
 
 
 def test_own_weights_start_at_their_configured_values():
@@ -25,7 +25,7 @@ def test_own_weights_start_at_their_configured_values():
 
 
 def test_shared_weights_are_one_positive_number_per_feature():
-    decoder = SharedWeights(3, ["goal", "vel"], {"vel": 0.05})
+    decoder = SharedOwnWeights(3, ["goal", "vel"], {"vel": 0.05})
     z, everyone = torch.randn(2, 4, 8), torch.ones(2, 4, dtype=torch.bool)
     weights = decoder(z, everyone)
     assert {name: weight.shape for name, weight in weights.items()} == dict.fromkeys(("goal", "vel"), (2, 3, 4))

@@ -14,8 +14,6 @@ effect when the call has ended, and no thread can write to memory that was relea
 from __future__ import annotations
 
 import dataclasses
-import functools
-import warnings
 from typing import Any
 
 import torch
@@ -29,6 +27,7 @@ from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.game_arrays import GameArrays, as_type
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.kernel.interface import MOST_AGENTS, OWN, PAIR, Address, EpoRun
+from epo_lightning.solvers.gauss_newton.recorded_steps import take_steps
 from epo_lightning.solvers.general import descent
 
 
@@ -58,16 +57,6 @@ def unsupported(energy: FeatureEnergy, scene: Scene, parameters: GameParameters)
     return f"the compiled layer is missing: {library}" if isinstance(library, str) else None
 
 
-@functools.cache
-def say_once(reason: str) -> None:
-    """Warn once per reason that plain PyTorch replaces the kernel."""
-    warnings.warn(
-        f"{reason}. Plain PyTorch does the same, 20 to 60 times as slowly; `solver.backend=pytorch` (in Python "
-        "`LevenbergMarquardt(backend='pytorch')`) says that this is intended.",
-        stacklevel=2,
-    )
-
-
 def solve(
     energy: FeatureEnergy,
     scene: Scene,
@@ -86,25 +75,6 @@ def solve(
     """
     call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact, threads=threads)
     return take_steps(call, parameters.initial_controls)
-
-
-def take_steps(call: Any, initial_controls: Float[Tensor, "B M N K 2"]) -> Solution:
-    """The solution of a call of this kernel or of the fused ones, with its derivative if that is wanted."""
-    if call.record:
-        controls, states, *iterates = _Steps.apply(call, initial_controls, *call.inputs)
-    else:
-        call.run()
-        iterates = list(call.iterates.unbind(0))
-        controls, states = iterates[-1], call.states
-    return Solution(
-        controls=controls,
-        states=states,
-        initial_energy=call.initial_energy,
-        energy=call.energy,
-        gradient_norm=call.gradient_norm,
-        status=call.status,
-        iterates=tuple(iterates) if call.keep_iterates else None,
-    )
 
 
 @torch.no_grad()
@@ -259,41 +229,6 @@ class _Call:
         arguments = (self.tape.address, self.game, self.arguments, gradients)
         interface.check(interface.library().epo_differentiate(*arguments))
         return found
-
-
-class _Steps(torch.autograd.Function):
-    """Autograd function of all steps of a call; returns controls, states and, with ``keep_iterates``, every iterate."""
-
-    @staticmethod
-    def forward(ctx: Any, call: Any, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
-        call.run()
-        ctx.call = call
-        # The kernel reads these tensors again in the backward pass. Because they are saved, autograd raises an error if
-        # one of them was changed in place.
-        ctx.save_for_backward(*inputs, *call.kept)
-        ctx.set_materialize_grads(False)
-        iterates = [iterate.clone() for iterate in call.iterates] if call.keep_iterates else []
-        # The autograd node would hold its own output, a reference cycle, which only the garbage collector could free.
-        states, call.states = call.states, None
-        return call.iterates[-1].clone(), states, *iterates
-
-    @staticmethod
-    @once_differentiable
-    def backward(
-        ctx: Any, controls: Tensor | None, states: Tensor | None, *iterates: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
-        call = ctx.call
-        _ = ctx.saved_tensors
-        bar = (
-            torch.zeros_like(call.start) if controls is None else controls.clone(memory_format=torch.contiguous_format)
-        )
-        along = None
-        if any(iterate is not None for iterate in iterates):
-            along = torch.stack([torch.zeros_like(bar) if iterate is None else iterate for iterate in iterates])
-        if states is not None:
-            states = states.contiguous()
-        gradients = call.differentiate(bar, along, states)
-        return None, bar, *gradients
 
 
 class _Minimum(torch.autograd.Function):

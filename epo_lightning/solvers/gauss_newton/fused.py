@@ -20,8 +20,8 @@ from torch import Tensor
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton.compiled import take_steps
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
+from epo_lightning.solvers.gauss_newton.recorded_steps import take_steps
 from epo_lightning.warp_kernels import described, installed, launch, warp
 
 if TYPE_CHECKING:

@@ -18,9 +18,8 @@ from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.host import readable
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import compiled, hosted
+from epo_lightning.solvers.gauss_newton import backends
 from epo_lightning.solvers.gauss_newton.expansion import expand
-from epo_lightning.solvers.gauss_newton.levenberg_marquardt import choose_backend
 from epo_lightning.solvers.gauss_newton.structured import Game, factorise, planar
 from epo_lightning.solvers.general import descent
 
@@ -45,10 +44,10 @@ def attach(
         controls, and a :class:`~epo_lightning.forecast.Status`: STOPPED where H is not positive definite, so that the
         controls are no minimum; such a problem has a gradient of zero.
     """
-    solve = choose_backend(backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls))
-    for compiling in (compiled, hosted):
-        if solve is compiling.solve:
-            return compiling.attach(energy, scene, parameters, controls, exact)
+    chosen = backends.choose(backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls))
+    kernel = backends.with_kernel(chosen)
+    if kernel is not None:
+        return kernel.attach(energy, scene, parameters, controls, exact)
     none = controls.new_zeros(controls.shape[:2]).flatten()
     game = Game(energy, scene, parameters, 1.0, none, readable(controls))
     found, status = _Attach.apply(game, exact, controls, *game.tensors())

@@ -2,18 +2,14 @@
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
 modes are solved at once and independently of each other. If a matrix cannot be factorised, its problem (one scene
-and mode) keeps its last good iterate; on a CPU, the factorisation is first repeated with more damping. Four backends
-compute the steps: :mod:`~epo_lightning.solvers.gauss_newton.compiled` on CPUs,
-:mod:`~epo_lightning.solvers.gauss_newton.hosted`, which copies games from a GPU to it,
-:mod:`~epo_lightning.solvers.gauss_newton.fused` on GPUs, and
-:mod:`~epo_lightning.solvers.gauss_newton.structured` anywhere. This module chooses the backend and, with adaptive damping,
-accepts or rejects steps.
+and mode) keeps its last good iterate; on a CPU, the factorisation is first repeated with more damping. One of the
+:mod:`~epo_lightning.solvers.gauss_newton.backends` computes the steps. With adaptive damping,
+:mod:`~epo_lightning.solvers.gauss_newton.adaptive` or the backend's kernel accepts or rejects them.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -26,17 +22,9 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
-from epo_lightning.solvers.gauss_newton import adaptive, compiled, fused, hosted, structured
+from epo_lightning.solvers.gauss_newton import adaptive, backends
 from epo_lightning.solvers.general import descent
 
-Backend = Callable[[FeatureEnergy, Scene, GameParameters, int, float, Tensor, bool, bool], Solution]
-"""(energy, scene, parameters, steps, step size, damping [B, M] or [B, M, N], keep iterates, exact) -> solution.
-
-An agent with infinite damping keeps its controls exactly; its trajectory is then a constant for the other agents."""
-
-DESCENTS = {compiled.solve: compiled.descend, hosted.solve: hosted.descend}
-"""For backends that take all adaptive steps in one call: the function that does, which has no derivative."""
-BACKENDS = ("auto", "pytorch", "compiled", "host", "warp")
 LARGEST_DAMPING = 1e30
 _FAR, _NEAR = 5, 15
 """Numbers of Gauss-Newton and of Newton steps that lead to a minimum. Newton steps converge only from a start near it."""
@@ -71,7 +59,7 @@ class LevenbergMarquardt(Stepwise):
             they converge quadratically, and Gauss-Newton steps linearly. They have no derivative of their own: use
             ``backward=implicit`` or ``detached``.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; ``host``, the same kernel for tensors on a GPU, which are
-            copied; ``warp``, fused kernels on a GPU; or ``auto``, the choice of :func:`choose_backend`.
+            copied; ``warp``, fused kernels on a GPU; or ``auto``, the choice of :func:`.backends.choose`.
     """
 
     needs_from_energy = frozenset({FEATURES})
@@ -100,8 +88,8 @@ class LevenbergMarquardt(Stepwise):
                 f"solver.damping must be {LARGEST_DAMPING:g} or less, not {self.damping:g}: its products leave the range of "
                 "single precision"
             )
-        if self.backend not in BACKENDS:
-            raise ConfigError(f"unknown solver.backend {self.backend!r}: {nearest(str(self.backend), BACKENDS)}")
+        if self.backend not in backends.NAMES:
+            raise ConfigError(f"unknown solver.backend {self.backend!r}: {nearest(str(self.backend), backends.NAMES)}")
         if self.backend == "warp" and self.newton_steps:
             raise ConfigError(
                 "solver.backend=warp has no Newton steps: set solver.newton_steps=0, or choose solver.backend=auto, "
@@ -182,47 +170,16 @@ class LevenbergMarquardt(Stepwise):
         if start.numel() == 0:
             return descent.nothing(start), damping
         fixed = not self.adaptive and not exact
-        solve = choose_backend(self.backend, energy, scene, parameters, fixed)
+        backend, size = backends.choose(self.backend, energy, scene, parameters, fixed), self.step_size
         if not self.adaptive:
-            return solve(energy, scene, parameters, steps, self.step_size, damping, self.keep_iterates, exact), damping
-        if solve in DESCENTS and not torch.is_grad_enabled() and not self.keep_iterates:
-            return DESCENTS[solve](energy, scene, parameters, steps, self.step_size, damping, exact)
+            return backend.solve(energy, scene, parameters, steps, size, damping, self.keep_iterates, exact), damping
+        kernel = backends.with_kernel(backend)
+        if kernel is not None and not torch.is_grad_enabled() and not self.keep_iterates:
+            return kernel.descend(energy, scene, parameters, steps, size, damping, exact)
 
         def step(rows: Tensor | slice, controls: Tensor, damping: Tensor) -> Solution:
             game = dataclasses.replace(parameters[rows], initial_controls=controls)
-            return solve(energy.of_scenes(rows), scene[rows], game, 1, self.step_size, damping, False, exact)
+            return backend.solve(energy.of_scenes(rows), scene[rows], game, 1, size, damping, False, exact)
 
-        here = solve(energy, scene, parameters, 0, self.step_size, damping, False, False)
+        here = backend.solve(energy, scene, parameters, 0, size, damping)
         return adaptive.descend(step, here, steps, damping, self.keep_iterates)
-
-
-def choose_backend(
-    name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, fixed: bool = False
-) -> Backend:
-    """The function that computes the steps of a game: ``solve`` of one of the backends.
-
-    Args:
-        name: the setting ``backend``. ``auto`` is ``compiled`` for tensors on a CPU. For those on a GPU it is ``warp`` if
-            that can solve the game and the steps are ``fixed``, and else ``host``: adaptive steps of many games end at
-            different times, of which only the host makes use. Where neither can solve the game, it is ``pytorch``.
-        energy, scene, parameters: the game.
-        fixed: whether all steps are Gauss-Newton steps with the same damping.
-
-    Raises:
-        ValueError: the backend of this name cannot solve the game.
-    """
-    if name == "pytorch":
-        return structured.solve
-    on_cpu = parameters.initial_controls.device.type == "cpu"
-    automatic = compiled if on_cpu else hosted
-    if not on_cpu and fixed and fused.obstacle(energy, scene, parameters) is None:
-        automatic = fused
-    chosen = {"compiled": compiled, "host": hosted, "warp": fused}.get(name, automatic)
-    obstacle = chosen.obstacle(energy, scene, parameters)
-    if obstacle is None:
-        return chosen.solve
-    if name != "auto":
-        raise ValueError(f"solver.backend is {name!r}, but {obstacle}; 'auto' and 'pytorch' can solve this game")
-    if not torch.compiler.is_exporting():
-        compiled.say_once(obstacle)
-    return structured.solve

@@ -23,7 +23,7 @@ from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS, equilibrium_valu
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.diagnostics import quasi_newton
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
-from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton import backends, compiled, structured
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -304,7 +304,7 @@ def test_games_unknown_to_the_kernel_are_supported():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, 1, 4, own=OWN)
     energy = FeatureEnergy(OWN, ["proximity"], dynamics=Unicycle("heun"))
-    compiled.say_once.cache_clear()
+    backends.say_once.cache_clear()
     with pytest.warns(UserWarning, match="compiled"):
         found = report(energy, scene, parameters, parameters.initial_controls)
     torch.testing.assert_close(found.energy, energy(scene, parameters, parameters.initial_controls)[:, 0])

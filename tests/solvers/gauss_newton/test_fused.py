@@ -15,8 +15,8 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import PAIR_FEATURES
 from epo_lightning.registry import ConfigError
-from epo_lightning.solvers.gauss_newton import fused, structured
-from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt, choose_backend
+from epo_lightning.solvers.gauss_newton import backends, fused, structured
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 warp = pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install 'epo_lightning[gpu]'")
 from epo_lightning.solvers.gauss_newton.fused_kernel import ahead_of_time, kernels
@@ -129,7 +129,7 @@ def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
     with pytest.raises(
         ValueError, match="backend is 'warp', but the fused kernels integrate by euler, not heun; 'auto' and"
     ):
-        choose_backend("warp", energy, scene, game)
+        backends.choose("warp", energy, scene, game)
     wide = random_scene(1, 9, history=2)
     assert "up to 8 agents, not 9" in fused.obstacle(FeatureEnergy(["acc"]), wide, random_game(wide, own=("acc",)))
     monkeypatch.setattr(fused, "LONGEST", 2 * game.initial_controls.numel() - 1)
@@ -142,7 +142,7 @@ def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
         LevenbergMarquardt(backend="warp", adaptive=True, newton_steps=2)
     monkeypatch.setattr(fused, "installed", lambda: False)
     with pytest.raises(ValueError, match=r"the fused kernels need NVIDIA Warp: pip install 'epo_lightning\[gpu\]'"):
-        choose_backend("warp", FeatureEnergy(["acc"]), scene, game)
+        backends.choose("warp", FeatureEnergy(["acc"]), scene, game)
 
 
 @pytest.mark.parametrize("architecture", [pytest.param(80, marks=pytest.mark.slow), 90])

@@ -15,9 +15,9 @@ from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.solvers.backward import Implicit
-from epo_lightning.solvers.gauss_newton import compiled, hosted, structured
+from epo_lightning.solvers.gauss_newton import backends, compiled, hosted, structured
 from epo_lightning.solvers.gauss_newton.kernel import interface
-from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt, choose_backend
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 if isinstance(interface.find(), str):
     pytest.skip("the compiled layer is missing", allow_module_level=True)
@@ -170,7 +170,7 @@ def test_adaptive_and_implicit_solutions_are_those_of_the_compiled_layer(copies)
     scene, energy = random_scene(3, 2, history=2, size=1.0), FeatureEnergy(["goal", "acc", "turnr"])
     game = random_game(scene, 2, 6, spread=0.1)
     minimise = LevenbergMarquardt(20, 1.0, 1.0, adaptive=True, newton_steps=5)
-    assert choose_backend("auto", energy, remote(scene), remote(game)) is hosted.solve
+    assert backends.choose("auto", energy, remote(scene), remote(game)) is hosted
     with torch.no_grad(), Factories():
         found, expected = minimise(energy, remote(scene), remote(game)), minimise(energy, scene, game)
     assert torch.equal(values(found.controls), expected.controls)
@@ -189,16 +189,16 @@ def test_the_host_backend_is_for_games_on_a_device_that_the_kernel_knows():
     scene, energy = random_scene(2, 2, history=2), FeatureEnergy(["goal", "acc"])
     game = random_game(scene)
     with pytest.raises(ValueError, match="backend is 'host', but these tensors are on the CPU already"):
-        choose_backend("host", energy, scene, game)
+        backends.choose("host", energy, scene, game)
     with pytest.raises(ValueError, match="backend is 'compiled', but the compiled layer runs on CPUs"):
-        choose_backend("compiled", energy, remote(scene), remote(game))
+        backends.choose("compiled", energy, remote(scene), remote(game))
     heun = FeatureEnergy(["goal", "acc"], dynamics=Unicycle("heun"))
     with pytest.raises(ValueError, match="backend is 'host', but the compiled layer integrates by euler, not heun"):
-        choose_backend("host", heun, remote(scene), remote(game))
-    compiled.say_once.cache_clear()
+        backends.choose("host", heun, remote(scene), remote(game))
+    backends.say_once.cache_clear()
     with pytest.warns(UserWarning, match="integrates by euler, not heun"):
-        chosen = choose_backend("auto", heun, remote(scene), remote(game))
-    assert chosen is structured.solve
+        chosen = backends.choose("auto", heun, remote(scene), remote(game))
+    assert chosen is structured
 
 
 def test_devices_without_copies_are_named(monkeypatch):

@@ -1,0 +1,112 @@
+"""The implementations of damped steps, and the choice of one of them for a game.
+
+- ``compiled``: the kernel for CPUs (:mod:`.compiled`).
+- ``host``: the same kernel for games on a GPU, which are copied (:mod:`.hosted`).
+- ``warp``: fused kernels on a GPU (:mod:`.fused`).
+- ``pytorch``: operations of PyTorch, anywhere and for every game (:mod:`.structured`).
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from epo_lightning.forecast import GameParameters, Solution
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import Scene
+from epo_lightning.solvers.gauss_newton import compiled, fused, hosted, structured
+
+NAMES = ("auto", "pytorch", "compiled", "host", "warp")
+
+
+@runtime_checkable
+class Backend(Protocol):
+    """A module that takes damped steps."""
+
+    def solve(
+        self,
+        energy: FeatureEnergy,
+        scene: Scene,
+        parameters: GameParameters,
+        steps: int,
+        step_size: float,
+        damping: Tensor,
+        keep_iterates: bool = False,
+        exact: bool = False,
+    ) -> Solution:
+        """S steps from the initial controls, as :func:`.structured.solve` takes them.
+
+        The damping is that of every game [B, M] or agent [B, M, N]. An agent with infinite damping keeps its controls
+        exactly; its trajectory is then a constant for the other agents.
+        """
+
+
+@runtime_checkable
+class KernelBackend(Backend, Protocol):
+    """A module whose kernel also takes all adaptive steps in one call, and differentiates minima."""
+
+    def descend(
+        self,
+        energy: FeatureEnergy,
+        scene: Scene,
+        parameters: GameParameters,
+        steps: int,
+        step_size: float,
+        damping: Tensor,
+        exact: bool = False,
+    ) -> tuple[Solution, Tensor]:
+        """S adaptive steps without a derivative; returns the solution and the damping to continue with."""
+
+    def attach(
+        self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
+    ) -> tuple[Tensor, Tensor]:
+        """The controls of a solution with their implicit derivative, and a status."""
+
+
+def with_kernel(backend: Backend) -> KernelBackend | None:
+    """The backend, if it is one whose kernel takes adaptive steps."""
+    return next((one for one in (compiled, hosted) if one is backend), None)
+
+
+def choose(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, fixed: bool = False) -> Backend:
+    """The backend for a game.
+
+    Args:
+        name: the setting ``backend``. ``auto`` is ``compiled`` for tensors on a CPU. For those on a GPU it is ``warp`` if
+            that can solve the game and the steps are ``fixed``, and else ``host``: adaptive steps of many games end at
+            different times, of which only the host makes use. Where neither can solve the game, it is ``pytorch``.
+        energy, scene, parameters: the game.
+        fixed: whether all steps are Gauss-Newton steps with the same damping.
+
+    Raises:
+        ValueError: the backend of this name cannot solve the game.
+    """
+    if name == "pytorch":
+        return structured
+    on_cpu = parameters.initial_controls.device.type == "cpu"
+    automatic = compiled if on_cpu else hosted
+    if not on_cpu and fixed and fused.obstacle(energy, scene, parameters) is None:
+        automatic = fused
+    chosen = {"compiled": compiled, "host": hosted, "warp": fused}.get(name, automatic)
+    obstacle = chosen.obstacle(energy, scene, parameters)
+    if obstacle is None:
+        return chosen
+    if name != "auto":
+        raise ValueError(f"solver.backend is {name!r}, but {obstacle}; 'auto' and 'pytorch' can solve this game")
+    if not torch.compiler.is_exporting():
+        say_once(obstacle)
+    return structured
+
+
+@functools.cache
+def say_once(reason: str) -> None:
+    """Warn once per reason that plain PyTorch replaces the kernel."""
+    warnings.warn(
+        f"{reason}. Plain PyTorch does the same, 20 to 60 times as slowly; `solver.backend=pytorch` (in Python "
+        "`LevenbergMarquardt(backend='pytorch')`) says that this is intended.",
+        stacklevel=2,
+    )
