@@ -44,6 +44,14 @@ def test_reversing_is_not_doubted() -> None:
     assert not doubts(changed(changed(walking(), HEADING, 0.0), SPEED, -1.5))
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf, 3e38])
+def test_numbers_that_are_not_finite_are_left_to_their_own_warning(value: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for entry in (0, HEADING, SPEED):
+            doubts(changed(walking(), entry, value))
+
+
 def test_absent_agents_and_steps_are_not_doubted() -> None:
     scene = changed(walking(), SPEED, 15.0)
     assert not doubts(dataclasses.replace(scene, agent_mask=torch.tensor([[False, True]])))
