@@ -76,7 +76,8 @@ class Status(IntEnum):
     SOLVED = 0
     """All steps were taken, with the configured damping and step size. It does not mean that the solver has converged."""
     DAMPED = 1
-    """A factorisation succeeded only with more damping, or steps were shortened, or an iteration has not converged."""
+    """A factorisation succeeded only with more damping, or steps were shortened; or the LQ games of ``solver=feedback`` have
+    not converged, so that the solution has no derivative."""
     STOPPED = 2
     """A step could not be taken and the last good iterate was kept; or an implicit gradient was requested where the Hessian
     is not positive definite."""

@@ -64,7 +64,7 @@ class Candidates(Minimiser):
         return self.candidates
 
     def games(self, modes: int) -> int:
-        """Number of games: 1, because the modes are different assignments in one game."""
+        """One game, of which the modes are different assignments."""
         return 1
 
     @abstractmethod

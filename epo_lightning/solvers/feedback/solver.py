@@ -136,7 +136,7 @@ class Feedback(BothSides):
 
     Attributes:
         iterations: largest number of LQ games.
-        tolerance: largest change of a state [m, rad, m/s] that the policies of a solved game want before its last step.
+        tolerance: a game is solved once its policies change no state [m, rad, m/s] by this much.
         regularisation: multiple of the identity that is added to the Hessians of every agent's cost by states and controls.
             It is part of the game: policies depend on it. 5 in GameInference.jl (Peters, 2020), which the paper's data are
             made with.

@@ -46,7 +46,7 @@ def descend(
         damping: damping at the start. Agents with infinite damping keep their controls.
         keep_iterates: whether the solution carries u_0 .. u_S.
     """
-    going = found.energy.isfinite()  # no comparison of energies accepts a step from any other one
+    going = found.energy.isfinite()  # others take no step: no energy is smaller than NaN
     found = dataclasses.replace(found, status=torch.where(going, found.status, Status.STOPPED))
     stops = not torch.is_grad_enabled() and readable(found.energy)
     left: Tensor | slice = slice(None)

@@ -229,10 +229,10 @@ class AugmentedLagrangian(Minimiser):
             jacobian, solved = torch.where(kept, jacobian, 0.0), torch.where(kept, solved, 0.0)
             lower_upper = torch.where(kept, pivots.LU, torch.eye(most, dtype=schur.dtype, device=schur.device))
         with torch.enable_grad():
-            quiet, heard = dense.silenced(game.scene, game.parameters, definite)
-            taught = dataclasses.replace(game, scene=quiet, parameters=heard)
-            slope = taught.slope(multipliers, controls)
-            excess = torch.cat([value.flatten(2) for value in taught.excess(controls).values()], -1)
+            scene, parameters = dense.with_zeros(game.scene, game.parameters, definite)
+            game = dataclasses.replace(game, scene=scene, parameters=parameters)
+            slope = game.slope(multipliers, controls)
+            excess = torch.cat([value.flatten(2) for value in game.excess(controls).values()], -1)
             excess = torch.where(real > 0, torch.take_along_dim(excess, rows, -1), 0.0)
             change, moved = (slope - slope.detach()).flatten(2)[..., None], (excess - excess.detach())[..., None]
             free = -torch.cholesky_solve(change + jacobian.mT @ (penalty * moved), factor)

@@ -142,7 +142,7 @@ class _Game:
         """The energy at given controls."""
         return self.descend(controls, 0, torch.ones_like(controls[:, :, 0, 0, 0]))[0]
 
-    def worlds(self, agents: int) -> _Game:
+    def copies_per_agent(self, agents: int) -> _Game:
         """A copy of every scene for each of its agents [B * N]."""
 
         def repeated(tensor: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ def _at_once(game: _Game, now: _Plans, steps: int) -> _Plans:
     batch, modes, agents = now.damping.shape
     mine = torch.eye(agents, dtype=torch.bool, device=now.controls.device).repeat(batch, 1)[:, None]
     before = _Plans(*(tensor.repeat_interleave(agents, 0) for tensor in vars(now).values()))
-    answers = _response(game.worlds(agents), before, mine, steps)
+    answers = _response(game.copies_per_agent(agents), before, mine, steps)
     own = torch.arange(agents, device=now.controls.device)
     plans = answers.controls.view(batch, agents, *now.controls.shape[1:])[:, own, :, own].permute(1, 2, 0, 3, 4)
     damping = answers.damping.view(batch, agents, modes, agents)[:, own, :, own].permute(1, 2, 0)

@@ -17,9 +17,9 @@ from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import separation
 from epo_lightning.game.feature_derivatives import Bounds, signal_and_change
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.game.game_end import free_controls
 from epo_lightning.game.pairs import pairs
 from epo_lightning.scene import Scene
+from epo_lightning.solvers.general import dense
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,7 @@ class ConstrainedGame:
 
     def jacobian(self, controls: Tensor) -> Float[Tensor, "B M C n"]:
         """dh/du of all constraints, in the order of :meth:`excess`; zero where there is none."""
-        count = controls.shape[2:].numel()
-        units = torch.eye(count, dtype=controls.dtype, device=controls.device).view(count, 1, 1, *controls.shape[2:])
-        signals = self._signals(controls, units.expand(-1, *controls.shape[:2], -1, -1, -1))
+        signals = self._signals(controls, dense.units(controls))
         return torch.cat([change.flatten(3) for *_, change in signals], -1).permute(1, 2, 3, 0)
 
     def _signals(self, controls: Tensor, directions: Tensor) -> list[tuple[str, Tensor, Tensor]]:
@@ -96,16 +94,7 @@ class ConstrainedGame:
 
     def hessian(self, multipliers: Tensor, controls: Tensor) -> Float[Tensor, "B M n n"]:
         """The Hessian of E + sum of lambda h, with ones on the diagonal for controls on which nothing depends."""
-        leaf, count = controls.detach().requires_grad_(), controls.shape[2:].numel()
-        slope = self.slope(multipliers, leaf)
-        units = (
-            torch.eye(count, dtype=controls.dtype, device=controls.device)
-            .view(count, 1, 1, *controls.shape[2:])
-            .expand(count, *controls.shape)
-        )
-        rows = torch.autograd.grad(slope, leaf, units, is_grads_batched=True, materialize_grads=True)[0]
-        idle = ~free_controls(self.scene, controls.shape[3]).repeat_interleave(2, -1).flatten(1)[:, None]
-        return rows.flatten(3).movedim(0, 2) + torch.diag_embed(idle.to(controls.dtype))
+        return dense.slope_change(lambda at: self.slope(multipliers, at), self.scene, controls)
 
     def augmented(
         self, multipliers: Mapping[str, Tensor], penalty: Tensor, controls: Tensor

@@ -30,11 +30,11 @@ from epo_lightning.solvers.gauss_newton import compiled
 class Copies(Protocol):
     """Copies of whole buffers of bytes between a device and the host."""
 
-    def down(self, buffer: Tensor) -> Tensor:
+    def to_host(self, buffer: Tensor) -> Tensor:
         """The bytes of a buffer on the device, in memory of the host; complete on return."""
         ...
 
-    def up(self, tensors: Sequence[Tensor]) -> Tensor:
+    def to_device(self, tensors: Sequence[Tensor]) -> Tensor:
         """The packed bytes of tensors of the host, in a buffer on the device."""
         ...
 
@@ -50,7 +50,7 @@ class PinnedCopies:
         self.stream = _stream(device)
         self.consumer = torch.cuda.current_stream(device)
 
-    def down(self, buffer: Tensor) -> Tensor:
+    def to_host(self, buffer: Tensor) -> Tensor:
         """The bytes of a buffer on the device; the host waits for them."""
         host = torch.empty(buffer.shape, dtype=buffer.dtype, pin_memory=True)
         self.stream.wait_stream(torch.cuda.current_stream(self.device))
@@ -61,7 +61,7 @@ class PinnedCopies:
         done.synchronize()
         return host
 
-    def up(self, tensors: Sequence[Tensor]) -> Tensor:
+    def to_device(self, tensors: Sequence[Tensor]) -> Tensor:
         """The packed bytes of tensors of the host; the device waits for them, and the host does not."""
         parts = _parts(tensors)
         host = torch.empty(sum(part.numel() for part in parts), dtype=torch.uint8, pin_memory=True)
@@ -111,10 +111,10 @@ def solve(
     exact: bool = False,
 ) -> Solution:
     """S damped Gauss-Newton steps of :func:`.compiled.solve` for tensors on a device; differentiable by the same inputs."""
-    road = _Road(parameters)
-    here, game, factor = road.down(_read(energy, scene), _given(energy, parameters), damping)
+    transfer = _Transfer(parameters)
+    here, game, factor = transfer.to_host(_read(energy, scene), _given(energy, parameters), damping)
     found = compiled.solve(energy, here, game, steps, step_size, factor, keep_iterates, exact, threads=_cores())
-    return road.up(found)[0]
+    return transfer.to_device(found)[0]
 
 
 def descend(
@@ -127,10 +127,10 @@ def descend(
     exact: bool = False,
 ) -> tuple[Solution, Float[Tensor, "B M *agents"]]:
     """S adaptive steps of :func:`.compiled.descend` for tensors on a device; the solution, and the damping afterwards."""
-    road = _Road(parameters)
-    here, game, factor = road.down(_read(energy, scene), _given(energy, parameters), damping)
+    transfer = _Transfer(parameters)
+    here, game, factor = transfer.to_host(_read(energy, scene), _given(energy, parameters), damping)
     found, last = compiled.descend(energy, here, game, steps, step_size, factor, exact, threads=_cores())
-    solution, damping = road.up(found, last)
+    solution, damping = transfer.to_device(found, last)
     return solution, damping
 
 
@@ -138,9 +138,9 @@ def attach(
     energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"], exact: bool
 ) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
     """The controls of a solution with their implicit derivative, and a status, as :func:`.compiled.attach` returns them."""
-    road = _Road(parameters)
-    here, game, copy = road.down(_read(energy, scene), _given(energy, parameters), controls)
-    found, status = road.up(*compiled.attach(energy, here, game, copy, exact, threads=_cores()))
+    transfer = _Transfer(parameters)
+    here, game, copy = transfer.to_host(_read(energy, scene), _given(energy, parameters), controls)
+    found, status = transfer.to_device(*compiled.attach(energy, here, game, copy, exact, threads=_cores()))
     return found, status
 
 
@@ -178,7 +178,7 @@ def _given(energy: FeatureEnergy, parameters: GameParameters) -> GameParameters:
     )
 
 
-class _Road:
+class _Transfer:
     """The way of a game to the host and of its solution back, on which autograd can follow."""
 
     def __init__(self, parameters: GameParameters) -> None:
@@ -186,19 +186,19 @@ class _Road:
         assert copies is not None, "see `obstacle`"
         self._copies = copies
 
-    def down(self, *things: Any) -> tuple[Any, ...]:
+    def to_host(self, *things: Any) -> tuple[Any, ...]:
         """Tensors and batches of tensors, by one copy to the host."""
         return self._moved(things, True)
 
-    def up(self, *things: Any) -> tuple[Any, ...]:
+    def to_device(self, *things: Any) -> tuple[Any, ...]:
         """Tensors and batches of tensors, by one copy to the device."""
         return self._moved(things, False)
 
-    def _moved(self, things: Sequence[Any], down: bool) -> tuple[Any, ...]:
+    def _moved(self, things: Sequence[Any], to_host: bool) -> tuple[Any, ...]:
         tensors = [
             tensor for thing in things for tensor in ((thing,) if isinstance(thing, Tensor) else thing.tensors())
         ]
-        moved = iter(_Move.apply(self._copies, down, *tensors))
+        moved = iter(_Move.apply(self._copies, to_host, *tensors))
         return tuple(next(moved) if isinstance(thing, Tensor) else thing.map(lambda _: next(moved)) for thing in things)
 
 
@@ -206,10 +206,10 @@ class _Move(torch.autograd.Function):
     """Autograd function that moves tensors in one copy, and the gradients of those that require them in another one."""
 
     @staticmethod
-    def forward(ctx: Any, copies: Copies, down: bool, *tensors: Tensor) -> tuple[Tensor, ...]:
-        ctx.copies, ctx.to_host = copies, down
+    def forward(ctx: Any, copies: Copies, to_host: bool, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.copies, ctx.to_host = copies, to_host
         ctx.set_materialize_grads(False)
-        moved = _move(copies, tensors, down)
+        moved = _move(copies, tensors, to_host)
         constant = [m for m, needed in zip(moved, ctx.needs_input_grad[2:], strict=True) if not needed]
         ctx.mark_non_differentiable(*constant)
         return moved
@@ -222,9 +222,9 @@ class _Move(torch.autograd.Function):
         return None, None, *(None if gradient is None else next(moved) for gradient in gradients)
 
 
-def _move(copies: Copies, tensors: Sequence[Tensor], down: bool) -> tuple[Tensor, ...]:
+def _move(copies: Copies, tensors: Sequence[Tensor], to_host: bool) -> tuple[Tensor, ...]:
     """The tensors on the other side, contiguous, after one copy."""
-    buffer = copies.down(torch.cat(_parts(tensors))) if down else copies.up(tensors)
+    buffer = copies.to_host(torch.cat(_parts(tensors))) if to_host else copies.to_device(tensors)
     found: list[Tensor] = [buffer] * len(tensors)
     start = 0
     for index in _order(tensors):

@@ -8,6 +8,7 @@ agents have a 1 on the diagonal and zeros elsewhere, so that they affect neither
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -57,26 +58,34 @@ def hessian(
     """
     if isinstance(energy, PiecewiseQuadratic):
         return _closed_form(energy, scene, parameters, controls)
+    return slope_change(lambda at: gradient(energy, scene, parameters, at)[1], scene, controls)
+
+
+def slope_change(
+    slope: Callable[[Tensor], Tensor], scene: Scene, controls: Float[Tensor, "B M N K 2"]
+) -> Float[Tensor, "B M n n"]:
+    """The derivative by the controls of a gradient dE/du, which is a function of them; differentiable as :func:`hessian`."""
     taped = torch.is_grad_enabled()
     with torch.enable_grad():
         if not controls.requires_grad:
             controls = controls.detach().requires_grad_()
-        _, slope = gradient(energy, scene, parameters, controls)
-        parts = [torch.zeros_like(units) for units in _units(controls).split(_PRODUCTS)]
-        if slope.requires_grad:  # or the energy is linear
-            parts = [
+        found, parts = slope(controls), units(controls).split(_PRODUCTS)
+        if found.requires_grad:
+            rows = [
                 torch.autograd.grad(
-                    slope,
+                    found,
                     controls,
-                    units,
+                    part,
                     retain_graph=True,
                     create_graph=taped,
                     is_grads_batched=True,
                     materialize_grads=True,
                 )[0]
-                for units in _units(controls).split(_PRODUCTS)
+                for part in parts
             ]
-        return _of_free(scene, controls.shape[3], torch.cat(parts).flatten(3).movedim(0, 2))
+        else:  # the energy is linear
+            rows = [torch.zeros_like(part) for part in parts]
+        return _of_free(scene, controls.shape[3], torch.cat(rows).flatten(3).movedim(0, 2))
 
 
 def gauss_newton(
@@ -97,7 +106,7 @@ def gauss_newton(
         return _closed_form(energy, scene, parameters, controls)
     energy.validate(scene, parameters, controls)
     if hasattr(energy, "linearisation"):
-        _, changes = energy.linearisation(scene, parameters, controls, _units(controls))
+        _, changes = energy.linearisation(scene, parameters, controls, units(controls))
     else:
 
         def residuals(at: Tensor) -> Tensor:
@@ -105,7 +114,7 @@ def gauss_newton(
             return torch.cat([residual.flatten(2) for residual in named.values()], -1)
 
         along = torch.func.vmap(lambda unit: torch.func.jvp(residuals, (controls,), (unit,))[1], chunk_size=_PRODUCTS)
-        changes = along(_units(controls))
+        changes = along(units(controls))
     jacobian = changes.movedim(0, -1)
     return _of_free(scene, controls.shape[3], jacobian.mT @ jacobian)
 
@@ -138,7 +147,7 @@ def attach(
     with torch.no_grad():
         matrix = (hessian if exact else gauss_newton)(energy, scene, parameters, controls)
         factor, definite = factorise(matrix)
-    scene, parameters = silenced(scene, parameters, definite)
+    scene, parameters = with_zeros(scene, parameters, definite)
     with torch.enable_grad():
         value, slope = gradient(energy, scene, parameters, torch.where(_wide(definite, controls), controls, 0.0))
         flat = slope.detach().flatten(2)
@@ -160,11 +169,11 @@ def factorise(matrix: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batc
     return torch.where(definite[..., None, None], factor, identity), definite
 
 
-def _units(controls: Tensor) -> Float[Tensor, "n B M N K 2"]:
+def units(controls: Tensor) -> Float[Tensor, "n B M N K 2"]:
     """All n unit vectors of controls, the same for every sample."""
     count = controls.shape[2:].numel()
-    units = torch.eye(count, dtype=controls.dtype, device=controls.device)
-    return units.view(count, 1, 1, *controls.shape[2:]).expand(count, *controls.shape)
+    identity = torch.eye(count, dtype=controls.dtype, device=controls.device)
+    return identity.view(count, 1, 1, *controls.shape[2:]).expand(count, *controls.shape)
 
 
 def _closed_form(
@@ -188,15 +197,15 @@ def _wide(mask: Bool[Tensor, "B M"], like: Tensor) -> Tensor:
     return mask.view(*mask.shape, *[1] * (like.dim() - 2))
 
 
-def silenced(scene: Scene, parameters: GameParameters, kept: Bool[Tensor, "B M"]) -> tuple[Scene, GameParameters]:
+def with_zeros(scene: Scene, parameters: GameParameters, kept: Bool[Tensor, "B M"]) -> tuple[Scene, GameParameters]:
     """The kept games, and zeros in place of the others, so that NaN in them reaches no gradient."""
 
-    def silence(tensor: Tensor) -> Tensor:
+    def zeroed(tensor: Tensor) -> Tensor:
         return torch.where(_wide(kept, tensor), tensor, torch.zeros_like(tensor))
 
     context, some = parameters.context, kept.any(1)
-    silent = dataclasses.replace(parameters, context=None).map(silence)
+    parameters = dataclasses.replace(parameters, context=None).map(zeroed)
     if context is not None:
         context = torch.where(some[:, None, None], context, 0.0)
     scene = dataclasses.replace(scene, agent_mask=scene.agent_mask & some[:, None])
-    return scene, dataclasses.replace(silent, context=context)
+    return scene, dataclasses.replace(parameters, context=context)

@@ -58,14 +58,14 @@ class Counted:
     def __init__(self):
         self.copied = []
 
-    def down(self, buffer):
-        self.copied.append(("down", buffer.numel()))
+    def to_host(self, buffer):
+        self.copied.append(("to host", buffer.numel()))
         return buffer.values_there.clone()
 
-    def up(self, tensors):
+    def to_device(self, tensors):
         assert not any(isinstance(tensor, Remote) for tensor in tensors)
         packed = torch.cat(hosted._parts(tensors))
-        self.copied.append(("up", packed.numel()))
+        self.copied.append(("to device", packed.numel()))
         return Remote(packed)
 
 
@@ -142,7 +142,7 @@ def test_results_are_those_of_the_compiled_layer_bit_for_bit(pair, dtype, copies
     there = remote(ours)
     solution = hosted.solve(energy, remote(scene), there, 2, 0.3, Remote(damping), keep_iterates=True)
     expected = compiled.solve(energy, scene, theirs, 2, 0.3, damping, keep_iterates=True)
-    assert [way for way, _ in copies.copied] == ["down", "up"]
+    assert [way for way, _ in copies.copied] == ["to host", "to device"]
     for name in ("controls", "states", "initial_energy", "energy", "gradient_norm", "status"):
         assert torch.equal(values(getattr(solution, name)), getattr(expected, name)), name
     assert all(torch.equal(values(a), b) for a, b in zip(solution.iterates, expected.iterates, strict=True))
@@ -150,7 +150,7 @@ def test_results_are_those_of_the_compiled_layer_bit_for_bit(pair, dtype, copies
     weigh = torch.randn_like(expected.states)
     ((solution.states * Remote(weigh)).sum() + solution.iterates[1].square().sum()).backward()
     ((expected.states * weigh).sum() + expected.iterates[1].square().sum()).backward()
-    assert [way for way, _ in copies.copied] == ["down", "up"]
+    assert [way for way, _ in copies.copied] == ["to host", "to device"]
     exact, found = gradients(theirs), gradients(there)
     assert all(torch.equal(values(found[name]), exact[name]) for name in exact)
 
@@ -163,7 +163,7 @@ def test_only_what_the_kernel_reads_is_copied(copies):
     agents, floats = 4 * 2, 4
     read = floats * agents * (4 + 2) + 2 * agents  # current states, sizes, two masks
     read += floats * (2 * agents * (2 + 2 + 7 * 2) + 2 * 4 + 2 * 4)  # weights, goals, controls; pairs, damping
-    assert copies.copied[0] == ("down", read)
+    assert copies.copied[0] == ("to host", read)
 
 
 def test_adaptive_and_implicit_solutions_are_those_of_the_compiled_layer(copies):
@@ -174,7 +174,9 @@ def test_adaptive_and_implicit_solutions_are_those_of_the_compiled_layer(copies)
     with torch.no_grad(), Factories():
         found, expected = minimise(energy, remote(scene), remote(game)), minimise(energy, scene, game)
     assert torch.equal(values(found.controls), expected.controls)
-    assert [way for way, _ in copies.copied] == ["down", "up"] * 2, "Gauss-Newton steps, and then Newton steps"
+    assert [way for way, _ in copies.copied] == ["to host", "to device"] * 2, (
+        "Gauss-Newton steps, and then Newton steps"
+    )
     ours, theirs = leaves_of(game), leaves_of(game)
     there = remote(ours)
     with Factories():
