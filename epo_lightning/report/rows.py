@@ -146,7 +146,7 @@ def untaught(rows: Sequence[Row]) -> str:
     return (
         "No mode is near the future on one of the sides in more than a fifth of the scenes (score `missed`) with "
         f"{', '.join(named)}. A mode may be untaught, and then errors say little about the method; docs/concepts.md, Modes, "
-        "has a remedy"
+        "has a remedy."
     )
 
 
