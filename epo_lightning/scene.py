@@ -249,6 +249,16 @@ class Scene(Batch):
         return result
 
 
+def heading_vector(heading: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2"]:
+    """Unit vectors (x, y) in the directions of headings [rad]."""
+    return torch.stack((heading.cos(), heading.sin()), -1)
+
+
+def velocities(states: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 2"]:
+    """Velocities (x, y) [m/s] of states."""
+    return states[..., SPEED, None] * heading_vector(states[..., HEADING])
+
+
 def _check_tensor(name: str, value: Any, numbers: str, shape: tuple[str | int, ...], sizes: dict[str, int]) -> None:
     """Compare a field of a scene with its declared type and shape, and store the size of each dimension letter in ``sizes``.
 

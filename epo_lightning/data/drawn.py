@@ -23,7 +23,7 @@ from epo_lightning.data.recorded.windows import MOST_AGENTS, SPACING, VECTORS, W
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.metrics.functional.interaction import SUBSETS
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import KINDS
+from epo_lightning.scene import KINDS, heading_vector
 from epo_lightning.task import Task
 
 VERSION = 1
@@ -79,7 +79,7 @@ def _walkers(scenes: int, agents: int, preset: Preset, draw: torch.Generator, ap
     heading = _between(-torch.pi, torch.pi, scenes, agents, draw=draw)
     turn = _between(-0.1, 0.1, scenes, agents, draw=draw)
     half = 0.5 * preset.task.horizon * preset.task.dt
-    way = torch.stack((heading.cos(), heading.sin()), -1)
+    way = heading_vector(heading)
     start = _between(-apart, apart, scenes, agents, 2, draw=draw) - half * speed[..., None] * way
     return _curves(start, heading, speed, turn, preset.time)
 

@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.scene import HEADING
+from epo_lightning.scene import HEADING, heading_vector
 
 THREE_FROM, FIVE_FROM = 4.0, 8.0
 """Lengths [m] from which vehicles have three and five circles."""
@@ -112,7 +112,7 @@ def row_overlap(
     """
     apart = first[..., :2] - second[..., :2]
     places_of = [places(size).expand(*apart.shape[:-1], _SLOTS) for size in (first_size, second_size)]
-    axes = [torch.stack((states[..., HEADING].cos(), states[..., HEADING].sin()), -1) for states in (first, second)]
+    axes = [heading_vector(states[..., HEADING]) for states in (first, second)]
     with torch.no_grad():
         ahead, back = (
             place[..., None, :] * axis.detach()[..., None] for place, axis in zip(places_of, axes, strict=True)

@@ -18,13 +18,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE, wrapped
+from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE, heading_vector, velocities, wrapped
 
 _BETA = {"euler": 1.0, "semi_implicit": 0.0, "heun": 0.5}
-
-
-def _direction(heading: Float[Tensor, "..."]) -> Float[Tensor, "... 2"]:
-    return torch.stack((heading.cos(), heading.sin()), -1)
 
 
 def _turn_left(vector: Float[Tensor, "... 2"]) -> Float[Tensor, "... 2"]:
@@ -89,8 +85,8 @@ class Unicycle:
         heading = start[..., HEADING] + scan[..., TURN_RATE]
         speed = start[..., SPEED] + scan[..., ACCELERATION]
         # Velocities at the nodes l = 0 .. K: before the first step and after every step.
-        before = start[..., SPEED, None] * _direction(start[..., HEADING])
-        velocity = torch.cat((before, speed[..., None] * _direction(heading)), -2)
+        before = velocities(start)
+        velocity = torch.cat((before, speed[..., None] * heading_vector(heading)), -2)
         position = start[..., :2] + self._travel(velocity, dt)
         return torch.cat((position, heading[..., None], speed[..., None]), -1)
 
@@ -100,7 +96,7 @@ class Unicycle:
         """The change of the states of :meth:`rollout` along the directions of the controls."""
         scan = dt * direction.cumsum(-2)
         by_heading, by_speed = scan[..., TURN_RATE, None], scan[..., ACCELERATION, None]
-        ahead = _direction(states[..., HEADING])
+        ahead = heading_vector(states[..., HEADING])
         velocity = by_speed * ahead + states[..., SPEED, None] * by_heading * _turn_left(ahead)
         position = self._travel(torch.cat((torch.zeros_like(velocity[..., :1, :]), velocity), -2), dt)
         return torch.cat((position, by_heading, by_speed), -1)

@@ -225,7 +225,7 @@ class Energy(ABC):
 
     def current_states(self, scene: Scene) -> Float[Tensor, "B 1 N 4"]:
         """The states x_0 at t0, zero for absent agents."""
-        return torch.where(scene.agent_mask[..., None], scene.current, 0.0)[:, None]
+        return scene.current_or_zero[:, None]
 
     def size(self, scene: Scene) -> Float[Tensor, "B N 2"]:
         """The agents' lengths and widths, zero for absent agents.

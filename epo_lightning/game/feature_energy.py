@@ -262,7 +262,7 @@ class FeatureEnergy(FeatureInputs):
         points of reference lines that are never the nearest.
         """
         present = scene.agent_mask
-        finite = torch.where(present[..., None], scene.current, 0.0).isfinite().flatten(1).all(1)
+        finite = scene.current_or_zero.isfinite().flatten(1).all(1)
         if self.needs_shape:
             finite = finite & self.size(scene).isfinite().flatten(1).all(1)
         elif self.needs_reach or "size" in self.needs:

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.scene import HEADING, SPEED, wrapped
+from epo_lightning.scene import HEADING, SPEED, velocities, wrapped
 
 JERK = 5.0
 """J, the jerk [m/s^3] that counts as much as a difference of ``noise``."""
@@ -43,7 +43,7 @@ def followed_controls(
         dt: length of a time step [s].
         noise: standard deviation [m] of the positions around a smooth motion; 0 to follow p_2 .. p_K exactly.
     """
-    start = torch.stack((current[..., HEADING].cos(), current[..., HEADING].sin()), -1) * current[..., SPEED, None]
+    start = velocities(current)
     begin = torch.stack((current[..., :2], current[..., :2] + dt * start), -2)
     smooth = _smoothing(positions.shape[-2], noise / (JERK * dt**3)).to(positions)
     free = smooth @ torch.cat((begin, positions[..., 1:, :]), -2)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from epo_lightning.game.circles import disc
 from epo_lightning.game.pairs import pair_mask, pairs
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.scene import Scene, velocities
 
 
 def closest_approach(scene: Scene, ahead: float) -> Float[Tensor, "B P"]:
@@ -31,9 +31,8 @@ def closest_approach(scene: Scene, ahead: float) -> Float[Tensor, "B P"]:
     """
     exists = pair_mask(scene)
     first, second = pairs(scene.agent_mask.shape[1], exists.device)
-    current = torch.where(scene.agent_mask[..., None], scene.current, 0.0)
-    heading, speed = current[..., HEADING], current[..., SPEED]
-    velocity = speed[..., None] * torch.stack((heading.cos(), heading.sin()), -1)
+    current = scene.current_or_zero
+    velocity = velocities(current)
     offset = current[:, first, :2] - current[:, second, :2]
     closing = velocity[:, first] - velocity[:, second]
     # Agents with equal velocities are closest now: the numerator is then zero.

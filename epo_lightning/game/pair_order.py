@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.game.pairs import pair_mask, pairs
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.scene import HEADING, Scene, heading_vector, velocities
 
 ALONG, ACROSS = "along", "across"
 DIRECTIONS = (ALONG, ACROSS)
@@ -46,29 +46,28 @@ class PairOrder:
 
     def directions(self, scene: Scene) -> Float[Tensor, "B P 2"]:
         """The unit vectors n_ij, in which i is ahead of j for an order of +1. Constants of the scene."""
-        initial = _initial(scene)
+        initial = scene.current_or_zero
         first, second = pairs(initial.shape[1], initial.device)
-        axis = torch.stack((initial[..., HEADING].cos(), initial[..., HEADING].sin()), -1)
+        axis = heading_vector(initial[..., HEADING])
         if self.direction == ALONG:
             line = axis[:, first]
             # Towards positive x (positive y for lines parallel to y), so that the result does not depend on the agent.
             upright = line[..., 0].abs() < _STILL
             towards = torch.where(upright, line[..., 1], line[..., 0])
             line = torch.where((towards < 0)[..., None], -line, line)
-            return _direction(axis[:, first] + axis[:, second], line)
-        velocity = initial[..., SPEED, None] * axis
+            return _unit_or(axis[:, first] + axis[:, second], line)
+        velocity = velocities(initial)
         joining = initial[:, first, :2] - initial[:, second, :2]
         upwards = torch.stack((torch.ones_like(joining[..., 0]), torch.zeros_like(joining[..., 0])), -1)
-        towards = _direction(velocity[:, first] - velocity[:, second], _direction(joining, upwards))
+        towards = _unit_or(velocity[:, first] - velocity[:, second], _unit_or(joining, upwards))
         return torch.stack((-towards[..., 1], towards[..., 0]), -1)
 
     def near(self, scene: Scene, steps: int) -> Bool[Tensor, "B P K"]:
         """The steps 1 .. K at which both agents would be near each other at constant velocity."""
-        initial = _initial(scene)
+        initial = scene.current_or_zero
         first, second = pairs(initial.shape[1], initial.device)
-        axis = torch.stack((initial[..., HEADING].cos(), initial[..., HEADING].sin()), -1)
         time = scene.dt * torch.arange(1, steps + 1, dtype=initial.dtype, device=initial.device)
-        position = initial[..., None, :2] + time[:, None] * (initial[..., SPEED, None] * axis)[..., None, :]
+        position = initial[..., None, :2] + time[:, None] * velocities(initial)[..., None, :]
         return (position[:, first] - position[:, second]).square().sum(-1) <= self.within**2
 
     def in_one_lane(
@@ -76,7 +75,7 @@ class PairOrder:
     ) -> Bool[Tensor, "B M P K"]:
         """The steps 1 .. K at which both agents, on straight lines to their goals, are within ``lane`` [m] across n_ij."""
         present = scene.agent_mask[:, None, :, None]
-        start, goals = torch.where(present, _initial(scene)[:, None, :, :2], 0.0), torch.where(present, goals, 0.0)
+        start, goals = torch.where(present, scene.current_or_zero[:, None, :, :2], 0.0), torch.where(present, goals, 0.0)
         first, second = pairs(goals.shape[2], goals.device)
         ahead = self.directions(scene)[:, None]
         aside = torch.stack((-ahead[..., 1], ahead[..., 0]), -1)
@@ -117,12 +116,7 @@ class PairOrder:
         return torch.where(behind, -1.0, 1.0).to(position.dtype), known
 
 
-def _initial(scene: Scene) -> Float[Tensor, "B N 4"]:
-    """The states x_0, zero for absent agents."""
-    return torch.where(scene.agent_mask[..., None], scene.current, 0.0)
-
-
-def _direction(vector: Float[Tensor, "*batch 2"], otherwise: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+def _unit_or(vector: Float[Tensor, "*batch 2"], otherwise: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
     """The unit vector, or ``otherwise`` where the vector vanishes."""
     length = vector.norm(dim=-1, keepdim=True)
     return torch.where(length > _STILL, vector / length.clamp_min(_STILL), otherwise)

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.game.circles import length_of
-from epo_lightning.scene import HEADING, SPEED
+from epo_lightning.scene import HEADING, SPEED, heading_vector, velocities
 
 TIME_GAP = 1.0
 """T, the time [s] that the rear agent keeps to the front one, in addition to the margin."""
@@ -68,15 +68,11 @@ def headway(first: Tensor, second: Tensor, first_size: Tensor, second_size: Tens
 def time_to_conflict(first: Tensor, second: Tensor, first_size: Tensor, second_size: Tensor, margin: Tensor) -> Tensor:
     """Overlap [m] at the closest approach, less the later it is, [.., K] for states [.., K, 4]."""
     offset = first[..., :2] - second[..., :2]
-    velocity = first[..., SPEED, None] * _direction(first) - second[..., SPEED, None] * _direction(second)
+    velocity = velocities(first) - velocities(second)
     time = _within(-(offset * velocity).sum(-1) / (velocity.square().sum(-1) + SLOW), CONFLICT_TIME)
     distance = length_of(offset + time[..., None] * velocity)
     _, width = _half_sums(first_size, second_size)
     return (1.0 - time / CONFLICT_TIME) * torch.relu(width + margin - distance)
-
-
-def _direction(states: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 2"]:
-    return torch.stack((states[..., HEADING].cos(), states[..., HEADING].sin()), -1)
 
 
 def _within(value: Tensor, limit: float) -> Tensor:
@@ -96,7 +92,7 @@ def _window(value: Tensor, half_width: Tensor) -> Tensor:
 
 def _common_axis(first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"]) -> tuple[Tensor, Tensor, Tensor]:
     """The offset of the first from the second agent along and across the common axis, and the cosine of the angle."""
-    one, other = _direction(first), _direction(second)
+    one, other = heading_vector(first[..., HEADING]), heading_vector(second[..., HEADING])
     cosine = (one * other).sum(-1)
     sign = torch.where(cosine < 0, -1.0, 1.0).to(cosine.dtype)
     axis = (one + sign[..., None] * other) / (2.0 + 2.0 * cosine.abs()).sqrt()[..., None]

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.metrics.functional.overlap import overlapping_pairs
-from epo_lightning.scene import HEADING, SPEED, Scene, wrapped
+from epo_lightning.scene import HEADING, SPEED, Scene, heading_vector, wrapped
 
 INTERACTIVE = "interactive"
 SUBSETS = ("calm", INTERACTIVE)
@@ -95,7 +95,7 @@ def interacting_pairs(scene: Scene, shape: str = "disc") -> Bool[Tensor, "B P"]:
 
 def straight_on(states: Float[Tensor, "*B 4"], times: Float[Tensor, " T"]) -> Float[Tensor, "*B T 4"]:
     """States of agents that keep their velocity for each of the times [s]."""
-    ahead = torch.stack((states[..., HEADING].cos(), states[..., HEADING].sin()), -1)
+    ahead = heading_vector(states[..., HEADING])
     moved = states[..., None, :2] + (states[..., SPEED, None] * times)[..., None] * ahead[..., None, :]
     return torch.cat((moved, states[..., None, 2:].expand(*moved.shape[:-1], 2)), -1)
 
@@ -122,7 +122,7 @@ def along(
     change = high - low
     heading = low[..., HEADING] + share[..., 0] * wrapped(change[..., HEADING])
     beyond = (target - arc[..., -1:]).clamp_min(0.0)
-    ahead = torch.stack((heading.cos(), heading.sin()), -1)
+    ahead = heading_vector(heading)
     place = low[..., :2] + share * change[..., :2] + beyond[..., None] * ahead
     return torch.cat((place, heading[..., None], speed[..., None, None].expand_as(heading[..., None])), -1)
 

@@ -22,7 +22,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OwnFeature, Source
 from epo_lightning.game.game_end import free_controls
 from epo_lightning.game.pairs import pairs
-from epo_lightning.scene import HEADING, SPEED, Scene, X, Y
+from epo_lightning.scene import HEADING, SPEED, Scene, X, Y, heading_vector
 from epo_lightning.solvers.feedback.compiled import CONTROL, STATE
 from epo_lightning.solvers.feedback.lq_game import LQGame
 
@@ -165,7 +165,7 @@ def _dynamics(
 ) -> tuple[Float[Tensor, "B M N K 4 4"], Float[Tensor, "B M N K 4 2"]]:
     """Derivatives of every agent's next state by its state and by its control, along x_0 .. x_K."""
     heading, speed = states[..., HEADING], states[..., SPEED]
-    ahead = torch.stack((heading.cos(), heading.sin()), -1)
+    ahead = heading_vector(heading)
     aside = speed[..., None] * torch.stack((-heading.sin(), heading.cos()), -1)
     # The displacement is dt (beta v_k e_k + (1 - beta) v_{k+1} e_{k+1}); column 0: by the heading, column 1: by the speed.
     by_node = dt * torch.stack((aside, ahead), -1)
