@@ -75,7 +75,10 @@ class PairOrder:
     ) -> Bool[Tensor, "B M P K"]:
         """The steps 1 .. K at which both agents, on straight lines to their goals, are within ``lane`` [m] across n_ij."""
         present = scene.agent_mask[:, None, :, None]
-        start, goals = torch.where(present, scene.current_or_zero[:, None, :, :2], 0.0), torch.where(present, goals, 0.0)
+        start, goals = (
+            torch.where(present, scene.current_or_zero[:, None, :, :2], 0.0),
+            torch.where(present, goals, 0.0),
+        )
         first, second = pairs(goals.shape[2], goals.device)
         ahead = self.directions(scene)[:, None]
         aside = torch.stack((-ahead[..., 1], ahead[..., 0]), -1)
