@@ -14,7 +14,7 @@ from epo_lightning.explore.edit import Edit
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.pairs import pairs
-from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS, equilibrium_values
+from epo_lightning.metrics.forecast import equilibrium_values
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import KINDS, Scene
 from epo_lightning.solvers.base import TABLES
@@ -111,7 +111,7 @@ class Session:
         chosen = torch.zeros_like(inferred.probabilities).index_fill(1, torch.tensor([mode]), 1.0)
         forecast = dataclasses.replace(inferred, parameters=parameters, solution=solution, probabilities=chosen)
         forecast = self.forecaster.examine(scene, self.forecaster.explain(scene, forecast))
-        distance = dict(zip(EQUILIBRIUM_METRICS, equilibrium_values(forecast), strict=True))
+        gap = equilibrium_values(forecast).get("nash_gap_relative")
         ended = time.perf_counter()
         present = scene.agent_mask[0].nonzero().flatten().tolist()
         horizon, start = self.forecaster.task.horizon, inferred.initial_states
@@ -135,7 +135,7 @@ class Session:
             "pair_energy": {name: _plain(value[0, mode]) for name, value in (forecast.pair_energy or {}).items()},
             "own_weights": {name: _plain(value[0, mode]) for name, value in parameters.own_weights.items()},
             "pair_weights": {name: _plain(value[0, mode]) for name, value in parameters.pair_weights.items()},
-            "nash_gap": _number(distance["nash_gap_relative"]),
+            "nash_gap": None if gap is None else _number(gap),
             "milliseconds": {
                 "network": 1000 * (decoded - began),
                 "solver": 1000 * (solved - decoded),

@@ -133,7 +133,9 @@ class ForecastMetrics(Metric):
         Raises:
             ValueError: the scene has no future or no sizes, or another number of agents or steps than the forecast.
         """
-        values = forecast_values(forecast, scene, self.shape)
+        found = forecast_values(forecast, scene, self.shape)
+        none = torch.full_like(found["minADE"], torch.nan)
+        values = torch.stack([found.get(name, none).double() for name in COLUMNS], dim=1)
         groups = torch.ones(len(values), 1, dtype=torch.bool, device=values.device)
         if self.subsets:
             numbers = torch.arange(len(self.subsets), device=values.device)
@@ -164,8 +166,8 @@ class ForecastMetrics(Metric):
         return scores
 
 
-def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> Float[Tensor, "B metrics"]:
-    """All metrics of every scene, in the order of ``COLUMNS``, in float64; NaN where a scene has no value.
+def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> dict[str, Float[Tensor, " B"]]:
+    """Metrics of every scene by name, NaN where a scene has no value; without those that the forecast cannot have.
 
     Raises:
         ValueError: the scene has no future or no sizes.
@@ -174,24 +176,29 @@ def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> Float[
         raise ValueError("displacements need scene.future [B, N, K, 4], which is None")
     if scene.size is None:
         raise ValueError("overlap rates need scene.size [B, N, 2], which is None")
-    assert scene.agent_mask is not None
     mask = scene.future_mask & scene.agent_mask[..., None]
-    states, future = forecast.states, scene.future
-    columns = [distance(states, future, mask) for distance in (min_ade, min_fde, min_sade, min_sfde)]
-    columns += overlap_rates(states, forecast.probabilities, scene.size, scene.agent_mask, shape)
-    for distance in (min_sade, min_sfde):
-        initial = forecast.initial_states
-        columns.append(torch.full_like(columns[0], torch.nan) if initial is None else distance(initial, future, mask))
-    columns += equilibrium_values(forecast)
-    none = torch.full_like(columns[0], torch.nan)
-    modes = min(states.shape[1], len(MODE_METRICS)) if states.shape[1] > 1 else 0
-    columns += min_sade_of_likely(states, forecast.probabilities, future, mask)[:, :modes].unbind(1)
-    columns += [none] * (len(MODE_METRICS) - modes)
-    columns.append(brier_min_sade(states, forecast.probabilities, future, mask) if modes else none)
-    columns.append(missed(states, future, mask))
-    columns.append(pair_effect(forecast, scene.agent_mask))
-    columns.append(none if (lost := stopped(forecast)) is None else lost.double().mean(1))
-    return torch.stack([column.double() for column in columns], dim=1)
+    states, probabilities, future = forecast.states, forecast.probabilities, scene.future
+    values = {
+        "minADE": min_ade(states, future, mask),
+        "minFDE": min_fde(states, future, mask),
+        "minSADE": min_sade(states, future, mask),
+        "minSFDE": min_sfde(states, future, mask),
+        "missed": missed(states, future, mask),
+        "pair_effect": pair_effect(forecast, scene.agent_mask),
+        **equilibrium_values(forecast),
+    }
+    overlaps = overlap_rates(states, probabilities, scene.size, scene.agent_mask, shape)
+    values["overlap_jfp"], values["overlap_authors"] = overlaps
+    if (initial := forecast.initial_states) is not None:
+        values["initial/minSADE"] = min_sade(initial, future, mask)
+        values["initial/minSFDE"] = min_sfde(initial, future, mask)
+    if states.shape[1] > 1:
+        likely = min_sade_of_likely(states, probabilities, future, mask)
+        values |= dict(zip(MODE_METRICS, likely.unbind(1), strict=False))
+        values["brier_minSADE"] = brier_min_sade(states, probabilities, future, mask)
+    if (lost := stopped(forecast)) is not None:
+        values[STOPPED] = lost.double().mean(1)
+    return values
 
 
 def calibration_values(forecast: JointForecast, scene: Scene) -> Float[Tensor, "B bins 3"]:
@@ -231,19 +238,24 @@ def stopped(forecast: JointForecast) -> Bool[Tensor, "B M"] | None:
     return None if solution is None or solution.constraints is None else solution.status == Status.STOPPED
 
 
-def equilibrium_values(forecast: JointForecast) -> list[Float[Tensor, " B"]]:
-    """``EQUILIBRIUM_METRICS`` of every scene; NaN where a value is not finite.
+def equilibrium_values(forecast: JointForecast) -> dict[str, Float[Tensor, " B"]]:
+    """``EQUILIBRIUM_METRICS`` of every scene, NaN where a value is not finite; none without a measured equilibrium.
 
     Agents whose objective is not positive have no relative gap.
     """
     found = forecast.equilibrium
     if found is None:
-        return [forecast.probabilities.new_full((len(forecast.probabilities),), torch.nan)] * len(EQUILIBRIUM_METRICS)
-    values = [found.initial, found.energy, found.optimum, found.gradient_norm]
+        return {}
+    values = {
+        "energy_initial": found.initial,
+        "energy_solved": found.energy,
+        "energy_optimum": found.optimum,
+        "gradient_norm": found.gradient_norm,
+        "nash_gap": torch.full_like(found.energy, torch.nan),
+        "nash_gap_relative": torch.full_like(found.energy, torch.nan),
+    }
     if found.nash_gap.shape[1]:
         positive = found.objective > 0
         relative = torch.where(positive, found.nash_gap / torch.where(positive, found.objective, 1.0), -torch.inf)
-        values += [found.nash_gap.amax(1), relative.amax(1)]
-    else:
-        values += [torch.full_like(found.energy, torch.nan)] * 2
-    return [torch.where(value.isfinite(), value, torch.nan) for value in values]
+        values |= {"nash_gap": found.nash_gap.amax(1), "nash_gap_relative": relative.amax(1)}
+    return {name: torch.where(value.isfinite(), value, torch.nan) for name, value in values.items()}
