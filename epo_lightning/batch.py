@@ -21,7 +21,7 @@ class Batch:
 
     def __repr__(self) -> str:
         """The fields that are there, one per line, with types and shapes of their tensors."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        values = {field.name: getattr(self, field.name, None) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
         lines = "\n".join(f"{name}={_described(value)}," for name, value in values.items() if value is not None)
         return f"{type(self).__name__}(\n{textwrap.indent(lines, '    ')}\n)"
 
@@ -58,10 +58,12 @@ class Batch:
         """Batches that have the same fields as one batch: their tensors one after the other along a dimension.
 
         Raises:
-            ValueError: some have tensors that others lack.
+            ValueError: no batch, or batches of different fields, names or plain values; the message names the field.
         """
-        together = zip(*(part.tensors() for part in parts), strict=True)
-        return parts[0].map(lambda _: torch.cat(next(together), dim))
+        if not parts:
+            raise ValueError(f"no {cls.__name__} to concatenate")
+        joined: Some = _joined(parts, dim, cls.__name__)
+        return joined
 
     def to(self: Some, target: torch.device | torch.dtype | str) -> Some:
         """A copy on another device, or with its floating-point tensors in another precision."""
@@ -82,6 +84,25 @@ def _described(value: Any) -> str:
         return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
     if isinstance(value, Mapping):
         return f"{{{', '.join(f'{key!r}: {_described(entry)}' for key, entry in value.items())}}}"
-    if isinstance(value, tuple):
+    if isinstance(value, tuple | list):
         return f"({', '.join(map(_described, value))})"
-    return repr(value)
+    return f"{type(value).__name__}{list(value.shape)}" if hasattr(value, "shape") else repr(value)
+
+
+def _joined(values: Sequence[Any], dim: int, where: str) -> Any:
+    """Tensors, or equal structures of them, one after the other along a dimension."""
+    first = values[0]
+    if all(isinstance(value, Tensor) for value in values):
+        return torch.cat(list(values), dim)
+    if all(isinstance(value, Batch) and type(value) is type(first) for value in values):
+        names = [field.name for field in dataclasses.fields(first)]
+        return type(first)(**{n: _joined([getattr(value, n) for value in values], dim, f"{where}.{n}") for n in names})
+    if all(isinstance(value, Mapping) and value.keys() == first.keys() for value in values):
+        return {key: _joined([value[key] for value in values], dim, f"{where}.{key}") for key in first}
+    if all(isinstance(value, tuple) and len(value) == len(first) for value in values):
+        return tuple(_joined(entries, dim, where) for entries in zip(*values, strict=True))
+    if any(isinstance(value, Tensor | Batch | Mapping | tuple) or value != first for value in values):
+        raise ValueError(
+            f"{where} differs between the parts, which cannot be concatenated: {[_described(v) for v in values]}"
+        )
+    return first

@@ -12,6 +12,8 @@ from epo_lightning.scene import HEADING, SPEED, Scene
 
 SLACK, SHARE, NOISE = 0.5, 0.4, 0.1
 """Velocity [m/s], share of the larger one, and displacement [m] by which observed and stated motions may differ."""
+NAMED = 10
+"""Largest number of scenes that a sentence names."""
 
 
 @np.errstate(invalid="ignore", over="ignore")  # numbers that are not finite have a warning of their own
@@ -23,17 +25,17 @@ def doubts(scene: Scene) -> list[str]:
     found = []
     if rows := _scenes(_moves_otherwise(scene)):
         found.append(
-            f"in scene(s) {rows} agents do not move in the direction of their headings with their speeds: states are x, y "
-            "[m], heading [rad], speed [m/s], oldest first, dt seconds apart"
+            f"in {rows} agents do not move in the direction of their headings with their speeds: states are x, y [m], "
+            "heading [rad], speed [m/s], oldest first, dt seconds apart"
         )
     if scene.goal_headings is not None:
         assert scene.goal_mask is not None
         turn = abs(_array(scene.goal_headings) - _array(scene.current)[..., HEADING, None])
         exists = _array(scene.goal_mask) & _array(scene.agent_mask)[..., None]
-        if rows := _scenes((turn > math.pi + 1e-3) & exists):
+        if rows := _scenes((turn > math.pi + 1e-3) & np.isfinite(turn) & exists):
             found.append(
-                f"in scene(s) {rows} a goal heading differs from the agent's heading at t0 by more than half a turn: "
-                "headings are not wrapped, so add or subtract 2 pi unless the agent has to turn that far"
+                f"in {rows} a goal heading differs from the agent's heading at t0 by more than half a turn: headings are "
+                "not wrapped, so add or subtract 2 pi unless the agent has to turn that far"
             )
     return found
 
@@ -53,10 +55,12 @@ def _moves_otherwise(scene: Scene) -> Bool[np.ndarray, "B N"]:
 
 
 def _array(tensor: Tensor) -> np.ndarray:
-    return np.asarray(tensor.detach().cpu().numpy())
+    tensor = tensor.detach().cpu().resolve_neg()
+    return np.asarray((tensor.double() if tensor.is_floating_point() else tensor).numpy())
 
 
-def _scenes(doubtful: np.ndarray) -> list[int]:
-    """Indices of the scenes with a doubtful entry."""
-    rows: list[int] = np.flatnonzero(doubtful.reshape(len(doubtful), -1).any(1)).tolist()
-    return rows
+def _scenes(doubtful: np.ndarray) -> str:
+    """The scenes with a doubtful entry, of many the first ones; empty if there are none."""
+    rows = np.flatnonzero(doubtful.any(axis=tuple(range(1, doubtful.ndim)))).tolist()
+    more = f" and {len(rows) - NAMED} more" if len(rows) > NAMED else ""
+    return f"scene(s) {', '.join(map(str, rows[:NAMED]))}{more} of the batch" if rows else ""

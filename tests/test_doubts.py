@@ -37,7 +37,7 @@ def changed(scene: Scene, entry: int, value: float) -> Scene:
 def test_motions_that_contradict_headings_and_speeds_are_doubted(entry: int, value: float) -> None:
     assert not doubts(walking())
     (doubt,) = doubts(changed(walking(), entry, value))
-    assert doubt.startswith("in scene(s) [0] agents do not move")
+    assert doubt.startswith("in scene(s) 0 of the batch agents do not move")
 
 
 def test_reversing_is_not_doubted() -> None:
@@ -50,6 +50,18 @@ def test_numbers_that_are_not_finite_are_left_to_their_own_warning(value: float)
         warnings.simplefilter("error")
         for entry in (0, HEADING, SPEED):
             doubts(changed(walking(), entry, value))
+
+
+def test_scenes_of_any_size_and_type_are_read() -> None:
+    scene = changed(walking(goal_headings=torch.full((1, 2, 1), math.inf)), SPEED, 15.0)
+    for other in (scene[slice(0, 0)], scene.to(torch.bfloat16)):
+        doubts(other)
+    turned = dataclasses.replace(scene, history=torch._neg_view(-scene.history))
+    assert len(doubts(turned)) == 1, "goal headings that are not finite have a warning of their own"
+    many = doubts(scene[[0] * 30])
+    assert "in scene(s) 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 20 more of the batch agents" in many[0]
+    forecaster, empty = epo_lightning.load("rpi/v_lstm_epo"), pretrained.examples("rpi/v_lstm_epo")[slice(0, 0)]
+    assert forecaster.predict(empty).states.shape[0] == 0
 
 
 def test_absent_agents_and_steps_are_not_doubted() -> None:

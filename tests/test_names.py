@@ -42,7 +42,7 @@ def annotated(module: ModuleType) -> Iterator[tuple[str, Any]]:
             continue
         yield name, value
         for method, entry in vars(value).items() if inspect.isclass(value) else ():
-            function = getattr(entry, "__func__", getattr(entry, "fget", entry))
+            function = next((getattr(entry, of) for of in ("__func__", "fget", "func") if hasattr(entry, of)), entry)
             # Generated constructors have the annotations of other modules.
             generated = method == "__new__" or (method == "__init__" and dataclasses.is_dataclass(value))
             if inspect.isfunction(function) and not generated:

@@ -186,3 +186,25 @@ def test_batches_are_printed_as_types_and_shapes() -> None:
     assert "    own_weights={'goal': float32[3, 1, 2]}," in repr(game)
     nested = repr(JointForecast(torch.zeros(3, 1, 2, 40, 4), torch.ones(3, 1), parameters=game))
     assert "    parameters=GameParameters(\n        own_weights={'goal': float32[3, 1, 2]},\n" in nested
+
+
+def test_batches_are_joined_field_by_field_and_name_by_name() -> None:
+    game = GameParameters({"a": torch.zeros(2, 1, 2), "b": torch.ones(2, 1, 2)}, {}, torch.zeros(2, 1, 2, 4, 2))
+    turned = GameParameters({"b": torch.ones(1, 1, 2), "a": torch.zeros(1, 1, 2)}, {}, torch.ones(1, 1, 2, 4, 2))
+    joined = GameParameters.concatenated([game, turned])
+    assert (joined.own_weights["a"] == 0).all()
+    assert joined.own_weights["b"].shape == (3, 1, 2)
+    assert joined.initial_controls[:, 0, 0, 0, 0].tolist() == [0.0, 0.0, 1.0]
+    assert GameParameters.concatenated([game, game], 1).initial_controls.shape == (2, 2, 2, 4, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [({"id": None}, "Scene.id"), ({"dt": 0.2}, "Scene.dt"), ({"id": None, "subset": torch.zeros(3).long()}, "Scene.")],
+)
+def test_batches_of_different_fields_are_not_joined(change: dict[str, object], field: str) -> None:
+    scene = dataclasses.replace(random_scene(3), subset=None)
+    with pytest.raises(ValueError, match=f"{field}.* differs between the parts"):
+        Scene.concatenated([scene, dataclasses.replace(scene, **change)])
+    with pytest.raises(ValueError, match="no Scene to concatenate"):
+        Scene.concatenated([])

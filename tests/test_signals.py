@@ -44,7 +44,7 @@ def test_a_stopped_verb_prints_a_message(
 
 def test_a_stopped_multirun_is_continued_by_itself() -> None:
     ending = SystemExit(143)
-    ending.add_note("`epo train resume=runs/one` continues")
+    ending.add_note("continue with `epo train resume=runs/one`")
     assert "existing=continue" in cli._farewell("terminated", ["train", "-m", "seed=0,1"], ending)
     assert "the same command" in cli._farewell("terminated", ["sweep", "rpi_main"], ending)
 

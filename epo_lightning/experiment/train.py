@@ -92,14 +92,15 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
 
 
 def resume(run: RunFolder) -> None:
-    """Continue a run that was stopped, with its own configuration, from its last finished epoch.
+    """Continue a run that was stopped, with its own configuration, from its last finished epoch, and make its measurements.
 
     Raises:
-        ConfigError: the run is finished, its settings or its data have changed, its checkpoint is damaged or belongs to
-            another architecture, or another process works on the run.
+        ConfigError: the run is finished and measured, its settings or its data have changed, its checkpoint is damaged or
+            belongs to another architecture, or another process works on the run.
     """
     settings = settings_of(run)
-    if run.finished and distributed.here(settings.trainer.devices).leads:
+    complete = run.finished and all(run.metrics_file(which).is_file() for which in settings.measures)
+    if complete and distributed.here(settings.trainer.devices).leads:
         raise ConfigError(f"{run.path} is finished: `epo evaluate run={run.path}` scores it")
     train(run.config(), begun=run)
 
@@ -160,7 +161,8 @@ def _continuation(run: RunFolder) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, SystemExit) as ending:
-        ending.add_note(f"`epo {'evaluate run=' if run.finished else 'train resume='}{run.path}` continues")
+        if run.record_file.is_file():
+            ending.add_note(f"continue with `epo train resume={run.path}`")
         raise
 
 

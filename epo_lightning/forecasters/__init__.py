@@ -134,7 +134,7 @@ def _given(model: Mapping[str, Any]) -> Forecaster:
             "forecaster, such as forecaster.frozen=runs/highway_sim/v_lstm/short-s0"
         )
     path = Path(frozen).expanduser()
-    # The precision of the forecaster on top decides for both.
+    # The forecaster on top is built in single precision, to which this one is rounded.
     return load(path / "checkpoints" / "best.ckpt" if path.is_dir() else frozen).float()
 
 

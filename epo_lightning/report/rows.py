@@ -24,7 +24,7 @@ CONDITIONS = ("data", "trainer", "callbacks")
 SIDES = ("executed/missed", "alternative/missed")
 """Scores of RPI: shares of the scenes in which no mode is near the future on one side."""
 MANY_MISSED = 0.2
-"""Share above which a row has a note. Rows whose modes are all taught have less than a tenth."""
+"""Share above which a row has a note."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,10 @@ class Row:
 
     @property
     def missing(self) -> list[int]:
-        """Seeds of the trained runs of RPI whose modes miss one of the sides in many scenes."""
+        """Seeds of the runs of RPI whose modes are trained by the closest one, and miss one of the sides in many scenes."""
+        config = self.runs[0].config
+        if (config.get("forecaster") or {}).get("one_game") or not interacts(config):
+            return []  # equilibria of one game, or agents that do not react: nothing is taught to single modes
         return [
             run.seed
             for run in self.runs
@@ -144,9 +147,8 @@ def untaught(rows: Sequence[Row]) -> str:
     if not named:
         return ""
     return (
-        "No mode is near the future on one of the sides in more than a fifth of the scenes (score `missed`) with "
-        f"{', '.join(named)}. A mode may be untaught, and then errors say little about the method; docs/concepts.md, Modes, "
-        "has a remedy."
+        "In more than a fifth of the scenes of one side, these rows have no mode near the future (score `missed`): "
+        f"{', '.join(named)}. A mode may be untaught, and then errors say little about the method (docs/concepts.md, Modes)."
     )
 
 

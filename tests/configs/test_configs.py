@@ -242,6 +242,7 @@ MISTAKES = {
     "train forecaster=scene_consistent solver.steps=4": "which takes no solver: leave it out",
     "train -m forecaster=epo,scene_consistent backward=implicit": "takes no backward: leave it out",
     "train experiment=rpi/v_lstm_epo +energy=exid": "leave out the plus: energy=exid",
+    "train forecaster=marginal ~solver.steps": "~solver.steps has no effect on forecaster=marginal",
     "train -m forecaster=epo,scene_consistent objective.relaxation=0.1": "write forecaster.relaxation=0.1",
     "train objective.power=2 +objective.annealing=0.3": "exclude each other",
     "train forecaster=scene_consistent +forecaster.power=2 +forecaster.annealing=0.3": "exclude each other",
@@ -364,14 +365,21 @@ def test_other_folders_beside_the_tree_are_not_groups() -> None:
             "experiment/mine.yaml",
             "# @package _global_\ndefaults: [rpi/v_lstm, {/backbone: hivt_m}]",
             "experiment=mine",
-            r"in the defaults list of conf/experiment/mine\.yaml.*`- override /backbone: hivt_m`, with the slash",
+            r"in the defaults list of /.*experiment/mine\.yaml.*`- override /backbone: hivt_m`, with the slash",
         ),
         (
             "experiment/rpi/mine.yaml",
             "# @package _global_\ndefaults: [/experiment/rpi/v_lstm, {override backbone: hivt_m}]",
             "experiment=rpi/mine",
-            r"in the defaults list of conf/experiment/rpi/mine\.yaml.*`- override /backbone: <option>`, with the slash",
+            r"in the defaults list of /.*experiment/rpi/mine\.yaml.*`- override /backbone: <option>`, with the slash",
         ),
+        (
+            "experiment/mine.yaml",
+            "title: mine",
+            "experiment=mine",
+            "mine.yaml must begin with the line `# @package _glo",
+        ),
+        ("experiment/mine.yaml", b"\xe9: 1", "experiment=mine", r"experiment/mine\.yaml is not YAML: 'utf-8' codec"),
         (
             "backbone/mine.yaml",
             "name: v_lstm\n  width: 3",
@@ -381,10 +389,10 @@ def test_other_folders_beside_the_tree_are_not_groups() -> None:
     ],
 )
 def test_mistakes_in_files_of_the_tree_are_named(
-    tmp_path: Path, file: str, content: str, words: str, message: str
+    tmp_path: Path, file: str, content: str | bytes, words: str, message: str
 ) -> None:
     (tmp_path / file).parent.mkdir(parents=True)
-    (tmp_path / file).write_text(content)
+    (tmp_path / file).write_bytes(content.encode() if isinstance(content, str) else content)
     with pytest.raises(ConfigError, match=message):
         compose("train", [words], [str(tmp_path)])
 

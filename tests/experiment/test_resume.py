@@ -114,13 +114,13 @@ def test_a_run_that_is_terminated_while_it_is_measured_ends(
         patch.setattr(Forecaster, during, terminate)
         assert epo(*words) == 143
     run = RunFolder(Path("parts"))
-    next_command = "evaluate run=parts" if run.finished else "train resume=parts"
-    assert capsys.readouterr().err.endswith(f"epo: terminated; `epo {next_command}` continues\n")
+    assert capsys.readouterr().err.endswith("epo: terminated; continue with `epo train resume=parts`\n")
     assert signal.getsignal(signal.SIGTERM) == before
     assert not run.metrics_file().exists()
     assert not run.locked
-    assert epo(*words) == 0
+    assert epo("train", "resume=parts") == 0
     assert run.metrics_file().exists()
+    assert epo("train", "resume=parts") == 2, "nothing is left to do"
 
 
 def test_a_run_terminated_outside_lightning_loops_ends_at_once(
@@ -136,7 +136,7 @@ def test_a_run_terminated_outside_lightning_loops_ends_at_once(
         patch.setattr(training, "_best_score", terminate)
         assert epo(*WORSENING, "run_dir=parts") == 143
     assert RunFolder(Path("parts")).state == "interrupted"
-    assert capsys.readouterr().err.endswith("epo: terminated; `epo train resume=parts` continues\n")
+    assert capsys.readouterr().err.endswith("epo: terminated; continue with `epo train resume=parts`\n")
 
 
 def give_to(run: str, accelerator: str) -> None:

@@ -211,6 +211,6 @@ def summary(report: Mapping[str, Any]) -> list[str]:
     solver = report["solver"]
     return [
         *lines,
-        f"  both sides are equilibria in {report['two_modes']['all']:.0%} of the records, which are two scenes each",
-        f"  {solver['sub_games_dropped']} of {solver['sub_games']} games had no equilibrium that was kept",
+        f"  {report['two_modes']['all']:.0%} of the records have an equilibrium on both sides, and are two scenes each",
+        f"  {solver['sub_games_dropped']} of {solver['sub_games']} sub-games were left out: no equilibrium was found",
     ]

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from epo_lightning.experiment.config.messages import one_sentence, sentence
+from epo_lightning.experiment.config.messages import one_sentence, sentence, without_header
 from epo_lightning.experiment.config.sources import options_of, recorded_name
 from epo_lightning.identity import canonical, essence, of_row
 from epo_lightning.registry import ConfigError, parts
@@ -105,6 +105,9 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     if "trainer" in values and "hydra" in config:
         _check_game(values, config.hydra.overrides.task)
     if choices.get("experiment"):
+        instance = GlobalHydra.instance().hydra
+        if isinstance(values.get("experiment"), Mapping) and instance is not None:  # its settings under its own name
+            raise ConfigError(without_header(instance, choices["experiment"]))
         choices["experiment"] = recorded_name(choices["experiment"], choices.get("data", ""))
         values["experiment"] = choices["experiment"]
     if "trainer" in values:
@@ -134,7 +137,7 @@ def _check_game(values: Mapping[str, Any], overrides: Iterable[str]) -> None:
         return
     own, section = inspect.signature(chosen).parameters, values["forecaster"]
     ignored = "|".join(part for part in OF_GAMES if part not in own)
-    settings = re.compile(rf"\+*((?!solver\.backend=)({ignored})[.=].*)")
+    settings = re.compile(rf"[+~]*((?!solver\.backend=)({ignored})(?:[.=].*)?)")
     given = [match for word in overrides if (match := settings.fullmatch(word))]
     if not ignored or not given:
         return
@@ -146,9 +149,10 @@ def _check_game(values: Mapping[str, Any], overrides: Iterable[str]) -> None:
         there = f"write {'' if known in section else '+'}{place}={value}"
     else:
         there = "leave it out"
+    how = " as conf/experiment/rpi/*_squared.yaml do" if part == "objective" else f" for those that take a {part}"
     raise ConfigError(
         f"{given[0].group()} has no effect on forecaster={name}, which takes no {part}: {there}; in a sweep over several "
-        "forecasters, give every row its own setting in an experiment file, as conf/experiment/rpi/*_squared.yaml do"
+        f"forecasters, write it into experiment files{how}"
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from epo_lightning.experiment.config.sources import options_of
+from epo_lightning.experiment.config.sources import file_of, options_of
 from epo_lightning.registry import ConfigError, nearest, parts
 
 if TYPE_CHECKING:
@@ -43,10 +43,12 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
     except (HydraException, OmegaConfBaseException) as error:
         repeated = re.search(r"Multiple values for ([\w./@]+)\. .*'override [\w./@]+: (\S+)'", str(error))
         if repeated:
-            raise ConfigError(_override(repeated.group(1), repeated.group(2), overrides)) from error
+            raise ConfigError(_override(instance, repeated.group(1), repeated.group(2), overrides)) from error
+        if re.search(r"'\w+@experiment\.", str(error)):
+            raise ConfigError(without_header(instance, _chosen(overrides))) from error
         unknown = re.search(r"Could not (?:override|delete from config\.) +'([\w./@]+)'", str(error))
         if unknown and (relative := re.fullmatch(r"experiment/(?:[\w-]+/)*([\w-]+)@[\w.-]+", unknown.group(1))):
-            raise ConfigError(_override(relative.group(1), "<option>", overrides)) from error
+            raise ConfigError(_override(instance, relative.group(1), "<option>", overrides)) from error
         if unknown and "Multiple values" not in str(error):
             raise ConfigError(_unknown_key(instance, name, unknown.group(1), overrides)) from error
         raise ConfigError(sentence(error)) from error
@@ -56,15 +58,27 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
         raise ConfigError(sentence(error)) from error
 
 
-def _override(group: str, option: str, overrides: Sequence[str]) -> str:
-    """The error message for a second option of a group, from the command line or from an experiment's file."""
-    if f"+{group}={option}" in overrides:
-        return f"+{group}={option}: {group} has an option already, so leave out the plus: {group}={option}"
-    chosen = [word.partition("=")[2] for word in overrides if word.startswith("experiment=")]
-    file = f"conf/experiment/{chosen[-1]}.yaml" if chosen else "the file that chooses it"
+def without_header(instance: Hydra, experiment: str) -> str:
+    """The error message for an experiment's file whose settings are not those of the whole configuration."""
     return (
-        f"{group} has an option already: in the defaults list of {file}, or of a file that it is based on, write "
-        f"`- override /{group}: {option}`, with the slash"
+        f"{file_of(instance, experiment)} must begin with the line `# @package _global_`, as every experiment does (in "
+        "UTF-8 without a byte order mark)"
+    )
+
+
+def _chosen(overrides: Sequence[str]) -> str:
+    """The experiment that the command line chooses."""
+    chosen = [word.partition("=")[2] for word in overrides if word.startswith("experiment=")]
+    return chosen[-1].strip("'\"") if chosen else "<row>"
+
+
+def _override(instance: Hydra, group: str, option: str, overrides: Sequence[str]) -> str:
+    """The error message for a second option of a group, from the command line or from an experiment's file."""
+    if any(word.startswith(f"+{group}=") for word in overrides):
+        return f"+{group}={option}: {group} has an option already, so leave out the plus: {group}={option}"
+    return (
+        f"{group} has an option already: in the defaults list of {file_of(instance, _chosen(overrides))}, or of a file that "
+        f"it is based on, write `- override /{group}: {option}`, with the slash"
     )
 
 

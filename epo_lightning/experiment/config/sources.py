@@ -37,17 +37,15 @@ class ParsedOnce(FileConfigSource):
         if key not in _PARSED:
             try:
                 loaded = super().load_config(config_path)
-            except YAMLError as error:
+            except (YAMLError, UnicodeDecodeError) as error:
                 raise ConfigError(_where(file, error)) from error
-            if config_path.startswith(f"{EXPERIMENTS}/") and loaded.header.get("package") != "_global_":
-                raise ConfigError(f"{file} must begin with the line `# @package _global_`, as every experiment does")
             _PARSED[key] = pickle.dumps(loaded)
         # Hydra changes what it is given, so that every composition gets a copy.
         result: ConfigResult = pickle.loads(_PARSED[key])
         return result
 
 
-def _where(file: Path, error: YAMLError) -> str:
+def _where(file: Path, error: Exception) -> str:
     """What is wrong in a file of YAML, and in which line."""
     mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
     line = "" if mark is None else f":{mark.line + 1}"
@@ -149,6 +147,14 @@ class SweepsSource(ParsedOnce):
 
 def _ours(config_path: str) -> bool:
     return config_path == GROUP or config_path.startswith(f"{GROUP}/")
+
+
+def file_of(instance: Hydra, option: str) -> str:
+    """Path of the file of an experiment, in the first folder of the search path that has it; its usual place if none has."""
+    for source in instance.config_loader.get_sources():
+        if (file := Path(source.path) / EXPERIMENTS / f"{option}.yaml").is_file():
+            return str(file)
+    return f"conf/{EXPERIMENTS}/{option}.yaml"
 
 
 def options_of(instance: Hydra, group: str) -> list[str]:
