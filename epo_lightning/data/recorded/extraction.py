@@ -21,6 +21,7 @@ from safetensors.numpy import save
 
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.plausibility import doubts
 from epo_lightning.data.recorded.surroundings import far_from_lanes
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.data.recorded.windows import WindowConfig, extract
@@ -90,7 +91,9 @@ def _extract(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         try:
-            recording = source.read()
+            recording = _read(source)
+            for doubt in doubts(recording.tracks):
+                warnings.warn(doubt, stacklevel=1)
             if has_map and recording.lanes is None:
                 raise ConfigError(f"the recording {source.name} has no map: set data.map=false, or give it one")
             if not has_map:
@@ -112,6 +115,22 @@ def _extract(
     about["warnings"] = sorted({str(warning.message) for warning in caught})
     about["seconds"] = time.perf_counter() - begin
     return columns, Extracted(counts, about, problem)
+
+
+def _read(source: RecordingSource) -> Recording:
+    """The recording.
+
+    Raises:
+        RecordingError: as its reader raises it, or in the place of an exception in which the reader fails.
+    """
+    try:
+        return source.read()
+    except (ConfigError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        place = source.files[0] if source.files else source.name
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]
+        raise RecordingError(place, f"its reader fails, {what}") from error
 
 
 def _may_be_readable(source: RecordingSource, error: RecordingError) -> bool:

@@ -384,7 +384,8 @@ class RecordedData(SceneDataModule):
                 counts[name] += less[name]
                 counts[name]["scenes"] = int(mask.sum())
             tables = Lazy(tables.names, lambda name: selected(parts.tables(name), kept.get(name)))
-        self.rule.refuse_empty(self.dataset_name, used, splits, counts)
+        warned = {source.name: extracted[source.name].about.get("warnings", ()) for source in used}
+        self.rule.refuse_empty(self.dataset_name, used, splits, counts, warned)
         columns = parts.folder / "columns"
         shutil.rmtree(columns, ignore_errors=True)  # files that a killed process left
         try:

@@ -97,6 +97,7 @@ class SplitRule:
         sources: Sequence[RecordingSource],
         splits: Mapping[str, Sequence[RecordingSource]],
         counts: Mapping[str, Mapping[str, int]],
+        warned: Mapping[str, Sequence[str]],
     ) -> None:
         """Check that every split has scenes.
 
@@ -105,6 +106,7 @@ class SplitRule:
             sources: the recordings.
             splits: the recordings of each split.
             counts: for each recording by name, windows, windows that were left out by reason, and scenes.
+            warned: warnings of each recording by name.
 
         Raises:
             ConfigError: a split has no scene; names its recordings, the reasons, and what to change.
@@ -119,9 +121,15 @@ class SplitRule:
                     total[reason] = total.get(reason, 0) + count
             gone = ", ".join(f"{reason}: {count}" for reason, count in total.items() if count) or "no window at all"
             full = {source.name for source in sources if counts[source.name].get("scenes")}
-            advice = "Relax data.windows." if split == ALL else f"{self._advice(sources, full)} Or relax data.windows."
+            advice = (
+                f"{self._advice(sources, full)} Or relax data.windows."
+                if full and split != ALL
+                else "Relax data.windows."
+            )
+            said = list(dict.fromkeys(f"Warning of {name}: {text}." for name in names for text in warned[name]))[:2]
             raise ConfigError(
-                f"the split {split!r} of {dataset} has no scene ({gone}). Its recordings are {_some(names)}. {advice}"
+                f"the split {split!r} of {dataset} has no scene ({gone}). Its recordings are {_some(names)}. "
+                f"{' '.join([*said, advice])}"
             )
 
     def _advice(self, sources: Sequence[RecordingSource], full: Collection[str]) -> str:

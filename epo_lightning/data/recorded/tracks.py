@@ -70,8 +70,8 @@ class TrackTable:
             path: path of the file, for error messages.
 
         Raises:
-            RecordingError: no rows, numbers that are not finite, implausible units, or an agent whose frames do not
-                increase.
+            RecordingError: no rows, numbers of another type or that are not finite, implausible units, or an agent whose
+                frames do not increase.
         """
 
         def first(bad: Any) -> int:
@@ -79,16 +79,27 @@ class TrackTable:
 
         if not len(self.agent):
             raise RecordingError(path, "the recording has no tracks; at least one was expected")
+        for name in ("agent", "frame", "ids", "kind"):
+            if not np.issubdtype((given := getattr(self, name)).dtype, np.integer):
+                raise RecordingError(path, f"{name} is of type {given.dtype}; whole numbers were expected: number them")
+        for name in ("position", "heading", "velocity", "size"):
+            if not np.issubdtype((given := getattr(self, name)).dtype, np.floating):
+                raise RecordingError(path, f"{name} is of type {given.dtype}; floating-point numbers were expected")
         if not (np.isfinite(self.rate) and 1.0 <= self.rate <= 1000.0):
             raise RecordingError(path, f"a frame rate of {self.rate} Hz was expected to lie between 1 and 1000 Hz")
         by_agent = np.diff(self.agent)
         backwards = (by_agent < 0) | ((by_agent == 0) & (np.diff(self.frame) <= 0))
         if backwards.any():
             row = first(backwards) + 1
+            track, frame, before = self.ids[self.agent[row]], self.frame[row], self.frame[row - 1]
+            if self.agent[row] == self.agent[row - 1] and frame == before:
+                raise RecordingError(
+                    path, f"track {track} has frame {frame} twice: is its id that of two agents, or a row repeated?"
+                )
             raise RecordingError(
                 path,
-                f"frame {self.frame[row]} of track {self.ids[self.agent[row]]} comes after its frame "
-                f"{self.frame[row - 1]}: frames of a track must increase, and an id must belong to one agent",
+                f"frame {frame} of track {track} comes after its frame {before}: frames of a track must increase, and an id "
+                "must belong to one agent",
             )
         for name, values, limit, unit in (
             ("position", self.position, FARTHEST, "m"),

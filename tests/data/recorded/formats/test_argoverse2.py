@@ -238,7 +238,7 @@ def at(row, **values):
         (at(4, track_id="seven"), "row 5: track_id is 'seven'; a number or AV was expected"),
         (at(4, track_id="-1"), "row 5: track_id is '-1'"),
         (at(4, timestep=-1), "row 5: timestep is -1; 0 to"),
-        (at(4, timestep=3), "frame 3 of track 7 comes after its frame 3"),
+        (at(4, timestep=3), "track 7 has frame 3 twice"),
         (at(4, object_type="bus"), "track 7 is of the types 'vehicle' and 'bus'"),
         (lambda t: t.with_columns(pl.col("velocity_x", "velocity_y") * 3.6), "positions move 0.278 times as fast"),
         (lambda t: t.with_columns(pl.col("heading") + np.pi / 2), "headings differ by 90 degrees"),

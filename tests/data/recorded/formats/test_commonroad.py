@@ -333,7 +333,7 @@ BOMB = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY e "ha"><!ENTITY f "&e;&e;">]>
         (SCENARIO.replace("<time><exact>1<", "<time><exact>-1<"), "time of state 1 of dynamicObstacle 7 is -1; a step"),
         (
             SCENARIO.replace("<time><exact>1<", "<time><exact>2<"),
-            "frame 2 of track 7 comes after its frame 2: frames of",
+            "track 7 has frame 2 twice: is its id",
         ),
         (
             SCENARIO.replace("<time><exact>0<", "<time><exact>5<"),

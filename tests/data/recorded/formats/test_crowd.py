@@ -156,11 +156,11 @@ def test_options_decide_on_the_data_set_and_unknown_ones_are_refused(tmp_path):
         (pedestrians().replace("1,3,ped", "1,3.5,ped"), None, "row 11: frame is '3.5'; a whole number was expected"),
         (pedestrians().replace("1,3,ped", "1,3,veh"), None, "row 11: label is 'veh'; 'ped' was expected in this file"),
         (pedestrians().replace("1,3,ped", "-1,3,ped"), None, "row 11: id is -1; 0 .. 999999 was expected"),
-        (pedestrians().replace("1,3,ped", "1,4,ped"), None, "frame 4 of track 1 comes after its frame 4"),
+        (pedestrians().replace("1,3,ped", "1,4,ped"), None, "track 1 has frame 4 twice"),
         (None, vehicles().replace("30.0", "inf", 1), r"veh_filtered.csv, row 3: x_est is inf; a finite number"),
         (None, vehicles(speed=90.0), "jumps from .* vehicles stay below 40 m/s"),
         (None, vehicles(speed=90.0, frames=1), None),
-        (pedestrians(2) + pedestrians(2).split("\n", 1)[1], None, "frame 1 of track 0 comes after its frame 1"),
+        (pedestrians(2) + pedestrians(2).split("\n", 1)[1], None, "track 0 has frame 1 twice"),
     ],
 )
 def test_invalid_files_are_refused(tmp_path, ped, veh, message):

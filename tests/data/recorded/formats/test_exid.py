@@ -201,7 +201,7 @@ def scaled(factor, *names):
         (at(4, heading=float("nan")), r"row 6: heading is nan; degrees"),
         (at(4, frame=-1), r"row 6: frame -1 was expected in 0"),
         (at(4, frame=2), r"frame 2 of track 10 comes after its frame 3: frames of a track must increase"),
-        (at(4, frame=3), r"frame 3 of track 10 comes after its frame 3"),
+        (at(4, frame=3), r"track 10 has frame 3 twice"),
         (at(4, trackId=99), r"row 6: trackId 99 is not in 07_tracksMeta.csv"),
         (at(4, recordingId=8), r"row 6: recordingId is not 7 as in 07_recordingMeta.csv: .* mixed up"),
         (

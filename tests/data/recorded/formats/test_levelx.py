@@ -172,7 +172,7 @@ def test_invalid_files_of_highd_are_refused(tmp_path, file, change, message):
     text = path.read_text()
     if message is None:
         path.write_text(text.replace("\n1,3,", "\n2,3,", 1))
-        message = "frame 2 of track 3 comes after its frame 2"
+        message = "track 3 has frame 2 twice"
     else:
         assert change[0] in text
         path.write_text(text.replace(*change))

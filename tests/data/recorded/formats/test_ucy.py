@@ -142,7 +142,7 @@ def test_rows_between_the_annotated_frames_are_left_out_and_counted(tmp_path):
         (ROWS.replace("9.0", "nan"), "row 7: x is 'nan'; a finite number was expected"),
         (ROWS.replace("31 5", "31.5 5"), "row 7: frame is '31.5'; a whole number"),
         (ROWS.replace("31 5", "31 1e12"), r"row 7: pedestrian is '1e12'; a whole number up to 1e\+09 was expected"),
-        (ROWS.replace("31 5", "21 7"), "frame 2 of track 7 comes after its frame 2: frames of a track must increase"),
+        (ROWS.replace("31 5", "21 7"), "track 7 has frame 2 twice: is its id that of two agents"),
         (ROWS.replace("9.0", "9e9"), r"position \[9000000000.0, 9000000000.0\] of track 5 .* another unit"),
         (ROWS.replace("-1.0", "-999"), "velocity"),
         ("1 1 0 0 0 0 0 0\n1 2 0 0 0 0 0 0", "all rows are of one frame"),

@@ -1,0 +1,84 @@
+"""Doubts about tracks: every mistake of units, axes and frames that positions, velocities and headings show."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.plausibility import doubts
+from epo_lightning.data.recorded.tracks import TrackTable
+from epo_lightning.scene import KINDS
+
+AGENTS, STEPS, RATE = 6, 40, 10.0
+
+
+def walking(noise: float = 0.02) -> TrackTable:
+    """Pedestrians on gentle curves, in noisy positions."""
+    random = np.random.default_rng(0)
+    time = np.arange(STEPS) / RATE
+    start = random.uniform(-math.pi, math.pi, AGENTS)
+    heading = start[:, None] + 0.3 * random.standard_normal((AGENTS, 1)) * time
+    velocity = 1.4 * np.stack((np.cos(heading), np.sin(heading)), -1)
+    position = np.cumsum(velocity, 1) / RATE + noise * random.standard_normal((AGENTS, STEPS, 2))
+    return TrackTable(
+        rate=RATE,
+        agent=np.repeat(np.arange(AGENTS), STEPS),
+        frame=np.tile(np.arange(STEPS), AGENTS),
+        position=position.reshape(-1, 2),
+        heading=heading.reshape(-1),
+        velocity=velocity.reshape(-1, 2),
+        ids=np.arange(AGENTS),
+        size=np.full((AGENTS, 2), 0.5),
+        kind=np.full(AGENTS, KINDS.index("pedestrian")),
+    ).check("walking.csv")
+
+
+def test_tracks_without_a_mistake_are_not_doubted() -> None:
+    assert not doubts(walking())
+    turns = dataclasses.replace(walking(), heading=walking().heading + 4 * math.pi)
+    assert not doubts(turns)
+    assert not doubts(dataclasses.replace(walking(), velocity=0.0 * walking().velocity)), "agents that stand"
+
+
+@pytest.mark.parametrize(
+    ("mistake", "said"),
+    [
+        (lambda t: {"position": 3.28 * t.position}, "agents move 3.3 times as fast in their positions"),
+        (lambda t: {"velocity": 3.6 * t.velocity}, "agents move 0.28 times as fast in their positions"),
+        (lambda t: {"rate": 25.0}, "agents move 2.5 times as fast in their positions"),
+        (lambda t: {"position": t.position[:, ::-1]}, "another direction than that of their velocities"),
+        (lambda t: {"heading": np.degrees(t.heading)}, "another direction than that of their headings"),
+        (lambda t: {"heading": math.pi / 2 - t.heading}, "another direction than that of their headings"),
+        (lambda t: {"heading": t.heading + math.pi}, "headings, by 1.. degrees in the median"),
+        (
+            lambda t: {"frame": 2 * t.frame, "rate": 20.0},
+            "frames of a track are 2 apart .* is the frame rate 10 Hz instead of 20",
+        ),
+    ],
+)
+def test_mistakes_are_named(mistake: Callable[[TrackTable], dict[str, np.ndarray]], said: str) -> None:
+    tracks = walking()
+    (doubt,) = doubts(dataclasses.replace(tracks, **mistake(tracks)))
+    assert re.search(said, doubt)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "said"),
+    [
+        (
+            "ids",
+            np.array([f"p{number}" for number in range(AGENTS)], dtype=object),
+            "ids is of type object; whole numbers",
+        ),
+        ("position", np.ones((AGENTS * STEPS, 2), dtype=int), "position is of type int64; floating-point numbers"),
+    ],
+)
+def test_numbers_of_another_type_are_refused(name: str, given: np.ndarray, said: str) -> None:
+    with pytest.raises(RecordingError, match=said):
+        dataclasses.replace(walking(), **{name: given}).check("walking.csv")
