@@ -270,8 +270,8 @@ def _multirun(arguments: Arguments) -> None:
 
         for job in listed:
             settings = read(Settings, compose.compose("train", job, arguments.extra))
-            assembly.check_buildable(settings)
-            train.refuse_occupied(settings, train.folder_for(settings))
+            data, _ = assembly.check_buildable(settings)
+            train.refuse_occupied(settings, train.folder_for(settings), data.digest)
         print(f"{len(listed)} runs")
         for done in compose.launch("train", arguments.overrides, listed, job_of_sweep, arguments.extra):
             if isinstance(done._return_value, Exception):

@@ -20,6 +20,7 @@ Where agents do not interact, the refined futures are the tracked ones.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import sys
 import warnings
@@ -30,6 +31,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.checks import check_number, is_number
+from epo_lightning.doubts import SHARE, SLACK, doubts
 from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.game.dynamics import Dynamics, Unicycle, controls_between
 from epo_lightning.game.energy import Energy
@@ -37,7 +39,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.flatness import followed_controls
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import SPEED, Scene
+from epo_lightning.scene import SPEED, Scene, velocities
 from epo_lightning.solvers.backward import Backward, Implicit
 from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -60,6 +62,16 @@ LARGEST = 1e6
 """Largest weight, margin and inverse temperature: squares and products of larger ones leave the range of float32."""
 JUMP = 5.0
 """Distance [m] from the present position up to which a future may begin, besides three times what the speed explains."""
+FAR, RESOLUTION = 1000.0, 0.01
+"""Distance [m] from the origin above which a scene is moved to it, and the coarsest resolution [m] without a warning."""
+UNTRACKED = 1.0
+"""Mean distance [m] of a given future from the one that is tracked, above which there is a warning."""
+EXAMPLES = {
+    "energy": "epo_lightning.game.energy.Energy, such as epo_lightning.FeatureEnergy(...)",
+    "solver": "epo_lightning.solvers.base.Minimiser, such as epo_lightning.LevenbergMarquardt(...)",
+    "backward": "epo_lightning.solvers.backward.Backward: Implicit(), Unrolled(), Truncated(...) or Detached()",
+}
+"""What the arguments of :func:`refine` are instances of."""
 SUM_TOLERANCE = 1e-3
 """Largest difference from one of the sum of a scene's probabilities; files of predictions are often rounded."""
 
@@ -125,9 +137,11 @@ def refine(
         ("backward", backward if backward is not None else Implicit(), Backward),
     ):
         if not isinstance(part, kind):
-            raise TypeError(f"{what} is a {type(part).__name__}; it takes a {kind.__module__}.{kind.__name__}")
+            raise TypeError(f"{what} is a {type(part).__name__}; it takes an instance of {EXAMPLES[what]}")
     scene.validate_values()
     check_forecast(states, probabilities, scene)
+    for doubt in doubts(scene):
+        warnings.warn(doubt, stacklevel=2)
     check_number("noise", noise, zero=True)
     if isinstance(inverse_temperature, Tensor):
         real = inverse_temperature.is_floating_point() and not inverse_temperature.dim()
@@ -151,14 +165,17 @@ def refine(
     for what, given in (("weights", weights), ("margins", margins)):
         for name, value in given.items():
             known = value.numel() > 0 if isinstance(value, Tensor) else is_number(value)
+            if known and not isinstance(value, Tensor) and value < 0:
+                raise ValueError(f"{what}[{name!r}] must be 0 or more, not {value:g}")
             if known and LARGEST < _largest(value) < math.inf:
                 raise ValueError(f"{what}[{name!r}] must be at most {LARGEST:g} in size, not {_largest(value):g}")
     learned = (*weights.values(), *margins.values(), inverse_temperature)
+    origin = _origin(states, scene)
     with torch.set_grad_enabled(torch.is_grad_enabled() and any(_requires_grad(value) for value in learned)):
-        return refined(
-            states,
+        forecast = refined(
+            _moved(states, -origin[:, None, None, None]),
             probabilities.log(),
-            scene,
+            dataclasses.replace(scene, history=_moved(scene.history, -origin[:, None, None])),
             energy,
             weights,
             margins,
@@ -166,6 +183,61 @@ def refine(
             noise,
             solver,
             Implicit() if backward is None else backward,
+        )
+    assert forecast.initial_states is not None
+    assert forecast.solution is not None
+    back = origin[:, None, None, None]
+    tracked = _moved(forecast.initial_states, back)
+    _warn_of_untracked(states, tracked.detach(), scene)
+    return dataclasses.replace(
+        forecast,
+        states=_moved(forecast.states, back),
+        initial_states=tracked,
+        solution=dataclasses.replace(forecast.solution, states=_moved(forecast.solution.states, back)),
+    )
+
+
+def _origin(states: Tensor, scene: Scene) -> Float[Tensor, "B 2"]:
+    """The mean present position of the agents of scenes in coordinates of a map; zero for scenes near the origin.
+
+    Such coordinates have few digits in single precision, and the game does not depend on the origin.
+    """
+    current = scene.current_or_zero[..., :2]
+    count = scene.agent_mask.sum(-1, keepdim=True).clamp_min(1)
+    largest = current.abs().flatten(1).amax(-1) if current.numel() else current.new_zeros(len(current))
+    farthest = max(largest.tolist(), default=0.0)
+    resolution = farthest * max(torch.finfo(tensor.dtype).eps for tensor in (states, scene.history))
+    if resolution > RESOLUTION:
+        warnings.warn(
+            f"positions are up to {farthest:.0f} m from the origin, where single precision has a resolution of "
+            f"{resolution:.2g} m: give scene and futures in double precision, or subtract an origin",
+            stacklevel=3,
+        )
+    return torch.where(largest[:, None] > FAR, current.sum(1) / count, 0.0)
+
+
+def _moved(states: Float[Tensor, "*batch X"], by: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*batch X"]:
+    """States with other positions."""
+    return torch.cat((states[..., :2] + by.to(states.dtype), states[..., 2:]), -1)
+
+
+def _warn_of_untracked(states: Tensor, tracked: Tensor, scene: Scene) -> None:
+    """Warn of given futures that unicycles with these present states do not follow, or do not begin as they move."""
+    way = torch.linalg.vector_norm(tracked[..., :2] - states[..., :2], dim=-1).mean(-1)
+    current = scene.current_or_zero.to(states.dtype)
+    begun = (states[..., 0, :2] - current[:, None, :, :2]) / scene.dt
+    stated = velocities(current)[:, None]
+    turned = torch.linalg.vector_norm(begun - stated, dim=-1)
+    largest = torch.maximum(torch.linalg.vector_norm(begun, dim=-1), torch.linalg.vector_norm(stated, dim=-1))
+    far = (way > UNTRACKED) | (turned > SLACK + SHARE * largest + NOISE / scene.dt)
+    far &= scene.agent_mask[:, None]
+    if far.any():
+        number, mode, agent = far.nonzero()[0].tolist()
+        warnings.warn(
+            f"{int(far.sum())} of the given futures of agents do not continue their present motion, the first one "
+            f"states[{number}, {mode}, {agent}]: are headings [rad], speeds [m/s] and dt [s] right, and is the first step "
+            "one dt after the present?",
+            stacklevel=3,
         )
 
 

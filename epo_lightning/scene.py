@@ -221,7 +221,7 @@ class Scene(Batch):
     @property
     def current_or_zero(self) -> Float[Tensor, "B N 4"]:
         """The states at t0; zero for absent agents, whose entries are padding of any value."""
-        return self.current.where(self.agent_mask[..., None], 0.0)
+        return torch.where(self.agent_mask[..., None], self.current, 0.0)
 
     @property
     def finite(self) -> Bool[Tensor, " B"]:

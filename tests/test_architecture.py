@@ -30,7 +30,7 @@ FLOORS = {
     "losses": set(),
     "game": {"scene", "forecast", "registry", "checks", "host"},
     "solvers": {"game", "scene", "forecast", "registry", "checks", "host", "warp_kernels"},
-    "refinement": {"game", "solvers", "scene", "forecast", "registry", "checks"},
+    "refinement": {"doubts", "game", "solvers", "scene", "forecast", "registry", "checks"},
     "predictions": {"scene", "registry", "run_folder", "refinement"},
     "encoders": {"scene"},
     "metrics": {"scene", "forecast", "registry"},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 
 import pytest
 import torch
@@ -249,7 +250,7 @@ BROKEN[0, 0, 1, 3, 0] = math.nan
             ValueError,
             r"weights\['accref'\] is of type .*complex64",
         ),
-        ({"energy": None}, TypeError, "energy is a NoneType; it takes a epo_lightning.game.energy.Energy"),
+        ({"energy": None}, TypeError, "energy is a NoneType; it takes an instance of epo_lightning.game.energy.Energy"),
         ({"solver": None}, TypeError, "solver is a NoneType"),
         ({"backward": "implicit"}, TypeError, "backward is a str"),
         ({"noise": -0.1}, ValueError, "noise must be a number, 0 or more"),
@@ -311,3 +312,45 @@ def test_one_weight_of_the_default_energy_can_be_changed():
         refine(states, torch.ones(1, 1), scene, weights={"circles": 20.0}).states, whole.states, rtol=0, atol=0
     )
     assert not torch.equal(whole.states, refine(states, torch.ones(1, 1), scene).states)
+
+
+def crossing_at(offset: float = 0.0, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, Scene]:
+    """Positions of the futures of two cars whose paths cross, and their scene; far from the origin by an offset."""
+    scene, states = crossing(dtype)
+    history = scene.history.clone()
+    history[..., :2] += offset
+    return states[..., :2] + offset, dataclasses.replace(scene, history=history)
+
+
+def test_scenes_in_coordinates_of_a_map_are_refined_as_near_the_origin() -> None:
+    near, far = (
+        refine(given, torch.ones(1, 1).double(), scene)
+        for given, scene in (crossing_at(dtype=torch.double), crossing_at(5.4e6, torch.double))
+    )
+    torch.testing.assert_close(far.states[..., :2] - 5.4e6, near.states[..., :2], rtol=0, atol=1e-6)
+    torch.testing.assert_close(far.initial_states[..., :2] - 5.4e6, near.initial_states[..., :2], rtol=0, atol=1e-6)
+    states, scene = crossing_at(5.4e6)
+    with pytest.warns(
+        UserWarning, match=r"up to 5400000 m from the origin, where single precision has a resolution of 0\.6"
+    ):
+        refine(states, torch.ones(1, 1), scene)
+
+
+@pytest.mark.parametrize(("entry", "factor"), [(2, 0.0), (2, 2.0), (3, 3.6), (3, 0.0)])
+def test_futures_that_contradict_the_present_states_are_warned_of(entry: int, factor: float) -> None:
+    states, scene = crossing_at()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        refine(states, torch.ones(1, 1), scene)
+    history = scene.history.clone()
+    history[..., entry] *= factor
+    with pytest.warns(UserWarning, match=r"of the given futures of agents do not continue .* states\[0, 0, [01]\]"):
+        refine(states, torch.ones(1, 1), dataclasses.replace(scene, history=history))
+
+
+def test_negative_weights_and_names_of_derivatives_are_refused() -> None:
+    states, scene = crossing_at()
+    with pytest.raises(ValueError, match=r"weights\['circles'\] must be 0 or more, not -20"):
+        refine(states, torch.ones(1, 1), scene, weights={"circles": -20.0})
+    with pytest.raises(TypeError, match=r"backward is a str; it takes an instance of .*Implicit\(\), Unrolled\(\)"):
+        refine(states, torch.ones(1, 1), scene, backward="unrolled")

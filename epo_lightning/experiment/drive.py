@@ -201,6 +201,7 @@ def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make
                 make = _of_run(forecaster, way, settings.mode == "nearest")
             except ConfigError as error:  # a forecaster without a game has no warm start and no pair terms
                 lacking.append(f"{path}, {way}: {error}")
+                print(f"left out: {lacking[-1]}", flush=True)
                 continue
             yield WAYS[way].format(title), make
     if len(lacking) == len(paths) * len(settings.ways) and not baselines:

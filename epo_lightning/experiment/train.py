@@ -69,7 +69,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
     if settings.trainer.devices > 1 and follower.trained_as_follower(settings.trainer.devices, run):
         return run
     if begun is None:
-        refuse_occupied(settings, run)
+        refuse_occupied(settings, run, data.digest)
     if not run.finished:
         data.setup("fit")  # raises an error for missing data before a run folder is made
     # In a sweep, another process may be training this run: wait until it has finished. Otherwise wait two seconds.
@@ -80,7 +80,9 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
             if not run.finished:
                 run.update(status=TRAINING, error=None)
         else:
-            refuse_occupied(settings, run)  # again, now under the lock: another process may have begun the run
+            refuse_occupied(
+                settings, run, data.digest
+            )  # again, now under the lock: another process may have begun the run
             run.begin(config, _record(settings, config, data.digest, overrides))
         if not run.finished:
             with _errors_recorded(run), assembly.signals():
@@ -273,19 +275,24 @@ def _steps_in(path: Path, model: LightningModule) -> int:
     return int(content.get("global_step", 0))
 
 
-def refuse_occupied(settings: Settings, run: RunFolder) -> None:
-    """Refuse a folder whose contents a new run would overwrite.
+def refuse_occupied(settings: Settings, run: RunFolder, digest: str) -> None:
+    """Refuse a folder whose contents a new run on the data of this digest would overwrite.
 
     Raises:
         ConfigError: the folder holds something other than a run that ``settings`` may continue (``existing=continue``).
     """
     if run.exists and not (settings.existing == "continue" and run.record_file.is_file()):
-        raise ConfigError(_occupied(run))
+        raise ConfigError(_occupied(run, digest))
 
 
-def _occupied(run: RunFolder) -> str:
+def _occupied(run: RunFolder, digest: str) -> str:
     if not run.record_file.is_file():
         return f"{run.path} exists and is not a run folder: nothing is overwritten; choose another run_dir=<folder>"
+    if (began_with := run.record.get("data_digest")) != digest:
+        return (
+            f"{run.path} holds a run on other data (digest {began_with}, now {digest}), of which folders of runs are not "
+            "named: nothing is overwritten; choose another run_dir=<folder> or runs=<folder>"
+        )
     if run.finished:
         other = " of other code than the present one" if of_other_code(run.record) else ""
         return (

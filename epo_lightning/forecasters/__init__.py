@@ -133,22 +133,23 @@ def _given(model: Mapping[str, Any]) -> Forecaster:
             "forecaster.frozen names no trained forecaster: give a run folder, a checkpoint or the name of a shipped "
             "forecaster, such as forecaster.frozen=runs/highway_sim/v_lstm/short-s0"
         )
-    path = Path(frozen).expanduser()
     # The forecaster on top is built in single precision, to which this one is rounded.
-    return load(path / "checkpoints" / "best.ckpt" if path.is_dir() else frozen).float()
+    return load(frozen).float()
 
 
 def load(checkpoint: str | Path) -> Forecaster:
     """Load a trained forecaster in evaluation mode. The checkpoint alone is needed, and no code in it is executed.
 
     Args:
-        checkpoint: path of a ``.ckpt`` file, or the name of a forecaster that ships with the package:
-            ``load("rpi/v_lstm_epo")``. A path that exists takes precedence.
+        checkpoint: path of a ``.ckpt`` file or of a run folder, whose best epoch is meant; or the name of a forecaster that
+            ships with the package, ``load("rpi/v_lstm_epo")``. A path that exists takes precedence.
 
     Raises:
         ConfigError: as :func:`~epo_lightning.forecasters.checkpoint.read_checkpoint`, or weights of another architecture.
     """
-    checkpoint = pretrained.checkpoint_of(checkpoint) or checkpoint
+    checkpoint = pretrained.checkpoint_of(checkpoint) or Path(checkpoint).expanduser()
+    if checkpoint.is_dir():
+        checkpoint = checkpoint / "checkpoints" / "best.ckpt"
     content = read_checkpoint(checkpoint)
     forecaster = build_forecaster(content["configuration"])
     if any(tensor.dtype == torch.double for tensor in content["state_dict"].values()):
