@@ -126,7 +126,7 @@ class SplitRule:
                 if full and split != ALL
                 else "Relax data.windows."
             )
-            said = list(dict.fromkeys(f"Warning of {name}: {text}." for name in names for text in warned[name]))[:2]
+            said = list(dict.fromkeys(f"Warning of {name}: {text}" for name in names for text in warned[name]))[:2]
             raise ConfigError(
                 f"the split {split!r} of {dataset} has no scene ({gone}). Its recordings are {_some(names)}. "
                 f"{' '.join([*said, advice])}"
