@@ -32,6 +32,16 @@ def weights(folder: str | Path, which: str = "last") -> dict[str, torch.Tensor]:
     return torch.load(RunFolder(Path(folder)).checkpoint(which), weights_only=True)["state_dict"]
 
 
+def test_a_folder_with_a_run_on_other_data_is_named_as_such(epo: Epo, refused: Callable[..., str]) -> None:
+    words = ("train", ROW, "data=drawn", "budget=smoke", "callbacks.progress=none", "run_dir=run")
+    assert epo(*words, "data.scenes=32") == 0
+    message = refused(*words, "data.scenes=48")
+    assert "run holds a run on other data (digest " in message
+    assert "choose another run_dir=<folder>" in message
+    assert "data.scenes: 32 there, 48 here" in refused(*words, "data.scenes=48", "existing=continue")
+    assert epo_lightning.load("run").configuration == epo_lightning.load("run/checkpoints/best.ckpt").configuration
+
+
 def test_a_run_folder_holds_what_a_run_needs(epo: Epo) -> None:
     assert epo("train", ROW, *TINY, "run_dir=run", "seed=3") == 0
     run = RunFolder.open("run")
@@ -147,7 +157,7 @@ def test_a_finished_run_is_never_overwritten(
 def test_another_configuration_does_not_continue_a_run(epo: Epo, refused: Callable[..., str]) -> None:
     assert epo("train", ROW, *TINY, "run_dir=run") == 0
     RunFolder(Path("run")).update(status="training")
-    assert "solver.steps" in refused("train", ROW, *TINY, "run_dir=run", "existing=continue", "solver.steps=5")
+    assert "optimizer.lr" in refused("train", ROW, *TINY, "run_dir=run", "existing=continue", "optimizer.lr=0.5")
     assert "keeps its own configuration" in refused("train", "resume=run", "seed=4")
     run = RunFolder(Path("run"))
     run.update(data_digest="other", identity=identity(run.config(), "other"))
