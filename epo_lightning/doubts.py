@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -16,47 +17,62 @@ NAMED = 10
 """Largest number of scenes that a sentence names."""
 
 
-@np.errstate(invalid="ignore", over="ignore")  # numbers that are not finite have a warning of their own
-def doubts(scene: Scene) -> list[str]:
-    """Sentences on scenes whose headings and speeds are not those of their positions, or whose goal headings are wrapped.
+# They are computed in numpy: for single scenes, every operation of PyTorch takes five times as long. Numbers that are not
+# finite have a warning of their own.
 
-    They are computed in numpy: for single scenes, every operation of PyTorch takes five times as long.
-    """
-    found = []
-    if rows := _scenes(_moves_otherwise(scene)):
-        found.append(
-            f"in {rows} agents do not move in the direction of their headings with their speeds: states are x, y [m], "
-            "heading [rad], speed [m/s], oldest first, dt seconds apart"
-        )
-    if scene.goal_headings is not None:
-        assert scene.goal_mask is not None
-        turn = abs(_array(scene.goal_headings) - _array(scene.current)[..., HEADING, None])
-        exists = _array(scene.goal_mask) & _array(scene.agent_mask)[..., None]
-        if rows := _scenes((turn > math.pi + 1e-3) & np.isfinite(turn) & exists):
-            found.append(
-                f"in {rows} a goal heading differs from the agent's heading at t0 by more than half a turn: headings are "
-                "not wrapped, so add or subtract 2 pi unless the agent has to turn that far"
-            )
-    return found
+
+@np.errstate(invalid="ignore", over="ignore")
+def of_motion(scene: Scene) -> str | None:
+    """A sentence on scenes whose headings and speeds are not those of their positions; None if there are none."""
+    if scene.history.shape[2] < 2 or not (rows := _scenes(_moves_otherwise(scene))):
+        return None
+    return (
+        f"in {rows} agents do not move in the direction of their headings with their speeds: states are x, y [m], heading "
+        "[rad], speed [m/s], oldest first, dt seconds apart"
+    )
+
+
+@np.errstate(invalid="ignore", over="ignore")
+def of_goal_headings(scene: Scene) -> str | None:
+    """A sentence on scenes whose goal headings were wrapped; None if there are none."""
+    if scene.goal_headings is None:
+        return None
+    assert scene.goal_mask is not None
+    turn = abs(array(scene.goal_headings) - array(scene.current)[..., HEADING, None])
+    exists = array(scene.goal_mask) & array(scene.agent_mask)[..., None]
+    rows = _scenes((turn > math.pi + 1e-3) & np.isfinite(turn) & exists)
+    if not rows:
+        return None
+    return (
+        f"in {rows} a goal heading differs from the agent's heading at t0 by more than half a turn: headings are not "
+        "wrapped, so add or subtract 2 pi unless the agent has to turn that far"
+    )
 
 
 def _moves_otherwise(scene: Scene) -> Bool[np.ndarray, "B N"]:
     """Mask of the agents whose mean observed velocity is not that of their headings and speeds."""
-    states, seen = _array(scene.history), _array(scene.history_mask)
-    steps = seen[..., 1:] & seen[..., :-1] & _array(scene.agent_mask)[..., None]
+    seen = array(scene.history_mask)
+    steps = seen[..., 1:] & seen[..., :-1] & array(scene.agent_mask)[..., None]
     time = scene.dt * steps.sum(-1).clip(1)
-    heading, speed = states[..., :-1, HEADING], states[..., :-1, SPEED]
-    stated = scene.dt * speed * np.exp(1j * heading)  # velocities in the plane, as complex numbers
-    moved = states[..., 1:, :2] - states[..., :-1, :2]
-    observed = moved[..., 0] + 1j * moved[..., 1]
-    stated, observed = (np.where(steps, way, 0.0).sum(-1) / time for way in (stated, observed))
-    allowed = SLACK + SHARE * np.maximum(abs(stated), abs(observed)) + NOISE / time
-    return abs(observed - stated) > allowed
+    states = array(scene.history)
+    velocity = states[..., :-1, SPEED] * np.exp(1j * states[..., :-1, HEADING])  # in the plane, as complex numbers
+    moved = np.diff(states[..., 0] + 1j * states[..., 1], axis=-1)
+    stated = np.where(steps, velocity, 0.0).sum(-1) * scene.dt / time
+    observed = np.where(steps, moved, 0.0).sum(-1) / time
+    return contradict(observed, stated, time)
 
 
-def _array(tensor: Tensor) -> np.ndarray:
+def contradict(one: np.ndarray, other: np.ndarray, time: np.ndarray | float) -> np.ndarray:
+    """Mask of velocities, as complex numbers, that differ by more than noise of positions within a time [s] explains."""
+    return np.asarray(abs(one - other) > SLACK + SHARE * np.maximum(abs(one), abs(other)) + NOISE / time)
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    """A tensor's values on the CPU, in single or double precision."""
     tensor = tensor.detach().cpu().resolve_neg()
-    return np.asarray((tensor.double() if tensor.is_floating_point() else tensor).numpy())
+    if tensor.is_floating_point() and tensor.dtype not in (torch.float32, torch.float64):
+        tensor = tensor.double()
+    return np.asarray(tensor.numpy())
 
 
 def _scenes(doubtful: np.ndarray) -> str:

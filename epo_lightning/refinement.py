@@ -26,12 +26,13 @@ import sys
 import warnings
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.checks import check_number, is_number
-from epo_lightning.doubts import SHARE, SLACK, doubts
+from epo_lightning.doubts import array, contradict
 from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.game.dynamics import Dynamics, Unicycle, controls_between
 from epo_lightning.game.energy import Energy
@@ -39,7 +40,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.flatness import followed_controls
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import SPEED, Scene, velocities
+from epo_lightning.scene import HEADING, SPEED, Scene
 from epo_lightning.solvers.backward import Backward, Implicit
 from epo_lightning.solvers.base import TABLES, Minimiser
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -64,8 +65,6 @@ JUMP = 5.0
 """Distance [m] from the present position up to which a future may begin, besides three times what the speed explains."""
 FAR, RESOLUTION = 1000.0, 0.01
 """Distance [m] from the origin above which a scene is moved to it, and the coarsest resolution [m] without a warning."""
-UNTRACKED = 1.0
-"""Mean distance [m] of a given future from the one that is tracked, above which there is a warning."""
 EXAMPLES = {
     "energy": "epo_lightning.game.energy.Energy, such as epo_lightning.FeatureEnergy(...)",
     "solver": "epo_lightning.solvers.base.Minimiser, such as epo_lightning.LevenbergMarquardt(...)",
@@ -140,8 +139,6 @@ def refine(
             raise TypeError(f"{what} is a {type(part).__name__}; it takes an instance of {EXAMPLES[what]}")
     scene.validate_values()
     check_forecast(states, probabilities, scene)
-    for doubt in doubts(scene):
-        warnings.warn(doubt, stacklevel=2)
     check_number("noise", noise, zero=True)
     if isinstance(inverse_temperature, Tensor):
         real = inverse_temperature.is_floating_point() and not inverse_temperature.dim()
@@ -171,11 +168,13 @@ def refine(
                 raise ValueError(f"{what}[{name!r}] must be at most {LARGEST:g} in size, not {_largest(value):g}")
     learned = (*weights.values(), *margins.values(), inverse_temperature)
     origin = _origin(states, scene)
+    if origin is not None:
+        near = dataclasses.replace(scene, history=_moved(scene.history, -origin[:, None, None]))
     with torch.set_grad_enabled(torch.is_grad_enabled() and any(_requires_grad(value) for value in learned)):
         forecast = refined(
-            _moved(states, -origin[:, None, None, None]),
+            states if origin is None else _moved(states, -origin[:, None, None, None]),
             probabilities.log(),
-            dataclasses.replace(scene, history=_moved(scene.history, -origin[:, None, None])),
+            scene if origin is None else near,
             energy,
             weights,
             margins,
@@ -184,28 +183,19 @@ def refine(
             solver,
             Implicit() if backward is None else backward,
         )
-    assert forecast.initial_states is not None
-    assert forecast.solution is not None
-    back = origin[:, None, None, None]
-    tracked = _moved(forecast.initial_states, back)
-    _warn_of_untracked(states, tracked.detach(), scene)
-    return dataclasses.replace(
-        forecast,
-        states=_moved(forecast.states, back),
-        initial_states=tracked,
-        solution=dataclasses.replace(forecast.solution, states=_moved(forecast.solution.states, back)),
-    )
+    return forecast if origin is None else _moved_back(forecast, origin[:, None, None, None])
 
 
-def _origin(states: Tensor, scene: Scene) -> Float[Tensor, "B 2"]:
-    """The mean present position of the agents of scenes in coordinates of a map; zero for scenes near the origin.
+def _origin(states: Tensor, scene: Scene) -> Float[Tensor, "B 2"] | None:
+    """The mean present position of the agents of scenes in coordinates of a map; None if all scenes are near the origin.
 
     Such coordinates have few digits in single precision, and the game does not depend on the origin.
     """
-    current = scene.current_or_zero[..., :2]
-    count = scene.agent_mask.sum(-1, keepdim=True).clamp_min(1)
-    largest = current.abs().flatten(1).amax(-1) if current.numel() else current.new_zeros(len(current))
-    farthest = max(largest.tolist(), default=0.0)
+    if float(scene.current[..., :2].abs().sum()) <= FAR:
+        return None
+    farthest = float(scene.current_or_zero[..., :2].abs().max())
+    if farthest <= FAR:
+        return None
     resolution = farthest * max(torch.finfo(tensor.dtype).eps for tensor in (states, scene.history))
     if resolution > RESOLUTION:
         warnings.warn(
@@ -213,7 +203,7 @@ def _origin(states: Tensor, scene: Scene) -> Float[Tensor, "B 2"]:
             f"{resolution:.2g} m: give scene and futures in double precision, or subtract an origin",
             stacklevel=3,
         )
-    return torch.where(largest[:, None] > FAR, current.sum(1) / count, 0.0)
+    return scene.current_or_zero[..., :2].sum(1) / scene.agent_mask.sum(-1, keepdim=True).clamp_min(1)
 
 
 def _moved(states: Float[Tensor, "*batch X"], by: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*batch X"]:
@@ -221,24 +211,16 @@ def _moved(states: Float[Tensor, "*batch X"], by: Float[Tensor, "*#batch 2"]) ->
     return torch.cat((states[..., :2] + by.to(states.dtype), states[..., 2:]), -1)
 
 
-def _warn_of_untracked(states: Tensor, tracked: Tensor, scene: Scene) -> None:
-    """Warn of given futures that unicycles with these present states do not follow, or do not begin as they move."""
-    way = torch.linalg.vector_norm(tracked[..., :2] - states[..., :2], dim=-1).mean(-1)
-    current = scene.current_or_zero.to(states.dtype)
-    begun = (states[..., 0, :2] - current[:, None, :, :2]) / scene.dt
-    stated = velocities(current)[:, None]
-    turned = torch.linalg.vector_norm(begun - stated, dim=-1)
-    largest = torch.maximum(torch.linalg.vector_norm(begun, dim=-1), torch.linalg.vector_norm(stated, dim=-1))
-    far = (way > UNTRACKED) | (turned > SLACK + SHARE * largest + NOISE / scene.dt)
-    far &= scene.agent_mask[:, None]
-    if far.any():
-        number, mode, agent = far.nonzero()[0].tolist()
-        warnings.warn(
-            f"{int(far.sum())} of the given futures of agents do not continue their present motion, the first one "
-            f"states[{number}, {mode}, {agent}]: are headings [rad], speeds [m/s] and dt [s] right, and is the first step "
-            "one dt after the present?",
-            stacklevel=3,
-        )
+def _moved_back(forecast: JointForecast, by: Float[Tensor, "B 1 1 1 2"]) -> JointForecast:
+    """A forecast with other positions."""
+    assert forecast.initial_states is not None
+    assert forecast.solution is not None
+    return dataclasses.replace(
+        forecast,
+        states=_moved(forecast.states, by),
+        initial_states=_moved(forecast.initial_states, by),
+        solution=dataclasses.replace(forecast.solution, states=_moved(forecast.solution.states, by)),
+    )
 
 
 def _largest(value: float | Tensor) -> float:
@@ -393,17 +375,7 @@ def check_forecast(states: Tensor, probabilities: Tensor, scene: Scene) -> None:
         raise ValueError(
             f"the present state scene.history[{at[0]}, {at[1]}, -1] is not finite: mark the agent as absent"
         )
-    gap = (states[..., 0, :2] - scene.current[:, None, :, :2]).norm(dim=-1)
-    reach = JUMP + 3.0 * scene.dt * scene.current[:, None, :, SPEED].abs()
-    torn = (gap > reach) & scene.agent_mask[:, None]
-    if torn.any():
-        at = torn.nonzero()[0].tolist()
-        warnings.warn(
-            f"states{at} begins {float(gap[tuple(at)]):.1f} m from the agent's present position, of which its speed "
-            f"explains {scene.dt * float(scene.current[at[0], at[2], SPEED].abs()):.1f} m: are futures and histories in the "
-            "same coordinates? The first step is one dt after the present",
-            stacklevel=3,
-        )
+    _warn_of_beginnings(states, scene)
     bad = ~(probabilities >= 0).all(1) | ((probabilities.sum(1) - 1).abs() > SUM_TOLERANCE)
     if bad.any():
         where = int(bad.nonzero()[0])
@@ -411,6 +383,35 @@ def check_forecast(states: Tensor, probabilities: Tensor, scene: Scene) -> None:
             f"probabilities[{where}] is {probabilities[where].tolist()}; the probabilities of a scene's joint modes are 0 "
             "or more and sum to 1"
         )
+
+
+def _warn_of_beginnings(states: Tensor, scene: Scene) -> None:
+    """Warn of futures that begin far from the present positions, or with another velocity than the present one.
+
+    Computed in numpy: for single scenes, every operation of PyTorch takes several times as long.
+    """
+    current, first = array(scene.current), array(states[..., 0, :2])
+    place, velocity = current[..., 0] + 1j * current[..., 1], current[..., SPEED] * np.exp(1j * current[..., HEADING])
+    moved = first[..., 0] + 1j * first[..., 1] - place[:, None]  # in the plane, as complex numbers
+    wrong = contradict(moved / scene.dt, velocity[:, None], scene.dt) & array(scene.agent_mask)[:, None]
+    if not wrong.any():
+        return
+    gap, own = abs(moved), scene.dt * abs(velocity)
+    torn = wrong & (gap > JUMP + 3.0 * own[:, None])
+    number, mode, agent = np.argwhere(torn if torn.any() else wrong)[0].tolist()
+    if torn.any():
+        said = (
+            f"states[{number}, {mode}, {agent}] begins {gap[number, mode, agent]:.1f} m from the agent's present position, "
+            f"of which its speed explains {own[number, agent]:.1f} m: are futures and histories in the same coordinates? The "
+            "first step is one dt after the present"
+        )
+    else:
+        said = (
+            f"{wrong.sum()} of the given futures of agents do not continue their present motion, the first one "
+            f"states[{number}, {mode}, {agent}]: are headings [rad], speeds [m/s] and dt [s] right, and is the first step "
+            "one dt after the present?"
+        )
+    warnings.warn(said, stacklevel=4)
 
 
 def check_energy(energy: Energy, solver: Minimiser) -> None:

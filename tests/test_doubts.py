@@ -12,8 +12,13 @@ from games import highway_scene
 
 import epo_lightning
 from epo_lightning import Scene, pretrained
-from epo_lightning.doubts import doubts
+from epo_lightning.doubts import of_goal_headings, of_motion
 from epo_lightning.scene import HEADING, SPEED
+
+
+def doubts(scene: Scene) -> list[str]:
+    """All doubts about a scene."""
+    return [doubt for doubt in (of_motion(scene), of_goal_headings(scene)) if doubt]
 
 
 def walking(**fields: torch.Tensor) -> Scene:
@@ -97,3 +102,16 @@ def test_a_prediction_warns() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         forecaster.predict(scene)
+        forecaster.predict(wrong)  # motions are looked at up to the first batch without a doubt
+
+
+@pytest.mark.parametrize("name", ["rpi/v_lstm_epo", "rpi/v_lstm_epo_game_refined"])
+def test_goal_headings_are_looked_at_where_forecasts_depend_on_them(name: str) -> None:
+    forecaster, scene = epo_lightning.load(name), pretrained.examples(name)[:2]
+    forecaster.predict(scene)
+    wrapped = dataclasses.replace(scene, goal_headings=scene.goal_headings - 2 * math.pi)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        forecaster.predict(wrapped)
+    said = ["a goal heading differs" in str(warning.message) for warning in caught]
+    assert said == ([True] if forecaster.reads_goal_headings else [])

@@ -10,8 +10,8 @@ import torch
 from lightning import LightningModule
 from torch import Tensor, nn
 
+from epo_lightning import doubts
 from epo_lightning.decoders.weights import SharedWeights
-from epo_lightning.doubts import doubts
 from epo_lightning.forecast import JointForecast
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.metrics.forecast import COLUMNS, STOPPED, stopped
@@ -32,6 +32,8 @@ class Forecaster(LightningModule):
         optimizer: the optimiser and its learning-rate schedule.
     """
 
+    reads_goal_headings: bool = False
+    """Whether forecasts depend on the headings that are wanted at goals."""
     configuration: dict[str, Any]
     """The model's configuration, from which this forecaster was built; stored in every checkpoint."""
     step_graph: Callable[[Scene], tuple[Tensor, dict[str, Tensor]]] | None = None
@@ -40,6 +42,7 @@ class Forecaster(LightningModule):
 
     def __init__(self, task: Task, optimizer: Adam) -> None:
         super().__init__()
+        self._plausible = False
         self.task = task
         self.optimizer = optimizer
         self.val_metrics = ForecastMetrics(task.subsets, task.shape)
@@ -55,7 +58,8 @@ class Forecaster(LightningModule):
 
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
         other scenes of the batch are the same as without it. Warnings say how many joint modes violate hard constraints, and
-        which scenes are probably wrong (:func:`epo_lightning.doubts.doubts`).
+        which scenes are probably wrong (:mod:`epo_lightning.doubts`). Motions are looked at up to the first batch without a
+        doubt: for every batch, this would take a tenth of a single scene's forecast.
 
         Raises:
             TypeError: the argument is not a :class:`Scene`.
@@ -66,7 +70,11 @@ class Forecaster(LightningModule):
         if abs(scene.dt - self.task.dt) > 1e-6:
             raise ValueError(f"the scene has dt = {scene.dt} s, but this forecaster was built for {self.task.dt} s")
         scene.validate_values()
-        for doubt in doubts(scene):
+        found = [] if self._plausible else [doubts.of_motion(scene)]
+        self._plausible = self._plausible or (found == [None] and len(scene.history) > 0)
+        if self.reads_goal_headings:
+            found.append(doubts.of_goal_headings(scene))
+        for doubt in filter(None, found):
             warnings.warn(doubt, stacklevel=3)
         broken = (~scene.finite).nonzero().flatten().tolist()
         if broken:
