@@ -402,8 +402,8 @@ def _warn_of_beginnings(states: Tensor, scene: Scene) -> None:
     if torn.any():
         said = (
             f"states[{number}, {mode}, {agent}] begins {gap[number, mode, agent]:.1f} m from the agent's present position, "
-            f"of which its speed explains {own[number, agent]:.1f} m: are futures and histories in the same coordinates? The "
-            "first step is one dt after the present"
+            f"of which its speed explains {own[number, agent]:.1f} m: are futures and histories in the same coordinates? "
+            "The first step is one dt after the present"
         )
     else:
         said = (
