@@ -1,4 +1,8 @@
-"""Doubts about scenes that a user has made: values that are allowed, and nearly always a mistake."""
+"""Doubts about scenes that a user has made: values that are allowed, and nearly always a mistake.
+
+They are computed in numpy: for single scenes, every operation of PyTorch takes five times as long. Numbers that are not
+finite are not doubted, because they have a warning of their own.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +19,6 @@ SLACK, SHARE, NOISE = 0.5, 0.4, 0.1
 """Velocity [m/s], share of the larger one, and displacement [m] by which observed and stated motions may differ."""
 NAMED = 10
 """Largest number of scenes that a sentence names."""
-
-
-# They are computed in numpy: for single scenes, every operation of PyTorch takes five times as long. Numbers that are not
-# finite have a warning of their own.
 
 
 @np.errstate(invalid="ignore", over="ignore")
