@@ -103,7 +103,7 @@ def _rounded(distance: Tensor, temperature: float) -> Tensor:
 
 
 class Softness(NamedTuple):
-    """What an imitation loss is at an optimisation step; the defaults are the paper's loss.
+    """Power, relaxation and temperature of an imitation loss at an optimisation step; the defaults are the paper's loss.
 
     Attributes:
         power: exponent of :func:`distances`.

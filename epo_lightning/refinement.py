@@ -191,7 +191,7 @@ def _origin(states: Tensor, scene: Scene) -> Float[Tensor, "B 2"] | None:
 
     Such coordinates have few digits in single precision, and the game does not depend on the origin.
     """
-    if float(scene.current[..., :2].abs().sum()) <= FAR:
+    if float(scene.current[..., :2].abs().sum()) <= FAR:  # a quick answer for most scenes
         return None
     farthest = float(scene.current_or_zero[..., :2].abs().max())
     if farthest <= FAR:
@@ -391,13 +391,18 @@ def _warn_of_beginnings(states: Tensor, scene: Scene) -> None:
     Computed in numpy: for single scenes, every operation of PyTorch takes several times as long.
     """
     current, first = array(scene.current), array(states[..., 0, :2])
-    place, velocity = current[..., 0] + 1j * current[..., 1], current[..., SPEED] * np.exp(1j * current[..., HEADING])
-    moved = first[..., 0] + 1j * first[..., 1] - place[:, None]  # in the plane, as complex numbers
-    wrong = contradict(moved / scene.dt, velocity[:, None], scene.dt) & array(scene.agent_mask)[:, None]
+    present = array(scene.agent_mask)[:, None]
+    with np.errstate(invalid="ignore", over="ignore"):  # absent agents may have any numbers
+        place, velocity = (
+            current[..., 0] + 1j * current[..., 1],
+            current[..., SPEED] * np.exp(1j * current[..., HEADING]),
+        )
+        moved = first[..., 0] + 1j * first[..., 1] - place[:, None]  # in the plane, as complex numbers
+        gap, own = abs(moved), scene.dt * abs(velocity)
+        torn = (gap > JUMP + 3.0 * own[:, None]) & present
+        wrong = torn | (contradict(moved / scene.dt, velocity[:, None], scene.dt) & present)
     if not wrong.any():
         return
-    gap, own = abs(moved), scene.dt * abs(velocity)
-    torn = wrong & (gap > JUMP + 3.0 * own[:, None])
     number, mode, agent = np.argwhere(torn if torn.any() else wrong)[0].tolist()
     if torn.any():
         said = (

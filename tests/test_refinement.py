@@ -348,6 +348,17 @@ def test_futures_that_contradict_the_present_states_are_warned_of(entry: int, fa
         refine(states, torch.ones(1, 1), dataclasses.replace(scene, history=history))
 
 
+def test_absent_agents_may_have_any_numbers() -> None:
+    states, scene = crossing_at()
+    for value in (math.nan, math.inf):
+        history, padded = scene.history.clone(), states.clone()
+        history[:, 1], padded[:, :, 1] = value, value
+        alone = dataclasses.replace(scene, history=history, agent_mask=torch.tensor([[True, False]]))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert refine(padded, torch.ones(1, 1), alone).states[:, :, 0].isfinite().all()
+
+
 def test_negative_weights_and_names_of_derivatives_are_refused() -> None:
     states, scene = crossing_at()
     with pytest.raises(ValueError, match=r"weights\['circles'\] must be 0 or more, not -20"):

@@ -19,7 +19,7 @@ from epo_lightning.drive.episodes import Episodes
 from epo_lightning.drive.world import EGO, Outcome, World
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.metrics.functional.overlap import overlaps_with
-from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE, heading_vector
+from epo_lightning.scene import ACCELERATION, SPEED, TURN_RATE, velocities
 
 SOON = 5.0
 """Longest time to collision [s] that is looked for; episodes without a shorter one count with it."""
@@ -117,8 +117,7 @@ def _approaching(happened: Outcome) -> Bool[Tensor, "B T+1 N"]:
     """Mask of the agents whose centre would come so near to that of the planned agent, within :data:`SOON` at constant
     velocities, that bodies may overlap."""
     states = happened.states.transpose(1, 2)
-    heading, speed = states[..., HEADING], states[..., SPEED]
-    velocity = speed[..., None] * heading_vector(heading)
+    velocity = velocities(states)
     offset = states[..., :2] - states[:, :, EGO, None, :2]
     closing = velocity - velocity[:, :, EGO, None]
     slowest = torch.finfo(closing.dtype).tiny

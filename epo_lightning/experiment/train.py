@@ -80,9 +80,8 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
             if not run.finished:
                 run.update(status=TRAINING, error=None)
         else:
-            refuse_occupied(
-                settings, run, data.digest
-            )  # again, now under the lock: another process may have begun the run
+            # Again, now under the lock: another process may have begun the run.
+            refuse_occupied(settings, run, data.digest)
             run.begin(config, _record(settings, config, data.digest, overrides))
         if not run.finished:
             with _errors_recorded(run), assembly.signals():
@@ -290,8 +289,8 @@ def _occupied(run: RunFolder, digest: str) -> str:
         return f"{run.path} exists and is not a run folder: nothing is overwritten; choose another run_dir=<folder>"
     if (began_with := run.record.get("data_digest")) != digest:
         return (
-            f"{run.path} holds a run on other data (digest {began_with}, now {digest}), of which folders of runs are not "
-            "named: nothing is overwritten; choose another run_dir=<folder> or runs=<folder>"
+            f"{run.path} holds a run on other data (digest {began_with}, now {digest}; the name of a run's folder does not "
+            "depend on it): nothing is overwritten; choose another run_dir=<folder> or runs=<folder>"
         )
     if run.finished:
         other = " of other code than the present one" if of_other_code(run.record) else ""

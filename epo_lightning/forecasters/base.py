@@ -42,7 +42,7 @@ class Forecaster(LightningModule):
 
     def __init__(self, task: Task, optimizer: Adam) -> None:
         super().__init__()
-        self._plausible = False
+        self._plausible = False  # whether `predict` has seen a batch whose motions are plausible
         self.task = task
         self.optimizer = optimizer
         self.val_metrics = ForecastMetrics(task.subsets, task.shape)
@@ -70,11 +70,10 @@ class Forecaster(LightningModule):
         if abs(scene.dt - self.task.dt) > 1e-6:
             raise ValueError(f"the scene has dt = {scene.dt} s, but this forecaster was built for {self.task.dt} s")
         scene.validate_values()
-        found = [] if self._plausible else [doubts.of_motion(scene)]
-        self._plausible = self._plausible or (found == [None] and len(scene.history) > 0)
-        if self.reads_goal_headings:
-            found.append(doubts.of_goal_headings(scene))
-        for doubt in filter(None, found):
+        motion = None if self._plausible else doubts.of_motion(scene)
+        self._plausible = self._plausible or (motion is None and len(scene.history) > 0)
+        headings = doubts.of_goal_headings(scene) if self.reads_goal_headings else None
+        for doubt in filter(None, (motion, headings)):
             warnings.warn(doubt, stacklevel=3)
         broken = (~scene.finite).nonzero().flatten().tolist()
         if broken:

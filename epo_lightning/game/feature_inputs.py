@@ -1,4 +1,4 @@
-"""What named features read of a game: settings, weights, targets, sizes and masks. Absent agents have zeros."""
+"""Inputs of named features: settings, weights, targets, sizes and masks. Absent agents have zeros."""
 
 from __future__ import annotations
 

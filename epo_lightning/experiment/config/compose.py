@@ -96,14 +96,14 @@ def resolve(config: DictConfig) -> dict[str, Any]:
 
     Raises:
         ConfigError: an interpolation of a key that does not exist, a value that is still missing, or settings of a
-            part for a forecaster that takes none.
+            part that the forecaster does not take.
     """
     from hydra.core.global_hydra import GlobalHydra
 
     choices = dict(config.hydra.runtime.choices) if "hydra" in config else {}
     values = _plain_values(config)
     if "trainer" in values and "hydra" in config:
-        _check_game(values, config.hydra.overrides.task)
+        _refuse_ignored(values, config.hydra.overrides.task)
     if choices.get("experiment"):
         instance = GlobalHydra.instance().hydra
         if isinstance(values.get("experiment"), Mapping) and instance is not None:  # its settings under its own name
@@ -122,7 +122,7 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     return values
 
 
-def _check_game(values: Mapping[str, Any], overrides: Iterable[str]) -> None:
+def _refuse_ignored(values: Mapping[str, Any], overrides: Iterable[str]) -> None:
     """Refuse settings of :data:`OF_GAMES` for a forecaster that takes no such part and would silently ignore them.
 
     Without this check, a table would have rows "power=1" and "power=2" with equal scores. The implementation of a solver,

@@ -46,7 +46,7 @@ class ParsedOnce(FileConfigSource):
 
 
 def _where(file: Path, error: Exception) -> str:
-    """What is wrong in a file of YAML, and in which line."""
+    """The problem in a file of YAML, with its line."""
     mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
     line = "" if mark is None else f":{mark.line + 1}"
     return f"{file}{line} is not YAML: {' '.join(str(problem or error).split())}"
