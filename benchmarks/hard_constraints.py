@@ -26,7 +26,7 @@ from epo_lightning import FeatureEnergy, GameParameters, LevenbergMarquardt, Sce
 from epo_lightning.experiment import assembly
 from epo_lightning.forecast import Status
 from epo_lightning.game.neighbours import closest_approach
-from epo_lightning.refinement import NOISE, track
+from epo_lightning.refinement.game import NOISE, track
 from epo_lightning.registry import ConfigError
 from epo_lightning.solvers.base import Minimiser
 from epo_lightning.solvers.gauss_newton.augmented_lagrangian import AugmentedLagrangian

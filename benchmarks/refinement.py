@@ -25,7 +25,8 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.metrics import ForecastMetrics
-from epo_lightning.refinement import INVERSE_TEMPERATURE, NOISE, WEIGHTS
+from epo_lightning.refinement import INVERSE_TEMPERATURE, WEIGHTS
+from epo_lightning.refinement.game import NOISE
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 

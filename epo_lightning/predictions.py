@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from epo_lightning.refinement import check_forecast
+from epo_lightning.refinement.given import check_forecast
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import write_file
 from epo_lightning.scene import Scene

@@ -27,7 +27,7 @@ from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.refinement import NOISE, track
+from epo_lightning.refinement.game import NOISE, track
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import FIELDS, HEADING, SPEED, Scene
 from epo_lightning.solvers.base import TABLES
@@ -127,7 +127,7 @@ class Planner(Protocol):
 class ForecastPlanner:
     """The planned agent's part of a forecaster's joint mode.
 
-    Forecasts without controls are tracked with the unicycle (:func:`~epo_lightning.refinement.track`).
+    Forecasts without controls are tracked with the unicycle (:func:`~epo_lightning.refinement.game.track`).
 
     Args:
         forecaster: any forecaster.

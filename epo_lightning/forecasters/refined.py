@@ -19,7 +19,7 @@ from epo_lightning.forecasters.epo_settings import check_start
 from epo_lightning.game.energy import Energy
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
-from epo_lightning.refinement import NOISE, check_energy, refined
+from epo_lightning.refinement.game import NOISE, check_energy, refined
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Backward
