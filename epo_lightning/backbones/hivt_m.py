@@ -20,7 +20,7 @@ class HiVTM(PolylineBackbone):
     """Hierarchical Vector Transformer, modified: a transformer per agent, then VIBES's two stages of attention.
 
     In HiVT itself the transformer already sees lanes and other agents; the paper moves both to the global graph (Appendix
-    C.1, "Agent History Encoder").
+    E.1, "Agent History Encoder").
 
     Attributes:
         history_heads: heads of the transformer's attention.

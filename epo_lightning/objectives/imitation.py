@@ -1,4 +1,4 @@
-"""Imitation through the solution: the joint future closest to the observed one is drawn towards it (Section 4.4, Eq. 12)."""
+"""Imitation through the solution: the joint future closest to the observed one is drawn towards it (Section 4.5, Eq. 12)."""
 
 from __future__ import annotations
 
