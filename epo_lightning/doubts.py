@@ -21,6 +21,14 @@ NAMED = 10
 """Largest number of scenes that a sentence names."""
 
 
+def of_history(scene: Scene, trained: int | None) -> str | None:
+    """A sentence on histories of another length than those of the training; None if they agree, or that is not known."""
+    steps = scene.history.shape[2]
+    if trained is None or steps == trained:
+        return None
+    return f"the history has {steps} steps, and that of the training had {trained}: expect larger errors"
+
+
 @np.errstate(invalid="ignore", over="ignore")
 def of_motion(scene: Scene) -> str | None:
     """A sentence on scenes whose headings and speeds are not those of their positions; None if there are none."""

@@ -24,6 +24,7 @@ class Task:
             candidates also have reference lines, the line of each candidate, and reference speeds.
         map: whether scenes have lanes.
         scale: unit [m] of positions at inputs and outputs of networks.
+        history: number H of observed steps; None if it is not known, as for checkpoints of older versions.
 
     Raises:
         ConfigError: a size or unit that no scene can have.
@@ -36,6 +37,7 @@ class Task:
     candidates: int = 1
     map: bool = False
     scale: float = 1.0
+    history: int | None = None
 
     def __post_init__(self) -> None:
         if self.horizon < 1 or self.candidates < 0:
@@ -43,6 +45,8 @@ class Task:
                 f"a task has 1 future step or more and 0 goal candidates or more, not horizon={self.horizon}, "
                 f"candidates={self.candidates}"
             )
+        if self.history is not None and self.history < 1:
+            raise ConfigError(f"a task's history must be 1 step or more, not {self.history}")
         for name in ("dt", "scale"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"a task's {name} must be positive and finite, not {getattr(self, name)}")

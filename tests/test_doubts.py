@@ -93,6 +93,19 @@ def test_vehicles_on_lanes_are_not_doubted() -> None:
     assert not doubts(highway_scene(50))
 
 
+@pytest.mark.parametrize("name", pretrained.names())
+def test_histories_of_another_length_than_those_of_the_training_are_doubted(name: str) -> None:
+    forecaster, scene = epo_lightning.load(name), pretrained.examples(name)[torch.arange(2)]
+    steps = scene.history.shape[2]
+    assert forecaster.task.history == steps
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        forecaster.predict(scene)
+    short = dataclasses.replace(scene, history=scene.history[:, :, 1:], history_mask=scene.history_mask[:, :, 1:])
+    with pytest.warns(UserWarning, match=f"the history has {steps - 1} steps, and that of the training had {steps}"):
+        forecaster.predict(short)
+
+
 def test_a_prediction_warns() -> None:
     name = "rpi/v_lstm_epo"
     forecaster, scene = epo_lightning.load(name), pretrained.examples(name)

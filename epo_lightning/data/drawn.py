@@ -42,15 +42,19 @@ class Preset:
 
     Attributes:
         agents: default number of agents.
-        history: number H of observed steps.
         task: sizes and units, those of the real data.
         tables: function from (scenes, agents, preset, generator) to the columns of records of this task.
     """
 
     agents: int
-    history: int
     task: Task
     tables: Callable[[int, int, Preset, torch.Generator], dict[str, Tensor]]
+
+    @property
+    def history(self) -> int:
+        """Number H of observed steps."""
+        assert self.task.history is not None
+        return self.task.history
 
     @property
     def time(self) -> Tensor:
@@ -192,7 +196,6 @@ def _highway(scenes: int, agents: int, preset: Preset, draw: torch.Generator) ->
 
 HIGHWAY = Preset(
     WindowConfig.agents,
-    WindowConfig.history,
     Task(
         WindowConfig.horizon,
         WindowConfig.dt,
@@ -201,15 +204,16 @@ HIGHWAY = Preset(
         candidates=LINES * PER_LINE,
         map=True,
         scale=20.0,
+        history=WindowConfig.history,
     ),
     _highway,
 )
 
 LIKE: Mapping[str, Preset] = {
-    "rpi": Preset(RPIData.num_agents, 19, RPIData.task, _rpi),
+    "rpi": Preset(RPIData.num_agents, RPIData.task, _rpi),
     "highway": HIGHWAY,
     "urban": HIGHWAY,
-    "pedestrians": Preset(4, 8, Task(12, 0.4, SUBSETS, candidates=0, scale=5.0), _pedestrians),
+    "pedestrians": Preset(4, Task(12, 0.4, SUBSETS, candidates=0, scale=5.0, history=8), _pedestrians),
 }
 """The sorts of random scenes, by the name in ``data.like``."""
 

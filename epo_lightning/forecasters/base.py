@@ -58,8 +58,9 @@ class Forecaster(LightningModule):
 
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
         other scenes of the batch are the same as without it. Warnings say how many joint modes violate hard constraints, and
-        which scenes are probably wrong (:mod:`epo_lightning.doubts`). Motions are looked at up to the first batch without a
-        doubt: for every batch, this would take a tenth of a single scene's forecast.
+        which scenes are probably wrong (:mod:`epo_lightning.doubts`), or have histories of another length than the training.
+        Motions are looked at up to the first batch without a doubt: for every batch, this would take a tenth of a single
+        scene's forecast.
 
         Raises:
             TypeError: the argument is not a :class:`Scene`.
@@ -73,7 +74,7 @@ class Forecaster(LightningModule):
         motion = None if self._plausible else doubts.of_motion(scene)
         self._plausible = self._plausible or (motion is None and len(scene.history) > 0)
         headings = doubts.of_goal_headings(scene) if self.reads_goal_headings else None
-        for doubt in filter(None, (motion, headings)):
+        for doubt in filter(None, (doubts.of_history(scene, self.task.history), motion, headings)):
             warnings.warn(doubt, stacklevel=3)
         broken = (~scene.finite).nonzero().flatten().tolist()
         if broken:

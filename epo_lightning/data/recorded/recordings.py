@@ -133,7 +133,14 @@ class RecordedData(SceneDataModule):
         self.frame = frame
         candidates = (self.windows.lines or LINES) * PER_LINE if map else 0
         self.task = Task(
-            self.windows.horizon, float(self.windows.dt), SUBSETS, shape, candidates, map=map, scale=float(scale)
+            horizon=self.windows.horizon,
+            dt=float(self.windows.dt),
+            subsets=SUBSETS,
+            shape=shape,
+            candidates=candidates,
+            map=map,
+            scale=float(scale),
+            history=self.history,
         )
         self.root = Path(root).expanduser() if root else cache.default_root()
 

@@ -111,8 +111,8 @@ class RPIData(SceneDataModule):
             that of runs that were trained before this was a setting; ``conf/data/rpi.yaml`` has 2.
     """
 
-    task = Task(horizon=40, dt=0.1, subsets=SUBSETS)
     num_agents, history = 2, 19
+    task = Task(horizon=40, dt=0.1, subsets=SUBSETS, history=history)
 
     def __init__(
         self,
