@@ -68,8 +68,7 @@ class Forecaster(LightningModule):
         """
         if not isinstance(scene, Scene):
             raise TypeError(f"predict takes an epo_lightning.scene.Scene, not a {type(scene).__name__}")
-        if abs(scene.dt - self.task.dt) > 1e-6:
-            raise ValueError(f"the scene has dt = {scene.dt} s, but this forecaster was built for {self.task.dt} s")
+        self._check_dt(scene)
         scene.validate_values()
         motion = None if self._plausible else doubts.of_motion(scene)
         self._plausible = self._plausible or (motion is None and len(scene.history) > 0)
@@ -95,6 +94,15 @@ class Forecaster(LightningModule):
         if lost is not None:
             _warn_of_stopped(float(lost.double().mean()) if lost.numel() else 0.0, len(lost))
         return forecast.map(lambda tensor: _blank(tensor, broken)) if broken else forecast
+
+    def on_after_batch_transfer(self, scene: Scene, _: int) -> Scene:
+        """The batch of a training, validation or test, whose time step must be the forecaster's."""
+        self._check_dt(scene)
+        return scene
+
+    def _check_dt(self, scene: Scene) -> None:
+        if abs(scene.dt - self.task.dt) > 1e-6:
+            raise ValueError(f"the scene has dt = {scene.dt} s, but this forecaster was built for {self.task.dt} s")
 
     def as_input(self, scene: Scene) -> Scene:
         """The scene on the device and in the precision of the parameters; in float32 on the CPU if there are none."""

@@ -194,3 +194,18 @@ def test_training_has_states_of_initial_strategies_only_where_they_are_taught(ba
     assert (forecaster.train()(scene).initial_states is None) == (backward == "unrolled")
     assert ("initial" in forecaster.weighted_losses(scene)[1]) == (backward != "unrolled")
     assert forecaster.predict(scene).initial_states.isfinite().all()
+
+
+def test_scenes_with_another_time_step_are_refused_in_training_and_tests() -> None:
+    forecaster, scene = build("epo"), random_scene(4, 2)
+    loader = DataLoader([dataclasses.replace(scene, dt=2.0 * scene.dt)], batch_size=None)
+    trainer = lightning.Trainer(
+        accelerator="cpu", max_steps=1, logger=False, enable_checkpointing=False, enable_progress_bar=False
+    )
+    for run in (trainer.fit, trainer.validate, trainer.test):
+        with pytest.raises(
+            ValueError, match=f"dt = {2.0 * scene.dt} s, but this forecaster was built for {scene.dt} s"
+        ):
+            run(forecaster, loader)
+    with pytest.raises(ValueError, match="this forecaster was built for"):
+        forecaster.predict(dataclasses.replace(scene, dt=2.0 * scene.dt))
