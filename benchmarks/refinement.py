@@ -6,7 +6,7 @@
 
 For every run: the forecasts as given; *tracked*, with the same weights but without pair terms; and *refined*
 (:func:`epo_lightning.refine`). Scores are those of ``epo evaluate``, for all scenes and for interactive ones where the data
-have them. OR is the overlap rate [%]. The time is the median (and the least) CPU time per scene in milliseconds, of batches
+have them. OR is the overlap rate. The time is the median (and the least) CPU time per scene in milliseconds, of batches
 of 1 and 32 scenes, without the forecaster. Nothing is written.
 """
 
@@ -130,7 +130,7 @@ def report(
         for group, prefix in groups:
             if f"{prefix}minSADE" not in found:  # the data have no scene of this subset
                 continue
-            values = [found[prefix + key] * (100 if key == "overlap_jfp" else 1) for key in SCORES]
+            values = [found[prefix + key] for key in SCORES]
             row = f"{settings.title}, seed {settings.seed}"
             print(f"{row:<28}{label:<9}{group:<13}" + "".join(f"{value:>9.4f}" for value in values), flush=True)
     times = ", ".join("{:.2f} ({:.2f}) in batches of {}".format(*milliseconds(given, b, refined), b) for b in (1, 32))
