@@ -26,7 +26,7 @@ def of_history(scene: Scene, trained: int | None) -> str | None:
     steps = scene.history.shape[2]
     if trained is None or steps == trained:
         return None
-    return f"the history has {steps} steps, and that of the training had {trained}: expect larger errors"
+    return f"the history has {steps} steps, and that of the training had {trained}: errors may be larger"
 
 
 @np.errstate(invalid="ignore", over="ignore")
