@@ -34,6 +34,8 @@ class Forecaster(LightningModule):
 
     reads_goal_headings: bool = False
     """Whether forecasts depend on the headings that are wanted at goals."""
+    reads_history: bool = True
+    """Whether forecasts depend on states before the present one."""
     configuration: dict[str, Any]
     """The model's configuration, from which this forecaster was built; stored in every checkpoint."""
     step_graph: Callable[[Scene], tuple[Tensor, dict[str, Tensor]]] | None = None
@@ -58,7 +60,7 @@ class Forecaster(LightningModule):
 
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
         other scenes of the batch are the same as without it. Warnings say how many joint modes violate hard constraints, and
-        which scenes are probably wrong (:mod:`epo_lightning.doubts`), or have histories of another length than the training.
+        which scenes are probably wrong (:mod:`epo_lightning.doubts`), and that histories have another length than in training.
         Motions are looked at up to the first batch without a doubt: for every batch, this would take a tenth of a single
         scene's forecast.
 
@@ -72,8 +74,9 @@ class Forecaster(LightningModule):
         scene.validate_values()
         motion = None if self._plausible else doubts.of_motion(scene)
         self._plausible = self._plausible or (motion is None and len(scene.history) > 0)
+        length = doubts.of_history(scene, self.task.history) if self.reads_history else None
         headings = doubts.of_goal_headings(scene) if self.reads_goal_headings else None
-        for doubt in filter(None, (doubts.of_history(scene, self.task.history), motion, headings)):
+        for doubt in filter(None, (length, motion, headings)):
             warnings.warn(doubt, stacklevel=3)
         broken = (~scene.finite).nonzero().flatten().tolist()
         if broken:
@@ -94,11 +97,6 @@ class Forecaster(LightningModule):
         if lost is not None:
             _warn_of_stopped(float(lost.double().mean()) if lost.numel() else 0.0, len(lost))
         return forecast.map(lambda tensor: _blank(tensor, broken)) if broken else forecast
-
-    def on_after_batch_transfer(self, scene: Scene, _: int) -> Scene:
-        """The batch of a training, validation or test, whose time step must be the forecaster's."""
-        self._check_dt(scene)
-        return scene
 
     def _check_dt(self, scene: Scene) -> None:
         if abs(scene.dt - self.task.dt) > 1e-6:
@@ -124,6 +122,7 @@ class Forecaster(LightningModule):
         return total, {name: value.detach() for name, (_, value) in terms.items()}
 
     def training_step(self, scene: Scene, _: int) -> Tensor:
+        self._check_dt(scene)
         total, terms = (self.step_graph or self.weighted_losses)(scene)
         size = len(scene.history)
         values = {"train/loss": total.detach(), **{f"train/{name}": value for name, value in terms.items()}}
@@ -141,12 +140,14 @@ class Forecaster(LightningModule):
             super().optimizer_zero_grad(*args)
 
     def validation_step(self, scene: Scene, _: int) -> None:
+        self._check_dt(scene)
         self.val_metrics.update(self(scene), scene)
 
     def on_validation_epoch_end(self) -> None:
         self._log_metrics("val", self.val_metrics)
 
     def test_step(self, scene: Scene, _: int) -> dict[str, JointForecast]:
+        self._check_dt(scene)
         forecast = self.examine(scene, self(scene))
         self.test_metrics.update(forecast, scene)
         return {"forecast": forecast}

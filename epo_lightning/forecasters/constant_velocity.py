@@ -18,6 +18,8 @@ from epo_lightning.task import Task
 class ConstantVelocity(Forecaster):
     """Const. Vel.: one joint future with controls of zero (Section 5, "Baselines"). Nothing is learned."""
 
+    reads_history = False
+
     def __init__(self, task: Task, optimizer: Adam, dynamics: Unicycle) -> None:
         super().__init__(task, optimizer)
         self.dynamics = dynamics
