@@ -60,7 +60,7 @@ class Forecaster(LightningModule):
 
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
         other scenes of the batch are the same as without it. Warnings say how many joint modes violate hard constraints, and
-        which scenes are probably wrong (:mod:`epo_lightning.doubts`), and that histories have another length than in training.
+        which scenes are probably wrong (:mod:`epo_lightning.doubts`), by their motions or the length of histories.
         Motions are looked at up to the first batch without a doubt: for every batch, this would take a tenth of a single
         scene's forecast.
 
