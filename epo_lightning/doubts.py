@@ -22,7 +22,10 @@ NAMED = 10
 
 
 def of_history(scene: Scene, trained: int | None) -> str | None:
-    """A sentence on histories of another length than those of the training; None if they agree, or that is not known."""
+    """A sentence on histories of another length than those of the training; None if they agree, or that is not known.
+
+    Histories are as long as their tensor: steps that are padded by ``history_mask`` count.
+    """
     steps = scene.history.shape[2]
     if trained is None or steps == trained:
         return None

@@ -13,7 +13,11 @@ from games import highway_scene
 import epo_lightning
 from epo_lightning import Scene, pretrained
 from epo_lightning.doubts import of_goal_headings, of_motion
+from epo_lightning.forecasters.constant_velocity import ConstantVelocity
+from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.optimizers import Adam
 from epo_lightning.scene import HEADING, SPEED
+from epo_lightning.task import Task
 
 
 def doubts(scene: Scene) -> list[str]:
@@ -104,6 +108,13 @@ def test_histories_of_another_length_than_those_of_the_training_are_doubted(name
     short = dataclasses.replace(scene, history=scene.history[:, :, 1:], history_mask=scene.history_mask[:, :, 1:])
     with pytest.warns(UserWarning, match=f"the history has {steps - 1} steps, and that of the training had {steps}"):
         forecaster.predict(short)
+
+
+def test_constant_velocity_needs_no_history() -> None:
+    forecaster = ConstantVelocity(Task(horizon=5, dt=0.1, history=19), Adam(), Unicycle())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        forecaster.predict(walking())
 
 
 def test_a_prediction_warns() -> None:
