@@ -28,7 +28,7 @@ BLOCKS = {
 }
 
 
-SLOW = ("highway_sim.md-0", "solver.md-1")
+SLOW = ("highway_sim.md-0", "features.md-0")
 """Blocks that take half a minute."""
 
 

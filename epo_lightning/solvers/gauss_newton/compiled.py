@@ -4,7 +4,7 @@ A *problem* is the game of one scene and mode. Problems are solved side by side,
 register.
 
 Every step is a linear-quadratic problem, which one backward and one forward recursion over time solve in O(K N^3); see
-`docs/solver.md` and `kernel/`. The library has a plain C interface: building it needs only a C++ compiler, and one build
+`docs/layer.md` and `kernel/`. The library has a plain C interface: building it needs only a C++ compiler, and one build
 works with every version of Python and PyTorch.
 
 The library's threads end before a call returns, and Python handles signals only between calls. An interrupt therefore takes

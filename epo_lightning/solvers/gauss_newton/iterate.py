@@ -8,7 +8,7 @@ left, a position changes as
     dp_k = dt sum_{l<k} M_l dz_l,   M_l = [e_l, v_l e'_l]     (explicit Euler; other integrators include l = k).
 
 Arrays are laid out [S, N, component, K] with S problems. Component 0 is speed (of z) or acceleration (of u), component
-1 is heading or turn rate. (The kernel and `docs/solver.md` have heading first, and their M_l contains the factor dt.)
+1 is heading or turn rate. (The kernel and `docs/layer.md` have heading first, and their M_l contains the factor dt.)
 """
 
 from __future__ import annotations
