@@ -6,13 +6,17 @@
 
 For every run: the forecasts as given; *tracked*, with the same weights but without pair terms; and *refined*
 (:func:`epo_lightning.refine`). Scores are those of ``epo evaluate``, for all scenes and for interactive ones where the data
-have them. OR is the overlap rate. The time is the median (and the least) CPU time per scene in milliseconds, of batches
-of 1 and 32 scenes, without the forecaster. Nothing is written.
+have them. OR is the overlap rate. The games are solved again by ten times as many steps in double precision, and energies
+and probabilities of *refined*, with its steps and with ten, are compared with those of these solutions. The time is the
+median (and the least) CPU time per scene in milliseconds, of batches of 1 and 32 scenes, without the forecaster. Nothing
+is written.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import functools
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,12 +24,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from epo_lightning import FeatureEnergy, JointForecast, Scene, refine
+from epo_lightning import FeatureEnergy, JointForecast, Scene, Solution, refine
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.metrics import ForecastMetrics
-from epo_lightning.refinement import INVERSE_TEMPERATURE, WEIGHTS
+from epo_lightning.refinement import INVERSE_TEMPERATURE, SOLVER, WEIGHTS
 from epo_lightning.refinement.game import NOISE
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
@@ -33,6 +37,10 @@ from epo_lightning.run_folder import RunFolder
 SCORES = {"minSADE": "SADE", "minSFDE": "SFDE", "minSADE_1": "k=1", "overlap_jfp": "OR"}
 REPEATS = 101
 """Calls whose median is the time."""
+FEW = 10
+"""Steps of a refinement that ends early, for comparison."""
+TOLERANCE = 0.01
+"""Differences of energies and probabilities that count."""
 
 Forecasts = list[tuple[Scene, Tensor, Tensor]]
 Refinement = Callable[[Tensor, Tensor, Scene], JointForecast]
@@ -65,6 +73,28 @@ def scores(given: Forecasts, subsets: Sequence[str], shape: str, refinement: Ref
     for scene, states, probabilities in given:
         metrics.update(refinement(states, probabilities, scene), scene)
     return {name: float(value) for name, value in metrics.compute().items()}
+
+
+def distances(given: Forecasts, refinement: Refinement, solved: Refinement) -> str:
+    """How far the energies and probabilities of a refinement are from those of solved games."""
+    energies, probabilities = [], []
+    for scene, futures, before in given:
+        ours = refinement(futures, before, scene)
+        theirs = solved(futures.double(), before.double(), scene.to(torch.float64))
+        energies.append((solution_of(ours).energy - solution_of(theirs).energy).flatten())
+        probabilities.append((ours.probabilities - theirs.probabilities).abs().amax(1))
+    above = (torch.cat(energies) > TOLERANCE).double().mean()
+    apart = torch.cat(probabilities)
+    return (
+        f"{100 * above:.2f} % of the modes have an energy that is higher by more than {TOLERANCE}; probabilities "
+        f"of {100 * (apart > TOLERANCE).double().mean():.2f} % of the scenes differ by more, at most by {apart.max():.3f}"
+    )
+
+
+def solution_of(forecast: JointForecast) -> Solution:
+    """The solution of a forecast that a refinement made."""
+    assert forecast.solution is not None
+    return forecast.solution
 
 
 def milliseconds(given: Forecasts, size: int, refinement: Refinement) -> tuple[float, float]:
@@ -121,8 +151,17 @@ def report(
         alone = {**weights, **dict.fromkeys(pair, 0.0)}
         return refine(states, probabilities, scene, energy, alone, noise=noise)
 
-    def refined(states: Tensor, probabilities: Tensor, scene: Scene) -> JointForecast:
-        return refine(states, probabilities, scene, energy, weights, noise=noise, inverse_temperature=beta)
+    def by(steps: int) -> Refinement:
+        return functools.partial(
+            refine,
+            energy=energy,
+            weights=weights,
+            noise=noise,
+            inverse_temperature=beta,
+            solver=dataclasses.replace(SOLVER, steps=steps),
+        )
+
+    refined = by(SOLVER.steps)
 
     groups = [("all", ""), *((name, f"{name}/") for name in subsets)]
     for label, refinement in (("given", plain), ("tracked", tracked), ("refined", refined)):
@@ -133,6 +172,8 @@ def report(
             values = [found[prefix + key] for key in SCORES]
             row = f"{settings.title}, seed {settings.seed}"
             print(f"{row:<28}{label:<9}{group:<13}" + "".join(f"{value:>9.4f}" for value in values), flush=True)
+    for steps in (FEW, SOLVER.steps):
+        print(f"after {steps} steps, {distances(given, by(steps), by(10 * SOLVER.steps))}", flush=True)
     times = ", ".join("{:.2f} ({:.2f}) in batches of {}".format(*milliseconds(given, b, refined), b) for b in (1, 32))
     agents, modes = given[0][1].shape[2], given[0][1].shape[1]
     print(f"CPU ms per scene of {agents} agents and {modes} modes: {times}", flush=True)

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from epo_lightning import FeatureEnergy, LevenbergMarquardt, Scene, Unicycle, refine
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.metrics.functional import overlap_rate
-from epo_lightning.refinement import ENERGY, WEIGHTS
-from epo_lightning.registry import ConfigError
+from epo_lightning.refinement import ENERGY, SOLVER, WEIGHTS
+from epo_lightning.registry import ConfigError, build
 
 DT, K = 0.2, 20
 APART = {**WEIGHTS, "circles": 0.0}
@@ -57,6 +58,30 @@ def test_crossing_trajectories_that_overlap_stop_overlapping():
     assert not overlaps(refined.states, scene).any()
     moved = (refined.states - states)[..., :2].norm(dim=-1)
     assert 0.2 < moved.max() < 6.0, "they give way by about a car's length"
+
+
+def test_games_of_dense_scenes_are_solved():
+    """Energies and probabilities are those of ten times as many steps in double precision."""
+    towards_centre = torch.randn(60, 4, 4) * torch.tensor([20.0, 20.0, 0.3, 1.0])
+    towards_centre[..., 2] += torch.atan2(-towards_centre[..., 1], -towards_centre[..., 0])
+    towards_centre[..., 3] += 8.0
+    scene = Scene(towards_centre[:, :, None], dt=DT, size=torch.tensor([4.5, 1.9]).expand(60, 4, 2))
+    controls = torch.randn(60, 5, 4, 1, 2) * torch.tensor([1.0, 0.1])
+    states = Unicycle().rollout(scene.current[:, None], controls.expand(-1, -1, -1, K, -1), DT)
+    even = torch.full((60, 5), 0.2)
+    ours = refine(states, even, scene)
+    solver = dataclasses.replace(SOLVER, steps=10 * SOLVER.steps)
+    solved = refine(states.double(), even.double(), scene.to(torch.float64), solver=solver)
+    assert (solved.solution.energy > 1.0).double().mean() > 0.3, "agents interact in many modes"
+    assert (ours.solution.energy <= solved.solution.energy + 0.01).double().mean() > 0.95
+    assert ((ours.probabilities - solved.probabilities).abs().amax(1) < 0.01).double().mean() > 0.95
+    few = refine(states, even, scene, solver=dataclasses.replace(SOLVER, steps=10))
+    assert (few.solution.energy <= solved.solution.energy + 0.01).double().mean() < 0.9, "ten steps are too few"
+
+
+def test_the_row_that_trains_weights_has_the_solver_of_refine():
+    row = compose("train", ["experiment=highway/v_lstm_refined", "forecaster.frozen=rpi/v_lstm_epo"])
+    assert build("solver", row["solver"]) == SOLVER
 
 
 def test_futures_that_do_not_interact_stay_as_they_were_tracked():

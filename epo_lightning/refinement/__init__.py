@@ -44,8 +44,8 @@ ENERGY = FeatureEnergy(own=("accref", "turnrref"), pair=("circles",))
 """The energy of :func:`refine` unless another one is given: intentions, and bodies of vehicles that do not overlap."""
 WEIGHTS = {"accref": 1.0, "turnrref": 20.0, "circles": 10.0}
 """Weights of :data:`ENERGY`. At 20 m/s, a turn rate of 0.05 rad/s is felt as an acceleration of 1 m/s^2."""
-SOLVER = LevenbergMarquardt(steps=10, step_size=1.0, damping=1.0, adaptive=True)
-"""The solver of :func:`refine` unless another one is given."""
+SOLVER = LevenbergMarquardt(steps=50, step_size=1.0, damping=1.0, adaptive=True)
+"""The solver of :func:`refine` unless another one is given. Modes take no further steps once they have arrived."""
 INVERSE_TEMPERATURE = 0.03
 """beta of :func:`refine` unless another one is given, chosen on validation data (docs/refine.md)."""
 LARGEST = 1e6

@@ -131,7 +131,7 @@ def check_energy(energy: Energy, solver: Minimiser) -> None:
         )
     if TABLES in solver.provides:
         raise ConfigError(
-            "a refinement descends from the given futures, and this solver chooses among candidates: use solver=converging"
+            "a refinement descends from the given futures, and this solver chooses among candidates: use solver=refinement"
         )
 
 
