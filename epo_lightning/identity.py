@@ -42,7 +42,12 @@ ELSEWHERE = (
 )
 """Keys of those sections that do not decide on the result: folders of data, the machine, logging and progress."""
 
-LATER = {"data.recipe": 1, "optimizer.shared_factor": 1, "forecaster.calibration.training": False}
+LATER = {
+    "data.recipe": 1,
+    "optimizer.shared_factor": 1,
+    "forecaster.calibration.starts": [0.0],
+    "forecaster.calibration.training": False,
+}
 """Settings that some recorded runs do not have, with the value that means the same as their absence; the last is gone."""
 SHARES = ("trainer.limit_train_batches", "trainer.limit_val_batches")
 """Keys for which 1 and 1.0 differ: 1 is a number of batches, and 1.0 is a share of all batches."""

@@ -79,6 +79,25 @@ def test_games_of_dense_scenes_are_solved():
     assert (few.solution.energy <= solved.solution.energy + 0.01).double().mean() < 0.9, "ten steps are too few"
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("distance", "speed", "heading", "apart"),
+    [(12.0, 5.0, 0.0, 4.5), (20.0, 0.0, 0.0, 2.5), (40.0, 10.0, math.pi, 2.5)],
+    ids=["behind a slower car", "before a parked car", "towards each other"],
+)
+@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
+def test_cars_on_exactly_one_line_avoid_each_other(dtype, distance, speed, heading, apart, order):
+    """There no energy has a derivative to the side; a car that stays on the line could only drive through the other one."""
+    start = torch.tensor([[0.0, 3.5, 0.0, 10.0], [distance, 3.5, heading, speed]], dtype=dtype)
+    scene = Scene(start[None, order, None], dt=DT, size=torch.tensor([[[4.5, 1.9], [4.5, 1.9]]], dtype=dtype))
+    along = start[:, 3:] * start[:, 2:3].cos() * DT * torch.arange(1.0, K + 1, dtype=dtype)
+    states = torch.stack((start[:, :1] + along, torch.full_like(along, 3.5)), -1)[None, None, order]
+    assert (states[0, 0, 0] - states[0, 0, 1]).norm(dim=-1).amin() < 2.0, "the given futures overlap"
+    refined = refine(states, torch.ones(1, 1, dtype=dtype), scene)
+    assert (refined.states[0, 0, 0] - refined.states[0, 0, 1])[:, :2].norm(dim=-1).amin() > apart
+    assert not overlaps(refined.states, scene).any()
+
+
 def test_the_row_that_trains_weights_has_the_solver_of_refine():
     row = compose("train", ["experiment=highway/v_lstm_refined", "forecaster.frozen=rpi/v_lstm_epo"])
     assert build("solver", row["solver"]) == SOLVER

@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from epo_lightning.drive.planners import Plan, Planner, turned
+from epo_lightning.drive.planners import Plan, Planner
 from epo_lightning.drive.world import EGO, Outcome, World
+from epo_lightning.frames import in_world
 from epo_lightning.game.dynamics import controls_between
 from epo_lightning.scene import Scene
 
@@ -107,8 +108,7 @@ def outside(position: Float[Tensor, "B N K 2"], scene: Scene) -> Float[Tensor, "
     """Positions of a scene in the world's frame; NaN for agents that are not there."""
     position = position.double()
     if scene.frame is not None:
-        frame = scene.frame.double()[:, None, None]
-        position = turned(position, frame[..., 2]) + frame[..., :2]
+        position = in_world(position, scene.frame.double())
     return position.where(scene.agent_mask[:, : position.shape[1], None, None], torch.nan)
 
 

@@ -25,6 +25,7 @@ from epo_lightning.drive.world import EGO, Search
 from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.epo import EPO
+from epo_lightning.frames import turned
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.refinement.game import NOISE, track
@@ -92,12 +93,6 @@ def shifted(controls: Float[Tensor, "*batch K 2"], steps: int) -> Float[Tensor, 
     """Strategies one step later: the first controls are dropped, and controls of zero are added or the end is cut."""
     rest = controls[..., 1:, :]
     return F.pad(rest, (0, 0, 0, max(0, steps - rest.shape[-2])))[..., :steps, :]
-
-
-def turned(vector: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch 2"]:
-    """Vectors turned to the left by an angle [rad]."""
-    (x, y), cosine, sine = vector.unbind(-1), angle.cos(), angle.sin()
-    return torch.stack((cosine * x - sine * y, sine * x + cosine * y), -1)
 
 
 def constant(speed: Float[Tensor, " B"], acceleration: float, steps: int, dt: float) -> Float[Tensor, "B K 2"]:

@@ -15,7 +15,8 @@ from epo_lightning.data.recorded.routes import Routes, pieces
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.surroundings import nearest_pieces
 from epo_lightning.data.recorded.tables import SceneTables
-from epo_lightning.data.recorded.windows import AGREE, SPACING, VECTORS, WindowConfig
+from epo_lightning.data.recorded.windows import SPACING, VECTORS, WindowConfig
+from epo_lightning.frames import AGREE
 from epo_lightning.scene import FIELDS, HEADING, SPEED, Scene
 
 

@@ -8,12 +8,15 @@ observations", RSS 2021) with one unknown per game: the logarithm s of a factor 
     |x(s) - observed|^2 / noise^2 + s^2 / spread^2
 
 over the positions x of the history, so that weights without any effect on the history stay as the network decoded them.
+A game may change its passing order or lose an equilibrium as s grows, and this cost jumps there. A descent from one start
+may end on the wrong side of a jump; therefore several starts may be tried.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,10 +24,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.checks import check_number, check_whole
+from epo_lightning.checks import check_number, check_whole, is_number
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import controls_between
 from epo_lightning.game.energy import Energy
+from epo_lightning.registry import ConfigError
 from epo_lightning.scene import HEADING, Scene, wrapped
 from epo_lightning.solvers.base import Minimiser
 
@@ -49,13 +53,18 @@ class Calibration:
             improvement and changed its weights by 5 % or more takes up to 20 further ones.
         noise: standard deviation [m] of the observed positions.
         spread: standard deviation of s before the history is seen.
+        starts: values of s with which the game is solved first. The steps begin at the one with the lowest cost.
     """
 
     steps: int = 6
     noise: float = 0.001
     spread: float = 1.0
+    starts: Sequence[float] = (0.0,)
 
     def __post_init__(self) -> None:
+        known = isinstance(self.starts, Sequence) and not isinstance(self.starts, str) and len(self.starts) > 0
+        if not known or not all(is_number(start) and math.isfinite(start) for start in self.starts):
+            raise ConfigError(f"calibration.starts must be a list of finite numbers, at least one, not {self.starts!r}")
         check_whole("calibration.steps", self.steps, least=0)
         check_number("calibration.noise", self.noise)
         check_number("calibration.spread", self.spread)
@@ -76,32 +85,46 @@ class Calibration:
             return parameters
         past = _at_first_step(scene).to(torch.double)
         game = parameters.map(lambda t: t.double() if t.is_floating_point() else t)
-        # Two copies of every game: one at s, and one beside it for the finite difference. They are solved at once, as modes.
-        copies = dataclasses.replace(game.map(lambda t: torch.cat((t, t), 1)), context=game.context)
         observed = past.future[:, None, :, :, :2]  # type: ignore[index]
         present = scene.agent_mask[:, None, :, None, None]
 
-        def misses(s: Tensor, start: Tensor, minimiser: Minimiser, scenes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            """Weighted misses [S, M, R] of the history, their derivative by s, and the strategies of both copies, in the
-            S chosen ``scenes``, to which s and the initial strategies belong."""
-            chosen = copies[scenes]
-            factor = torch.cat((s, s + _DIFFERENCE), 1).exp()[..., None]
-            weights = {name: weight * factor for name, weight in chosen.pair_weights.items()}
+        games = next(iter(game.pair_weights.values())).shape[1]
+
+        def solve(s: Tensor, start: Tensor, minimiser: Minimiser, scenes: Tensor) -> tuple[Tensor, Tensor]:
+            """Weighted misses [S, C*M, R] of the history and strategies of C copies of every game, in the S chosen
+            ``scenes``, to which s [S, C*M] and the initial strategies belong. Copies are solved at once, as modes."""
+            count = s.shape[1] // games
+            copies = dataclasses.replace(
+                game[scenes].map(lambda t: torch.cat(count * (t,), 1)), context=game[scenes].context
+            )
+            weights = {name: weight * s.exp()[..., None] for name, weight in copies.pair_weights.items()}
             found = minimiser(
-                energy, past[scenes], dataclasses.replace(chosen, pair_weights=weights, initial_controls=start)
+                energy, past[scenes], dataclasses.replace(copies, pair_weights=weights, initial_controls=start)
             )
             missed = found.states[..., :before, :2] - observed[scenes]
-            here, beside = (torch.where(present[scenes], missed, 0.0).flatten(2) / self.noise).chunk(2, 1)
-            return here, (beside - here) / _DIFFERENCE, found.controls
+            return torch.where(present[scenes], missed, 0.0).flatten(2) / self.noise, found.controls
 
-        games = next(iter(game.pair_weights.values())).shape[1]
-        s = observed.new_zeros(len(observed), games)
-        damping = torch.ones_like(s)
-        start = _with_history(past, game.initial_controls.shape[3])
+        def misses(s: Tensor, start: Tensor, minimiser: Minimiser, scenes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """Misses [S, M, R], their derivative by s, and the strategies of two copies: at s, and beside it."""
+            missed, controls = solve(torch.cat((s, s + _DIFFERENCE), 1), start, minimiser, scenes)
+            here, beside = missed.chunk(2, 1)
+            return here, (beside - here) / _DIFFERENCE, controls
+
         descent = minimiser.descent()
-        all_scenes = torch.arange(len(s), device=s.device)
-        missed, change, controls = misses(s, start.expand(-1, 2 * games, -1, -1, -1), descent, all_scenes)
         near = descent.near_minimum()
+        every = torch.arange(len(observed), device=observed.device)
+        s = observed.new_tensor(self.starts).repeat_interleave(games).expand(len(observed), -1)
+        controls = _with_history(past, game.initial_controls.shape[3])
+        if len(self.starts) > 1:
+            missed, controls = solve(s, controls.expand(-1, s.shape[1], -1, -1, -1), descent, every)
+            least = self._cost(missed, s).unflatten(1, (-1, games)).argmin(1)  # [B, M]
+            chosen = least * games + torch.arange(games, device=s.device)
+            s, controls = s.gather(1, chosen), controls[every[:, None], chosen]
+            descent = near
+        damping = torch.ones_like(s)
+        missed, change, controls = misses(
+            s, torch.cat(2 * (controls.expand(-1, games, -1, -1, -1),), 1), descent, every
+        )
         done = torch.zeros_like(s, dtype=torch.bool)
         for taken in range(1, self.steps + _FURTHER + 1):
             slope = (change * missed).sum(-1) + s / self.spread**2

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -123,7 +123,7 @@ class EPO(Forecaster):
         control_scale: float = 0.3,
         motions: Mapping[str, float] | None = None,
         game_horizon: int | None = None,
-        calibration: Mapping[str, float] | None = None,
+        calibration: Mapping[str, float | Sequence[float]] | None = None,
         own_weights: str = "decoded",
         pair_weights: str = "decoded",
         one_game: bool = False,

@@ -105,7 +105,9 @@ def check_initial(initial: str, modes: int, one_game: bool, energy: Energy, solv
         )
 
 
-def check_calibration(calibration: Mapping[str, float] | None, energy: Energy, solver: Minimiser) -> None:
+def check_calibration(
+    calibration: Mapping[str, float | Sequence[float]] | None, energy: Energy, solver: Minimiser
+) -> None:
     """Refuse a calibration with a solver that does not lead to a minimum, or of a game with decoded reference controls.
 
     Raises:

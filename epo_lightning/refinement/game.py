@@ -16,7 +16,7 @@ from epo_lightning.game.energy import Energy
 from epo_lightning.game.flatness import followed_controls
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import Scene
+from epo_lightning.scene import HEADING, Scene
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import TABLES, Minimiser
 
@@ -26,6 +26,10 @@ NOISE = 0.1
 """Standard deviation [m] of given positions around a smooth motion, unless another one is given."""
 OBEYS = 1e-3
 """Difference [m] of positions up to which futures with headings and speeds obey the dynamics."""
+ON_A_LINE = 1e-4
+"""Offset [m] and sine of an angle up to which agents drive on one line."""
+SWERVE = 1e-3
+"""Turn rate [rad/s] with which agents on one line begin to avoid each other."""
 
 
 def refined(
@@ -66,7 +70,7 @@ def refined(
             name: _expanded(f"margins[{name!r}]", margins[name], (batch, modes, pairs), states)
             for name in energy.decoded_margins
         },
-        initial_controls=controls,
+        initial_controls=controls + swerve(scene)[:, None, :, None],
         reference_controls=controls,
     )
     solution = backward(solver, energy, scene, parameters)
@@ -108,6 +112,25 @@ def track(states: Tensor, scene: Scene, dynamics: Dynamics, noise: float) -> Flo
         missed = (dynamics.rollout(current, told, scene.dt) - states)[..., :2].abs().amax((-2, -1))
         controls = torch.where((missed < OBEYS)[..., None, None], told, controls)
     return torch.where(present[..., None], controls, 0.0)
+
+
+def swerve(scene: Scene) -> Float[Tensor, "B N 2"]:
+    """Controls that take agents who drive on exactly one line off it; zero for all others.
+
+    On the line no energy has a derivative to the side, and a vehicle that follows it could only drive through the one ahead.
+    To break this tie, a vehicle behind turns to its left, one in front to its right, and both of two that approach each
+    other to their right.
+    """
+    position, heading = scene.current[..., :2], scene.current[..., HEADING]
+    offset = position[:, None] - position[:, :, None]  # [B, N, N, 2]: of every agent j from every agent i
+    ahead = torch.stack((heading.cos(), heading.sin()), -1)[:, :, None]
+    along = (offset * ahead).sum(-1)
+    across = ahead[..., 0] * offset[..., 1] - ahead[..., 1] * offset[..., 0]
+    angle = heading[:, None] - heading[:, :, None]
+    pairs = scene.agent_mask[:, None] & scene.agent_mask[:, :, None]
+    on_a_line = pairs & (across.abs() < ON_A_LINE) & (angle.sin().abs() < ON_A_LINE)
+    side = torch.where(on_a_line, angle.cos() * along.sign(), 0.0).sum(-1)
+    return torch.stack((torch.zeros_like(side), SWERVE * side), -1)
 
 
 def check_energy(energy: Energy, solver: Minimiser) -> None:

@@ -123,7 +123,7 @@ def test_two_processes_give_the_numbers_of_one(epo: Epo, row: str) -> None:
 @pytest.mark.parametrize(
     ("row", "precision"),
     [
-        *((row, "32-true") for row in ("rpi/v_lstm_sc", "rpi/v_lstm_epo", "exid/v_lstm_sc", "exid/hivt_m_epo")),
+        *((row, "32-true") for row in ("rpi/v_lstm_sc", "rpi/v_lstm_epo", "exid/v_lstm_sc")),
         *(
             (row, "64-true")
             for row in ("rpi/v_lstm_epo", "exid/v_lstm", "exid/v_lstm_sc", "exid/vibes_epo", "exid/hivt_m_epo")
@@ -131,7 +131,12 @@ def test_two_processes_give_the_numbers_of_one(epo: Epo, row: str) -> None:
     ],
 )
 def test_two_processes_give_the_scores_of_one(epo: Epo, row: str, precision: str) -> None:
-    """Scores in single precision at the paper's learning rate; greater ones amplify rounding errors in one process too."""
+    """Scores in single precision at the paper's learning rate; greater ones amplify rounding errors in one process too.
+
+    Rows on highways that decode goals are compared in double precision only. Of two candidates that are nearly equal,
+    rounding chooses the goal: on one machine, HiVT-M + EPO has an error of 3.271 m after these steps in one process with
+    one thread, and of 3.284 m with two threads, in two processes and in double precision.
+    """
     data = RPI if row.startswith("rpi") else HIGHWAY
     words = ("train", f"experiment={row}", *QUIET, *data, *steps(12), "optimizer.lr=5e-5", "score=test")
     for name, devices in (("one", 1), ("two", 2)):

@@ -8,6 +8,8 @@ import math
 import pytest
 import torch
 
+import epo_lightning
+from epo_lightning import pretrained
 from epo_lightning.drive.rpi import ENERGY as RPI
 from epo_lightning.drive.rpi import RPIWorld
 from epo_lightning.forecast import GameParameters
@@ -64,6 +66,33 @@ def test_weights_that_are_off_by_a_large_factor_are_found_as_well(guess: float, 
     inferred = parameters(torch.tensor([guess], dtype=torch.double), 1, AHEAD, goals)
     found = Calibration()(SOLVER, ENERGY, scene, inferred)
     assert float(found.pair_weights["proximity"]) == pytest.approx(true, rel=1e-2)
+
+
+def test_several_starts_find_weights_beyond_a_jump_of_the_cost() -> None:
+    """In the fifth of these games w is 13.3. An equilibrium is lost near 12.6, and a descent from 11.3 ends before it."""
+    name = "rpi/v_lstm_epo_feedback"
+    forecaster, scene = epo_lightning.load(name), pretrained.examples(name)[4]
+    found = {}
+    for starts in ((0.0,), (0.0, -0.4, -0.2, 0.2, 0.4)):
+        forecaster.calibration = dataclasses.replace(forecaster.calibration, starts=starts)
+        forecast = forecaster.predict(scene)
+        weights = forecast.parameters
+        found[len(starts)] = float(
+            (weights.pair_weights["clearance"] / weights.own_weights["acc"][..., :1]).flatten()[0]
+        )
+    assert found[5] > 1.15 * found[1]
+
+
+def test_a_start_that_is_worse_changes_nothing() -> None:
+    true = torch.tensor([2.0, 5.0, 10.0], dtype=torch.double)
+    scene, goals = played(true)
+    inferred = parameters(1.1 * true, 2, AHEAD, goals)
+    one, several = (
+        Calibration(starts=starts)(SOLVER, ENERGY, scene, inferred).pair_weights["proximity"]
+        for starts in ((0.0,), (0.0, 1.5, -1.5))
+    )
+    torch.testing.assert_close(several, one, rtol=1e-5, atol=0)
+    torch.testing.assert_close(several, true[:, None, None].expand(3, 2, 1), rtol=1e-2, atol=0)
 
 
 def test_headings_that_wrap_give_the_same_weights() -> None:
@@ -146,7 +175,7 @@ def test_no_steps_change_nothing_and_invalid_settings_are_refused() -> None:
     scene, goals = played(torch.tensor([4.0], dtype=torch.double))
     inferred = parameters(torch.tensor([8.0], dtype=torch.double), 1, AHEAD, goals)
     assert Calibration(steps=0)(SOLVER, ENERGY, scene, inferred) is inferred
-    for settings in ({"steps": -1}, {"noise": 0.0}, {"spread": -1.0}):
+    for settings in ({"steps": -1}, {"noise": 0.0}, {"spread": -1.0}, {"starts": []}, {"starts": [math.inf]}):
         with pytest.raises(ConfigError, match=f"calibration.{next(iter(settings))}"):
             Calibration(**settings)
 

@@ -24,6 +24,7 @@ from epo_lightning.data.recorded.routes import BEYOND, Routes, pieces, reach
 from epo_lightning.data.recorded.surroundings import nearest_pieces, reachable_pieces
 from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.tracks import Recording
+from epo_lightning.frames import AGREE
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import KINDS
 
@@ -35,8 +36,6 @@ STANDING = 2.0
 """Speed [m/s] up to which a vehicle may be parked."""
 MOST_BESIDE = 0.5
 """Largest share of positions of moving vehicles on no lane; above it, the map does not belong to the tracks."""
-AGREE = 0.2
-"""Smallest length of the mean of the agents' unit directions; below it, they have no common direction."""
 MOST_AGENTS, MOST_LINES, LONGEST_SMOOTHING = 64, 64, 10.0
 """Largest numbers of agents of a scene and of lines of an agent, and largest length [s] of the smoothing window."""
 MOMENTS, AT_ENDS = "agents at steps of the clock", "near the beginning or end of a track"
