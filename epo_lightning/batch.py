@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, SupportsIndex, TypeVar
 
 import torch
 from torch import Tensor
@@ -73,8 +74,8 @@ class Batch:
 
     def __getitem__(self: Some, index: Any) -> Some:
         """The chosen scenes of the batch; an integer keeps the batch dimension."""
-        if isinstance(index, int):
-            index = [index]
+        if isinstance(index, SupportsIndex) and getattr(index, "ndim", 0) == 0:
+            index = [operator.index(index)]
         return self.map(lambda tensor: tensor[index])
 
 

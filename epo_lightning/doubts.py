@@ -17,6 +17,8 @@ from epo_lightning.scene import HEADING, SPEED, Scene
 
 SLACK, SHARE, NOISE = 0.5, 0.4, 0.1
 """Velocity [m/s], share of the larger one, and displacement [m] by which observed and stated motions may differ."""
+FAR = 1e4
+"""Distance [m] from the origin in which no scene of a training has been."""
 NAMED = 10
 """Largest number of scenes that a sentence names."""
 
@@ -30,6 +32,33 @@ def of_history(scene: Scene, trained: int | None) -> str | None:
     if trained is None or steps == trained:
         return None
     return f"the history has {steps} steps, and that of the training had {trained}: errors may be larger"
+
+
+def of_game_end(scene: Scene, longest: int | None) -> str | None:
+    """A sentence on games that go on after the forecast and whose ends are not given; None if there are none.
+
+    Args:
+        scene: the scenes.
+        longest: steps of the longest game of the forecaster; None if its games end with the forecast.
+    """
+    if longest is None or scene.game_steps is not None:
+        return None
+    return (
+        f"the scene has no game_steps, so each game is taken to last {longest} steps after t0: give the number of steps "
+        "[B] to the end of each game, or errors may be larger"
+    )
+
+
+@np.errstate(invalid="ignore", over="ignore")
+def of_coordinates(scene: Scene) -> str | None:
+    """A sentence on scenes in the coordinates of a map; None if there are none."""
+    far = abs(array(scene.current)[..., :2]).max(-1) > FAR
+    if not (rows := _scenes(far & array(scene.agent_mask))):
+        return None
+    return (
+        f"in {rows} agents are more than {FAR / 1000:.0f} km from the origin. Forecasters read positions as they are given, "
+        "and single precision rounds these to a millimetre or more: epo_lightning.frames.aligned moves scenes to the origin"
+    )
 
 
 @np.errstate(invalid="ignore", over="ignore")

@@ -110,6 +110,23 @@ def test_histories_of_another_length_than_those_of_the_training_are_doubted(name
         forecaster.predict(short)
 
 
+@pytest.mark.parametrize("name", ["rpi/v_lstm_epo_game_refined", "rpi/v_lstm_epo_feedback"])
+def test_games_without_their_ends_are_doubted(name: str) -> None:
+    """They are taken to last as long as the longest one, and errors are many times as large."""
+    forecaster, scene = epo_lightning.load(name), pretrained.examples(name)
+    with pytest.warns(UserWarning, match="no game_steps, so each game is taken to last 82 steps"):
+        endless = forecaster.predict(dataclasses.replace(scene, game_steps=None))
+    assert (endless.states - forecaster.predict(scene).states)[..., :2].abs().amax() > 0.1
+
+
+def test_coordinates_of_a_map_are_doubted() -> None:
+    name = "highway_sim/hivt_m_epo"
+    forecaster, scene = epo_lightning.load(name), pretrained.examples(name)[torch.arange(2)].to(torch.float64)
+    history = scene.history + torch.tensor([5e5, 5.4e6, 0.0, 0.0])
+    with pytest.warns(UserWarning, match=r"in scene\(s\) 0, 1 of the batch agents are more than 10 km from the origin"):
+        forecaster.predict(dataclasses.replace(scene, history=history))
+
+
 def test_constant_velocity_needs_no_history() -> None:
     forecaster = ConstantVelocity(Task(horizon=5, dt=0.1, history=19), Adam(), Unicycle())
     with warnings.catch_warnings():

@@ -36,6 +36,8 @@ class Forecaster(LightningModule):
     """Whether forecasts depend on the headings that are wanted at goals."""
     reads_history: bool = True
     """Whether forecasts depend on states before the present one."""
+    longest_game: int | None = None
+    """Steps from t0 to the end of the longest game, if games go on after the forecast."""
     configuration: dict[str, Any]
     """The model's configuration, from which this forecaster was built; stored in every checkpoint."""
     step_graph: Callable[[Scene], tuple[Tensor, dict[str, Tensor]]] | None = None
@@ -60,9 +62,10 @@ class Forecaster(LightningModule):
 
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
         other scenes of the batch are the same as without it. Warnings say how many joint modes violate hard constraints, and
-        which scenes are probably wrong (:mod:`epo_lightning.doubts`), by their motions or the length of histories.
-        Motions are looked at up to the first batch without a doubt: for every batch, this would take a tenth of a single
-        scene's forecast.
+        which scenes are probably wrong (:mod:`epo_lightning.doubts`). Motions and coordinates are looked at up to the first
+        batch without a doubt: for every batch, this would take a tenth of a single scene's forecast.
+
+        Several threads may predict at once with a forecaster in evaluation mode, as :func:`epo_lightning.load` returns it.
 
         Raises:
             TypeError: the argument is not a :class:`Scene`.
@@ -72,11 +75,12 @@ class Forecaster(LightningModule):
             raise TypeError(f"predict takes an epo_lightning.scene.Scene, not a {type(scene).__name__}")
         self._check_dt(scene)
         scene.validate_values()
-        motion = None if self._plausible else doubts.of_motion(scene)
-        self._plausible = self._plausible or (motion is None and len(scene.history) > 0)
+        motions = () if self._plausible else (doubts.of_motion(scene), doubts.of_coordinates(scene))
+        self._plausible = self._plausible or (not any(motions) and len(scene.history) > 0)
         length = doubts.of_history(scene, self.task.history) if self.reads_history else None
         headings = doubts.of_goal_headings(scene) if self.reads_goal_headings else None
-        for doubt in filter(None, (length, motion, headings)):
+        end = doubts.of_game_end(scene, self.longest_game)
+        for doubt in filter(None, (length, *motions, headings, end)):
             warnings.warn(doubt, stacklevel=3)
         broken = (~scene.finite).nonzero().flatten().tolist()
         if broken:

@@ -153,6 +153,7 @@ class EPO(Forecaster):
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
         self.reads_goal_headings = "goal_headings" in energy.needs
+        self.longest_game = self.game_horizon if self.game_horizon > task.horizon else None
         # The part `backward` runs the minimiser and defines the derivative of its solution. (A LightningModule has a method
         # of that name.)
         self.differentiable_solve, self.objective = backward, objective
