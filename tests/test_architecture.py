@@ -13,6 +13,7 @@ ROOT = Path(epo_lightning.__file__).parent
 FLOORS = {
     "batch": set(),
     "doubts": {"scene"},
+    "frames": {"scene"},
     "scene": {"batch"},
     "forecast": {"batch"},
     "registry": set(),
@@ -36,7 +37,7 @@ FLOORS = {
     "metrics": {"scene", "forecast", "registry"},
     "decoders": {"scene", "registry", "checks", "game", "host", "warp_kernels"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
-    "data": {"scene", "registry", "schema", "checks", "task", "metrics"},
+    "data": {"scene", "frames", "registry", "schema", "checks", "task", "metrics"},
     "objectives": {"scene", "forecast", "registry", "game", "solvers", "decoders", "losses"},
     "forecasters": {
         "scene",
@@ -58,6 +59,7 @@ FLOORS = {
     },
     "explore": {"scene", "forecast", "registry", "schema", "forecasters", "game", "metrics", "solvers"},
     "drive": {
+        "frames",
         "batch",
         "scene",
         "forecast",

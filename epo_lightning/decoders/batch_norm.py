@@ -34,8 +34,9 @@ class _Sum(torch.autograd.Function):
 class NormalisePresent(torch.autograd.Function):
     """Batch normalisation with the statistics of the rows that are present; the result of absent rows is the bias.
 
-    Returns also the mean, the sum of squared deviations and the number of present rows. The derivative is written out:
-    automatic differentiation launches three times as many kernels, and for so few numbers a GPU's time is that of launches.
+    Returns also the mean, the sum of squared deviations and the number of present rows, with zeros if there are none. The
+    derivative is written out: automatic differentiation launches three times as many kernels, and for so few numbers a
+    GPU's time is that of launches.
     """
 
     @staticmethod
@@ -48,16 +49,17 @@ class NormalisePresent(torch.autograd.Function):
         eps: float,
     ) -> tuple[Float[Tensor, "rows F"], Float[Tensor, " F"], Float[Tensor, " F"], Float[Tensor, ""]]:
         here = present[:, None]
-        count = present.sum().clamp_min(1).to(rows.dtype)
+        number = present.sum().to(rows.dtype)
+        count = number.clamp_min(1)
         mean = torch.where(here, rows, 0.0).sum(0) / count
         deviation = torch.where(here, rows, mean) - mean
         square = deviation.square().sum(0)
         scale = (square / count + eps).rsqrt()
         normalised = deviation * scale
         ctx.save_for_backward(here, count, normalised, scale * weight)
-        ctx.mark_non_differentiable(mean, square, count)
+        ctx.mark_non_differentiable(mean, square, number)
         ctx.set_materialize_grads(False)  # no zeros for them
-        return torch.addcmul(bias, normalised, weight), mean, square, count
+        return torch.addcmul(bias, normalised, weight), mean, square, number
 
     @staticmethod
     @once_differentiable
@@ -76,7 +78,8 @@ class NormalisePresent(torch.autograd.Function):
 class MaskedBatchNorm(nn.BatchNorm1d):
     """Batch normalisation with statistics of existing agents only, over all processes of a training.
 
-    The result does not depend on how rows are spread over processes.
+    The result does not depend on how rows are spread over processes. Without any present row the statistics stay as they
+    are. One present row has no variance: on a CPU it is refused, as by ``nn.BatchNorm1d``, unless another process has rows.
     """
 
     def forward(self, features: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -122,10 +125,11 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         # to combine, but their difference would lose digits.
         table = _Sum.apply(torch.stack([parts if r == rank else torch.zeros_like(parts) for r in range(world)]))
         counts, means, squares = table.split([1, values.shape[1], values.shape[1]], 1)
-        total = counts.sum().clamp_min(1)
+        number = counts.sum()
+        total = number.clamp_min(1)
         mean = (counts * means).sum(0) / total
         square = (squares + counts * (means - mean).square()).sum(0)
-        self._follow(mean, square, total)
+        self._follow(mean, square, number)
         normalised = (values - mean) * (square / total + self.eps).rsqrt()
         return (normalised * self.weight + self.bias).to(rows.dtype)
 
@@ -137,5 +141,6 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         assert self.num_batches_tracked is not None
         assert self.momentum is not None
         self.num_batches_tracked += 1
-        self.running_mean.lerp_(mean, self.momentum)
-        self.running_var.lerp_(square / (count - 1).clamp_min(1), self.momentum)
+        share = torch.where(count > 0, mean.new_full((), self.momentum), 0.0)
+        self.running_mean.lerp_(mean, share)
+        self.running_var.lerp_(square / (count - 1).clamp_min(1), share)

@@ -168,6 +168,7 @@ class _Processes(_Launcher):
         self._place, self._store, self._task = place, store, task
         self._followers: list[tuple[subprocess.Popen[bytes], IO[bytes]]] = []
         self._over = threading.Event()
+        self._watcher: threading.Thread | None = None
 
     def launch(self, function: Callable[..., Any], *args: Any, trainer: Any = None, **kwargs: Any) -> Any:
         """Result of ``function``, called while the followers run.
@@ -233,7 +234,8 @@ class _Processes(_Launcher):
                 start_new_session=True,  # Ctrl-C reaches the leader only
             )
             self._followers.append((process, errors))
-        threading.Thread(target=self._watch, args=(self._over,), daemon=True, name="epo-followers").start()
+        self._watcher = threading.Thread(target=self._watch, args=(self._over,), daemon=True, name="epo-followers")
+        self._watcher.start()
 
     def _watch(self, over: threading.Event) -> None:
         """Abort NCCL when a follower has failed: unlike gloo, it does not notice the death of a process."""
@@ -265,6 +267,8 @@ class _Processes(_Launcher):
     def _end(self) -> None:
         """End followers, process group and store, so that the process is as before."""
         self._over.set()
+        if self._watcher is not None:  # it reads the followers' files
+            self._watcher.join()
         for process, errors in self._followers:
             process.kill()
             process.wait()

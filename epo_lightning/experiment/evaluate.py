@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import TQDMProgressBar
 
@@ -28,6 +29,8 @@ from epo_lightning.schema import read
 
 SECTIONS = ("metrics", "truth")
 """Sections of a file of scores that hold numbers by name."""
+LOCK = ".scores.lock"
+"""File in a run folder that a process locks while it writes scores: two evaluations may end at the same moment."""
 TOLERANCE = 1e-5
 """Relative difference below which two scores are the same: machines and batch sizes change the last digits."""
 
@@ -113,7 +116,8 @@ def score(
             print(f"  {note}")
         if pretrained.ships(run.path):
             return run.path, metrics
-        return keep_other(run, other, which, checkpoint, metrics), metrics
+        with FileLock(run.path / LOCK):
+            return keep_other(run, other, which, checkpoint, metrics), metrics
     data = open_data(run, of_run, settings.batch_size)
     if data.task.subsets != forecaster.task.subsets:  # a checkpoint that is older than the subsets of its data
         forecaster.test_metrics = ForecastMetrics(data.task.subsets, data.task.shape)
@@ -126,7 +130,8 @@ def score(
     scored = {"split": settings.own_split, "data_digest": data.digest, "checkpoint": which, "metrics": metrics}
     if costs:
         scored["truth"] = costs
-    file = keep(run, scored, checkpoint)
+    with FileLock(run.path / LOCK):
+        file = keep(run, scored, checkpoint)
     if file == run.metrics_file():
         logs.publish(run)
     return file, shown

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import warnings
@@ -171,6 +172,7 @@ def program_of(forecaster: Forecaster, example: Tensors, dt: float) -> ExportedP
 
     A game's solver lays out its matrices for a number of agents, which is that of the example.
     """
+    forecaster = copy.deepcopy(forecaster)  # the program's solvers are those of plain PyTorch
     games = games_of(forecaster)
     for game in games:
         if isinstance(game.solver, LevenbergMarquardt):

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from lightning.pytorch.loggers import Logger
-from lightning.pytorch.utilities import rank_zero_only
 
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import DashboardSettings, PredictSettings, Settings
@@ -53,15 +52,10 @@ def scores(run: RunFolder, monitor: str) -> dict[str, float]:
 def open_logs(settings: Settings, config: Mapping[str, Any], run: RunFolder, step: int = 0) -> Iterator[list[Logger]]:
     """Context with the loggers of a run, the CSV file first. They are closed at its end; after an exception, they report it.
 
-    If several processes train one run together, only the first one has loggers.
-
     Args:
         config: the resolved configuration.
         step: the optimisation step that a continued run starts from.
     """
-    if getattr(rank_zero_only, "rank", 0):
-        yield []
-        return
     run.logs.mkdir(parents=True, exist_ok=True)
     file = CSVLog(run, settings.logger.csv.flush, step)
     dashboards = _dashboards(settings, config, run)

@@ -77,8 +77,11 @@ def ship(run: RunFolder, name: str, recipe: Recipe, folder: Path) -> Path:
     with TemporaryDirectory() as place:
         packed = _pack(run, RunFolder(Path(place) / "packed"))
         write_file(packed.path / "card.md", card(name, recipe, packed))
+        whole = folder.with_name(f".{folder.name}")  # beside it, so that no moment has half a folder
+        shutil.rmtree(whole, ignore_errors=True)
+        shutil.copytree(packed.path, whole, ignore=shutil.ignore_patterns(".*"))
         shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(packed.path, folder, ignore=shutil.ignore_patterns(".*"))
+        whole.rename(folder)
     return folder
 
 

@@ -6,7 +6,6 @@ import contextlib
 import math
 import platform
 import shlex
-import shutil
 import time
 import warnings
 from collections.abc import Iterator, Sequence
@@ -222,8 +221,8 @@ def _keep_unlearned(trainer: Trainer, model: LightningModule, data: Any, run: Ru
     """Validate once and write the checkpoints, for a forecaster with nothing to learn (no parameters, or zero steps)."""
     trainer.validate(model, data, verbose=False)
     run.checkpoints.mkdir(parents=True, exist_ok=True)
-    trainer.save_checkpoint(run.checkpoint("last"))
-    shutil.copyfile(run.checkpoint("last"), run.checkpoint("best"))
+    for name in ("last", "best"):
+        trainer.save_checkpoint(run.checkpoint(name))
 
 
 def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:

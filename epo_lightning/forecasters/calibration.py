@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole, is_number
@@ -80,51 +80,33 @@ class Calibration:
             scene: the scene, whose game ends ``game_steps`` after t0.
             parameters: the inferred game.
         """
-        before = scene.history.shape[2] - 1
-        if self.steps == 0 or before == 0 or not parameters.pair_weights:
+        if self.steps == 0 or scene.history.shape[2] == 1 or not parameters.pair_weights:
             return parameters
-        past = _at_first_step(scene).to(torch.double)
         game = parameters.map(lambda t: t.double() if t.is_floating_point() else t)
-        observed = past.future[:, None, :, :, :2]  # type: ignore[index]
-        present = scene.agent_mask[:, None, :, None, None]
-
-        games = next(iter(game.pair_weights.values())).shape[1]
-
-        def solve(s: Tensor, start: Tensor, minimiser: Minimiser, scenes: Tensor) -> tuple[Tensor, Tensor]:
-            """Weighted misses [S, C*M, R] of the history and strategies of C copies of every game, in the S chosen
-            ``scenes``, to which s [S, C*M] and the initial strategies belong. Copies are solved at once, as modes."""
-            count = s.shape[1] // games
-            copies = dataclasses.replace(
-                game[scenes].map(lambda t: torch.cat(count * (t,), 1)), context=game[scenes].context
-            )
-            weights = {name: weight * s.exp()[..., None] for name, weight in copies.pair_weights.items()}
-            found = minimiser(
-                energy, past[scenes], dataclasses.replace(copies, pair_weights=weights, initial_controls=start)
-            )
-            missed = found.states[..., :before, :2] - observed[scenes]
-            return torch.where(present[scenes], missed, 0.0).flatten(2) / self.noise, found.controls
-
-        def misses(s: Tensor, start: Tensor, minimiser: Minimiser, scenes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            """Misses [S, M, R], their derivative by s, and the strategies of two copies: at s, and beside it."""
-            missed, controls = solve(torch.cat((s, s + _DIFFERENCE), 1), start, minimiser, scenes)
-            here, beside = missed.chunk(2, 1)
-            return here, (beside - here) / _DIFFERENCE, controls
-
+        past = _PastGame(energy, _at_first_step(scene).to(torch.double), game, self.noise)
         descent = minimiser.descent()
-        near = descent.near_minimum()
-        every = torch.arange(len(observed), device=observed.device)
-        s = observed.new_tensor(self.starts).repeat_interleave(games).expand(len(observed), -1)
-        controls = _with_history(past, game.initial_controls.shape[3])
-        if len(self.starts) > 1:
-            missed, controls = solve(s, controls.expand(-1, s.shape[1], -1, -1, -1), descent, every)
-            least = self._cost(missed, s).unflatten(1, (-1, games)).argmin(1)  # [B, M]
-            chosen = least * games + torch.arange(games, device=s.device)
-            s, controls = s.gather(1, chosen), controls[every[:, None], chosen]
-            descent = near
+        s, start = past.first_guess(self.starts, self.spread, descent)
+        s = self._descend(past, s, start, descent if len(self.starts) == 1 else descent.near_minimum())
+        complete = (scene.history_mask | ~scene.agent_mask[..., None]).all(-1).all(-1)
+        factor = torch.where(complete[:, None] & s.isfinite(), s, 0.0).exp()[..., None]
+        weights = {name: weight * factor.to(weight.dtype) for name, weight in parameters.pair_weights.items()}
+        return dataclasses.replace(parameters, pair_weights=weights)
+
+    def _descend(
+        self, past: _PastGame, s: Float[Tensor, "B M"], start: Float[Tensor, "B _ N T 2"], first: Minimiser
+    ) -> Float[Tensor, "B M"]:
+        """s after the Gauss-Newton steps, of which every scene takes as many as it needs.
+
+        Args:
+            past: the games.
+            s: where the steps begin.
+            start: strategies of both copies (:meth:`_PastGame.misses`) from which the first minimum is sought.
+            first: its minimiser; later minima are near earlier ones.
+        """
+        every = torch.arange(len(s), device=s.device)
+        missed, change, controls = past.misses(s, start, first, every)
+        near = first.near_minimum()
         damping = torch.ones_like(s)
-        missed, change, controls = misses(
-            s, torch.cat(2 * (controls.expand(-1, games, -1, -1, -1),), 1), descent, every
-        )
         done = torch.zeros_like(s, dtype=torch.bool)
         for taken in range(1, self.steps + _FURTHER + 1):
             slope = (change * missed).sum(-1) + s / self.spread**2
@@ -132,16 +114,16 @@ class Calibration:
             trial = s + (-slope / (damping * curvature)).clamp(-_LARGEST_STEP, _LARGEST_STEP)
             # A scene ends on its own, so that it does not depend on the other scenes of its batch.
             size = (trial - s).abs()
-            small = ~(size >= _CONVERGED) & ~done
-            s = torch.where(small & trial.isfinite(), trial, s)
-            done = done | small
+            converged = ~(size >= _CONVERGED) & ~done
+            s = torch.where(converged & trial.isfinite(), trial, s)
+            done = done | converged
             going = (~done).any(1).nonzero()[:, 0]
             if not len(going):
                 break
-            solved = misses(trial[going], controls[going], near, going)
+            solved = past.misses(trial[going], controls[going], near, going)
             # Scenes that have ended are not solved again; nothing of them is better.
             found = [old.index_copy(0, going, new) for old, new in zip((missed, change, controls), solved, strict=True)]
-            better = (self._cost(found[0], trial) < self._cost(missed, s)) & ~done
+            better = (_cost(found[0], trial, self.spread) < _cost(missed, s, self.spread)) & ~done
             damping = torch.where(better, (damping / 3.0).clamp_min(1.0), damping * 4.0)
             s = torch.where(better, trial, s)
             missed = torch.where(better[..., None], found[0], missed)
@@ -150,14 +132,84 @@ class Calibration:
             controls = torch.where(both, found[2], controls)
             if taken >= self.steps:
                 done = done | ~(better & (size >= _LARGE))
-        complete = (scene.history_mask | ~scene.agent_mask[..., None]).all(-1).all(-1)
-        factor = torch.where(complete[:, None] & s.isfinite(), s, 0.0).exp()[..., None]
-        weights = {name: weight * factor.to(weight.dtype) for name, weight in parameters.pair_weights.items()}
-        return dataclasses.replace(parameters, pair_weights=weights)
+        return s
 
-    def _cost(self, missed: Tensor, s: Tensor) -> Float[Tensor, "B M"]:
-        cost = missed.square().sum(-1) + s.square() / self.spread**2
-        return torch.where(cost.isfinite(), cost, math.inf)
+
+@dataclass(frozen=True)
+class _PastGame:
+    """The inferred games, posed at the first observed state, whose solutions have to lead through the history.
+
+    Attributes:
+        energy: the energy of the games.
+        past: the scenes at their first observed step, whose future is the rest of the history.
+        game: the inferred games.
+        noise: standard deviation [m] of the observed positions.
+    """
+
+    energy: Energy
+    past: Scene
+    game: GameParameters
+    noise: float
+
+    @property
+    def games(self) -> int:
+        """Number of games M of a scene."""
+        return next(iter(self.game.pair_weights.values())).shape[1]
+
+    def solve(
+        self,
+        s: Float[Tensor, "S C"],
+        start: Float[Tensor, "S C N T 2"],
+        minimiser: Minimiser,
+        scenes: Int[Tensor, " S"],
+    ) -> tuple[Float[Tensor, "S C R"], Float[Tensor, "S C N T 2"]]:
+        """Misses of the history, in units of the noise, and strategies, of copies of the games of some scenes.
+
+        Args:
+            s: for every copy; C is a multiple of the number of games. Copies are solved at once, as modes.
+            start: initial strategies.
+            minimiser: the solver.
+            scenes: the scenes S to which these belong.
+        """
+        of_scenes, past = self.game[scenes], self.past[scenes]
+        count = s.shape[1] // self.games
+        copies = dataclasses.replace(of_scenes.map(lambda t: torch.cat(count * (t,), 1)), context=of_scenes.context)
+        weights = {name: weight * s.exp()[..., None] for name, weight in copies.pair_weights.items()}
+        found = minimiser(self.energy, past, dataclasses.replace(copies, pair_weights=weights, initial_controls=start))
+        assert past.future is not None
+        observed = past.future[:, None, :, :, :2]
+        missed = found.states[..., : observed.shape[3], :2] - observed
+        present = past.agent_mask[:, None, :, None, None]
+        return torch.where(present, missed, 0.0).flatten(2) / self.noise, found.controls
+
+    def misses(
+        self, s: Float[Tensor, "S M"], start: Tensor, minimiser: Minimiser, scenes: Tensor
+    ) -> tuple[Float[Tensor, "S M R"], Float[Tensor, "S M R"], Float[Tensor, "S _ N T 2"]]:
+        """Misses, their derivative by s, and the strategies of two copies of every game: at s, and beside it."""
+        missed, controls = self.solve(torch.cat((s, s + _DIFFERENCE), 1), start, minimiser, scenes)
+        here, beside = missed.chunk(2, 1)
+        return here, (beside - here) / _DIFFERENCE, controls
+
+    def first_guess(
+        self, starts: Sequence[float], spread: float, minimiser: Minimiser
+    ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B _ N T 2"]]:
+        """The start with the lowest cost, and the strategies of two copies of every game from which to go on."""
+        observed = _with_history(self.past, self.game.initial_controls.shape[3])
+        every = torch.arange(len(observed), device=observed.device)
+        s = observed.new_tensor(starts).repeat_interleave(self.games).expand(len(observed), -1)
+        controls = observed.expand(-1, s.shape[1], -1, -1, -1)
+        if len(starts) > 1:
+            missed, controls = self.solve(s, controls, minimiser, every)
+            least = _cost(missed, s, spread).unflatten(1, (-1, self.games)).argmin(1)
+            chosen = least * self.games + torch.arange(self.games, device=s.device)
+            s, controls = s.gather(1, chosen), controls[every[:, None], chosen]
+        return s, torch.cat((controls, controls), 1)
+
+
+def _cost(missed: Float[Tensor, "S M R"], s: Float[Tensor, "S M"], spread: float) -> Float[Tensor, "S M"]:
+    """What a calibration minimises; infinite where a game has no solution."""
+    cost = missed.square().sum(-1) + s.square() / spread**2
+    return torch.where(cost.isfinite(), cost, math.inf)
 
 
 def _at_first_step(scene: Scene) -> Scene:

@@ -24,7 +24,6 @@ from epo_lightning.decoders.strategies import InitialStrategies, ZeroStrategies
 from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, SharedOwnWeights, SharedPairWeights
 from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
 from epo_lightning.forecasters.base import Forecaster
-from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.forecasters.epo_settings import (
     WEIGHTS,
@@ -133,7 +132,7 @@ class EPO(Forecaster):
     ) -> None:
         Combination.of(energy=energy, solver=solver, backward=backward, objective=objective).check()
         check_needs(energy, task)
-        self.calibration = None if calibration is None else Calibration(**calibration)  # type: ignore[arg-type]
+        self.calibration = check_calibration(calibration, energy, solver)
         self.one_game = one_game
         self.game_horizon = task.horizon if game_horizon is None else game_horizon
         check_horizon(self.game_horizon, energy, objective, task)
@@ -141,7 +140,6 @@ class EPO(Forecaster):
         check_initial(initial, modes, one_game, energy, solver)
         check_choice("own_weights", own_weights, WEIGHTS)
         check_choice("pair_weights", pair_weights, WEIGHTS)
-        check_calibration(calibration, energy, solver)
         check_gate(gate, energy)
         # The network decodes probabilities, except where they follow from energies of candidates (TABLES) or from orders.
         defined = TABLES in solver.provides or energy.pair_order is not None

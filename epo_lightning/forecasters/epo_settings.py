@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.features import OWN_FEATURES
@@ -107,22 +109,30 @@ def check_initial(initial: str, modes: int, one_game: bool, energy: Energy, solv
 
 def check_calibration(
     calibration: Mapping[str, float | Sequence[float]] | None, energy: Energy, solver: Minimiser
-) -> None:
-    """Refuse a calibration with a solver that does not lead to a minimum, or of a game with decoded reference controls.
+) -> Calibration | None:
+    """The configured calibration, if any.
 
     Raises:
-        ConfigError: see above.
+        ConfigError: an unknown key; a solver that does not lead to a minimum; a game with decoded reference controls; or as
+            :class:`~epo_lightning.forecasters.calibration.Calibration`.
     """
-    if calibration is not None and "reference_controls" in energy.needs:
+    if calibration is None:
+        return None
+    if "reference_controls" in energy.needs:
         raise ConfigError(
             "forecaster.calibration poses the game at the first observed state, for which no reference controls are "
             "decoded: leave accref and turnrref out of energy.own, or set calibration to null"
         )
-    if calibration is not None and STATIONARY not in solver.provides:
+    if STATIONARY not in solver.provides:
         raise ConfigError(
             "forecaster.calibration needs a solver that leads to a minimum, such as both_sides, game or converging; set "
             "it to null for this one"
         )
+    known = [field.name for field in dataclasses.fields(Calibration)]
+    for name in calibration:
+        if name not in known:
+            raise ConfigError(f"unknown key forecaster.calibration.{name}: {nearest(str(name), known)}")
+    return Calibration(**calibration)  # type: ignore[arg-type]
 
 
 def check_gate(gate: Mapping[str, Any] | None, energy: Energy) -> None:

@@ -193,7 +193,7 @@ class FeatureEnergy(FeatureInputs):
         closing = (normal * (moved[0] - moved[1])[..., :2]).sum(-1)
         for name, pair in self.pair_features.items():
             if pair.declared:
-                value, slope, _ = pair_derivatives(pair, distance, self.reach(scene, parameters, name)[..., None])
+                value, slope, _ = pair_derivatives(pair, distance, self.reach(scene, parameters, name))
                 assert slope is not None
                 change = slope * closing
             else:

@@ -195,15 +195,16 @@ class FeatureInputs(Energy):
         finite = [extent(self.size(scene)) for extent in extents if extent is not None]
         return torch.stack(finite).amax(0) if len(finite) == len(extents) else None
 
-    def reach(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B _ P"]:
+    def reach(self, scene: Scene, parameters: GameParameters, name: str) -> Float[Tensor, "B _ P _"]:
         """The distance [m] at which the discs of two agents touch, r_i + r_j, with the margin of the pair feature ``name``.
 
-        The shape is [B, M, P] for decoded margins and [B, 1, P] otherwise.
+        The shape is [B, M, P, 1] for decoded margins and [B, 1, P, 1] otherwise; other energies may have distances that
+        differ from step to step.
         """
         radius = disc(self.size(scene))
         first, second = pairs(scene.agent_mask.shape[1], radius.device)
         reach = (radius[:, first] + radius[:, second])[:, None]
-        return reach + self.margin(scene, parameters, name) if self.pair_features[name].margin else reach
+        return (reach + self.margin(scene, parameters, name) if self.pair_features[name].margin else reach)[..., None]
 
     def residual_mask(self, scene: Scene, feature: OwnFeature, steps: int) -> Bool[Tensor, "B 1 1 R"] | None:
         """Mask of the residuals of a declared own feature before the end of each game; None if no residual is after it."""

@@ -47,6 +47,19 @@ def test_statistics_of_present_rows_need_no_selection(kind, filling, present, mo
         torch.testing.assert_close(one, other, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("kind", ["selection", "operations", pytest.param("kernels", marks=needs_warp)])
+def test_a_batch_without_a_present_row_leaves_the_statistics_as_they_are(kind, monkeypatch):
+    norm = MaskedBatchNorm(3).double().train()
+    norm.running_mean.fill_(5.0)
+    norm.running_var.fill_(3.0)
+    monkeypatch.setattr(batch_norm, "readable", lambda _: kind == "selection")
+    if kind == "kernels":
+        monkeypatch.setattr(MaskedBatchNorm, "_without_waiting", MaskedBatchNorm._fused)
+    norm(torch.randn(2, 4, 3, dtype=torch.float64), torch.zeros(2, 4, dtype=torch.bool))
+    assert norm.running_mean.tolist() == 3 * [5.0]
+    assert norm.running_var.tolist() == 3 * [3.0]
+
+
 def given_rows(rows=5, features=3, dtype=torch.float64):
     """Rows, weight and bias that need gradients."""
     return [

@@ -130,13 +130,15 @@ def test_rows_are_written_at_once_and_a_full_disk_is_an_error(epo: Epo) -> None:
         file.log_metrics({"a": 2.0}, 1)
 
 
-def test_only_the_first_of_several_processes_logs(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert epo("train", ROW, *TINY, "run_dir=run") == 0
-    run, before = RunFolder.open("run"), Path("run/logs/metrics.csv").read_bytes()
-    monkeypatch.setattr(logs.rank_zero_only, "rank", 1)
-    with logs.open_logs(read(Settings, run.config()), run.config(), run) as loggers:
-        assert loggers == []
-    assert Path("run/logs/metrics.csv").read_bytes() == before
+def test_a_task_of_slurm_that_trains_a_run_of_its_own_logs(tmp_path: Path) -> None:
+    """As by `srun -n 4 bash -c 'epo train seed=$SLURM_PROCID'`: Lightning reads the variable when it is imported."""
+    words = ("train", "experiment=rpi/v_lstm", "data=drawn", "budget=smoke", "run_dir=run")
+    environment = {**os.environ, "SLURM_PROCID": "1"}
+    task = subprocess.run(
+        [sys.executable, "-m", "epo_lightning.cli", *words], env=environment, cwd=tmp_path, check=False
+    )
+    assert task.returncode == 0
+    assert "val/minSADE" in (tmp_path / "run/logs/metrics.csv").read_text()
 
 
 # TensorBoard

@@ -195,6 +195,7 @@ def test_calibration_solves_its_games_as_training_does(monkeypatch: pytest.Monke
         ({"game_horizon": 39}, r"forecaster\.game_horizon must be 40 or more"),
         ({"own_weights": "decode"}, r"unknown forecaster\.own_weights 'decode': did you mean 'decoded'\?"),
         ({"calibration": {"noise": math.nan}}, r"calibration\.noise"),
+        ({"calibration": {"nois": 0.1}}, r"unknown key forecaster\.calibration\.nois: .*noise"),
         ({"calibration": {"step": 3}}, "step"),
     ],
 )

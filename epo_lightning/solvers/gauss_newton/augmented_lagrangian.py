@@ -94,6 +94,7 @@ class AugmentedLagrangian(Minimiser):
 
     def __post_init__(self) -> None:
         check_whole("solver.rounds", self.rounds, least=1)
+        check_whole("solver.newton_steps", self.newton_steps, least=1)
         check_number("solver.penalty", self.penalty)
         if self.penalty > LARGEST_PENALTY:
             raise ConfigError(

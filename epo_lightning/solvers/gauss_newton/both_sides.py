@@ -149,5 +149,5 @@ def _chosen(found: Solution, modes: int) -> Solution:
 def _same(states: Tensor) -> Tensor:
     """Whether two solutions of a scene are the same, [B, C, C]."""
     position = states[..., :2]
-    apart = (position[:, :, None] - position[:, None]).norm(dim=-1).flatten(3).amax(-1)
-    return apart < DISTINCT
+    apart = (position[:, :, None] - position[:, None]).norm(dim=-1)
+    return (apart < DISTINCT).flatten(3).all(-1)

@@ -79,7 +79,7 @@ class ConstrainedGame:
                 closing = (normal * (moving[:, :, :, first] - moving[:, :, :, second])).sum(-1)
                 exists = (energy.pair_weight(scene, parameters, name) != 0)[..., None]
                 exists = exists & energy.pair_exists(scene, energy.pair_features[name], distance.shape[-1])
-                reach = energy.reach(scene, parameters, name)[..., None]
+                reach = energy.reach(scene, parameters, name)
                 found.append((name, *_where(exists, reach - distance, -closing)))
         return found
 
@@ -155,7 +155,7 @@ class ShiftedEnergy(FeatureEnergy):
 
     def reach(self, scene: Scene, parameters: GameParameters, name: str) -> Tensor:
         reach = super().reach(scene, parameters, name)
-        return reach[..., None] + self.shifts[name] if name in self.shifts else reach
+        return reach + self.shifts[name] if name in self.shifts else reach
 
     def extent(self, scene: Scene) -> Tensor | None:
         extent = super().extent(scene)

@@ -216,7 +216,7 @@ def _of_pairs(
         weight = energy.pair_weight(scene, parameters, name)[..., None]
         exists = energy.pair_exists(scene, pair, distance.shape[-1])
         if pair.declared:
-            value, slope, _ = pair_derivatives(pair, distance, energy.reach(scene, parameters, name)[..., None])
+            value, slope, _ = pair_derivatives(pair, distance, energy.reach(scene, parameters, name))
             assert slope is not None
             force = weight * torch.where(exists, slope, 0.0)
             apart = energy.at_pair_steps(moved[..., :2][:, :, :, ends])

@@ -134,6 +134,21 @@ def test_the_jacobian_of_the_constraints_is_that_of_automatic_differentiation():
     torch.testing.assert_close(game.jacobian(controls)[0, 0], expected)
 
 
+def test_the_game_of_a_round_has_the_augmented_lagrangian_as_its_energy():
+    """E + mu/2 sum max(0, h + lambda / mu)^2; also for three agents, whose pairs are as many as numbers of steps may be."""
+    scene, parameters = meeting(3, steps=3)
+    game = ConstrainedGame(ENERGY, AugmentedLagrangian().hard(ENERGY), scene, parameters)
+    draw = torch.Generator().manual_seed(0)
+    controls = 0.3 * torch.randn(1, 1, 3, 3, 2, dtype=torch.double, generator=draw)
+    excess = game.excess(controls)
+    multipliers = {name: torch.rand(h.shape, dtype=torch.double, generator=draw) for name, h in excess.items()}
+    penalty = torch.full((1, 1), 7.0, dtype=torch.double)
+    energy, *augmented = game.augmented(multipliers, penalty, controls)
+    beyond = [(h + multipliers[name] / 7.0).clamp_min(0).square().sum() for name, h in excess.items()]
+    expected = game.objective(scene, parameters, controls) + 3.5 * torch.stack(beyond).sum()
+    torch.testing.assert_close(energy(*augmented, controls), expected)
+
+
 def test_agents_keep_apart_where_soft_ones_overlap():
     scene, parameters = meeting(4, steps=10)
     soft = LevenbergMarquardt(steps=40, step_size=1.0, damping=1.0, adaptive=True, newton_steps=20)
@@ -254,6 +269,7 @@ def test_settings_and_games_that_cannot_be_used_are_refused():
     for setting, message in (
         ({"penalty": 0.0}, "penalty"),
         ({"growth": 0.5}, "growth"),
+        ({"newton_steps": 0}, "newton_steps"),
         ({"constraints": []}, "empty"),
     ):
         with pytest.raises(ConfigError, match=message):
