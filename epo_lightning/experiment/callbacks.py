@@ -104,7 +104,7 @@ def _require_logged(monitor: str | None, trainer: Trainer) -> None:
     Raises:
         ConfigError: the message names the scores that it does log.
     """
-    if monitor is not None and monitor not in trainer.callback_metrics and not trainer.sanity_checking:
+    if monitor is not None and monitor not in trainer.callback_metrics:
         raise ConfigError(
             f"callbacks.monitor={monitor} is not logged by this forecaster: {nearest(monitor, trainer.callback_metrics)}"
         )
@@ -151,8 +151,6 @@ class FirstLine(Callback):
         self._title, self._folder = title, folder
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if not trainer.is_global_zero:
-            return
         steps = trainer.estimated_stepping_batches
         length = f"at most {steps:.0f} steps" if math.isfinite(steps) else "no limit of steps"
         begun = f"from step {trainer.global_step}, " if trainer.global_step else ""
@@ -179,7 +177,7 @@ class Progress(Callback):
 
     def _tell(self, trainer: Trainer) -> None:
         now = time.monotonic()
-        if now - self._told < self._every or not trainer.is_global_zero or not math.isfinite(self._began):
+        if now - self._told < self._every or not math.isfinite(self._began):
             return
         self._told = now
         steps = trainer.estimated_stepping_batches

@@ -6,10 +6,9 @@ Read :mod:`.iterate` (the unknowns, called nodes) and :class:`.quadratic_model.Q
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.forecast import GameParameters
@@ -17,25 +16,23 @@ from epo_lightning.game.feature_derivatives import (
     Bounds,
     add_linear_gradient,
     linear_signal,
-    margin_derivatives,
     nearest_point,
     own_derivatives,
-    pair_derivatives,
     steering,
     steering_second_derivatives,
-    undeclared_change_by_agent,
 )
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.game.features import OwnFeature, PairFeature, Source
+from epo_lightning.game.features import OwnFeature, Source
 from epo_lightning.scene import HEADING, TURN_RATE, Scene
 from epo_lightning.solvers.gauss_newton.edges import Edges
+from epo_lightning.solvers.gauss_newton.expansion_sums import Sums, outer
 from epo_lightning.solvers.gauss_newton.iterate import Iterate, suffix_sums
+from epo_lightning.solvers.gauss_newton.pair_expansion import add_pairs, add_undeclared_pair, pair_terms
 from epo_lightning.solvers.gauss_newton.quadratic_model import (
     GoalTerm,
     HeadingTerm,
     LaneTerm,
     OwnTerm,
-    PairTerm,
     QuadraticModel,
     Separation,
     SignalTerm,
@@ -43,7 +40,7 @@ from epo_lightning.solvers.gauss_newton.quadratic_model import (
 )
 
 XX_YY = slice(2, None, 2)
-"""Entries xx and yy among the five of :attr:`_Sums.positions`: x, y, xx, xy, yy."""
+"""Entries xx and yy among the five of :attr:`.Sums.positions`: x, y, xx, xy, yy."""
 
 
 @torch.no_grad()
@@ -64,7 +61,7 @@ def expand(
             derivatives of residuals.
     """
     at = Iterate.of(energy, scene, parameters, controls)
-    sums = _Sums.zeros(at, exact)
+    sums = Sums.zeros(at, exact)
     own = {}
     for name, feature in energy.own_features.items():
         if feature.declared:
@@ -83,10 +80,10 @@ def expand(
     if separation is not None:
         for name, pair_feature in energy.pair_features.items():
             if not pair_feature.declared:
-                linked |= _add_undeclared_pair(sums, edges, pair_feature, name)
-        pair = _pair_terms(at, edges, separation)
+                linked |= add_undeclared_pair(sums, edges, pair_feature, name)
+        pair = pair_terms(at, edges, separation)
         if pair:
-            linked |= _add_pairs(sums, edges, separation, pair)
+            linked |= add_pairs(sums, edges, separation, pair)
     if exact:
         _set_undeclared_hessian(sums, edges)
     by_velocity = at.to_velocities(sums.positions[:, :, :2])
@@ -115,63 +112,7 @@ def expand(
     )
 
 
-@dataclass
-class _Sums:
-    """Running sums over features, to which the functions below add.
-
-    Attributes:
-        at, exact: as for :func:`expand`.
-        agent_value: own energy of each agent. The energy of all pairs of a problem is added to the problem's first agent.
-        control_gradient, node_gradient: gradients by controls and by nodes, without the part that acts through positions
-            (``positions``).
-        positions: gradient by positions (x, y), then their second derivatives (xx, xy, yy).
-        control, rate, node, cross, own_dense, pair_position, pair_dense: see :class:`QuadraticModel`.
-    """
-
-    at: Iterate
-    exact: bool
-    agent_value: Tensor
-    control_gradient: Tensor
-    node_gradient: Tensor
-    positions: Tensor
-    control: Tensor
-    node: Tensor
-    rate: Tensor | None = None
-    cross: Tensor | None = None
-    own_dense: Tensor | None = None
-    pair_position: Tensor | None = None
-    pair_dense: Tensor | None = None
-
-    @classmethod
-    def zeros(cls, at: Iterate, exact: bool) -> _Sums:
-        """Sums over no feature."""
-
-        def zeros(components: int) -> Tensor:
-            return at.u.new_zeros(at.problems, at.agents, components, at.horizon)
-
-        return cls(
-            at,
-            exact,
-            agent_value=at.u.new_zeros(at.problems, at.agents),
-            control_gradient=zeros(2),
-            node_gradient=zeros(2),
-            positions=zeros(5),
-            control=zeros(2),
-            node=zeros(2),
-        )
-
-    def crossed(self) -> Tensor:
-        """The array ``cross``, allocated at first use."""
-        if self.cross is None:
-            self.cross = torch.zeros_like(self.node)
-        return self.cross
-
-    def add_value(self, scaled: Tensor, value: Tensor) -> None:
-        """Add the energy of a feature, 1/2 w^2 c^2, with ``scaled`` = w^2 c."""
-        self.agent_value += 0.5 * (scaled * value).flatten(2).sum(-1)
-
-
-def _add_own(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> OwnTerm:
+def _add_own(sums: Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> OwnTerm:
     """Add a declared own feature."""
     match feature.source:
         case Source.STEERING:
@@ -195,7 +136,7 @@ def _bounds(at: Iterate, feature: OwnFeature) -> Bounds:
     return {feature.signal: (lower, upper)}
 
 
-def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> SignalTerm:
+def _add_signal(sums: Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> SignalTerm:
     at, square = sums.at, weight.square()
     signal = linear_signal(feature, at.u, at.speed, at.dt, channels=-2)
     if feature.needs:
@@ -225,7 +166,7 @@ def _add_signal(sums: _Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]
     return SignalTerm(feature, weight, c)
 
 
-def _add_steering(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
+def _add_steering(sums: Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
     at, square = sums.at, weight.square()
     angle, by_turn_rate, by_speed = steering(*at.steered())
     if at.within_game is not None:
@@ -250,7 +191,7 @@ def _add_steering(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
     return SteeringTerm(weight, angle, by_turn_rate, by_speed)
 
 
-def _add_lane(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
+def _add_lane(sums: Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
     at = sums.at
     assert at.around.line is not None
     position = at.states[..., :2]
@@ -263,12 +204,12 @@ def _add_lane(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
     sums.positions[:, :, :2] += scaled
     sums.positions[:, :, XX_YY] += square
     if sums.exact or at.energy.lane_slides:
-        sums.positions[:, :, 2:] -= square * _outer(tangent, 2)
+        sums.positions[:, :, 2:] -= square * outer(tangent, 2)
     sums.add_value(scaled, offset)
     return LaneTerm(weight, offset, tangent)
 
 
-def _add_goal(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
+def _add_goal(sums: Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
     at, square = sums.at, weight.square()
     assert at.around.goals is not None
     offset = at.last(at.x[:, :, :2]) - at.around.goals.flatten(0, 1)
@@ -279,7 +220,7 @@ def _add_goal(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
     return GoalTerm(weight, offset)
 
 
-def _add_heading(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> HeadingTerm:
+def _add_heading(sums: Sums, weight: Float[Tensor, "S N 1"]) -> HeadingTerm:
     at, square = sums.at, weight.square()
     offset = at.last(at.x[:, :, HEADING, None]) - at.by_problem(at.around.goal_headings)
     scaled = square * offset
@@ -289,7 +230,7 @@ def _add_heading(sums: _Sums, weight: Float[Tensor, "S N 1"]) -> HeadingTerm:
     return HeadingTerm(weight, offset)
 
 
-def _add_undeclared(sums: _Sums, name: str) -> None:
+def _add_undeclared(sums: Sums, name: str) -> None:
     at = sums.at
     directions = at.node_directions()
     moved = at.energy.dynamics.tangent(at.states, directions, at.dt), directions
@@ -305,110 +246,7 @@ def _add_undeclared(sums: _Sums, name: str) -> None:
         sums.own_dense = block if sums.own_dense is None else sums.own_dense + block
 
 
-def _by_edge(at: Iterate, edges: Edges, values: Float[Tensor, "B _ P *steps"]) -> Float[Tensor, "E _"]:
-    """Values of pairs by edge, one for all steps or one per step.
-
-    Those that are the same in all modes may have a dimension of 1 for modes.
-    """
-    if values.dim() == 4:
-        return edges.of_pairs(values.expand(-1, at.modes, -1, -1).flatten(0, 2))
-    return edges.of_pairs(values.expand(-1, at.modes, -1).flatten())[:, None]
-
-
-def _edge_exists(at: Iterate, edges: Edges, feature: PairFeature, steps: int) -> Bool[Tensor, "E _"]:
-    """Mask of the edges whose agents are present, at the evaluated steps of their game."""
-    exists = at.energy.pair_exists(at.scene, feature, steps).expand(-1, at.modes, -1, -1).flatten(0, 2)
-    return exists.index_select(0, edges.pair)
-
-
-def _edge_weight(at: Iterate, edges: Edges, name: str) -> Float[Tensor, "E 1"]:
-    return _by_edge(at, edges, at.energy.pair_weight(at.scene, at.parameters, name))
-
-
-def _pair_terms(at: Iterate, edges: Edges, separation: Separation) -> dict[str, PairTerm]:
-    """The declared pair features with their derivatives by the distance."""
-    terms = {}
-    for name, feature in at.energy.pair_features.items():
-        if feature.declared:
-            reach = _by_edge(at, edges, at.energy.reach(at.scene, at.parameters, name))
-            c = pair_derivatives(feature, separation.distance, reach, second=True)
-            by_margin = None
-            if name in at.energy.decoded_margins:
-                by_margin = margin_derivatives(feature, separation.distance, reach, c)
-            if at.within_game is not None:
-                active = _edge_exists(at, edges, feature, separation.distance.shape[-1])
-                c = c.within(active)
-                by_margin = by_margin and (by_margin[0].where(active, 0.0), by_margin[1].where(active, 0.0))
-            terms[name] = PairTerm(_edge_weight(at, edges, name), c, by_margin)
-    return terms
-
-
-def _add_pairs(sums: _Sums, edges: Edges, separation: Separation, terms: dict[str, PairTerm]) -> Bool[Tensor, " E"]:
-    """Add the declared pair features; returns the edges that couple their agents."""
-    at, normal = sums.at, separation.normal
-    by_distance = torch.zeros_like(separation.distance)
-    curvature, value = torch.zeros_like(by_distance), torch.zeros_like(by_distance)
-    for term in terms.values():
-        c = term.c
-        assert c.first is not None
-        square = term.weight.square()
-        scaled = square * c.value
-        value += scaled * c.value
-        if sums.exact and c.second is not None:
-            curvature += scaled * c.second
-        by_distance += scaled * c.first
-        curvature += square * c.first.square()
-    gradient = by_distance[:, None] * normal
-    position = curvature[:, None] * _outer(normal, 1)
-    if sums.exact:
-        turning = by_distance * separation.inverse
-        position -= turning[:, None] * _outer(normal, 1)
-        position[:, ::2] += turning[:, None]
-    gradient, position = at.at_every_step(gradient), at.at_every_step(position)
-    edges.spread_(sums.positions, torch.cat((gradient, position), 1), torch.cat((-gradient, position), 1))
-    sums.pair_position = position
-    _add_pair_value(sums, edges, value)
-    return (curvature != 0).any(1)
-
-
-def _add_undeclared_pair(sums: _Sums, edges: Edges, feature: PairFeature, name: str) -> Bool[Tensor, " E"]:
-    """Add an undeclared pair feature; returns the edges that couple their agents."""
-    at, energy = sums.at, sums.at.energy
-    both = edges.ends(energy.at_pair_steps(at.states.flatten(0, 1)))
-    moved = energy.dynamics.tangent(at.states, at.node_directions(), at.dt).flatten(1, 2)
-    moved = energy.at_pair_steps(moved).permute(1, 2, 0, 3, 4)  # [S, N, 2 K, L, 4]
-    first, second = (side.transpose(0, 1) for side in edges.ends(moved))
-    others: tuple[Tensor, ...] = ()
-    if feature.needs:
-        others = edges.ends(energy.size(at.scene).repeat_interleave(at.modes, 0)[:, :, None])
-    if feature.margin:
-        others = (*others, _by_edge(at, edges, energy.margin(at.scene, at.parameters, name)))
-    weight, exists = _edge_weight(at, edges, name), _edge_exists(at, edges, feature, both[0].shape[-2])
-    ends = energy.evaluated(at.scene)
-    if ends is not None:
-        ends = ends[edges.first // (at.agents * at.modes)]
-    found = undeclared_change_by_agent(feature, both, (first, second), *others, ends=ends)
-    value, by_first, by_second = (weight * torch.where(exists, part, 0.0) for part in found)
-    jacobians = by_first.permute(1, 0, 2), by_second.permute(1, 0, 2)  # [E, 2 K, R]
-    gradients = (side @ value[..., None] for side in jacobians)
-    edges.spread_(sums.node_gradient, *(part.view(-1, 2, at.horizon) for part in gradients))
-    _add_pair_value(sums, edges, value.square())
-    if not sums.exact:
-        if sums.own_dense is None:
-            sums.own_dense = value.new_zeros(at.problems, at.agents, 2 * at.horizon, 2 * at.horizon)
-        edges.spread_(sums.own_dense, *(side @ side.mT for side in jacobians))
-        shared = jacobians[0] @ jacobians[1].mT
-        sums.pair_dense = shared if sums.pair_dense is None else sums.pair_dense + shared
-    return ((by_first != 0) & exists).any(-1).any(0)
-
-
-def _add_pair_value(sums: _Sums, edges: Edges, value: Float[Tensor, "E L"]) -> None:
-    """Add the energies of pairs, 1/2 w^2 c^2, with ``value`` = w^2 c^2."""
-    first_of_problem = edges.first // sums.at.agents * sums.at.agents
-    sums.agent_value.flatten().index_add_(0, first_of_problem, 0.5 * value.sum(-1))
-
-
-def _set_undeclared_hessian(sums: _Sums, edges: Edges) -> None:
+def _set_undeclared_hessian(sums: Sums, edges: Edges) -> None:
     """Set the second derivatives of undeclared features, by automatic differentiation of their gradient, row by row."""
     at, part = sums.at, sums.at.energy.undeclared
     if part is not None and not edges.pair.shape[0]:
@@ -436,9 +274,3 @@ def _set_undeclared_hessian(sums: _Sums, edges: Edges) -> None:
     if part.pair:
         rows_of = edges.first * at.agents + edges.second % at.agents
         sums.pair_dense = at_nodes.flatten(0, 2)[rows_of]
-
-
-def _outer(vector: Tensor, dim: int) -> Tensor:
-    """The entries xx, xy and yy of v v^T."""
-    x, y = vector.unbind(dim)
-    return torch.stack((x * x, x * y, y * y), dim)
