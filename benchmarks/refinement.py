@@ -19,6 +19,7 @@ import dataclasses
 import functools
 import statistics
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch
@@ -199,6 +200,9 @@ def main(given: Sequence[str] | None = None) -> None:
     chosen = parser.parse_args(given)
     torch.set_num_threads(1)
     assembly.quiet()
+    warnings.filterwarnings(
+        "ignore", message="(.* of the given futures of agents|states)"
+    )  # of marginal forecasters, for every call
     print(f"{'run':<28}{'':<9}{'scenes':<13}" + "".join(f"{label:>9}" for label in SCORES.values()))
     try:
         weights = WEIGHTS if chosen.weights is None else numbers(chosen.weights)
