@@ -254,6 +254,17 @@ def heading_vector(heading: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2"
     return torch.stack((heading.cos(), heading.sin()), -1)
 
 
+def rotated(vector: Float[Tensor, "*#batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 2"]:
+    """Vectors (x, y) rotated to the left by an angle [rad]; minus a heading leads to its frame, (forward, left).
+
+    Example:
+        >>> rotated(torch.tensor([2.0, 1.0]), torch.tensor(math.pi / 2)).round()
+        tensor([-1.,  2.])
+    """
+    (x, y), cosine, sine = vector.unbind(-1), angle.cos(), angle.sin()
+    return torch.stack((cosine * x - sine * y, sine * x + cosine * y), -1)
+
+
 def velocities(states: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 2"]:
     """Velocities (x, y) [m/s] of states."""
     return states[..., SPEED, None] * heading_vector(states[..., HEADING])
