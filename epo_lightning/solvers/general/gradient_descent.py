@@ -13,7 +13,6 @@ and learning from diverged controls would make the weights larger still.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,10 +77,6 @@ class GradientDescent(Stepwise):
     def __post_init__(self) -> None:
         check_steps(self.steps, self.scale)
         check_number("solver.step_size", self.step_size)
-
-    def with_steps(self, steps: int) -> GradientDescent:
-        """This minimiser with another number of steps."""
-        return dataclasses.replace(self, steps=steps)
 
     def run(
         self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Progress | None = None
