@@ -31,6 +31,8 @@ from epo_lightning.batch import Batch
 X, Y, HEADING, SPEED = range(4)
 KINDS = ("car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "other")
 """Classes of agents; ``Scene.kind`` is an index into this tuple."""
+SHAPES = ("disc", "box")
+"""Outlines of agents: discs with the length as diameter, or boxes of length times width."""
 ACCELERATION, TURN_RATE = range(2)
 LARGEST_HEADING = 1e4
 """Largest size of a heading [rad]: beyond it, single precision has no digits left for a direction."""

@@ -19,7 +19,7 @@ FLOORS = {
     "checks": {"registry"},
     "arguments": {"registry"},
     "schema": {"registry"},
-    "task": {"registry"},
+    "task": {"scene", "registry"},
     "identity": {"registry"},
     "masking": set(),
     "host": set(),

@@ -18,9 +18,8 @@ from epo_lightning.game.network_energy import NetworkEnergy
 from epo_lightning.game.networks import MOTION, Layers, motion, squared_distances
 from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import SPEED, Scene
+from epo_lightning.scene import SHAPES, SPEED, Scene
 
-SHAPES = ("disc", "box")
 _AT_ONCE = 100_000
 """Number of pairs of rows of circles that are compared together, which bounds the memory."""
 

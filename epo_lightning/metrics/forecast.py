@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,8 +24,8 @@ from epo_lightning.metrics.functional import (
     reliability,
 )
 from epo_lightning.metrics.functional.calibration import BINS
-from epo_lightning.metrics.functional.overlap import Shape, check_choice, overlap_rates
-from epo_lightning.scene import Scene
+from epo_lightning.metrics.functional.overlap import check_choice, overlap_rates
+from epo_lightning.scene import SHAPES, Scene
 
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "overlap_authors")
 """Scores of every forecaster; displacements in m, overlaps as rates."""
@@ -118,7 +118,7 @@ class ForecastMetrics(Metric):
 
     def __init__(self, subsets: Sequence[str] = (), shape: str = "disc", **options: Any) -> None:
         super().__init__(**options)
-        check_choice("shape", shape, get_args(Shape))
+        check_choice("shape", shape, SHAPES)
         self.subsets, self.shape = tuple(subsets), shape
         # The first row is for all scenes, the others for one subset each.
         zeros = torch.zeros(1 + len(self.subsets), len(COLUMNS), dtype=torch.float64)

@@ -21,10 +21,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import HEADING
+from epo_lightning.scene import HEADING, SHAPES
 
 Definition = Literal["jfp", "authors"]
-Shape = Literal["disc", "box"]
 
 TOUCH = 1e-6
 """Depth [m] up to which an overlap counts as touching (a rounding error)."""
@@ -109,7 +108,7 @@ def overlaps(
     Raises:
         ConfigError: an unknown shape.
     """
-    check_choice("shape", shape, get_args(Shape))
+    check_choice("shape", shape, SHAPES)
     first, second = torch.triu_indices(states.shape[1], states.shape[1], 1, device=states.device)
     overlap = _discs_overlap if shape == "disc" else _boxes_overlap
     at_step = overlap(states[:, first], states[:, second], size[:, first, None], size[:, second, None])
@@ -128,7 +127,7 @@ def overlaps_with(
     Raises:
         ConfigError: an unknown shape.
     """
-    check_choice("shape", shape, get_args(Shape))
+    check_choice("shape", shape, SHAPES)
     others = torch.arange(states.shape[1], device=states.device) != agent
     overlap = _discs_overlap if shape == "disc" else _boxes_overlap
     one = states[:, agent, None].expand(-1, states.shape[1] - 1, -1, -1)
