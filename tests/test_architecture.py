@@ -33,7 +33,7 @@ FLOORS = {
     "refinement": {"doubts", "game", "solvers", "scene", "forecast", "registry", "checks"},
     "predictions": {"scene", "registry", "run_folder", "refinement"},
     "encoders": {"scene"},
-    "metrics": {"scene", "forecast", "registry"},
+    "metrics": {"scene", "forecast", "registry", "checks"},
     "decoders": {"scene", "registry", "checks", "game", "host", "warp_kernels"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
     "data": {"scene", "registry", "schema", "checks", "task", "metrics"},
