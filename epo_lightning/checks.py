@@ -42,7 +42,7 @@ def check_whole(key: str, value: Any, least: int = 1) -> None:
         raise ConfigError(f"{key} must be a whole number, {least} or more, not {value!r}")
 
 
-def check_number(key: str, value: Any, zero: bool = False, finite: bool = True) -> None:
+def check_number(key: str, value: Any, zero: bool = False, finite: bool = True, null: bool = False) -> None:
     """Check that a configured value is a positive number.
 
     Args:
@@ -50,11 +50,16 @@ def check_number(key: str, value: Any, zero: bool = False, finite: bool = True) 
         value: value of the key.
         zero: whether 0 is allowed.
         finite: whether infinity is refused.
+        null: whether None is allowed.
 
     Raises:
         ConfigError: another value; the message names the key.
     """
+    if null and value is None:
+        return
     allowed = is_number(value) and (value > 0 or (zero and value == 0)) and not (finite and value == math.inf)
     if not allowed:
-        wanted = ("0 or more" if zero else "positive") + (", and finite" if finite else "")
+        wanted = (
+            ("0 or more" if zero else "positive") + (", and finite" if finite else "") + (", or null" if null else "")
+        )
         raise ConfigError(f"{key} must be a number, {wanted}, not {value!r}")

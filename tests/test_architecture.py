@@ -37,7 +37,7 @@ FLOORS = {
     "decoders": {"scene", "registry", "checks", "game", "host", "warp_kernels"},
     "backbones": {"scene", "registry", "encoders", "decoders"},
     "data": {"scene", "registry", "schema", "checks", "task", "metrics"},
-    "objectives": {"scene", "forecast", "registry", "game", "solvers", "decoders", "losses"},
+    "objectives": {"scene", "forecast", "registry", "checks", "game", "solvers", "decoders", "losses"},
     "forecasters": {
         "scene",
         "doubts",
