@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.scene import HEADING, Scene
+from epo_lightning.scene import HEADING, Scene, rotated
 
 AGREE = 0.2
 """Smallest length of the mean of the agents' unit directions; below it, they have no common direction."""
@@ -54,7 +54,7 @@ def aligned(scene: Scene) -> Scene:
     def points(values: Tensor) -> Tensor:
         """Positions, or lines from one position to the next, in the frames."""
         batch = (len(values), *[1] * (values.dim() - 2))
-        ends = [turned(end - origin.view(*batch, 2), -angle.view(batch)) for end in values.split(2, -1)]
+        ends = [rotated(end - origin.view(*batch, 2), -angle.view(batch)) for end in values.split(2, -1)]
         return torch.cat(ends, -1)
 
     def states(values: Tensor) -> Tensor:
@@ -75,13 +75,7 @@ def in_world(states: Float[Tensor, "B *batch X"], frame: Float[Tensor, "B 3"]) -
     """States x, y, heading, speed, or positions x, y, of scenes in coordinates of the world, as precise as the frame."""
     batch = (len(states), *[1] * (states.dim() - 2))
     values, angle = states.to(frame.dtype), frame[:, 2].view(batch)
-    position = turned(values[..., :2], angle) + frame[:, :2].view(*batch, 2)
+    position = rotated(values[..., :2], angle) + frame[:, :2].view(*batch, 2)
     if values.shape[-1] == 2:
         return position
     return torch.cat((position, (values[..., HEADING] + angle)[..., None], values[..., HEADING + 1 :]), -1)
-
-
-def turned(vector: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch 2"]:
-    """Vectors turned to the left by an angle [rad]."""
-    (x, y), cosine, sine = vector.unbind(-1), angle.cos(), angle.sin()
-    return torch.stack((cosine * x - sine * y, sine * x + cosine * y), -1)

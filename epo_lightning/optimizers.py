@@ -40,11 +40,9 @@ class Adam:
     clip: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.lr < float("inf"):
-            raise ConfigError(f"optimizer.lr must be positive and finite, not {self.lr}")
+        check_number("optimizer.lr", self.lr)
         check_number("optimizer.shared_factor", self.shared_factor)
-        if self.clip is not None and not self.clip > 0:
-            raise ConfigError(f"optimizer.clip must be positive or null, not {self.clip}")
+        check_number("optimizer.clip", self.clip, finite=False, null=True)
         if self.schedule not in _SCHEDULES:
             raise ConfigError(f"unknown optimizer.schedule {self.schedule!r}: {nearest(self.schedule, _SCHEDULES)}")
 

@@ -9,13 +9,22 @@
         checkpoints/best.ckpt  the epoch with the smallest `callbacks.monitor` (validation minSADE)
         checkpoints/last.ckpt  the last finished epoch, with everything that continuing needs
         logs/                  metrics.csv: what was logged while training; TensorBoard's and W&B's files lie beside it
-        metrics.json           scores on the test split, written by ``evaluate`` ({"split", "data", "checkpoint", "metrics"})
+        metrics.json           scores on the test split, written by ``evaluate``: "split", "data_digest", "checkpoint",
+                               "metrics", and on RPI "truth", the errors of inferred costs, where the run infers costs
         metrics-val.json       scores on the validation split, where `score` or `epo evaluate` asks for them
         runtime.json           time of one joint forecast, where `score` asks for it
+        scores-<split>-<checkpoint>-<digest>.json
+                               scores of another checkpoint than ``best``, or scores that differ from those in
+                               ``metrics.json`` or ``metrics-val.json``
+        scores-on-<data>-<split>-<digest>-<digest>.json
+                               scores on other data; the digests are those of the test and of the checkpoint
+        runtime-<device>-<threads>.json
+                               an earlier ``runtime.json``, set aside by a sweep: ``cpu`` or ``gpu``, and number of threads
         progress.json          step and machine of the training; exists only while it runs
         .lock                  locked as long as a process works on the run; the system releases it when the process dies
 
 Files are replaced as a whole, so a reader never sees an incomplete one, even if the writing process is killed.
+Names of the forms ``scores-..`` and ``runtime-..`` that are taken get a number, as in ``runtime-cpu-1-2.json``.
 ``metrics.json`` holds no time, path or version, so that two equal runs give the same bytes.
 """
 

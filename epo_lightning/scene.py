@@ -31,6 +31,8 @@ from epo_lightning.batch import Batch
 X, Y, HEADING, SPEED = range(4)
 KINDS = ("car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "other")
 """Classes of agents; ``Scene.kind`` is an index into this tuple."""
+SHAPES = ("disc", "box")
+"""Outlines of agents: discs with the length as diameter, or boxes of length times width."""
 ACCELERATION, TURN_RATE = range(2)
 LARGEST_HEADING = 1e4
 """Largest size of a heading [rad]: beyond it, single precision has no digits left for a direction."""
@@ -252,6 +254,17 @@ class Scene(Batch):
 def heading_vector(heading: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2"]:
     """Unit vectors (x, y) in the directions of headings [rad]."""
     return torch.stack((heading.cos(), heading.sin()), -1)
+
+
+def rotated(vector: Float[Tensor, "*#batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 2"]:
+    """Vectors (x, y) rotated to the left by an angle [rad]; minus a heading leads to its frame, (forward, left).
+
+    Example:
+        >>> rotated(torch.tensor([2.0, 1.0]), torch.tensor(math.pi / 2)).round()
+        tensor([-1.,  2.])
+    """
+    (x, y), cosine, sine = vector.unbind(-1), angle.cos(), angle.sin()
+    return torch.stack((cosine * x - sine * y, sine * x + cosine * y), -1)
 
 
 def velocities(states: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 2"]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from epo_lightning.registry import ConfigError
+from epo_lightning.scene import SHAPES
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ class Task:
         for name in ("dt", "scale"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"a task's {name} must be positive and finite, not {getattr(self, name)}")
-        if self.shape not in ("disc", "box"):
-            raise ConfigError(f"a task's shape must be disc or box, not {self.shape!r}")
+        if self.shape not in SHAPES:
+            raise ConfigError(f"a task's shape must be {' or '.join(SHAPES)}, not {self.shape!r}")
 
     @classmethod
     def from_config(cls, model: Mapping[str, Any]) -> Task:

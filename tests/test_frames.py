@@ -11,8 +11,8 @@ from games import highway_scene
 from torch.testing import assert_close
 
 from epo_lightning import Scene, pretrained
-from epo_lightning.frames import aligned, in_world, turned
-from epo_lightning.scene import HEADING, wrapped
+from epo_lightning.frames import aligned, in_world
+from epo_lightning.scene import HEADING, rotated, wrapped
 
 
 def moved(scene: Scene, angle: float, by: tuple[float, float]) -> Scene:
@@ -20,7 +20,7 @@ def moved(scene: Scene, angle: float, by: tuple[float, float]) -> Scene:
     shift = torch.tensor(by, dtype=torch.float64)
 
     def points(values: torch.Tensor) -> torch.Tensor:
-        return turned(values, torch.tensor(angle, dtype=torch.float64)) + shift
+        return rotated(values, torch.tensor(angle, dtype=torch.float64)) + shift
 
     def states(values: torch.Tensor) -> torch.Tensor:
         return torch.cat((points(values[..., :2]), values[..., 2:3] + angle, values[..., 3:]), -1)

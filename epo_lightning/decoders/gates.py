@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from epo_lightning.checks import check_number, check_whole
 from epo_lightning.game.neighbours import closest_approach, grouped, nearest, within
+from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 
@@ -147,7 +148,7 @@ class AttentionGate(Gate):
         agents = z.shape[1]
         query, key = self.query(z), self.key(z)
         product = query @ key.mT / math.sqrt(query.shape[-1])
-        first, second = torch.triu_indices(agents, agents, 1, device=z.device)
+        first, second = pairs(agents, z.device)
         score = 0.5 * (product[:, first, second] + product[:, second, first])
         score = torch.where(distance < torch.inf, score, 0.0)  # features of absent agents have no meaning
         ranking = distance / self.scale - score.detach()

@@ -82,12 +82,12 @@ class GivenGoals(nn.Module):
     """The goals that the data gives, the same in every mode; nothing is learned.
 
     Args:
-        games: number M of games, one for each mode or a single one for all modes.
+        variants: number of choices of goals: one for each mode, or a single one.
     """
 
-    def __init__(self, games: int) -> None:
+    def __init__(self, variants: int) -> None:
         super().__init__()
-        self.games = games
+        self.variants = variants
 
     def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Goals:
         """The given goals.
@@ -95,10 +95,10 @@ class GivenGoals(nn.Module):
         Raises:
             ValueError: the scene gives no goal, or several candidates per agent.
         """
-        positions = given_goals(scene)[:, None].expand(-1, self.games, -1, -1)
+        positions = given_goals(scene)[:, None].expand(-1, self.variants, -1, -1)
         exist, headings = _exist(scene)[:, :, 0], None
         if scene.goal_headings is not None:
-            headings = scene.goal_headings[:, :, 0].where(exist, 0.0)[:, None].expand(-1, self.games, -1)
+            headings = scene.goal_headings[:, :, 0].where(exist, 0.0)[:, None].expand(-1, self.variants, -1)
         return Goals(exist, positions, headings=headings)
 
 
@@ -111,12 +111,12 @@ class GoalDecoder(nn.Module):
     Args:
         width: size of the agent features.
         scale: unit [m] of positions at the network's inputs.
-        games: number M of games, one for each mode or a single one for all modes.
+        variants: number of choices of goals: one for each mode, or a single one.
     """
 
-    def __init__(self, width: int, scale: float = 1.0, games: int = 1) -> None:
+    def __init__(self, width: int, scale: float = 1.0, variants: int = 1) -> None:
         super().__init__()
-        self.width, self.scale, self.games = width, scale, games
+        self.width, self.scale, self.variants = width, scale, variants
         self.mlp = MLP(width + 2, 64, 1, norm="batch", bias=False)
 
     def forward(self, z: Float[Tensor, "B N D"], scene: Scene) -> Goals:
@@ -126,7 +126,7 @@ class GoalDecoder(nn.Module):
             ValueError: the scene has no candidates.
         """
         logits = self.logits(z, scene)
-        chosen = most_likely(logits, self.games)
+        chosen = most_likely(logits, self.variants)
         return Goals(_exist(scene).any(-1), *choose(scene, chosen), logits, chosen, chosen_headings(scene, chosen))
 
     def logits(self, z: Float[Tensor, "B N D"], scene: Scene) -> Float[Tensor, "B N G"]:

@@ -39,16 +39,16 @@ class Orders(nn.Module):
 
     Args:
         width: size of the agent features.
-        games: number M of games, one for each order.
+        variants: number of choices of orders: one for each mode, or a single one.
         symmetric: whether the order keeps its sign when the two agents are swapped
             (:attr:`~epo_lightning.game.pair_order.PairOrder.symmetric`).
     """
 
-    def __init__(self, width: int, games: int, symmetric: bool = False) -> None:
+    def __init__(self, width: int, variants: int, symmetric: bool = False) -> None:
         super().__init__()
-        if games < 1:
-            raise ValueError(f"the number of games must be 1 or more, not {games}")
-        self.games, self.symmetric = games, symmetric
+        if variants < 1:
+            raise ValueError(f"the number of variants must be 1 or more, not {variants}")
+        self.variants, self.symmetric = variants, symmetric
         self.mlp = MLP(2 * width, 64, 1, norm="layer", bias=symmetric)  # the difference cancels a bias
 
     def forward(
@@ -68,7 +68,7 @@ class Orders(nn.Module):
         forth, back = (self.mlp(ends.flatten(-2))[..., 0] for ends in (agents, agents.flip(-2)))
         matter = matter & mask[:, first] & mask[:, second]
         logits = torch.where(matter, forth + back if self.symmetric else forth - back, 0.0)
-        order = most_likely(logits, matter, self.games)
+        order = most_likely(logits, matter, self.variants)
         log_probability = torch.where(matter[:, None], F.logsigmoid(order * logits[:, None]), 0.0).sum(-1)
         return DecodedOrders(order, log_probability, logits)
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from epo_lightning.decoders.mlp import MLP
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import HEADING
+from epo_lightning.scene import HEADING, rotated
 
 
 class SceneProbabilities(nn.Module):
@@ -95,10 +95,10 @@ class PairwiseProbabilities(nn.Module):
         current = torch.where(mask[..., None], current, 0.0)
         positions = torch.where(mask[:, None, :, None, None], positions.detach(), 0.0)
         heading = current[:, None, :, None, HEADING]
-        travelled = _in_frame(positions - current[:, None, :, None, :2], heading) / self.scale
+        travelled = rotated(positions - current[:, None, :, None, :2], -heading) / self.scale
         own = self.own(torch.cat((z[:, None].expand(-1, modes, -1, -1), travelled.flatten(-2)), -1))  # B M N 64
 
-        relative = _in_frame(positions[:, :, None] - positions[:, :, :, None], heading[:, :, :, None]) / self.scale
+        relative = rotated(positions[:, :, None] - positions[:, :, :, None], -heading[:, :, :, None]) / self.scale
         pair = self.subject(own)[:, :, :, None] + self.other(own)[:, :, None] + self.relative(relative.flatten(-2))
         pair = self.norm(pair).relu()  # B M N N 64
         others = mask[:, None] & ~torch.eye(agents, dtype=torch.bool, device=mask.device)  # B N N
@@ -106,12 +106,6 @@ class PairwiseProbabilities(nn.Module):
 
         joint = _mean(own + seen, mask[:, None])
         return self.mode(torch.cat((joint, joint.mean(1, keepdim=True).expand_as(joint)), -1))[..., 0]
-
-
-def _in_frame(offset: Float[Tensor, "*batch K 2"], heading: Float[Tensor, "*frame"]) -> Float[Tensor, "*batch K 2"]:
-    """Offsets along and to the left of a heading."""
-    x, y, cos, sin = offset[..., 0], offset[..., 1], heading.cos(), heading.sin()
-    return torch.stack((cos * x + sin * y, cos * y - sin * x), -1)
 
 
 def _mean(features: Float[Tensor, "*batch N D"], mask: Bool[Tensor, "*some N"]) -> Float[Tensor, "*batch D"]:

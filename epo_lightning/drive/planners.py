@@ -25,12 +25,11 @@ from epo_lightning.drive.world import EGO, Search
 from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.epo import EPO
-from epo_lightning.frames import turned
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.refinement.game import NOISE, track
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import FIELDS, HEADING, SPEED, Scene
+from epo_lightning.scene import FIELDS, HEADING, SPEED, Scene, rotated
 from epo_lightning.solvers.base import TABLES
 from epo_lightning.solvers.diagnostics.equilibrium import descend_features
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -76,8 +75,8 @@ class Plan(Batch):
             return self
         (here, there), like = (frame.double() for frame in (before.frame, now.frame)), self.states
         turn = here[:, 2] - there[:, 2]
-        shift = turned(here[:, :2] - there[:, :2], -there[:, 2]).to(like)
-        position = turned(self.states[..., :2], turn.to(like)[:, None, None]) + shift[:, None, None]
+        shift = rotated(here[:, :2] - there[:, :2], -there[:, 2]).to(like)
+        position = rotated(self.states[..., :2], turn.to(like)[:, None, None]) + shift[:, None, None]
         heading = self.states[..., HEADING] + turn.to(like)[:, None, None]
         return dataclasses.replace(
             self, states=torch.cat((position, heading[..., None], self.states[..., SPEED, None]), -1)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from epo_lightning import checks
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, Energy
@@ -46,8 +47,7 @@ def check_choice(name: str, value: str, known: Sequence[str]) -> None:
     Raises:
         ConfigError: the message names the nearest known one.
     """
-    if value not in known:
-        raise ConfigError(f"unknown forecaster.{name} {value!r}: {nearest(str(value), known)}")
+    checks.check_choice(f"forecaster.{name}", value, known)
 
 
 def check_horizon(game_horizon: int, energy: Energy, objective: Objective, task: Task) -> None:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from epo_lightning.checks import check_number, check_whole
+from epo_lightning.checks import check_choice, check_number, check_whole
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import disc, length_of, row_extent, row_overlap, rows_may_overlap
 from epo_lightning.game.dynamics import Dynamics
@@ -17,10 +17,9 @@ from epo_lightning.game.limits import Bound
 from epo_lightning.game.network_energy import NetworkEnergy
 from epo_lightning.game.networks import MOTION, Layers, motion, squared_distances
 from epo_lightning.game.pairs import pairs
-from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import SPEED, Scene
+from epo_lightning.registry import register
+from epo_lightning.scene import SHAPES, SPEED, Scene
 
-SHAPES = ("disc", "box")
 _AT_ONCE = 100_000
 """Number of pairs of rows of circles that are compared together, which bounds the memory."""
 
@@ -71,8 +70,7 @@ class CollisionEnergy(NetworkEnergy):
     ) -> None:
         super().__init__(dynamics, width, horizon, scale, own, pair, bounds, pair_stride)
         check_whole("energy.hidden", hidden)
-        if shape not in SHAPES:
-            raise ConfigError(f"unknown shape {shape!r} of agents: {nearest(str(shape), SHAPES)}")
+        check_choice("shape", shape, SHAPES, of="agents")
         check_number("energy.gamma", gamma)
         check_whole("energy.waypoints", waypoints)
         self.shape, self.gamma = shape, gamma

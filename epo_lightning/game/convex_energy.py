@@ -30,12 +30,12 @@ from torch import Tensor
 from epo_lightning.checks import check_number
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import disc
-from epo_lightning.game.double_integrator import DoubleIntegrator, rotate
+from epo_lightning.game.double_integrator import DoubleIntegrator
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy, check_names
 from epo_lightning.game.pair_order import ALONG, DIRECTIONS, PairOrder
 from epo_lightning.game.pairs import pair_mask, pairs
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.scene import HEADING, SPEED, Scene, rotated
 
 FLOOR = 1e-3
 """Added to the squared weight of lateral accelerations, so that the Hessian is positive definite also in float32."""
@@ -266,7 +266,7 @@ class ConvexEnergy(Energy):
             heading = self.current_states(scene)[:, 0, :, HEADING]
             assert self.pair_order is not None
             line = self.pair_order.directions(scene)
-            ends = [rotate(line, -heading[:, which]) for which in (first, second)]
+            ends = [rotated(line, -heading[:, which]) for which in (first, second)]
             signed = torch.nn.functional.one_hot(torch.stack((first, second)), agents).to(controls.dtype)
             sides = signed[0][..., None] * ends[0][:, :, None] - signed[1][..., None] * ends[1][:, :, None]
             sides = sides.flatten(2)  # [B, P, 2 N]
@@ -309,7 +309,7 @@ class ConvexEnergy(Energy):
         if "goals" in self.needs:
             assert parameters.goals is not None
             goals = torch.where(present[..., None], parameters.goals, 0.0)
-            to_goal = rotate(states[..., :2] - goals[..., None, :], -initial[..., None, HEADING])
+            to_goal = rotated(states[..., :2] - goals[..., None, :], -initial[..., None, HEADING])
         if "reference_speed" in self.needs:
             assert scene.reference_speed is not None
             reference_speed = torch.where(present, scene.reference_speed[:, None], 0.0)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from epo_lightning.game.circles import length_of
 from epo_lightning.registry import register
-from epo_lightning.scene import HEADING, SPEED
+from epo_lightning.scene import HEADING, SPEED, rotated
 
 STANDING = 0.1
 """Speed [m/s] below which the heading at t0 is used instead of the direction of the velocity."""
@@ -36,19 +36,12 @@ class DoubleIntegrator:
         start = initial[..., None, :].expand(*controls.shape[:-2], 1, 4)
         velocity = _before(start) + dt * controls.cumsum(-2)  # along and across theta_0
         travelled = dt * torch.cat((_before(start), velocity[..., :-1, :]), -2).cumsum(-2)
-        position = start[..., :2] + rotate(travelled, start[..., HEADING])
+        position = start[..., :2] + rotated(travelled, start[..., HEADING])
         ahead, aside = velocity.unbind(-1)
         moving = velocity.square().sum(-1) >= STANDING**2
         turned = torch.atan2(torch.where(moving, aside, 0.0), torch.where(moving, ahead, 1.0))
         heading = start[..., HEADING] + turned
         return torch.cat((position, heading[..., None], length_of(velocity)[..., None]), -1)
-
-
-def rotate(vector: Float[Tensor, "*#batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 2"]:
-    """R(angle) times a vector."""
-    x, y = vector.unbind(-1)
-    cosine, sine = angle.cos(), angle.sin()
-    return torch.stack((cosine * x - sine * y, sine * x + cosine * y), -1)
 
 
 def _before(start: Float[Tensor, "*batch 1 4"]) -> Float[Tensor, "*batch 1 2"]:

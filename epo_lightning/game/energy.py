@@ -89,7 +89,8 @@ class Energy(ABC):
         """Inputs of the terms, which the scene or the decoded parameters supply.
 
         Some of ``goals``, ``goal_headings``, ``reference``, ``reference_speed``, ``reference_controls``, ``size``,
-        ``context`` and ``order``. Sizes that only pair terms use are not listed; ``validate`` checks that they are there.
+        ``context`` and ``order``. Sizes that only named pair features use (:mod:`~epo_lightning.game.features`) are not
+        listed; ``validate`` checks that they are there. Sizes that other pair terms use are listed.
         """
         return set()
 

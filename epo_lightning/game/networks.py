@@ -13,8 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from epo_lightning.game.circles import length_of
-from epo_lightning.game.double_integrator import rotate
-from epo_lightning.scene import HEADING, SPEED
+from epo_lightning.scene import HEADING, SPEED, rotated
 
 MOTION, ENCOUNTER = 5, 6
 """Number of values that describe an agent's state at one step, and the encounter of two agents."""
@@ -33,7 +32,7 @@ def motion(
         scale: metres, and metres per second, per unit of the values.
     """
     start = initial[..., None, :]
-    place = rotate(states[..., :2] - start[..., :2], -start[..., HEADING]) / scale
+    place = rotated(states[..., :2] - start[..., :2], -start[..., HEADING]) / scale
     heading = states[..., HEADING] - start[..., HEADING]
     return torch.cat((place, torch.stack((heading.cos(), heading.sin(), states[..., SPEED] / scale), -1)), -1)
 
@@ -81,7 +80,7 @@ def encounter(
     )
     last, their_last = (states[..., -1, :].expand(*shape, 4) for states in (first, second))
     heading = their_last[..., HEADING] - last[..., HEADING]
-    place = rotate(their_last[..., :2] - last[..., :2], -last[..., HEADING]) / scale
+    place = rotated(their_last[..., :2] - last[..., :2], -last[..., HEADING]) / scale
     time = (step + 1).to(first.dtype) / first.shape[-2]
     distance = length_of(ours - theirs) / scale
     return torch.cat((place, torch.stack((distance, time, heading.cos(), heading.sin()), -1)), -1)

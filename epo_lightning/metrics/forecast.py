@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics import Metric
 
+from epo_lightning.checks import check_choice
 from epo_lightning.forecast import JointForecast, Status
 from epo_lightning.metrics.functional import (
     brier_min_sade,
@@ -24,8 +25,8 @@ from epo_lightning.metrics.functional import (
     reliability,
 )
 from epo_lightning.metrics.functional.calibration import BINS
-from epo_lightning.metrics.functional.overlap import Shape, check_choice, overlap_rates
-from epo_lightning.scene import Scene
+from epo_lightning.metrics.functional.overlap import overlap_rates
+from epo_lightning.scene import SHAPES, Scene
 
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "overlap_authors")
 """Scores of every forecaster; displacements in m, overlaps as rates."""
@@ -118,7 +119,7 @@ class ForecastMetrics(Metric):
 
     def __init__(self, subsets: Sequence[str] = (), shape: str = "disc", **options: Any) -> None:
         super().__init__(**options)
-        check_choice("shape", shape, get_args(Shape))
+        check_choice("shape", shape, SHAPES, of="agents")
         self.subsets, self.shape = tuple(subsets), shape
         # The first row is for all scenes, the others for one subset each.
         zeros = torch.zeros(1 + len(self.subsets), len(COLUMNS), dtype=torch.float64)

@@ -10,6 +10,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from epo_lightning.checks import is_number
 from epo_lightning.forecast import JointForecast
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError
@@ -71,8 +72,7 @@ def checked_weights(
     if set(weights) != set(names):
         raise ConfigError(f"{key} must name {list(names)}, not {sorted(weights)}")
     for name, value in weights.items():
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not 0 <= value < math.inf:
+        if not is_number(value) or not 0 <= value < math.inf:
             raise ConfigError(f"{key}.{name} must be a number, 0 or more, not {value!r}")
     if not any(weights.values()):
         raise ConfigError(f"{key} are all 0, so there is no loss: give at least one of {list(names)} a positive weight")

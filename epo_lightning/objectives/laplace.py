@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning import losses
+from epo_lightning.checks import check_number
 from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.game.energy import RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
@@ -71,8 +72,7 @@ class Laplace(Objective):
         annealing: float = 0.0,
         annealing_steps: int = 2000,
     ) -> None:
-        if not 0 <= damping < float("inf"):
-            raise ValueError(f"objective.damping must be 0 or more, and finite, not {damping}")
+        check_number("objective.damping", damping, zero=True)
         self.weights = checked_weights(weights, self.term_names)
         self.damping = damping
         self.annealing = losses.Annealing(annealing, annealing_steps)

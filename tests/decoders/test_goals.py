@@ -110,7 +110,7 @@ def test_goal_headings_are_chosen_with_the_goals():
     headings = torch.where(scene.goal_mask, torch.randn(3, 2, 6), torch.nan)
     scene = dataclasses.replace(scene, goal_headings=headings)
     scene.agent_mask[2, 1] = False
-    goals = GoalDecoder(8, games=modes)(torch.randn(3, 2, 8), scene)
+    goals = GoalDecoder(8, variants=modes)(torch.randn(3, 2, 8), scene)
     for b, m, i in torch.cartesian_prod(torch.arange(3), torch.arange(modes), torch.arange(2)).tolist():
         expected = headings[b, i, goals.chosen[b, m, i]] if scene.agent_mask[b, i] else torch.tensor(0.0)
         assert goals.headings[b, m, i] == expected

@@ -31,6 +31,7 @@ from epo_lightning.data.recorded.windows import WindowConfig, identifying
 from epo_lightning.data.workers import Report, finished
 from epo_lightning.metrics.functional.interaction import SUBSETS
 from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.scene import SHAPES
 from epo_lightning.schema import read
 from epo_lightning.task import Task
 
@@ -118,7 +119,7 @@ class RecordedData(SceneDataModule):
         for name, value, known in (
             ("frame", frame, FRAMES),
             ("val_by", val_by, UNITS),
-            ("shape", shape, ("box", "disc")),
+            ("shape", shape, SHAPES),
             ("duplicates", duplicates, DUPLICATES),
         ):
             if value not in known:

@@ -14,17 +14,14 @@ length times width). Agents that only touch share no area and do not overlap.
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import HEADING
+from epo_lightning.checks import check_choice
+from epo_lightning.scene import HEADING, SHAPES
 
-Definition = Literal["jfp", "authors"]
-Shape = Literal["disc", "box"]
+DEFINITIONS = ("jfp", "authors")
 
 TOUCH = 1e-6
 """Depth [m] up to which an overlap counts as touching (a rounding error)."""
@@ -65,7 +62,7 @@ def overlap_rate(
         >>> overlap_rate(states, one, size, present, definition="authors")
         tensor([0.5000])
     """
-    check_choice("definition", definition, get_args(Definition))
+    check_choice("definition", definition, DEFINITIONS, of="an overlap rate")
     jfp, authors = overlap_rates(states, probabilities, size, agent_mask, shape)
     return jfp if definition == "jfp" else authors
 
@@ -109,7 +106,7 @@ def overlaps(
     Raises:
         ConfigError: an unknown shape.
     """
-    check_choice("shape", shape, get_args(Shape))
+    check_choice("shape", shape, SHAPES, of="agents")
     first, second = torch.triu_indices(states.shape[1], states.shape[1], 1, device=states.device)
     overlap = _discs_overlap if shape == "disc" else _boxes_overlap
     at_step = overlap(states[:, first], states[:, second], size[:, first, None], size[:, second, None])
@@ -128,7 +125,7 @@ def overlaps_with(
     Raises:
         ConfigError: an unknown shape.
     """
-    check_choice("shape", shape, get_args(Shape))
+    check_choice("shape", shape, SHAPES, of="agents")
     others = torch.arange(states.shape[1], device=states.device) != agent
     overlap = _discs_overlap if shape == "disc" else _boxes_overlap
     one = states[:, agent, None].expand(-1, states.shape[1] - 1, -1, -1)
@@ -169,13 +166,3 @@ def _axes(heading: Float[Tensor, "B P K"]) -> Float[Tensor, "B P K 2 2"]:
     """Unit vectors along and across an agent."""
     cos, sin = heading.cos(), heading.sin()
     return torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], -2)
-
-
-def check_choice(what: str, value: str, known: tuple[str, ...]) -> None:
-    """Refuse an unknown value.
-
-    Raises:
-        ConfigError: the message names the nearest known one.
-    """
-    if value not in known:
-        raise ConfigError(f"unknown {what} {value!r} of an overlap rate: {nearest(value, known)}")

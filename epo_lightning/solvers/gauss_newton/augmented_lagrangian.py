@@ -30,7 +30,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.checks import check_number, check_whole
@@ -305,16 +305,16 @@ class _Rounds:
         found, damping = solver.inner().run(*augmented, solver.newton_steps, self.damping[rows], exact=True)
         controls = torch.where(descent.wide(was_open), found.controls, self.controls[rows])
         norm = torch.where(was_open, found.gradient_norm, self.norm[rows])
-        excess = game.excess(controls)
+        excess, mu = game.excess(controls), descent.wide(penalty, 2)
         # Above a multiplier's slack, h counts; far below, the multiplier itself does, which the update removes.
-        missing = _largest({name: h.maximum(-multipliers[name] / _wide(penalty)) for name, h in excess.items()})
+        missing = _largest({name: h.maximum(-multipliers[name] / mu) for name, h in excess.items()})
         met, flat = missing <= solver.tolerance, math.sqrt(torch.finfo(norm.dtype).eps)
         # The update is that of a minimum: far from one, more steps are taken first.
         near = torch.where(met, flat, max(flat, NEAR)) * self.steepest[rows]
         settled = was_open & (norm <= near)
         for name, multiplier in multipliers.items():
-            updated = (multiplier + _wide(penalty) * excess[name]).clamp_min(0.0)
-            self.multipliers[name][rows] = torch.where(_wide(settled), updated, multiplier)
+            updated = (multiplier + mu * excess[name]).clamp_min(0.0)
+            self.multipliers[name][rows] = torch.where(descent.wide(settled, 2), updated, multiplier)
         slow = settled & (missing > SUFFICIENT * self.before[rows])
         hopeless = slow & ~met & (penalty >= LARGEST_PENALTY)
         self.penalty[rows] = torch.where(slow & ~met, (solver.growth * penalty).clamp_max(LARGEST_PENALTY), penalty)
@@ -325,11 +325,6 @@ class _Rounds:
         self.open[rows] = was_open & ~(settled & met) & ~hopeless
 
 
-def _wide(samples: Shaped[Tensor, "B M"]) -> Shaped[Tensor, "B M 1 1"]:
-    return samples[..., None, None]
-
-
 def _largest(values: Mapping[str, Tensor]) -> Float[Tensor, "B M"]:
-    """Largest absolute entry of every sample; zero where there is none."""
-    flat = torch.cat([value.flatten(2) for value in values.values()], -1).abs()
-    return flat.amax(-1) if flat.shape[-1] else flat.sum(-1)
+    """The largest absolute value of every sample, over all constraints; zero where there is none."""
+    return descent.largest(torch.cat([value.flatten(2) for value in values.values()], -1))

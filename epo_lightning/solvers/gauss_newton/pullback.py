@@ -130,8 +130,9 @@ def _gradients_along_mu(model: QuadraticModel, changes: _Changes) -> _Sums:
     return _Sums(control, node, mu.new_zeros(problems, agents, 3, 2, steps))
 
 
-# Each of the following four functions adds the derivatives of one feature that are not in :func:`_gradients_along_mu`. It
-# returns J mu (``along_mu``) and r + J d (``ahead``), both without the feature's weight.
+# Each of the functions for one own feature (`_pull_signal`, `_pull_steering`, `_pull_lane` and `_pull_goal`) adds the
+# derivatives of this feature that are not in `_gradients_along_mu`. It returns J mu (``along_mu``) and r + J d (``ahead``),
+# both without the feature's weight. `_pull_pairs` does the same for all pair features at once and returns gradients instead.
 
 
 def _pull_signal(term: SignalTerm, changes: _Changes, sums: _Sums, dt: float) -> tuple[Tensor, Tensor]:

@@ -149,12 +149,12 @@ def attach(
         factor, definite = factorise(matrix)
     scene, parameters = with_zeros(scene, parameters, definite)
     with torch.enable_grad():
-        value, slope = gradient(energy, scene, parameters, torch.where(_wide(definite, controls), controls, 0.0))
+        value, slope = gradient(energy, scene, parameters, torch.where(descent.wide(definite), controls, 0.0))
         flat = slope.detach().flatten(2)
         step = torch.cholesky_solve(flat[..., None], factor)[..., 0]
         descent.warn_if_far(value, 0.5 * (flat * step).sum(-1), definite)
         move = torch.cholesky_solve((slope - slope.detach()).flatten(2)[..., None], factor).view_as(controls)
-        attached = controls - torch.where(_wide(definite, move), move, 0.0)
+        attached = controls - torch.where(descent.wide(definite), move, 0.0)
         return attached, torch.where(definite, Status.SOLVED, Status.STOPPED).long()
 
 
@@ -193,15 +193,11 @@ def _of_free(scene: Scene, steps: int, matrix: Float[Tensor, "B M n n"]) -> Floa
     return torch.where(both, matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device))
 
 
-def _wide(mask: Bool[Tensor, "B M"], like: Tensor) -> Tensor:
-    return mask.view(*mask.shape, *[1] * (like.dim() - 2))
-
-
 def with_zeros(scene: Scene, parameters: GameParameters, kept: Bool[Tensor, "B M"]) -> tuple[Scene, GameParameters]:
     """The kept games, and zeros in place of the others, so that NaN in them reaches no gradient."""
 
     def zeroed(tensor: Tensor) -> Tensor:
-        return torch.where(_wide(kept, tensor), tensor, torch.zeros_like(tensor))
+        return torch.where(descent.wide(kept, tensor.dim() - 2), tensor, torch.zeros_like(tensor))
 
     context, some = parameters.context, kept.any(1)
     parameters = dataclasses.replace(parameters, context=None).map(zeroed)

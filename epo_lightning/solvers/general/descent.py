@@ -39,14 +39,14 @@ def begin(energy: Energy, scene: Scene, parameters: GameParameters) -> tuple[Sce
     return scene, torch.where(scene.agent_mask[:, None, :, None, None], start, 0.0)
 
 
-def wide(samples: Shaped[Tensor, "B M"]) -> Shaped[Tensor, "B M 1 1 1"]:
-    """Values of samples that broadcast with controls."""
-    return samples[..., None, None, None]
+def wide(samples: Shaped[Tensor, "B M"], dimensions: int = 3) -> Shaped[Tensor, "B M *ones"]:
+    """Values of samples that broadcast with controls, or with other tensors that have these more dimensions."""
+    return samples[(..., *[None] * dimensions)]
 
 
-def largest(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "B M"]:
+def largest(values: Float[Tensor, "B M *some"]) -> Float[Tensor, "B M"]:
     """The largest absolute entry of every sample; zero where there is none."""
-    flat = controls.flatten(2).abs()
+    flat = values.flatten(2).abs()
     return flat.amax(-1) if flat.shape[-1] else flat.sum(-1)
 
 

@@ -13,7 +13,6 @@ and learning from diverged controls would make the weights larger still.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from epo_lightning.game.selection import evaluated
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
+from epo_lightning.solvers.general import descent
 from epo_lightning.solvers.general.dense import gradient
 
 
@@ -77,10 +77,6 @@ class GradientDescent(Stepwise):
     def __post_init__(self) -> None:
         check_steps(self.steps, self.scale)
         check_number("solver.step_size", self.step_size)
-
-    def with_steps(self, steps: int) -> GradientDescent:
-        """This minimiser with another number of steps."""
-        return dataclasses.replace(self, steps=steps)
 
     def run(
         self, energy: Energy, scene: Scene, parameters: GameParameters, steps: int, memory: Progress | None = None
@@ -148,7 +144,7 @@ def descend(
     length, lowest, taken = progress.length, progress.lowest, progress.taken
     slack = 5.0 * (10.0 + scene.agent_mask.sum(1)[:, None] * start.shape[-2:].numel()) if noise else 0.0
     for step in range(steps):
-        reach = length[..., None, None, None]
+        reach = descent.wide(length)
         moved = controls - step_size * reach * channels.square() * slope
         if noise:
             moved = moved + noise * reach.sqrt() * channels * torch.where(present, torch.randn_like(start), 0.0)
@@ -156,20 +152,14 @@ def descend(
         with torch.set_grad_enabled(torch.is_grad_enabled() and step < steps - 1):
             value, ahead, finite_there = _evaluate(energy, scene, parameters, moved, finite)
         good = finite_there & (value <= lowest + slack)
-        keep = good[..., None, None, None]
+        keep = descent.wide(good)
         controls, slope = torch.where(keep, moved, controls), torch.where(keep, ahead, slope)
         energies, length = torch.where(good, value, energies), torch.where(good, length, 0.5 * length)
         lowest = torch.minimum(lowest, energies)
         taken = taken | good
     shortened = torch.where(length < 1.0, Status.DAMPED, Status.SOLVED)
-    solution = Solution(
-        controls=controls,
-        states=energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt),
-        initial_energy=initial_energy,
-        energy=energies,
-        gradient_norm=slope.detach().flatten(2).norm(dim=-1),
-        status=torch.where(finite & (taken | (steps == 0)), shortened, Status.STOPPED),
-    )
+    status = torch.where(finite & (taken | (steps == 0)), shortened, Status.STOPPED)
+    solution = descent.solution(energy, scene, controls, (initial_energy, energies), slope.detach(), status)
     return solution, Progress(length, lowest, taken)
 
 
@@ -182,7 +172,7 @@ def _evaluate(
 ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M N K 2"], Bool[Tensor, "B M"]]:
     """The energy, its gradient, and a mask of the samples in ``going`` where both are finite."""
     value, slope = gradient(energy, scene, parameters, controls)
-    going = going & value.isfinite() & slope.flatten(2).isfinite().all(-1)
+    going = going & descent.finite(value, slope)
     if torch.is_grad_enabled() and not going.all():
 
         def again(*game: Any) -> tuple[Tensor, Tensor]:
