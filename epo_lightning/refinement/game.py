@@ -16,7 +16,7 @@ from epo_lightning.game.energy import Energy
 from epo_lightning.game.flatness import followed_controls
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.scene import HEADING, Scene
+from epo_lightning.scene import HEADING, Scene, heading_vector
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import TABLES, Minimiser
 
@@ -123,7 +123,7 @@ def swerve(scene: Scene) -> Float[Tensor, "B N 2"]:
     """
     position, heading = scene.current[..., :2], scene.current[..., HEADING]
     offset = position[:, None] - position[:, :, None]  # [B, N, N, 2]: of every agent j from every agent i
-    ahead = torch.stack((heading.cos(), heading.sin()), -1)[:, :, None]
+    ahead = heading_vector(heading)[:, :, None]
     along = (offset * ahead).sum(-1)
     across = ahead[..., 0] * offset[..., 1] - ahead[..., 1] * offset[..., 0]
     angle = heading[:, None] - heading[:, :, None]
