@@ -176,7 +176,7 @@ def test_the_decoder_of_margins_leaves_the_other_networks_as_they_are():
         ({"forecaster": {**EPO, "margin": {"most": 1.0}}}, r"forecaster\.margin has the keys largest and start"),
         ({"forecaster": {**EPO, "margin": {"start": 2.0}}}, r"forecaster\.margin takes 0 < start < largest"),
         ({"solver": {"name": "levenberg_marquardt", "stepsize": 1}}, "did you mean 'step_size'"),
-        ({"optimizer": {"name": "adam", "lr": -1.0}}, "optimizer.lr must be positive"),
+        ({"optimizer": {"name": "adam", "lr": -1.0}}, "optimizer.lr must be a number, positive"),
         ({"optimizer": {"name": "adam", "schedule": "cosin"}}, "did you mean 'cosine'"),
         ({"objective": {"name": "imitation", "weights": {"imitation": 1.0}}}, "weights must name"),
         ({"forecaster": {**EPO, "modes": 0}}, "modes must be 1 or more"),
