@@ -74,9 +74,16 @@ class Batch:
 
     def __getitem__(self: Some, index: Any) -> Some:
         """The chosen scenes of the batch; an integer keeps the batch dimension."""
-        if isinstance(index, SupportsIndex) and getattr(index, "ndim", 0) == 0:
+        if _is_whole(index):
             index = [operator.index(index)]
         return self.map(lambda tensor: tensor[index])
+
+
+def _is_whole(index: Any) -> bool:
+    """Whether an index is one whole number, also of NumPy or PyTorch; Booleans are masks."""
+    if isinstance(index, Tensor):
+        return index.ndim == 0 and not index.is_floating_point() and index.dtype != torch.bool
+    return isinstance(index, SupportsIndex) and not isinstance(index, bool) and getattr(index, "ndim", 0) == 0
 
 
 def _described(value: Any) -> str:

@@ -33,7 +33,7 @@ def aligned(scene: Scene) -> Scene:
     which the result keeps.
 
     Returns:
-        scenes whose ``frame`` leads back (:func:`in_world`).
+        scenes whose ``frame`` leads back (:func:`in_world`), but for whole turns of headings.
 
     Raises:
         ValueError: scenes that have a frame already.
@@ -47,7 +47,7 @@ def aligned(scene: Scene) -> Scene:
     origin = current[..., :2].sum(1) / count
     heading = current[..., HEADING]
     direction = torch.where(there, torch.stack((heading.cos(), heading.sin()), -1), 0.0).sum(1) / count
-    first = heading.gather(1, scene.agent_mask.int().argmax(1, keepdim=True))[:, 0]
+    first = torch.where(scene.agent_mask & (scene.agent_mask.cumsum(1) == 1), heading, 0.0).sum(1)
     angle = torch.where(direction.norm(dim=-1) < AGREE, first, torch.atan2(direction[:, 1], direction[:, 0]))
     turns = 2 * math.pi * torch.round((heading - angle[:, None]) / (2 * math.pi))
 

@@ -21,6 +21,7 @@
         runtime-<device>-<threads>.json
                                an earlier ``runtime.json``, set aside by a sweep: ``cpu`` or ``gpu``, and number of threads
         progress.json          step and machine of the training; exists only while it runs
+        .scores.lock           locked while a process writes scores
         .lock                  locked as long as a process works on the run; the system releases it when the process dies
 
 Files are replaced as a whole, so a reader never sees an incomplete one, even if the writing process is killed.

@@ -17,6 +17,7 @@ from epo_lightning import FeatureEnergy, LevenbergMarquardt, Scene, Unicycle, re
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.metrics.functional import overlap_rate
 from epo_lightning.refinement import ENERGY, SOLVER, WEIGHTS
+from epo_lightning.refinement.game import swerve
 from epo_lightning.registry import ConfigError, build
 
 DT, K = 0.2, 20
@@ -96,6 +97,21 @@ def test_cars_on_exactly_one_line_avoid_each_other(dtype, distance, speed, headi
     refined = refine(states, torch.ones(1, 1, dtype=dtype), scene)
     assert (refined.states[0, 0, 0] - refined.states[0, 0, 1])[:, :2].norm(dim=-1).amin() > apart
     assert not overlaps(refined.states, scene).any()
+
+
+def test_a_distant_car_on_the_line_does_not_change_who_avoids_whom():
+    """A car 130 m ahead drives away from two that approach each other."""
+    rows = torch.tensor([[0.0, 0.0, 0.0, 12.0], [30.0, 0.0, math.pi, 1.0], [131.0, 0.0, 0.0, 15.0]]).double()
+    time = DT * torch.arange(1.0, K + 1).double()
+    states = torch.stack((rows[:, :1] + rows[:, 3:] * rows[:, 2:3].cos() * time, torch.zeros(3, K).double()), -1)
+    size = torch.tensor([4.5, 1.9]).double().expand(1, 3, 2)
+    two, three = (
+        refine(states[None, None, :n], torch.ones(1, 1).double(), Scene(rows[None, :n, None], dt=DT, size=size[:, :n]))
+        for n in (2, 3)
+    )
+    assert_close(three.solution.energy, two.solution.energy, rtol=0.05, atol=0)
+    assert (three.states[0, 0, 0] - three.states[0, 0, 1])[:, :2].norm(dim=-1).amin() > 2.5
+    assert (swerve(Scene(rows[None, :2, None], dt=DT))[..., 1] < 0).all(), "both turn to their right"
 
 
 def test_the_row_that_trains_weights_has_the_solver_of_refine():

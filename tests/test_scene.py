@@ -147,6 +147,11 @@ def test_indexing_and_conversion_apply_to_all_tensors_of_a_scene():
     assert torch.equal(chosen.history.float(), scene.history[[2, 0]])
     for one in (1, np.int64(1), torch.tensor(1), -3):
         assert torch.equal(scene[one].history, scene.history[1:2])
+    single = scene[0]
+    for nothing in (torch.tensor([False]), np.array([False])):
+        assert len(single[nothing].history) == 0
+    with pytest.raises((IndexError, ValueError)):
+        scene[torch.tensor(False)]  # a mask, not the first scene
 
 
 def test_only_unmasked_values_must_be_finite():

@@ -80,6 +80,18 @@ def test_opposed_headings_take_the_first_agent() -> None:
     assert float(aligned(Scene(history, dt=0.1)).current[0, 0, HEADING]) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_the_first_agent_may_be_absent_and_scenes_empty() -> None:
+    history = torch.tensor([[[[7.0, 7.0, 2.0, 1.0]], [[0.0, 0.0, 1.0, 5.0]], [[9.0, 9.0, 1.0 + math.pi, 5.0]]]])
+    scene = aligned(Scene(history, dt=0.1, agent_mask=torch.tensor([[False, True, True]])))
+    assert float(scene.current[0, 1, HEADING]) == pytest.approx(0.0, abs=1e-6)
+    for empty in (
+        Scene(history, dt=0.1, agent_mask=torch.zeros(1, 3, dtype=torch.bool)),
+        Scene(torch.zeros(2, 0, 1, 4), dt=0.1),
+        Scene(torch.zeros(0, 2, 1, 4), dt=0.1),
+    ):
+        assert aligned(empty).frame.isfinite().all()
+
+
 def test_absent_agents_do_not_move_the_frame() -> None:
     history = torch.tensor([[[[2.0, 1.0, 0.3, 5.0]], [[math.nan] * 4]]])
     scene = aligned(Scene(history, dt=0.1, agent_mask=torch.tensor([[True, False]])))

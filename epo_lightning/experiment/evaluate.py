@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import TQDMProgressBar
 
@@ -31,6 +32,8 @@ SECTIONS = ("metrics", "truth")
 """Sections of a file of scores that hold numbers by name."""
 LOCK = ".scores.lock"
 """File in a run folder that a process locks while it writes scores: two evaluations may end at the same moment."""
+PATIENCE = 60.0
+"""Longest wait for another process that writes scores [s]."""
 TOLERANCE = 1e-5
 """Relative difference below which two scores are the same: machines and batch sizes change the last digits."""
 
@@ -116,7 +119,7 @@ def score(
             print(f"  {note}")
         if pretrained.ships(run.path):
             return run.path, metrics
-        with FileLock(run.path / LOCK):
+        with _alone(run):
             return keep_other(run, other, which, checkpoint, metrics), metrics
     data = open_data(run, of_run, settings.batch_size)
     if data.task.subsets != forecaster.task.subsets:  # a checkpoint that is older than the subsets of its data
@@ -130,7 +133,7 @@ def score(
     scored = {"split": settings.own_split, "data_digest": data.digest, "checkpoint": which, "metrics": metrics}
     if costs:
         scored["truth"] = costs
-    with FileLock(run.path / LOCK):
+    with _alone(run):
         file = keep(run, scored, checkpoint)
     if file == run.metrics_file():
         logs.publish(run)
@@ -224,6 +227,29 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
     digest = _digest(checkpoint)
     stem = f"scores-{scored['split']}-{Path(scored['checkpoint']).stem}-{digest[:8]}"
     return _beside(run, stem, {**scored, "checkpoint_digest": digest}, ("data_digest", "checkpoint_digest"))
+
+
+@contextmanager
+def _alone(run: RunFolder) -> Iterator[None]:
+    """Context in which no other process writes scores of the run. A folder that cannot be written needs no lock.
+
+    Raises:
+        ConfigError: another process holds the lock for longer than scores take to be written.
+    """
+    lock = FileLock(run.path / LOCK, timeout=PATIENCE)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise ConfigError(
+            f"another process has written scores of {run.path} for {PATIENCE:.0f} s: stop it, or remove {run.path / LOCK}"
+        ) from None
+    except OSError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _beside(run: RunFolder, stem: str, scored: dict[str, Any], keys: Sequence[str]) -> Path:

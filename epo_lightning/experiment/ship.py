@@ -77,11 +77,14 @@ def ship(run: RunFolder, name: str, recipe: Recipe, folder: Path) -> Path:
     with TemporaryDirectory() as place:
         packed = _pack(run, RunFolder(Path(place) / "packed"))
         write_file(packed.path / "card.md", card(name, recipe, packed))
-        whole = folder.with_name(f".{folder.name}")  # beside it, so that no moment has half a folder
-        shutil.rmtree(whole, ignore_errors=True)
-        shutil.copytree(packed.path, whole, ignore=shutil.ignore_patterns(".*"))
-        shutil.rmtree(folder, ignore_errors=True)
-        whole.rename(folder)
+        new, old = (folder.with_name(f".{folder.name}-{which}") for which in ("new", "old"))
+        for aside in (new, old):
+            shutil.rmtree(aside, ignore_errors=True)
+        shutil.copytree(packed.path, new, ignore=shutil.ignore_patterns(".*"))
+        if folder.exists():
+            folder.rename(old)
+        new.rename(folder)  # a kill before this leaves a whole folder beside it
+        shutil.rmtree(old, ignore_errors=True)
     return folder
 
 

@@ -95,7 +95,7 @@ class Calibration:
     def _descend(
         self, past: _PastGame, s: Float[Tensor, "B M"], start: Float[Tensor, "B _ N T 2"], first: Minimiser
     ) -> Float[Tensor, "B M"]:
-        """s after the Gauss-Newton steps, of which every scene takes as many as it needs.
+        """s after the Gauss-Newton steps, of which every scene takes as many as it needs; zero where no game was solved.
 
         Args:
             past: the games.
@@ -132,7 +132,7 @@ class Calibration:
             controls = torch.where(both, found[2], controls)
             if taken >= self.steps:
                 done = done | ~(better & (size >= _LARGE))
-        return s
+        return torch.where(_cost(missed, s, self.spread).isfinite(), s, 0.0)
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def swerve(scene: Scene) -> Float[Tensor, "B N 2"]:
 
     On the line no energy has a derivative to the side, and a vehicle that follows it could only drive through the one ahead.
     To break this tie, a vehicle behind turns to its left, one in front to its right, and both of two that approach each
-    other to their right.
+    other to their right. Among several others on the line, the nearest ones decide.
     """
     position, heading = scene.current[..., :2], scene.current[..., HEADING]
     offset = position[:, None] - position[:, :, None]  # [B, N, N, 2]: of every agent j from every agent i
@@ -127,9 +127,11 @@ def swerve(scene: Scene) -> Float[Tensor, "B N 2"]:
     along = (offset * ahead).sum(-1)
     across = ahead[..., 0] * offset[..., 1] - ahead[..., 1] * offset[..., 0]
     angle = heading[:, None] - heading[:, :, None]
-    pairs = scene.agent_mask[:, None] & scene.agent_mask[:, :, None]
-    on_a_line = pairs & (across.abs() < ON_A_LINE) & (angle.sin().abs() < ON_A_LINE)
-    side = torch.where(on_a_line, angle.cos() * along.sign(), 0.0).sum(-1)
+    both_exist = scene.agent_mask[:, None] & scene.agent_mask[:, :, None]
+    on_a_line = both_exist & (across.abs() < ON_A_LINE) & (angle.sin().abs() < ON_A_LINE) & (along != 0)
+    distance = torch.where(on_a_line, along.abs(), torch.inf)
+    share = torch.where(on_a_line, (distance.amin(-1, keepdim=True) / distance) ** 4, 0.0)
+    side = torch.where(on_a_line, angle.cos() * along.sign() * share, 0.0).sum(-1)
     return torch.stack((torch.zeros_like(side), SWERVE * side), -1)
 
 

@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,9 +11,10 @@ import torch
 import yaml
 from experiment import tiny
 from experiment.conftest import TINY, Epo
+from filelock import FileLock
 
 import epo_lightning
-from epo_lightning.experiment.callbacks import RandomStates
+from epo_lightning.experiment import evaluate
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
@@ -92,51 +88,27 @@ def test_validation_scores_go_to_their_own_file(epo: Epo) -> None:
     assert not Path("run/metrics.json").exists()
 
 
-def test_a_stopped_run_continues_bit_for_bit(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ("train", ROW, *TINY, "trainer.max_epochs=4", "callbacks.patience=3")
-    assert epo(*words, "run_dir=whole") == 0
-
-    starts = []
-    original = RandomStates.on_train_epoch_start
-
-    def stop(self: RandomStates, trainer: object, module: object) -> None:
-        starts.append(1)
-        if len(starts) == 3:
-            raise RuntimeError("power failure")
-        original(self, trainer, module)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(RandomStates, "on_train_epoch_start", stop)
-        with pytest.raises(RuntimeError, match="power failure"):
-            epo(*words, "run_dir=parts")
-    assert not RunFolder(Path("parts")).finished
-    torch.manual_seed(1234)  # another process would have another random state
-    assert epo("train", "resume=parts") == 0
-    for which in ("last", "best"):
-        whole, parts = weights("whole", which), weights("parts", which)
-        assert all(torch.equal(whole[key], parts[key]) for key in whole)
-    assert Path("whole/logs/metrics.csv").read_text() == Path("parts/logs/metrics.csv").read_text()
+def test_two_evaluations_do_not_write_at_the_same_moment(
+    epo: Epo, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run") == 0
+    monkeypatch.setattr(evaluate, "PATIENCE", 0.1)
+    with FileLock(f"run/{evaluate.LOCK}"):
+        assert "another process has written scores of run for" in refused("evaluate", "run=run")
+    assert epo("evaluate", "run=run") == 0
 
 
-@pytest.mark.slow
-def test_a_killed_run_continues_to_the_same_metrics(tmp_path: Path) -> None:
-    program = [sys.executable, str(Path(tiny.__file__).resolve())]
-    root = Path(__file__).parents[2]
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    words = ["train", ROW, *TINY, "trainer.max_epochs=60", "+data.count=256", "trainer.limit_train_batches=1.0"]
-    subprocess.run([*program, *words, "run_dir=whole"], cwd=tmp_path, env=environment, check=True)
-    process = subprocess.Popen([*program, *words, "run_dir=parts"], cwd=tmp_path, env=environment)
-    last = tmp_path / "parts" / "checkpoints" / "last.ckpt"
-    deadline = time.monotonic() + 120
-    while not last.is_file() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    time.sleep(0.5)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert not RunFolder(tmp_path / "parts").finished, "the run ended before it could be killed"
-    subprocess.run([*program, "train", "resume=parts"], cwd=tmp_path, env=environment, check=True)
-    subprocess.run([*program, "evaluate", "runs=."], cwd=tmp_path, env=environment, check=True)
-    assert (tmp_path / "whole/metrics.json").read_bytes() == (tmp_path / "parts/metrics.json").read_bytes()
+def test_scores_that_are_stored_are_computed_again_in_a_folder_that_cannot_be_written(
+    epo: Epo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run") == 0
+    assert epo("evaluate", "run=run") == 0
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", "run/.scores.lock")
+
+    monkeypatch.setattr(evaluate.FileLock, "acquire", refuse)
+    assert epo("evaluate", "run=run") == 0
 
 
 def test_a_finished_run_is_never_overwritten(

@@ -95,6 +95,16 @@ def test_a_start_that_is_worse_changes_nothing() -> None:
     torch.testing.assert_close(several, true[:, None, None].expand(3, 2, 1), rtol=1e-2, atol=0)
 
 
+def test_games_without_a_solution_keep_their_weights() -> None:
+    """Whatever the first start is; the other scene of the batch is calibrated as if it were alone."""
+    scene, goals = played(torch.tensor([4.0, 4.0], dtype=torch.double))
+    scene.history[0] = torch.nan
+    inferred = parameters(torch.tensor([8.0, 8.0], dtype=torch.double), 1, AHEAD, goals)
+    found = Calibration(starts=(0.5, -0.5))(SOLVER, ENERGY, scene, inferred).pair_weights["proximity"].flatten()
+    assert found[0] == 8.0
+    assert float(found[1]) == pytest.approx(4.0, rel=1e-2)
+
+
 def test_headings_that_wrap_give_the_same_weights() -> None:
     """The same history, turned so that an agent's heading passes pi; recordings write it in [-pi, pi)."""
     true, angle = torch.tensor([5.0, 10.0], dtype=torch.double), 0.07
