@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.scene import HEADING, Scene, rotated
+from epo_lightning.scene import HEADING, Scene, heading_vector, rotated
 
 AGREE = 0.2
 """Smallest length of the mean of the agents' unit directions; below it, they have no common direction."""
@@ -46,7 +46,7 @@ def aligned(scene: Scene) -> Scene:
     count = there.sum(1).clamp_min(1)
     origin = current[..., :2].sum(1) / count
     heading = current[..., HEADING]
-    direction = torch.where(there, torch.stack((heading.cos(), heading.sin()), -1), 0.0).sum(1) / count
+    direction = torch.where(there, heading_vector(heading), 0.0).sum(1) / count
     first = torch.where(scene.agent_mask & (scene.agent_mask.cumsum(1) == 1), heading, 0.0).sum(1)
     angle = torch.where(direction.norm(dim=-1) < AGREE, first, torch.atan2(direction[:, 1], direction[:, 0]))
     turns = 2 * math.pi * torch.round((heading - angle[:, None]) / (2 * math.pi))
