@@ -65,7 +65,7 @@ class Forecaster(LightningModule):
         which scenes are probably wrong (:mod:`epo_lightning.doubts`). Motions and coordinates are looked at up to the first
         batch without a doubt: for every batch, this would take a tenth of a single scene's forecast.
 
-        Several threads may predict at once with a forecaster in evaluation mode, as :func:`epo_lightning.load` returns it.
+        Several threads may predict at once with a forecaster in evaluation mode, as ``epo_lightning.load`` returns it.
 
         Raises:
             TypeError: the argument is not a :class:`Scene`.
