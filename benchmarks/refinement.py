@@ -152,7 +152,7 @@ def report(
         alone = {**weights, **dict.fromkeys(pair, 0.0)}
         return refine(states, probabilities, scene, energy, alone, noise=noise)
 
-    def by(steps: int) -> Refinement:
+    def with_steps(steps: int) -> Refinement:
         return functools.partial(
             refine,
             energy=energy,
@@ -162,7 +162,7 @@ def report(
             solver=dataclasses.replace(SOLVER, steps=steps),
         )
 
-    refined = by(SOLVER.steps)
+    refined = with_steps(SOLVER.steps)
 
     groups = [("all", ""), *((name, f"{name}/") for name in subsets)]
     for label, refinement in (("given", plain), ("tracked", tracked), ("refined", refined)):
@@ -174,7 +174,7 @@ def report(
             row = f"{settings.title}, seed {settings.seed}"
             print(f"{row:<28}{label:<9}{group:<13}" + "".join(f"{value:>9.4f}" for value in values), flush=True)
     for steps in (FEW, SOLVER.steps):
-        print(f"after {steps} steps, {distances(given, by(steps), by(10 * SOLVER.steps))}", flush=True)
+        print(f"after {steps} steps, {distances(given, with_steps(steps), with_steps(10 * SOLVER.steps))}", flush=True)
     times = ", ".join("{:.2f} ({:.2f}) in batches of {}".format(*milliseconds(given, b, refined), b) for b in (1, 32))
     agents, modes = given[0][1].shape[2], given[0][1].shape[1]
     print(f"CPU ms per scene of {agents} agents and {modes} modes: {times}", flush=True)
@@ -200,9 +200,8 @@ def main(given: Sequence[str] | None = None) -> None:
     chosen = parser.parse_args(given)
     torch.set_num_threads(1)
     assembly.quiet()
-    warnings.filterwarnings(
-        "ignore", message="(.* of the given futures of agents|states)"
-    )  # of marginal forecasters, for every call
+    # Every call warns of the futures of marginal forecasters.
+    warnings.filterwarnings("ignore", message="(.* of the given futures of agents|states)")
     print(f"{'run':<28}{'':<9}{'scenes':<13}" + "".join(f"{label:>9}" for label in SCORES.values()))
     try:
         weights = WEIGHTS if chosen.weights is None else numbers(chosen.weights)

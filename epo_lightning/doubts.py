@@ -18,7 +18,7 @@ from epo_lightning.scene import HEADING, SPEED, Scene
 SLACK, SHARE, NOISE = 0.5, 0.4, 0.1
 """Velocity [m/s], share of the larger one, and displacement [m] by which observed and stated motions may differ."""
 FAR = 1e4
-"""Distance [m] from the origin in which no scene of a training has been."""
+"""Distance [m] from the origin beyond which positions are taken for coordinates of a map."""
 NAMED = 10
 """Largest number of scenes that a sentence names."""
 

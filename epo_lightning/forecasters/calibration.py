@@ -207,7 +207,7 @@ class _PastGame:
 
 
 def _cost(missed: Float[Tensor, "S M R"], s: Float[Tensor, "S M"], spread: float) -> Float[Tensor, "S M"]:
-    """What a calibration minimises; infinite where a game has no solution."""
+    """Cost that a calibration minimises; infinite where a game has no solution."""
     cost = missed.square().sum(-1) + s.square() / spread**2
     return torch.where(cost.isfinite(), cost, math.inf)
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from epo_lightning.backbones.base import Backbone
-from epo_lightning.checks import check_number
+from epo_lightning.checks import check_choice, check_number
 from epo_lightning.decoders.goals import GivenGoals, GoalDecoder, Goals, NoGoals
 from epo_lightning.decoders.motions import Motions
 from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
@@ -28,7 +28,6 @@ from epo_lightning.forecasters.combination import Combination
 from epo_lightning.forecasters.epo_settings import (
     WEIGHTS,
     check_calibration,
-    check_choice,
     check_decodes_probabilities,
     check_gate,
     check_horizon,
@@ -138,8 +137,8 @@ class EPO(Forecaster):
         check_horizon(self.game_horizon, energy, objective, task)
         check_modes(modes, one_game, solver)
         check_initial(initial, modes, one_game, energy, solver)
-        check_choice("own_weights", own_weights, WEIGHTS)
-        check_choice("pair_weights", pair_weights, WEIGHTS)
+        check_choice("forecaster.own_weights", own_weights, WEIGHTS)
+        check_choice("forecaster.pair_weights", pair_weights, WEIGHTS)
         check_gate(gate, energy)
         # The network decodes probabilities, except where they follow from energies of candidates (TABLES) or from orders.
         defined = TABLES in solver.provides or energy.pair_order is not None

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from epo_lightning import checks
+from epo_lightning.checks import check_choice
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, Energy
@@ -39,15 +39,6 @@ def check_needs(energy: Energy, task: Task) -> None:
             f"features of energy.own need {', '.join(sorted(lacking))}, which this data does not provide: leave the "
             "features out, or choose data with a map"
         )
-
-
-def check_choice(name: str, value: str, known: Sequence[str]) -> None:
-    """Refuse a name that ``forecaster.<name>`` does not know.
-
-    Raises:
-        ConfigError: the message names the nearest known one.
-    """
-    checks.check_choice(f"forecaster.{name}", value, known)
 
 
 def check_horizon(game_horizon: int, energy: Energy, objective: Objective, task: Task) -> None:
@@ -89,7 +80,7 @@ def check_initial(initial: str, modes: int, one_game: bool, energy: Energy, solv
     Raises:
         ConfigError: see above, or motions of another model than the unicycle.
     """
-    check_choice("initial", initial, INITIAL)
+    check_choice("forecaster.initial", initial, INITIAL)
     if one_game and initial == "zero" and solver.strategies(modes) > 1 and energy.pair_order is None:
         raise ConfigError(
             "all modes would be the same: forecaster.one_game=true gives them one game, and forecaster.initial=zero one "

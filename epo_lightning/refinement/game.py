@@ -115,7 +115,7 @@ def track(states: Tensor, scene: Scene, dynamics: Dynamics, noise: float) -> Flo
 
 
 def swerve(scene: Scene) -> Float[Tensor, "B N 2"]:
-    """Controls that take agents that drive on exactly one line off it; zero for all others.
+    """Turn rates [rad/s], as controls, that take agents on exactly one line off it; zero for all others.
 
     On the line no energy has a derivative to the side, and a vehicle that follows it could only drive through the one ahead.
     To break this tie, a vehicle behind turns to its left, one in front to its right, and both of two that approach each
