@@ -12,19 +12,9 @@ from torchmetrics import Metric
 
 from epo_lightning.checks import check_choice
 from epo_lightning.forecast import JointForecast, Status
-from epo_lightning.metrics.functional import (
-    brier_min_sade,
-    closest_mode,
-    expected_calibration_error,
-    min_ade,
-    min_fde,
-    min_sade,
-    min_sade_of_likely,
-    min_sfde,
-    missed,
-    reliability,
-)
+from epo_lightning.metrics.functional import expected_calibration_error, reliability
 from epo_lightning.metrics.functional.calibration import BINS
+from epo_lightning.metrics.functional.displacement import Errors
 from epo_lightning.metrics.functional.overlap import overlap_rates
 from epo_lightning.scene import SHAPES, Scene
 
@@ -134,7 +124,8 @@ class ForecastMetrics(Metric):
         Raises:
             ValueError: the scene has no future or no sizes, or another number of agents or steps than the forecast.
         """
-        found = forecast_values(forecast, scene, self.shape)
+        average = Errors.average(forecast.states, *observed_future(scene))
+        found = forecast_values(forecast, scene, average, self.shape)
         none = torch.full_like(found["minADE"], torch.nan)
         values = torch.stack([found.get(name, none).double() for name in COLUMNS], dim=1)
         groups = torch.ones(len(values), 1, dtype=torch.bool, device=values.device)
@@ -147,7 +138,7 @@ class ForecastMetrics(Metric):
         counted[:, 1:] &= torch.tensor(_OF_SUBSETS, device=values.device)
         self.total += torch.where(counted, values[:, None], 0.0).sum(0)
         self.count += counted.sum(0)
-        self.bins += torch.einsum("bg,bnx->gnx", groups.double(), calibration_values(forecast, scene))
+        self.bins += torch.einsum("bg,bnx->gnx", groups.double(), calibration_values(forecast.probabilities, average))
 
     def compute(self) -> dict[str, Tensor]:
         """Scores by name.
@@ -167,56 +158,67 @@ class ForecastMetrics(Metric):
         return scores
 
 
-def forecast_values(forecast: JointForecast, scene: Scene, shape: str) -> dict[str, Float[Tensor, " B"]]:
+def observed_future(scene: Scene) -> tuple[Float[Tensor, "B N K 4"], Bool[Tensor, "B N K"]]:
+    """The future of a scene, and the mask of the steps at which present agents were observed.
+
+    Raises:
+        ValueError: the scene has no future.
+    """
+    if scene.future is None or scene.future_mask is None:
+        raise ValueError("displacements need scene.future [B, N, K, 4], which is None")
+    return scene.future, scene.future_mask & scene.agent_mask[..., None]
+
+
+def forecast_values(
+    forecast: JointForecast, scene: Scene, average: Errors, shape: str
+) -> dict[str, Float[Tensor, " B"]]:
     """Metrics of every scene by name, NaN where a scene has no value; without those that the forecast cannot have.
+
+    Args:
+        forecast, scene: a batch.
+        average: the forecast's errors as averages over steps.
+        shape: outline of the agents in overlap rates.
 
     Raises:
         ValueError: the scene has no future or no sizes.
     """
-    if scene.future is None or scene.future_mask is None:
-        raise ValueError("displacements need scene.future [B, N, K, 4], which is None")
     if scene.size is None:
         raise ValueError("overlap rates need scene.size [B, N, 2], which is None")
-    mask = scene.future_mask & scene.agent_mask[..., None]
-    states, probabilities, future = forecast.states, forecast.probabilities, scene.future
+    states, probabilities = forecast.states, forecast.probabilities
+    future, mask = observed_future(scene)
+    final = Errors.final(states, future, mask)
     values = {
-        "minADE": min_ade(states, future, mask),
-        "minFDE": min_fde(states, future, mask),
-        "minSADE": min_sade(states, future, mask),
-        "minSFDE": min_sfde(states, future, mask),
-        "missed": missed(states, future, mask),
+        "minADE": average.marginal(),
+        "minFDE": final.marginal(),
+        "minSADE": average.joint(),
+        "minSFDE": final.joint(),
+        "missed": average.missed(),
         "pair_effect": pair_effect(forecast, scene.agent_mask),
         **equilibrium_values(forecast),
     }
     overlaps = overlap_rates(states, probabilities, scene.size, scene.agent_mask, shape)
     values["overlap_jfp"], values["overlap_authors"] = overlaps
     if (initial := forecast.initial_states) is not None:
-        values["initial/minSADE"] = min_sade(initial, future, mask)
-        values["initial/minSFDE"] = min_sfde(initial, future, mask)
+        values["initial/minSADE"] = Errors.average(initial, future, mask).joint()
+        values["initial/minSFDE"] = Errors.final(initial, future, mask).joint()
     if states.shape[1] > 1:
-        likely = min_sade_of_likely(states, probabilities, future, mask)
-        values |= dict(zip(MODE_METRICS, likely.unbind(1), strict=False))
-        values["brier_minSADE"] = brier_min_sade(states, probabilities, future, mask)
+        values |= dict(zip(MODE_METRICS, average.joint_of_likely(probabilities).unbind(1), strict=False))
+        values["brier_minSADE"] = average.brier(probabilities)
     if (lost := stopped(forecast)) is not None:
         values[STOPPED] = lost.double().mean(1)
     return values
 
 
-def calibration_values(forecast: JointForecast, scene: Scene) -> Float[Tensor, "B bins 3"]:
+def calibration_values(probabilities: Float[Tensor, "B M"], average: Errors) -> Float[Tensor, "B bins 3"]:
     """Sums of the bins of the calibration error of every scene, in float64.
 
     All sums are zero for forecasts with a single mode, for scenes without observations, and for broken forecasts, of which
     no mode is the closest or whose probabilities are not numbers.
     """
-    assert scene.future is not None
-    assert scene.future_mask is not None
-    mask = scene.future_mask & scene.agent_mask[..., None]
-    probabilities = forecast.probabilities
-    known = min_sade(forecast.states, scene.future, mask).isfinite() & probabilities.isfinite().all(1)
+    known = average.joint().isfinite() & probabilities.isfinite().all(1)
     if probabilities.shape[1] == 1:
         known = torch.zeros_like(known)
-    closest = closest_mode(forecast.states, scene.future, mask)
-    return torch.where(known[:, None, None], reliability(probabilities.nan_to_num(0.0), closest), 0.0)
+    return torch.where(known[:, None, None], reliability(probabilities.nan_to_num(0.0), average.closest()), 0.0)
 
 
 def pair_effect(forecast: JointForecast, agent_mask: Bool[Tensor, "B N"]) -> Float[Tensor, " B"]:

@@ -33,9 +33,14 @@ Example: two agents stand at the origin; mode 0 is right about the first one, mo
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+RADIUS = 0.25
+"""Distance [m] within which a joint mode is near the future (:func:`missed`)."""
 
 
 def min_ade(
@@ -51,21 +56,28 @@ def min_ade(
     Raises:
         ValueError: shapes that do not agree.
     """
-    return _marginal(*_average_errors(states, future, mask))
+    return Errors.average(states, future, mask).marginal()
 
 
 def min_fde(
     states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, " B"]:
     """Mean over agents of the displacement at step K of each agent's own best mode [m]; as :func:`min_ade`."""
-    return _marginal(*_final_errors(states, future, mask))
+    return Errors.final(states, future, mask).marginal()
 
 
 def min_sade(
     states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
 ) -> Float[Tensor, " B"]:
     """Average displacement of all agents in the best joint mode [m]; arguments as of :func:`min_ade`."""
-    return _joint(*_average_errors(states, future, mask))
+    return Errors.average(states, future, mask).joint()
+
+
+def min_sfde(
+    states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
+) -> Float[Tensor, " B"]:
+    """Displacement at step K of all agents in the best joint mode [m]; arguments as of :func:`min_ade`."""
+    return Errors.final(states, future, mask).joint()
 
 
 def min_sade_of_likely(
@@ -75,17 +87,14 @@ def min_sade_of_likely(
     mask: Bool[Tensor, "B N K"],
 ) -> Float[Tensor, "B M"]:
     """The minSADE among the k most likely joint modes, k = 1 .. M [m]; equally likely modes keep their order."""
-    error, counted = _average_errors(states, future, mask)
-    order = probabilities.argsort(dim=1, descending=True, stable=True)
-    joint = (error.sum(-1) / counted.sum(-1, keepdim=True)).gather(1, order)
-    return joint.cummin(1).values
+    return Errors.average(states, future, mask).joint_of_likely(probabilities)
 
 
 def closest_mode(
     states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
 ) -> Int[Tensor, " B"]:
     """Index of the joint mode of the minSADE, the first one if several are equally close; 0 for a scene without a value."""
-    return _average_errors(states, future, mask)[0].sum(-1).argmin(1)
+    return Errors.average(states, future, mask).closest()
 
 
 def brier_min_sade(
@@ -95,31 +104,85 @@ def brier_min_sade(
     mask: Bool[Tensor, "B N K"],
 ) -> Float[Tensor, " B"]:
     """minSADE + (1 - p)^2 with the probability p of the closest joint mode [m]; infinite if p is not a number."""
-    best = closest_mode(states, future, mask)
-    wrong = (1.0 - probabilities.gather(1, best[:, None])[:, 0]).square()
-    return min_sade(states, future, mask) + wrong.nan_to_num(nan=torch.inf)
+    return Errors.average(states, future, mask).brier(probabilities)
 
 
 def missed(
     states: Float[Tensor, "B M N K X"],
     future: Float[Tensor, "B N K _"],
     mask: Bool[Tensor, "B N K"],
-    radius: float = 0.25,
+    radius: float = RADIUS,
 ) -> Float[Tensor, " B"]:
     """1 for scenes whose minSADE is above ``radius`` [m]: no joint mode is near the future; else 0.
 
     On data with known alternatives (RPI), its mean over the scenes of one alternative is the share in which that alternative
     is missing among the modes. NaN for a scene without a value.
     """
-    distance = min_sade(states, future, mask)
-    return torch.where(distance.isnan(), distance, (distance > radius).to(distance.dtype))
+    return Errors.average(states, future, mask).missed(radius)
 
 
-def min_sfde(
-    states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
-) -> Float[Tensor, " B"]:
-    """Displacement at step K of all agents in the best joint mode [m]; arguments as of :func:`min_ade`."""
-    return _joint(*_final_errors(states, future, mask))
+@dataclass(frozen=True)
+class Errors:
+    """The distance of every agent from its future in every joint mode [m], as one average over steps or at the last step.
+
+    The metrics above follow from it; several metrics of the same forecast share one.
+
+    Attributes:
+        distance: of the agents, [B, M, N]; zero for agents that are not counted.
+        counted: mask of the agents that were observed, [B, N].
+    """
+
+    distance: Float[Tensor, "B M N"]
+    counted: Bool[Tensor, "B N"]
+
+    @classmethod
+    def average(
+        cls, states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
+    ) -> Errors:
+        """Means over the observed steps; arguments as of :func:`min_ade`."""
+        _check_shapes(states, future, mask)
+        steps = mask.sum(-1)
+        return cls(_distances(states, future, mask).sum(-1) / steps[:, None].clamp_min(1), steps > 0)
+
+    @classmethod
+    def final(
+        cls, states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
+    ) -> Errors:
+        """Distances at step K; arguments as of :func:`min_ade`."""
+        _check_shapes(states, future, mask)
+        last = mask[..., -1:]
+        return cls(_distances(states[..., -1:, :], future[..., -1:, :], last)[..., 0], last[..., 0])
+
+    def marginal(self) -> Float[Tensor, " B"]:
+        """mean_i min_m; 0 / 0 is the NaN of an empty scene."""
+        return self.distance.amin(1).sum(-1) / self.counted.sum(-1)
+
+    def joint(self) -> Float[Tensor, " B"]:
+        """min_m mean_i."""
+        return self._of_modes().amin(1)
+
+    def joint_of_likely(self, probabilities: Float[Tensor, "B M"]) -> Float[Tensor, "B M"]:
+        """min_m mean_i among the k most likely modes; see :func:`min_sade_of_likely`."""
+        order = probabilities.argsort(dim=1, descending=True, stable=True)
+        return self._of_modes().gather(1, order).cummin(1).values
+
+    def closest(self) -> Int[Tensor, " B"]:
+        """argmin_m mean_i; see :func:`closest_mode`."""
+        return self.distance.sum(-1).argmin(1)
+
+    def brier(self, probabilities: Float[Tensor, "B M"]) -> Float[Tensor, " B"]:
+        """min_m mean_i plus the squared error of that mode's probability; see :func:`brier_min_sade`."""
+        wrong = (1.0 - probabilities.gather(1, self.closest()[:, None])[:, 0]).square()
+        return self.joint() + wrong.nan_to_num(nan=torch.inf)
+
+    def missed(self, radius: float = RADIUS) -> Float[Tensor, " B"]:
+        """1 where min_m mean_i is above the radius [m]; see :func:`missed`."""
+        error = self.joint()
+        return torch.where(error.isnan(), error, (error > radius).to(error.dtype))
+
+    def _of_modes(self) -> Float[Tensor, "B M"]:
+        """mean_i."""
+        return self.distance.sum(-1) / self.counted.sum(-1, keepdim=True)
 
 
 def _distances(
@@ -130,24 +193,6 @@ def _distances(
     error = torch.linalg.vector_norm(offset, dim=-1)
     error = error.nan_to_num(nan=torch.inf, posinf=torch.inf)
     return torch.where(mask[:, None], error, 0.0)
-
-
-def _average_errors(
-    states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
-) -> tuple[Float[Tensor, "B M N"], Bool[Tensor, "B N"]]:
-    """Mean over the observed steps, and the agents that have any."""
-    _check_shapes(states, future, mask)
-    steps = mask.sum(-1)
-    return _distances(states, future, mask).sum(-1) / steps[:, None].clamp_min(1), steps > 0
-
-
-def _final_errors(
-    states: Float[Tensor, "B M N K X"], future: Float[Tensor, "B N K _"], mask: Bool[Tensor, "B N K"]
-) -> tuple[Float[Tensor, "B M N"], Bool[Tensor, "B N"]]:
-    """Error at the last step, and the agents observed there."""
-    _check_shapes(states, future, mask)
-    last = mask[..., -1:]
-    return _distances(states[..., -1:, :], future[..., -1:, :], last)[..., 0], last[..., 0]
 
 
 def _check_shapes(states: Tensor, future: Tensor, mask: Tensor) -> None:
@@ -163,13 +208,3 @@ def _check_shapes(states: Tensor, future: Tensor, mask: Tensor) -> None:
         )
     if mask.shape != future.shape[:3]:
         raise ValueError(f"the mask has shape {list(mask.shape)}; this future takes {list(future.shape[:3])}")
-
-
-def _marginal(error: Float[Tensor, "B M N"], counted: Bool[Tensor, "B N"]) -> Float[Tensor, " B"]:
-    """mean_i min_m; errors of agents that are not counted are zero, and 0 / 0 is the NaN of an empty scene."""
-    return error.amin(1).sum(-1) / counted.sum(-1)
-
-
-def _joint(error: Float[Tensor, "B M N"], counted: Bool[Tensor, "B N"]) -> Float[Tensor, " B"]:
-    """min_m mean_i."""
-    return error.sum(-1).amin(-1) / counted.sum(-1)
