@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins import DoublePrecision
@@ -26,7 +26,7 @@ from epo_lightning.experiment import debugging, step_graph
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings
 from epo_lightning.experiment.dashboards import mlflow
-from epo_lightning.forecasters import SUPPLIED, build_forecaster
+from epo_lightning.forecasters import SUPPLIED, Forecaster, build_forecaster
 from epo_lightning.metrics.forecast import SCORES
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder
@@ -59,7 +59,7 @@ def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
     return {**sections, "goal": settings.goal, **data.task.to_config()}
 
 
-def build(settings: Settings) -> tuple[Any, LightningModule]:
+def build(settings: Settings) -> tuple[Any, Forecaster]:
     """The data module and the forecaster of a run. Initial weights are drawn from the global random state; no data is read.
 
     Raises:
@@ -78,7 +78,7 @@ def build(settings: Settings) -> tuple[Any, LightningModule]:
     return data, forecaster
 
 
-def check_goal(settings: Settings, forecaster: LightningModule) -> None:
+def check_goal(settings: Settings, forecaster: Forecaster) -> None:
     """Refuse ``goal=all`` for a forecaster without a backbone of its own, whose forecasts it would not change.
 
     Raises:
@@ -105,7 +105,7 @@ def check_monitor(monitor: str, task: Task) -> None:
         raise ConfigError(f"unknown callbacks.monitor {monitor!r}: {nearest(monitor, known)}")
 
 
-def build_model(settings: Settings, data: Any) -> LightningModule:
+def build_model(settings: Settings, data: Any) -> Forecaster:
     """The forecaster of a configuration for the task of ``data``, see :func:`build`."""
     configuration = describe_model(settings, data)
     for group in PARTS[1:]:  # all but "data", which was checked when it was built
@@ -127,7 +127,7 @@ def parameters(model: torch.nn.Module) -> int:
     return sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
 
 
-def check_buildable(settings: Settings) -> tuple[Any, LightningModule]:
+def check_buildable(settings: Settings) -> tuple[Any, Forecaster]:
     """Check that data module and forecaster can be built, without an effect on random states and without warnings.
 
     Raises:

@@ -23,12 +23,9 @@ from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import FIELDS, Scene
-from epo_lightning.warp_kernels import installed
 
 WARM_UP = 3
 """Training steps before the capture: they compile kernels and make handles of libraries, which a capture cannot contain."""
-BACKENDS = ("pytorch", "warp", "auto")
-"""Values of ``solver.backend`` with which no work of the host is part of a step; ``auto`` only where Warp is installed."""
 SCHEDULES = ("relaxation", "annealing")
 """Settings of losses that change with the number of the step."""
 
@@ -180,7 +177,7 @@ def _layout(scene: Scene) -> tuple[Any, ...]:
     return scene.dt, *(None if tensor is None else (tensor.shape, tensor.dtype) for tensor in tensors)
 
 
-def check(settings: Settings, forecaster: LightningModule) -> None:
+def check(settings: Settings, forecaster: Forecaster) -> None:
     """Refuse ``trainer.graph`` for a training whose steps no graph can repeat.
 
     Raises:
@@ -188,18 +185,13 @@ def check(settings: Settings, forecaster: LightningModule) -> None:
     """
     if not settings.trainer.graph:
         return
-    solver = getattr(forecaster, "solver", None)
-    if getattr(solver, "on_host", False):
+    solver = forecaster.solver
+    if solver is not None and solver.on_host:
+        name = settings.solver["name"]
         raise ConfigError(
-            f"trainer.graph=true with solver.name={settings.solver['name']}: its games are solved on the host, which a CUDA "
-            "graph cannot contain; set trainer.graph=false"
-        )
-    backend = getattr(solver, "backend", BACKENDS[0])
-    on_host = backend == "auto" and (not installed() or getattr(solver, "adaptive", False))
-    if backend not in BACKENDS or on_host:
-        raise ConfigError(
-            f"trainer.graph=true with solver.backend={backend}: games would be solved on the host, which a CUDA graph "
-            "cannot contain; choose solver.backend=warp (pip install 'epo_lightning[gpu]') or pytorch"
+            f"trainer.graph=true with solver.name={name} and solver.backend={solver.backend}: its games are solved on "
+            "the host, which a CUDA graph cannot contain; set trainer.graph=false, or take solver=levenberg_marquardt with "
+            "solver.adaptive=false and solver.backend=warp (pip install 'epo_lightning[gpu]') or pytorch"
         )
     for section in ("forecaster", "objective"):
         for name in SCHEDULES:

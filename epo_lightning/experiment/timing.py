@@ -47,10 +47,10 @@ def measure(run: RunFolder, settings: Settings) -> dict[str, Any]:
             _wait(device)
             if number >= 0:
                 seconds.append(time.perf_counter() - started)
-    solver = getattr(forecaster, "solver", None)
+    solver = None if forecaster.solver is None else forecaster.solver.for_test()
     measured = {
         "agents": scenes[0].history.shape[1],
-        "steps": None if solver is None else getattr(solver.for_test(), "steps", None),
+        "steps": None if solver is None else solver.steps,
         "modes": forecast.states.shape[1],
         "batch": 1,
         "samples": SAMPLES,

@@ -18,6 +18,7 @@ from epo_lightning.metrics.forecast import COLUMNS, STOPPED, stopped
 from epo_lightning.objectives.base import Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.scene import Scene
+from epo_lightning.solvers.base import Minimiser
 from epo_lightning.task import Task
 
 
@@ -36,6 +37,8 @@ class Forecaster(LightningModule):
     """Whether forecasts depend on the headings that are wanted at goals."""
     reads_history: bool = True
     """Whether forecasts depend on states before the present one."""
+    solver: Minimiser | None = None
+    """The minimiser of its games, if it has games."""
     longest_game: int | None = None
     """Steps from t0 to the end of the longest game, if games go on after the forecast."""
     configuration: dict[str, Any]

@@ -104,6 +104,8 @@ class EPO(Forecaster):
         ConfigError: parts that do not work together, with the changes that would work; or a value out of its range.
     """
 
+    solver: Minimiser
+
     def __init__(
         self,
         task: Task,

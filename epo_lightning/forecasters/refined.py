@@ -51,6 +51,8 @@ class Refined(Forecaster):
         ConfigError: parts that do not work together, or a forecaster of another task.
     """
 
+    solver: Minimiser
+
     def __init__(
         self,
         task: Task,

@@ -128,8 +128,7 @@ class Implicit(Backward):
         if (own := minimiser.attach(energy, scene, games, solution, exact)) is not None:
             controls, status = own
         elif isinstance(energy, FeatureEnergy):
-            backend = getattr(minimiser, "backend", "auto")
-            controls, status = implicit.attach(energy, scene, games, solution.controls, exact, backend)
+            controls, status = implicit.attach(energy, scene, games, solution.controls, exact, minimiser.backend)
         else:
             controls, status = dense.attach(energy, scene, games, solution.controls, exact)
         states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)

@@ -31,16 +31,24 @@ class Minimiser(ABC):
 
     Attributes:
         needs_from_energy: properties that the energy must offer (:mod:`epo_lightning.game.energy`).
-        on_host: whether games on a GPU are always copied to the CPU and solved there.
+        steps: number of steps, where it is a setting.
+        backend: setting that chooses the implementation of Gauss-Newton computations
+            (:mod:`epo_lightning.solvers.gauss_newton.backends`); ``auto`` for minimisers without this setting.
     """
 
     needs_from_energy: ClassVar[frozenset[str]] = frozenset()
-    on_host: ClassVar[bool] = False
+    steps: int | None = None
+    backend: str = "auto"
 
     @property
     def provides(self) -> frozenset[str]:
         """Properties of the solution: :data:`PATH`, :data:`STEPS`, :data:`STATIONARY`, :data:`SAMPLES`, :data:`TABLES`."""
         return frozenset()
+
+    @property
+    def on_host(self) -> bool:
+        """Whether games on a GPU are copied to the CPU and solved there."""
+        return False
 
     @abstractmethod
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:

@@ -195,9 +195,16 @@ def test_settings_that_exclude_a_graph_are_refused(changes: dict[str, Any], name
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (("experiment=rpi/v_lstm_epo", "solver.adaptive=true"), "solver.backend=auto"),
-        (("experiment=rpi/v_lstm_epo", "solver.backend=host"), "solver.backend=host"),
+        (
+            ("experiment=rpi/v_lstm_epo", "solver.adaptive=true"),
+            "solver.name=levenberg_marquardt and solver.backend=auto",
+        ),
+        (
+            ("experiment=rpi/v_lstm_epo", "solver.backend=host"),
+            "solver.name=levenberg_marquardt and solver.backend=host",
+        ),
         (("experiment=rpi/v_lstm_epo_feedback", "solver.backend=pytorch"), "solver.name=feedback"),
+        (("experiment=rpi/v_lstm_epo", "solver=both_sides", "backward=implicit"), "solver.name=both_sides"),
         (("experiment=rpi/v_lstm_epo", "solver.backend=warp", "objective.relaxation=0.1"), "objective.relaxation=0.1"),
         (("experiment=rpi/v_lstm_sc", "+forecaster.annealing=1.0"), "forecaster.annealing=1.0"),
     ],

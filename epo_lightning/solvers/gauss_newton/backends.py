@@ -19,6 +19,7 @@ from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton import compiled, fused, hosted, structured
+from epo_lightning.warp_kernels import installed
 
 NAMES = ("auto", "pytorch", "compiled", "host", "warp")
 
@@ -100,6 +101,11 @@ def choose(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParam
     if not torch.compiler.is_exporting():
         say_once(obstacle)
     return structured
+
+
+def on_host(name: str, fixed: bool) -> bool:
+    """Whether :func:`choose` has games on a GPU solved by the host, unless only PyTorch can solve them."""
+    return name in ("compiled", "host") or (name == "auto" and not (fixed and installed()))
 
 
 @functools.cache

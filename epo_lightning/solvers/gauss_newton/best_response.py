@@ -68,9 +68,18 @@ class BestResponse(Minimiser):
         check_whole("solver.rounds", self.rounds, least=0)
         check_whole("solver.steps", self.steps, least=1)
         check_number("solver.tolerance", self.tolerance, zero=True)
-        LevenbergMarquardt(damping=self.damping, backend=self.backend)  # checks both
+        self.inner()  # checks its settings
         if self.order not in ORDERS:
             raise ConfigError(f"unknown solver.order {self.order!r}: {nearest(str(self.order), ORDERS)}")
+
+    @property
+    def on_host(self) -> bool:
+        """Whether the steps of games on a GPU are taken on the host."""
+        return self.inner().on_host
+
+    def inner(self) -> LevenbergMarquardt:
+        """The steps of an agent."""
+        return LevenbergMarquardt(step_size=1.0, damping=self.damping, adaptive=True, backend=self.backend)
 
     @torch.no_grad()
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
@@ -84,8 +93,7 @@ class BestResponse(Minimiser):
         scene, start = descent.begin(energy, scene, parameters)
         if start.numel() == 0:
             return descent.nothing(start)
-        solver = LevenbergMarquardt(step_size=1.0, adaptive=True, backend=self.backend)
-        game = _Game(energy, scene, parameters.for_every_mode(start.shape[1]), solver)
+        game = _Game(energy, scene, parameters.for_every_mode(start.shape[1]), self.inner())
         begun = game.at(start)
         value, usable = begun.energy, (begun.status != Status.STOPPED) & begun.energy.isfinite()
         damping = start.new_full(start.shape[:3], self.damping)

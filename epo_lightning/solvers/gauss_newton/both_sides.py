@@ -66,6 +66,11 @@ class BothSides(Minimiser):
         for gamma in self.reflections:
             check_number("solver.reflections", gamma)
 
+    @property
+    def on_host(self) -> bool:
+        """Whether the steps of games on a GPU are taken on the host."""
+        return self.open_loop().on_host
+
     def open_loop(self) -> LevenbergMarquardt:
         """The steps from each initial strategy to the minimum below it, an open-loop equilibrium."""
         return LevenbergMarquardt(

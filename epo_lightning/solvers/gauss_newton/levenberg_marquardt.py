@@ -101,6 +101,11 @@ class LevenbergMarquardt(Stepwise):
         """A path and steps without Newton steps, and the derivative of a minimum in any case."""
         return frozenset({STATIONARY} if self.newton_steps else {PATH, STEPS, STATIONARY})
 
+    @property
+    def on_host(self) -> bool:
+        """Whether the backend solves games on a GPU on the host."""
+        return backends.on_host(self.backend, fixed=not self.adaptive)
+
     def for_test(self) -> Stepwise:
         """The solver to use outside training."""
         return self if self.test_steps is None else self.with_steps(self.test_steps)

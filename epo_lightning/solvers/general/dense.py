@@ -17,6 +17,7 @@ from torch import Tensor
 
 from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.energy import RESIDUALS, Energy
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.game_end import free_controls
 from epo_lightning.host import readable
 from epo_lightning.scene import Scene
@@ -105,7 +106,7 @@ def gauss_newton(
     if isinstance(energy, PiecewiseQuadratic):
         return _closed_form(energy, scene, parameters, controls)
     energy.validate(scene, parameters, controls)
-    if hasattr(energy, "linearisation"):
+    if isinstance(energy, FeatureEnergy):
         _, changes = energy.linearisation(scene, parameters, controls, units(controls))
     else:
 

@@ -171,6 +171,8 @@ def test_adaptive_and_implicit_solutions_are_those_of_the_compiled_layer(copies)
     game = random_game(scene, 2, 6, spread=0.1)
     minimise = LevenbergMarquardt(20, 1.0, 1.0, adaptive=True, newton_steps=5)
     assert backends.choose("auto", energy, remote(scene), remote(game)) is hosted
+    assert minimise.on_host
+    assert not dataclasses.replace(minimise, backend="pytorch").on_host
     with torch.no_grad(), Factories():
         found, expected = minimise(energy, remote(scene), remote(game)), minimise(energy, scene, game)
     assert torch.equal(values(found.controls), expected.controls)
