@@ -16,15 +16,19 @@ from torch import Tensor
 
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.checks import check_choice, check_number
-from epo_lightning.decoders.goals import GivenGoals, GoalDecoder, Goals, NoGoals
-from epo_lightning.decoders.motions import Motions
+from epo_lightning.decoders.goals import Goals
 from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
 from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
-from epo_lightning.decoders.strategies import InitialStrategies, ZeroStrategies
-from epo_lightning.decoders.weights import Margins, OwnWeights, PairWeights, SharedOwnWeights, SharedPairWeights
+from epo_lightning.decoders.weights import Margins
 from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.combination import Combination
+from epo_lightning.forecasters.epo_decoders import (
+    goals_decoder,
+    own_weights_decoder,
+    pair_weights_decoder,
+    strategies_decoder,
+)
 from epo_lightning.forecasters.epo_settings import (
     WEIGHTS,
     check_calibration,
@@ -34,7 +38,6 @@ from epo_lightning.forecasters.epo_settings import (
     check_initial,
     check_margin,
     check_modes,
-    check_motions,
     check_needs,
     check_start,
 )
@@ -163,35 +166,16 @@ class EPO(Forecaster):
         width, scale, horizon = backbone.width, task.scale, self.game_horizon
         own_names, pair_names = energy.weighted
         start = check_start(own_start, own_names, energy.own)
-        ranges = {} if motions is None and initial != "motions" else check_motions(motions)
         # Do not change the order: every module draws its initial weights from the same sequence of random numbers.
-        self.own_weights: OwnWeights | SharedOwnWeights
-        if own_weights == "shared":
-            self.own_weights = SharedOwnWeights(games, own_names, start)
-        else:
-            self.own_weights = OwnWeights(width, games, own_names, start)
-        self.pair_weights: PairWeights | SharedPairWeights
-        if pair_weights == "shared":
-            self.pair_weights = SharedPairWeights(games, pair_names, pair_start)
-        else:
-            self.pair_weights = PairWeights(width, games, pair_names, pair_start, symmetric_pairs, positive=one_game)
-        self.strategies: InitialStrategies | ZeroStrategies | Motions
-        if initial == "decoded":
-            self.strategies = InitialStrategies(width, strategies, horizon, control_scale)
-        elif initial == "zero":
-            self.strategies = ZeroStrategies(strategies, horizon)
-        else:
-            self.strategies = Motions(horizon, strategies, **ranges)
+        self.own_weights = own_weights_decoder(own_weights, width, games, own_names, start)
+        self.pair_weights = pair_weights_decoder(
+            pair_weights, width, games, pair_names, pair_start, symmetric_pairs, positive=one_game
+        )
+        self.strategies = strategies_decoder(initial, width, strategies, horizon, control_scale, motions)
         order = energy.pair_order
         # Orders and goals of the modes are variants of one game, unless the solver chooses the modes itself.
         variants = games if order is None or TABLES in solver.provides else modes
-        self.goals: GoalDecoder | GivenGoals | NoGoals
-        if task.candidates > 1 and energy.needs & {"goals", "goal_headings", "reference"}:
-            self.goals = GoalDecoder(width, scale, variants)
-        elif energy.needs & {"goals", "goal_headings"}:
-            self.goals = GivenGoals(variants)
-        else:
-            self.goals = NoGoals()
+        self.goals = goals_decoder(energy, task, width, variants)
         self.orders = None if order is None else Orders(width, variants, order.symmetric)
         self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, task.horizon, scale)
         # Built last: decoders of margins and gates must not change the initial weights of the networks above.
