@@ -108,20 +108,6 @@ class Row:
         return sorted({run.git_commit for run in self.runs})
 
     @property
-    def mixed_code(self) -> str:
-        """A note on runs that were trained by different code; empty if there are none, or if it was not recorded."""
-        seeds: dict[str, list[str]] = {}
-        for run in self.runs:
-            seeds.setdefault(run.code, []).append(str(run.seed))
-        if len([code for code in seeds if code]) < 2:
-            return ""
-        groups = "; ".join(", ".join(same) for same in seeds.values())
-        return (
-            f"{self.name} ({self.runs[0].data}) mixes runs of different code (seeds {groups}), which may not be comparable. "
-            "Train all of them with the present code, in another folder (runs=<folder>)"
-        )
-
-    @property
     def missing(self) -> list[int]:
         """Seeds of the runs of RPI whose modes are trained by the closest one, and miss one of the sides in many scenes."""
         config = self.runs[0].config
@@ -139,17 +125,39 @@ class Row:
         return [run.command for run in self.runs]
 
 
-def untaught(rows: Sequence[Row]) -> str:
-    """A note on rows with runs that may have an untaught mode; empty if there are none."""
+def of_different_code(rows: Sequence[Row]) -> list[str]:
+    """Notes on the data sets whose runs were trained by different code, as far as it was recorded."""
+    notes = []
+    for data in dict.fromkeys(row.runs[0].data for row in rows):
+        codes: dict[str, dict[str, list[str]]] = {}
+        for row in rows:
+            for run in row.runs:
+                if run.data == data and run.learned and run.code:
+                    codes.setdefault(run.code, {}).setdefault(row.name, []).append(str(run.seed))
+        if len(codes) < 2:
+            continue
+        groups = (
+            ", ".join(f"{name} (seed {', '.join(dict.fromkeys(seeds))})" for name, seeds in trained.items())
+            for trained in codes.values()
+        )
+        notes.append(
+            f"Runs on {data} were trained by {len(codes)} versions of the code, which may explain differences between them: "
+            f"{'; '.join(groups)}. To train all of them with the present code, choose another folder (runs=<folder>)."
+        )
+    return notes
+
+
+def untaught(rows: Sequence[Row]) -> list[str]:
+    """A note on rows with runs that may have an untaught mode, if there are any."""
     named = [
         f"{row.name} ({row.runs[0].data}; {len(row.missing)} of {len(row.runs)} runs)" for row in rows if row.missing
     ]
     if not named:
-        return ""
-    return (
+        return []
+    return [
         "In more than a fifth of the scenes of one side, these rows have no mode near the future (score `missed`): "
         f"{', '.join(named)}. A mode may be untaught, and then errors say little about the method (docs/concepts.md, Modes)."
-    )
+    ]
 
 
 def plain_rows(runs: Iterable[EvaluatedRun]) -> list[Row]:

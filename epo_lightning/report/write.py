@@ -30,7 +30,7 @@ from epo_lightning.report.render import (
     to_rich,
     without_html,
 )
-from epo_lightning.report.rows import untaught
+from epo_lightning.report.rows import of_different_code, untaught
 from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, read_parts, scored, scored_elsewhere
 from epo_lightning.report.selection import BestSetting, best_settings
 from epo_lightning.report.statistics import build_comparisons
@@ -135,8 +135,7 @@ def write_report(
     best, hint = _best(report.evaluated)
     settings = [settings_sheet(best)] if best else []
     rows = distinct(tables)
-    of_rows = filter(None, (*(row.mixed_code for row in rows), untaught(rows)))
-    notes = [*of_rows, *notes, *damaged, *([hint] if hint else [])]
+    notes = [*of_different_code(rows), *untaught(rows), *notes, *damaged, *([hint] if hint else [])]
     made, charts = how_made(tables, timings), charts_of(tables, timings)
     costs = cost_sheets(tables, timings)
     elsewhere = transfers(report.runs)

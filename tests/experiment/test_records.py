@@ -297,21 +297,24 @@ def test_the_hash_of_the_code_is_that_of_the_files_on_which_results_depend(
 def test_runs_of_other_code_are_pointed_out(
     epo: Epo, refused: Callable[..., str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A sweep keeps them and says so, as does a training in their folder; the report names the rows that mix them."""
-    words = ("sweep", "rpi_main", *TINY, "experiment=rpi/v_lstm", "score=test")
-    assert epo(*words, "seed=0,1") == 0
+    """A sweep keeps them and says so, as does a training in their folder; the report names rows and seeds by their code."""
+    words = ("sweep", "rpi_main", *TINY, "score=test")
+    assert epo(*words, "experiment=rpi/v_lstm", "seed=0,1") == 0
+    assert epo("report", "runs=runs", "scenes=false") == 0
+    assert "versions of the code" not in Path("report/results.md").read_text()
     assert "Python file has changed" not in capsys.readouterr().out
     monkeypatch.setattr(provenance, "code", lambda: "other")
-    assert epo(*words, "seed=0,1,2") == 0
+    assert epo(*words, "experiment=rpi/v_lstm,rpi/v_lstm_sc", "seed=0,1,2") == 0
     assert (
         "2 of the 2 finished runs are kept although a Python file has changed since they began"
         in capsys.readouterr().out
     )
     assert epo("report", "runs=runs", "scenes=false") == 0
-    note = "V-LSTM (tiny) mixes runs of different code (seeds 0, 1; 2)"
+    note = "Runs on tiny were trained by 2 versions of the code"
     assert note in capsys.readouterr().out.replace("\n", " ")
-    assert note in Path("report/results.md").read_text()
-    (run,) = (RunFolder(path.parent) for path in Path("runs").rglob("run.json") if '"seed": 0' in path.read_text())
+    noted = next(line for line in Path("report/results.md").read_text().splitlines() if line.startswith(note))
+    assert "V-LSTM (seed 0, 1); V-LSTM (seed 2), V-LSTM + SC (seed 0, 1, 2)." in noted
+    (run,) = (RunFolder(path) for path in Path("runs").rglob("v_lstm/*-s0*"))
     train = ("train", "experiment=rpi/v_lstm", *TINY, "seed=0", f"run_dir={run.path}")
     assert "holds a finished run of other code than the present one: nothing is overwritten" in refused(*train)
     run.update(status="training")
