@@ -21,19 +21,17 @@ Where agents do not interact, the refined futures are the tracked ones.
 from __future__ import annotations
 
 import dataclasses
-import math
-import sys
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
-from epo_lightning.checks import check_number, is_number
+from epo_lightning.checks import check_number
 from epo_lightning.forecast import JointForecast
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.refinement.game import NOISE, refined
-from epo_lightning.refinement.given import check_forecast
+from epo_lightning.refinement.given import check_forecast, check_inverse_temperature, check_parts, check_values
 from epo_lightning.refinement.origin import moved, moved_back, origin_of
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Backward, Implicit
@@ -48,14 +46,6 @@ SOLVER = LevenbergMarquardt(steps=50, step_size=1.0, damping=1.0, adaptive=True)
 """The solver of :func:`refine` unless another one is given. Modes take no further steps once they have arrived."""
 INVERSE_TEMPERATURE = 0.03
 """beta of :func:`refine` unless another one is given, chosen on validation data (docs/refine.md)."""
-LARGEST = 1e6
-"""Largest weight, margin and inverse temperature: squares and products of larger ones leave the range of float32."""
-EXAMPLES = {
-    "energy": "epo_lightning.game.energy.Energy, such as epo_lightning.FeatureEnergy(...)",
-    "solver": "epo_lightning.solvers.base.Minimiser, such as epo_lightning.LevenbergMarquardt(...)",
-    "backward": "epo_lightning.solvers.backward.Backward: Implicit(), Unrolled(), Truncated(...) or Detached()",
-}
-"""What the arguments of :func:`refine` are instances of."""
 
 
 def refine(
@@ -111,44 +101,20 @@ def refine(
         >>> bool(apart(given[None, None]) < 0.1), bool(apart(refined.states) > 2.0)
         (True, True)
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene is a {type(scene).__name__}; refine() takes an epo_lightning.Scene")
-    for what, part, kind in (
-        ("energy", energy, Energy),
-        ("solver", solver, Minimiser),
-        ("backward", backward if backward is not None else Implicit(), Backward),
-    ):
-        if not isinstance(part, kind):
-            raise TypeError(f"{what} is a {type(part).__name__}; it takes an instance of {EXAMPLES[what]}")
+    backward = Implicit() if backward is None else backward
+    check_parts(scene, energy, solver, backward)
     scene.validate_values()
     check_forecast(states, probabilities, scene)
     check_number("noise", noise, zero=True)
-    if isinstance(inverse_temperature, Tensor):
-        real = inverse_temperature.is_floating_point() and not inverse_temperature.dim()
-        if not real or not inverse_temperature.isfinite() or inverse_temperature < 0:
-            raise ValueError(f"inverse_temperature must be one finite number, 0 or more, not {inverse_temperature}")
-    else:
-        check_number("inverse_temperature", inverse_temperature, zero=True)
-    for name, values in (("weights", weights), ("margins", margins)):
-        if values is not None and not isinstance(values, Mapping):
-            raise TypeError(
-                f"{name} is a {type(values).__name__}; it takes a mapping from names of features to numbers"
-            )
-    if _largest(inverse_temperature) > LARGEST:
-        raise ValueError(f"inverse_temperature must be at most {LARGEST:g}, not {_largest(inverse_temperature):g}")
+    check_inverse_temperature(inverse_temperature)
+    check_values("weights", weights)
+    check_values("margins", margins)
     if energy is not ENERGY and weights is None:
         names = [name for part in energy.weighted for name in part]
         raise ValueError(
             f"an energy of your own needs weights=, a number for each of {', '.join(names) or 'its features'}"
         )
     weights, margins = {**(WEIGHTS if energy is ENERGY else {}), **(weights or {})}, dict(margins or {})
-    for what, given in (("weights", weights), ("margins", margins)):
-        for name, value in given.items():
-            known = value.numel() > 0 if isinstance(value, Tensor) else is_number(value)
-            if known and not isinstance(value, Tensor) and value < 0:
-                raise ValueError(f"{what}[{name!r}] must be 0 or more, not {value:g}")
-            if known and LARGEST < _largest(value) < math.inf:
-                raise ValueError(f"{what}[{name!r}] must be at most {LARGEST:g} in size, not {_largest(value):g}")
     learned = (*weights.values(), *margins.values(), inverse_temperature)
     origin = origin_of(scene, states.dtype)
     if origin is not None:
@@ -164,19 +130,9 @@ def refine(
             inverse_temperature,
             noise,
             solver,
-            Implicit() if backward is None else backward,
+            backward,
         )
     return forecast if origin is None else moved_back(forecast, origin[:, None, None, None])
-
-
-def _largest(value: float | Tensor) -> float:
-    """The largest absolute value."""
-    if isinstance(value, Tensor):
-        return float(value.detach().abs().max())
-    try:
-        return abs(float(value))
-    except OverflowError:  # a whole number that no float holds
-        return sys.float_info.max
 
 
 def _requires_grad(value: float | Tensor) -> bool:

@@ -1,20 +1,39 @@
-"""Checks of given futures and probabilities, which may come from any program."""
+"""Checks of what a refinement is given: futures and probabilities of any program, weights, and parts of the game."""
 
 from __future__ import annotations
 
+import math
+import sys
 import warnings
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from epo_lightning.checks import check_number, is_number
 from epo_lightning.doubts import array, contradict
+from epo_lightning.game.energy import Energy
 from epo_lightning.scene import HEADING, SPEED, Scene
+from epo_lightning.solvers.backward import Backward
+from epo_lightning.solvers.base import Minimiser
 
 JUMP = 5.0
 """Distance [m] from the present position up to which a future may begin, besides three times what the speed explains."""
 SUM_TOLERANCE = 1e-3
 """Largest difference from one of the sum of a scene's probabilities; files of predictions are often rounded."""
+LARGEST = 1e6
+"""Largest weight, margin and inverse temperature: squares and products of larger ones leave the range of float32."""
+PARTS = {
+    "scene": (Scene, "epo_lightning.Scene"),
+    "energy": (Energy, "epo_lightning.game.energy.Energy, such as epo_lightning.FeatureEnergy(...)"),
+    "solver": (Minimiser, "epo_lightning.solvers.base.Minimiser, such as epo_lightning.LevenbergMarquardt(...)"),
+    "backward": (
+        Backward,
+        "epo_lightning.solvers.backward.Backward: Implicit(), Unrolled(), Truncated(...) or Detached()",
+    ),
+}
+"""Classes of the arguments of :func:`~epo_lightning.refinement.refine` that are parts, and how to get an instance."""
 
 
 def check_forecast(states: Tensor, probabilities: Tensor, scene: Scene) -> None:
@@ -66,6 +85,53 @@ def check_forecast(states: Tensor, probabilities: Tensor, scene: Scene) -> None:
         )
 
 
+def check_parts(scene: Scene, energy: Energy, solver: Minimiser, backward: Backward) -> None:
+    """Check the types of scene and parts.
+
+    Raises:
+        TypeError: the argument, its type, and what it takes.
+    """
+    for name, part in (("scene", scene), ("energy", energy), ("solver", solver), ("backward", backward)):
+        kind, example = PARTS[name]
+        if not isinstance(part, kind):
+            raise TypeError(f"{name} is a {type(part).__name__}; it takes an instance of {example}")
+
+
+def check_inverse_temperature(value: float | Tensor) -> None:
+    """Check an inverse temperature, a number or a tensor with a single entry.
+
+    Raises:
+        ValueError: it is negative, above :data:`LARGEST`, or no real number.
+    """
+    if isinstance(value, Tensor):
+        real = value.is_floating_point() and not value.dim()
+        if not real or not value.isfinite() or value < 0:
+            raise ValueError(f"inverse_temperature must be one finite number, 0 or more, not {value}")
+    else:
+        check_number("inverse_temperature", value, zero=True)
+    if _largest(value) > LARGEST:
+        raise ValueError(f"inverse_temperature must be at most {LARGEST:g}, not {_largest(value):g}")
+
+
+def check_values(what: str, given: Mapping[str, float | Tensor] | None) -> None:
+    """Check the sizes of weights or margins by feature; their names and shapes are those of an energy and a scene.
+
+    Raises:
+        TypeError: no mapping.
+        ValueError: a negative number, or one whose square leaves the range of single precision.
+    """
+    if given is None:
+        return
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{what} is a {type(given).__name__}; it takes a mapping from names of features to numbers")
+    for name, value in given.items():
+        known = value.numel() > 0 if isinstance(value, Tensor) else is_number(value)
+        if known and not isinstance(value, Tensor) and value < 0:
+            raise ValueError(f"{what}[{name!r}] must be 0 or more, not {value:g}")
+        if known and LARGEST < _largest(value) < math.inf:
+            raise ValueError(f"{what}[{name!r}] must be at most {LARGEST:g} in size, not {_largest(value):g}")
+
+
 def _warn_of_beginnings(states: Tensor, scene: Scene) -> None:
     """Warn of futures that begin far from the present positions, or with another velocity than the present one.
 
@@ -98,3 +164,13 @@ def _warn_of_beginnings(states: Tensor, scene: Scene) -> None:
             "one dt after the present?"
         )
     warnings.warn(said, stacklevel=4)
+
+
+def _largest(value: float | Tensor) -> float:
+    """The largest absolute value."""
+    if isinstance(value, Tensor):
+        return float(value.detach().abs().max())
+    try:
+        return abs(float(value))
+    except OverflowError:  # a whole number that no float holds
+        return sys.float_info.max
