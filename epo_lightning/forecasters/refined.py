@@ -75,11 +75,13 @@ class Refined(Forecaster):
                 f"a refinement decodes no margins: fix those of {', '.join(energy.decoded_margins)} in metres, such as "
                 f"energy.margins={{{energy.decoded_margins[0]}: 0.5}}"
             )
-        _check_task(given.task, task)
+        _check_task(given, task)
         check_number("forecaster.inverse_temperature", inverse_temperature)
         check_number("forecaster.noise", noise, zero=True)
         super().__init__(task, optimizer)
         self.given = given.eval().requires_grad_(False)
+        self.reads_history, self.reads_goal_headings = given.reads_history, given.reads_goal_headings
+        self.longest_game = given.longest_game
         self.energy, self.solver, self.objective, self.noise = energy, solver, objective, noise
         self.differentiable_solve = backward  # a LightningModule has a method `backward`
         own, pair = energy.weighted
@@ -147,17 +149,19 @@ def _check_pair_start(start: float | Mapping[str, float], features: Sequence[str
         check_number(f"forecaster.pair_start.{name}", value)
 
 
-def _check_task(given: Task, task: Task) -> None:
+def _check_task(given: Forecaster, task: Task) -> None:
     """Refuse to refine a forecaster of scenes with other sizes or units.
 
     Raises:
         ConfigError: the message names what differs.
     """
-    names = ("horizon", "dt", "candidates", "map", "scale")
-    differing = [name for name in names if getattr(given, name) != getattr(task, name)]
+    names, known = ["horizon", "dt", "candidates", "map", "scale"], given.task
+    if given.reads_history and None not in (known.history, task.history):
+        names.append("history")
+    differing = [name for name in names if getattr(known, name) != getattr(task, name)]
     if differing:
         shown = ", ".join(
-            f"{name} is {getattr(given, name)} there and {getattr(task, name)} here" for name in differing
+            f"{name} is {getattr(known, name)} there and {getattr(task, name)} here" for name in differing
         )
         raise ConfigError(
             f"forecaster.frozen was trained for scenes of another kind: {shown}; choose the data it knows"

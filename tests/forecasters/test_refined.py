@@ -148,6 +148,7 @@ GIVEN = highway_model(marginal(3))
             {"given": highway_model(marginal(3), dt=0.1, horizon=7)},
             "horizon is 7 there and 8 here, dt is 0.1 there and 0.2",
         ),
+        ({"given": highway_model(marginal(3), history=3), "history": 5}, "history is 3 there and 5 here"),
         (
             {"given": GIVEN, "energy": {"name": "features", "own": ["accref"], "pair": ["clearance"]}},
             "fix those of clearance in metres",
