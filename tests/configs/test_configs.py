@@ -15,6 +15,7 @@ import pytest
 from experiment import tiny
 from experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
 from hydra.types import RunMode
+from omegaconf import OmegaConf
 from suites import untrained
 
 from epo_lightning.data.datamodule import SceneDataModule
@@ -375,6 +376,12 @@ def test_other_folders_beside_the_tree_are_not_groups() -> None:
         ),
         (
             "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [_self_, rpi/v_lstm]\ntitle: mine",
+            "experiment=mine",
+            r"in the defaults list of /.*experiment/mine\.yaml, `- _self_` stands before `- rpi/v_lstm`, .* `- _self_` last",
+        ),
+        (
+            "experiment/mine.yaml",
             "title: mine",
             "experiment=mine",
             "mine.yaml must begin with the line `# @package _glo",
@@ -395,6 +402,20 @@ def test_mistakes_in_files_of_the_tree_are_named(
     (tmp_path / file).write_bytes(content.encode() if isinstance(content, str) else content)
     with pytest.raises(ConfigError, match=message):
         compose("train", [words], [str(tmp_path)])
+
+
+@pytest.mark.parametrize("base", ["rpi/v_lstm_sc_relaxed", "us101/vibes_epo"])
+def test_rows_of_own_can_be_based_on_any_row(base: str, tmp_path: Path) -> None:
+    """Rows name their bases from the root of the tree: a relative name would be looked up beside the row of one's own."""
+    for file in (CONF / "experiment").rglob("*.yaml"):
+        bases = [entry for entry in OmegaConf.load(file).get("defaults", []) if isinstance(entry, str)]
+        assert all(entry == "_self_" or entry.startswith("/experiment/") for entry in bases), file
+    mine = tmp_path / "experiment" / "rpi" / "mine.yaml"
+    mine.parent.mkdir(parents=True)
+    mine.write_text(f"# @package _global_\ndefaults: [/experiment/{base}, _self_]\ntitle: mine\n")
+    config = compose("train", ["experiment=rpi/mine"], [str(tmp_path)])
+    assert config["title"] == "mine"
+    assert row_identity({**config, "title": ""}, "") == row_identity({**of_experiment(base), "title": ""}, "")
 
 
 def test_a_file_of_the_tree_is_read_again_when_it_has_changed(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult
-from omegaconf import OmegaConf
+from omegaconf import Container, DictConfig, OmegaConf
 from yaml import YAMLError
 
 from epo_lightning.registry import ConfigError
@@ -65,10 +65,13 @@ class TreeSource(ParsedOnce):
     def load_config(self, config_path: str) -> ConfigResult:
         row = self._row_on_highways(config_path)
         if row is None:
-            return super().load_config(config_path)
+            found = super().load_config(config_path)
+            if config_path.startswith(f"{EXPERIMENTS}/"):
+                _check_order(Path(self.path) / self._normalize_file_name(config_path), found.config)
+            return found
         data, name = row
         return ConfigResult(
-            config=OmegaConf.create({"defaults": [f"highway/{name}", {"override /data": data}]}),
+            config=OmegaConf.create({"defaults": [f"/experiment/highway/{name}", {"override /data": data}]}),
             path=f"{self.scheme()}://{self.path}",
             provider=self.provider,
             header={"package": "_global_"},
@@ -103,6 +106,21 @@ class TreeSource(ParsedOnce):
         if not super().is_config(f"{EXPERIMENTS}/highway/{name}"):
             return None
         return folder.partition("/")[2], name
+
+
+def _check_order(file: Path, config: Container) -> None:
+    """Refuse a row that lists itself before the row that it is based on, whose settings would replace its own.
+
+    Raises:
+        ConfigError: the file, and what to change.
+    """
+    defaults = list(config.get("defaults") or []) if isinstance(config, DictConfig) else []
+    later = defaults[defaults.index("_self_") + 1 :] if "_self_" in defaults else []
+    if based := [entry for entry in later if isinstance(entry, str)]:
+        raise ConfigError(
+            f"in the defaults list of {file}, `- _self_` stands before `- {based[0]}`, whose settings would replace those "
+            "of this file: put `- _self_` last"
+        )
 
 
 def recorded_name(experiment: str, data: str) -> str:
