@@ -114,6 +114,18 @@ def test_a_distant_car_on_the_line_does_not_change_who_avoids_whom():
     assert (swerve(Scene(rows[None, :2, None], dt=DT))[..., 1] < 0).all(), "both turn to their right"
 
 
+def test_absent_agents_on_the_line_are_not_avoided():
+    """Padding may hold any numbers, such as zeros on the line of an agent that drives along the x axis."""
+    rows = torch.tensor([[-9.0, 0.0, 0.0, 8.0], [0.0, 0.0, 0.0, 0.0], [30.0, 0.0, math.pi, 8.0]]).double()
+    for there, turned in (([1, 0, 0], 0), ([1, 1, 0], 2), ([1, 0, 1], 2)):
+        mask = torch.tensor([there], dtype=torch.bool)
+        found = swerve(Scene(rows[None, :, None], dt=DT, agent_mask=mask))[0, :, 1]
+        assert int((found != 0).sum()) == turned
+        assert (found[~mask[0]] == 0).all()
+    alone = swerve(Scene(rows[None, ::2, None], dt=DT))[0]
+    assert_close(found[::2], alone[:, 1], rtol=0, atol=0)
+
+
 def test_the_row_that_trains_weights_has_the_solver_of_refine():
     row = compose("train", ["experiment=highway/v_lstm_refined", "forecaster.frozen=rpi/v_lstm_epo"])
     assert build("solver", row["solver"]) == SOLVER

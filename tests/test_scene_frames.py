@@ -81,6 +81,20 @@ def test_opposed_headings_take_the_first_agent() -> None:
     assert float(aligned(Scene(history, dt=0.1)).current[0, 0, HEADING]) == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("off", "expected"),
+    [
+        (0.5, 1.0),  # the mean direction has the length sin(0.25) / 2 = 0.12: the heading of the first agent
+        (1.0, 0.5 + math.pi / 2),  # sin(0.5) / 2 = 0.24: the direction itself, halfway between 1.0 and off - pi + 1.0
+    ],
+)
+def test_directions_agree_by_the_length_of_their_mean(off: float, expected: float) -> None:
+    """Four agents: a sum of directions is four times as long as their mean."""
+    history = torch.zeros(1, 4, 1, 4).double()
+    history[0, :, 0, HEADING] = torch.tensor([1.0, 1.0, 1.0 - math.pi, 1.0 + math.pi - off])
+    assert float(aligned(Scene(history, dt=0.1)).frame[0, 2]) == pytest.approx(expected)
+
+
 def test_the_first_agent_may_be_absent_and_scenes_empty() -> None:
     history = torch.tensor([[[[7.0, 7.0, 2.0, 1.0]], [[0.0, 0.0, 1.0, 5.0]], [[9.0, 9.0, 1.0 + math.pi, 5.0]]]])
     scene = aligned(Scene(history, dt=0.1, agent_mask=torch.tensor([[False, True, True]])))

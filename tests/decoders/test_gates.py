@@ -99,6 +99,24 @@ def test_an_untrained_attention_gate_is_nearly_that_of_the_nearest_and_learns():
     assert all(parameter.grad.abs().sum() > 0 for parameter in attention.parameters())
 
 
+def test_features_of_absent_agents_have_no_meaning():
+    """Whatever they are: choice and factors are the same, and pairs of absent agents keep the factor of one."""
+    scene, z = highway_scene(4, 5), torch.randn(4, 5, 16)
+    scene = dataclasses.replace(scene, agent_mask=scene.agent_mask & (torch.arange(5) != 2))
+    attention = AttentionGate(2, 4, ahead=1.6, width=16, scale=20.0)
+    with torch.no_grad():
+        attention.key.weight.mul_(100.0)
+    found = [attention(z.masked_fill(~scene.agent_mask[..., None], value), scene) for value in (0.0, 1e3, math.nan)]
+    for chosen, factor in found:
+        assert torch.equal(chosen, found[0].chosen)
+        assert torch.equal(factor, found[0].factor)
+    absent = ~(scene.agent_mask[:, :, None] & scene.agent_mask[:, None])[:, *torch.triu_indices(5, 5, 1)]
+    assert absent.any()
+    assert not found[0].chosen[absent].any()
+    assert (found[0].factor[absent] == 1.0).all()
+    assert (found[0].factor[~absent] != 1.0).all()
+
+
 def test_the_score_decides_the_choice():
     """Agent 0 pays attention to agent 3 alone, however far it is."""
     scene, z = highway_scene(1, 4), torch.eye(4)[None]

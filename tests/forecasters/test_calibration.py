@@ -7,13 +7,14 @@ import math
 
 import pytest
 import torch
+from games import pad, widen
 
 import epo_lightning
 from epo_lightning import pretrained
 from epo_lightning.drive.rpi import ENERGY as RPI
 from epo_lightning.drive.rpi import RPIWorld
 from epo_lightning.forecast import GameParameters
-from epo_lightning.forecasters.calibration import Calibration
+from epo_lightning.forecasters.calibration import Calibration, _cost
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import HEADING, Scene, wrapped
@@ -166,6 +167,21 @@ def test_scenes_with_gaps_in_the_history_keep_their_weights() -> None:
     found = Calibration()(SOLVER, ENERGY, dataclasses.replace(scene, history_mask=seen), inferred)
     assert found.pair_weights["proximity"].flatten()[0] == 8.0
     assert abs(found.pair_weights["proximity"].flatten()[1] - 4.0) < 0.1
+
+
+def test_absent_agents_leave_no_gap_in_the_history() -> None:
+    true = torch.tensor([4.0], dtype=torch.double)
+    scene, goals = played(true)
+    inferred = parameters(2 * true, 1, AHEAD, goals)
+    assert not pad(scene).history_mask[:, 2:].any()
+    found = Calibration()(SOLVER, ENERGY, pad(scene), widen(inferred)).pair_weights["proximity"]
+    torch.testing.assert_close(found[..., 0], true[:, None], rtol=1e-2, atol=0)  # the pair of both present agents
+
+
+def test_the_cost_counts_deviations_in_their_own_spread() -> None:
+    """Two games, missed by 3 and 4 times the noise, at s = 1 with a spread of 2; the second one has no solution."""
+    missed = torch.tensor([[[3.0, 4.0], [3.0, math.nan]]])
+    assert _cost(missed, torch.ones(1, 2), 2.0).tolist() == [[25.0 + 1 / 4, math.inf]]
 
 
 def test_noise_moves_weights_less() -> None:

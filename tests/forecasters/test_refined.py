@@ -50,6 +50,19 @@ class Refinements:
     def test_gradients_reach_every_parameter(self):
         self.assert_learns()
 
+    def test_the_end_of_a_recorded_game_is_not_that_of_the_refinement(self):
+        """The game of a refinement ends with the forecast; ``game_steps`` is the end of the game that was recorded."""
+        forecaster, scene = self.forecaster().eval(), self.crowded()
+        with torch.no_grad():
+            plain = forecaster.explain(scene, forecaster(scene))
+            for end in (1, 1000):
+                ended = Scene(**{**vars(scene), "game_steps": torch.full((len(scene.history),), end)})
+                found = forecaster.explain(ended, forecaster(ended))
+                for name in ("own_energy", "pair_energy"):
+                    terms = getattr(plain, name)
+                    assert any((value > 0).any() for value in terms.values())
+                    torch.testing.assert_close(getattr(found, name), terms, rtol=0, atol=0)
+
     def test_learning_fits_a_batch(self):
         """Futures that were made with other weights are better explained after some steps."""
         forecaster, scene = self.forecaster().train(), self.crowded()

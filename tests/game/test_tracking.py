@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from epo_lightning.game.double_integrator import DoubleIntegrator
 from epo_lightning.game.dynamics import Unicycle
-from epo_lightning.game.tracking import demonstrated, observed_controls
+from epo_lightning.game.tracking import demonstrated, observed_controls, with_motion
 from epo_lightning.scene import HEADING, Scene
 
 EULER = Unicycle()
@@ -69,6 +69,32 @@ def test_a_rollout_follows_motion_of_other_dynamics():
     assert error.mean() < 0.25 * guess_error.mean()
     assert (error < 0.01).all()
     assert (found - controls).square().mean().sqrt() < 0.1
+
+
+def test_the_distance_that_remains_is_a_mean_over_observed_steps():
+    """Against a loop: steps that were not observed count neither as hits nor as misses."""
+    scene, _ = driven(dynamics=Unicycle("semi_implicit"), horizon=12)
+    seen = torch.rand(3, 2, 12) < 0.5
+    seen[0, 0] = False
+    scene = dataclasses.replace(scene, future_mask=seen)
+    found, error = observed_controls(EULER, scene)
+    reached = EULER.rollout(scene.current, found, scene.dt)
+    for b, i in ((b, i) for b in range(3) for i in range(2)):
+        missed = [(reached - scene.future)[b, i, k, :2].norm() for k in range(12) if seen[b, i, k]]
+        assert error[b, i].item() == pytest.approx(float(sum(missed)) / max(1, len(missed)), abs=1e-12)
+    assert error[0, 0] == 0.0
+    assert (error > 0).sum() == 5
+
+
+def test_heading_and_speed_of_a_motion_have_no_gradient():
+    """The direction of a standing agent has no derivative: NaN must not come back through it to the positions."""
+    positions = torch.tensor([[1.0, 2.0], [1.0, 2.0], [1.0, 5.0]], dtype=torch.float64, requires_grad=True)
+    current = torch.tensor([1.0, 2.0, 0.7, 0.0], dtype=torch.float64)
+    states = with_motion(positions, current, 0.5)
+    expected = [[1.0, 2.0, 0.7, 0.0], [1.0, 2.0, 0.7, 0.0], [1.0, 5.0, math.pi / 2, 6.0]]
+    assert_close(states, torch.tensor(expected, dtype=torch.float64))
+    states.sum().backward()
+    assert torch.equal(positions.grad, torch.ones_like(positions))
 
 
 def test_noise_does_not_become_wild_controls():

@@ -132,6 +132,21 @@ def test_a_nan_forecast_has_infinite_scores() -> None:
     assert all(value.isposinf() for value in metrics.compute().values())
 
 
+def test_broken_probabilities_do_not_enter_the_calibration() -> None:
+    """A scene whose probabilities are not numbers makes no statement: the calibration error is that of the other scenes."""
+    case, _ = big_case()
+    broken = dataclasses.replace(case.forecast(), probabilities=case.probabilities.clone())
+    broken.probabilities[3] = torch.nan
+    broken.probabilities[8, 0] = torch.nan
+    scores = []
+    for forecast, scenes in ((broken, range(23)), (case.forecast(), [i for i in range(23) if i not in (3, 8)])):
+        metrics = ForecastMetrics()
+        for i in scenes:
+            metrics.update(forecast[i : i + 1], case.scene()[i : i + 1])
+        scores.append(float(metrics.compute()["ECE"]))
+    assert scores[0] == pytest.approx(scores[1], abs=1e-12)
+
+
 def test_absent_agents_do_not_count() -> None:
     """Absent agents are ignored for any values in the forecast, the future, its mask and the sizes."""
     case, subset = big_case()

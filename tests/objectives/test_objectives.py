@@ -38,6 +38,24 @@ def test_the_difference_after_the_forecast_is_a_mean_over_scenes() -> None:
         assert float(_difference_ahead(scene, forecast)) == expected
 
 
+def test_the_difference_after_the_forecast_teaches_the_initial_controls_alone() -> None:
+    """The solution is what they should become: it is not drawn towards them. By hand: 1 / (1 mode, 1 agent, 1 step, 2)."""
+    initial, controls = torch.ones(1, 1, 1, 3, 2).requires_grad_(), torch.zeros(1, 1, 1, 3, 2).requires_grad_()
+    states, none = torch.zeros(1, 1, 1, 3, 4), torch.zeros(1, 1)
+    forecast = JointForecast(
+        states=states[..., :2, :],
+        probabilities=torch.ones(1, 1),
+        parameters=GameParameters(own_weights={}, pair_weights={}, initial_controls=initial),
+        solution=Solution(controls, states, none, none, none, none.long()),
+    )
+    difference = _difference_ahead(Scene(history=torch.zeros(1, 1, 1, 4), dt=0.1), forecast)
+    assert isinstance(difference, torch.Tensor)
+    difference.backward()
+    assert controls.grad is None
+    assert initial.grad is not None
+    assert initial.grad.flatten().tolist() == [0.0, 0.0, 0.0, 0.0, 0.5, 0.5]
+
+
 class TestImitation(ObjectiveSuite):
     config = {"name": "imitation", "weights": {"imitation": 1.0, "goal": 0.1, "probability": 0.1, "initial": 1.0}}
 

@@ -172,6 +172,15 @@ def test_probabilities_and_missed_alternatives_have_a_table_of_the_rows_that_wer
     assert "(1 - p)^2" not in legend([tables["executed and alternative and calm apart"]])
 
 
+def test_the_most_likely_mode_alone_has_no_table(tmp_path: Path) -> None:
+    """It would repeat the main table: only forecasts of several modes have scores of the k most likely ones."""
+    make_run(tmp_path / "one", "V-LSTM", "marginal", scores(0.3) | {"minSADE_1": 0.3})
+    assert not [table for table in build_tables(collect(tmp_path)) if "most likely" in table.title]
+    make_run(tmp_path / "two", "V-LSTM + EPO", "epo", scores(0.3) | {"minSADE_1": 0.4, "minSADE_2": 0.3})
+    (table,) = (table for table in build_tables(collect(tmp_path)) if "most likely" in table.title)
+    assert [column.metric for column in table.columns] == ["minSADE_1", "minSADE_2"]
+
+
 def test_interactive_scenes_have_a_table_with_all_columns(tmp_path: Path) -> None:
     calm, interactive = (
         {f"{name}/{metric}": score for metric, score in scores(*values).items()}

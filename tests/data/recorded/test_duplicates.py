@@ -12,7 +12,17 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from epo_lightning.data.recorded.duplicates import AGAIN, ELSEWHERE, ENOUGH, RUN, Drives, align, used_once
+from epo_lightning.data.recorded.duplicates import (
+    AGAIN,
+    CHANGES,
+    ELSEWHERE,
+    ENOUGH,
+    RUN,
+    Drives,
+    align,
+    runs,
+    used_once,
+)
 from epo_lightning.data.recorded.extraction import _raw
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.tables import SceneTables
@@ -244,3 +254,15 @@ def test_lankershim_files_that_are_copies_of_others_give_no_second_scene(tmp_pat
     assert not kept["2_18"].any(), "a copy under other coordinates"
     assert counts["2_18"][AGAIN] == len(tables["2_18"])
     assert kept["2_4"].all()
+
+
+@pytest.mark.parametrize(("changes", "found"), [(CHANGES - 1, 0), (CHANGES, 1), (RUN - 1, 1)])
+def test_a_run_identifies_a_vehicle_from_a_number_of_changes_on(changes: int, found: int) -> None:
+    """One run of speeds that rise ``changes`` times and are constant afterwards, and its equal elsewhere and later."""
+    speed = 5.0 + 0.1 * np.minimum(np.arange(RUN), changes)
+    place = np.stack([speed.cumsum(), np.zeros(RUN)], 1)
+    agent = np.zeros(RUN, dtype=int)
+    first, key = runs(Drives(RATE, agent, np.arange(RUN), place, speed, np.array([7])))
+    assert first.tolist() == [0] * found
+    _, again = runs(Drives(RATE, agent, 50 + np.arange(RUN), place + 9.0, speed, np.array([3])))
+    assert key.tolist() == again.tolist()

@@ -404,3 +404,11 @@ def test_joined_scenes_are_the_same_scenes():
 def test_invalid_window_settings_are_refused(key, value, message):
     with pytest.raises(ConfigError, match=message):
         WindowConfig(**{key: value})
+
+
+@pytest.mark.parametrize(("radius", "found"), [(30.0, True), (29.99, False)])
+def test_a_neighbour_may_be_as_far_away_as_the_radius(radius, found):
+    """Two vehicles that stand 30 m apart."""
+    of = recording(vehicles=[(1, 100.0, 0, 0.0, None), (2, 130.0, 0, 0.0, None)])
+    scenes, _ = extract(of, WindowConfig(agents=2, least_agents=2, radius=radius, lane_change=False))
+    assert (scenes is not None) == found

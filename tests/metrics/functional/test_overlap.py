@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from epo_lightning.metrics.functional import overlap_rate, overlapping_pairs
+from epo_lightning.metrics.functional.overlap import overlaps, overlaps_with
 from epo_lightning.registry import ConfigError
 
 from .. import reference
@@ -107,6 +108,23 @@ def test_scene_is_the_same_alone_in_a_batch_and_padded(shape: str) -> None:
         shape,
     )
     assert torch.equal(padded.nan_to_num(-1), whole.nan_to_num(-1))
+
+
+@pytest.mark.parametrize("shape", ["disc", "box"])
+@pytest.mark.parametrize("agent", [0, 1, 2])
+def test_overlaps_with_one_agent_are_those_of_its_pairs(shape: str, agent: int) -> None:
+    """Also where the agent itself is absent: then it overlaps nobody."""
+    case = make_case(3, scenes=60, steps=2)
+    states, sizes = case.states[:, 0], case.size
+    for one in (True, False):
+        there = case.agent_mask.clone()
+        there[:, agent] = one
+        every = overlaps(states, sizes, there, shape)
+        members = torch.triu_indices(states.shape[1], states.shape[1], 1)
+        mine = every[:, (members == agent).any(0)]  # pairs with an agent, in the order of the others
+        found = overlaps_with(agent, states, sizes, there, shape)
+        assert torch.equal(found, mine)
+        assert found.any() == one
 
 
 @pytest.mark.parametrize("shape", ["disc", "box"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from itertools import product
 
 import numpy as np
@@ -22,7 +23,7 @@ from epo_lightning.game.pairs import pairs
 from epo_lightning.metrics.forecast import equilibrium_values
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.diagnostics import quasi_newton
-from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
+from epo_lightning.solvers.diagnostics.equilibrium import Descent, equilibrium
 from epo_lightning.solvers.gauss_newton import backends, compiled, structured
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -547,3 +548,40 @@ def test_energies_without_a_minimum_have_no_optimum_and_no_gap(monkeypatch):
     metrics = equilibrium_values(dataclasses.replace(forecast, equilibrium=found))
     names = [name for name, value in metrics.items() if value[1].isnan()]
     assert names == ["energy_optimum", "nash_gap", "nash_gap_relative"]
+
+
+def test_a_best_response_is_the_better_of_two_minima_and_unknown_without_an_optimum(monkeypatch):
+    """With given minima instead of a minimiser: three scenes of two agents, in the second one no optimum is found."""
+    scene = random_scene(3, 2, dtype=torch.float64)
+    energy, parameters = FeatureEnergy(OWN, ["proximity"]), random_game(scene, 1, STEPS, own=OWN)
+    best = torch.randn_like(parameters.initial_controls)
+    starts = []
+
+    def values(*numbers):
+        return torch.tensor(numbers, dtype=torch.float64)
+
+    def descend(energy, scene, game, agent):
+        starts.append((game.initial_controls, agent))
+        if agent is None:
+            optimum, found = values(1.0, 1.5, 2.0), torch.tensor([True, False, True])
+            return Descent(values(9.0, 9.0, 9.0), optimum, best, values(0.0, 0.0, 0.0), found)
+        before = values(5.0, 6.0, 5.0, 5.0, 7.0, 5.0)
+        from_own, from_optimum = values(3.0, 1.0, 2.0, 2.0, 7.5, 4.0), values(2.0, 4.0, 2.0, 2.0, 7.2, torch.nan)
+        after = from_own if len(starts) == 2 else from_optimum
+        return Descent(before, after, game.initial_controls, before, torch.ones(6, dtype=torch.bool))
+
+    monkeypatch.setattr(importlib.import_module(equilibrium.__module__), "descend_features", descend)
+    found = report(energy, scene, parameters, parameters.initial_controls)
+    expected = values(5.0 - 2.0, 6.0 - 1.0, torch.nan, torch.nan, 0.0, 1.0).view(3, 2)
+    torch.testing.assert_close(found.nash_gap, expected, equal_nan=True)
+    torch.testing.assert_close(found.optimum, values(1.0, torch.nan, 2.0), equal_nan=True)
+    # The second minimisation starts at the agent's own strategy in the optimum; the other agent keeps its strategy.
+    (_, none), (first, agents), (second, _) = starts
+    assert none is None
+    assert agents.tolist() == [0, 1] * 3
+    solved = parameters.initial_controls
+    for world in range(6):
+        origin, mine = divmod(world, 2)
+        assert torch.equal(first[world], solved[origin])
+        assert torch.equal(second[world, 0, mine], best[origin, 0, mine])
+        assert torch.equal(second[world, 0, 1 - mine], solved[origin, 0, 1 - mine])

@@ -108,6 +108,18 @@ def test_messages_are_exact_on_trees(agents, edges, impossible):
     torch.testing.assert_close(bethe, total)
 
 
+@pytest.mark.parametrize("damping", [0.0, 0.3, 0.8])
+def test_the_damping_is_the_weight_of_the_old_message(damping):
+    """Two agents hear each other's message alone: after n updates it has the weight 1 - damping^n."""
+    unary, pair, everyone = drawn(agents=2)
+    to_second = (-unary[:, 0, :, None] - pair[:, 0]).logsumexp(1)
+    to_first = (-unary[:, 1, None] - pair[:, 0]).logsumexp(2)
+    for updates in (1, 2, 3):
+        found, _ = assignments.sum_product(unary, pair, everyone, updates, damping)
+        belief = -unary + (1.0 - damping**updates) * torch.stack((to_first, to_second), 1)
+        torch.testing.assert_close(found, belief.log_softmax(-1))
+
+
 @pytest.mark.parametrize(
     ("spread", "worst", "typical", "worst_log_z"),
     [(0.5, 1e-3, 2e-4, 2.5e-3), (2.0, 5e-2, 1e-2, 0.2), (5.0, 0.35, 8e-2, 1.5)],
@@ -309,3 +321,14 @@ def test_single_precision_and_large_energies():
     assert log_partition.dtype == bethe.dtype == torch.float32
     assert log_marginals.isfinite().all()
     torch.testing.assert_close(found.exp(), (-unary).softmax(-1), rtol=1e-3, atol=1e-5)
+
+
+def test_modes_may_be_exactly_as_far_apart_as_asked():
+    """One agent with candidates at 0, 0.5, 1 and 3 m, the cheapest first."""
+    unary = torch.arange(4.0)[None, None]
+    states = torch.zeros(1, 4, 1, 2, 4)
+    states[0, :, 0, :, 0] = torch.tensor([0.0, 0.5, 1.0, 3.0])[:, None]
+    pair, everyone = torch.zeros(1, 0, 4, 4), torch.ones(1, 1, dtype=torch.bool)
+    for apart, expected in ((1.0, [0, 2, 3]), (0.5, [0, 1, 2]), (1.01, [0, 3, 1])):
+        found, _ = assignments.best(unary, pair, everyone, 3, states, apart)
+        assert found[0, :, 0].tolist() == expected

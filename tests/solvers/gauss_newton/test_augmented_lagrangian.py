@@ -314,3 +314,21 @@ def test_games_that_end_early_have_the_derivative_of_finite_differences():
     expected = (total(1) - total(-1)) / (2 * step)
     assert (expected.abs() > 1e-3).all()
     torch.testing.assert_close((slope * along).sum((1, 2, 3)), expected, rtol=1e-4, atol=0)
+
+
+def test_moved_limits_reach_pairs_that_are_apart():
+    """Three agents, 1.7 m apart with discs of 0.6 m: limits that are moved by 1.5 m are violated, and by 0.5 m not."""
+    scene, parameters = meeting(3, steps=4)
+    controls = parameters.initial_controls
+    scene = dataclasses.replace(scene, history=scene.history * torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.double))
+    game = ConstrainedGame(ENERGY, ("proximity",), scene, parameters)
+    penalty = torch.full((1, 1), 10.0, dtype=torch.double)
+    apart = float((scene.current[0, 0, :2] - scene.current[0, 1, :2]).norm())
+    alone = float(game.objective(scene, parameters, controls))
+    for shift in (0.5, 1.5):
+        moved = {name: torch.full_like(value, 10.0 * shift) for name, value in game.excess(controls).items()}
+        augmented = game.augmented(moved, penalty, controls)
+        found = LevenbergMarquardt(steps=0, backend="pytorch")(*augmented)
+        violation = max(0.0, 0.6 + shift - apart)
+        assert float(found.energy) == pytest.approx(alone + 3 * 4 * 0.5 * 10.0 * violation**2)
+        assert (violation > 0) == (shift > 1)

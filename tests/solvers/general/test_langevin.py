@@ -10,7 +10,7 @@ from games import ALL, BOUNDS, leaves_of, pad, random_game, random_scene, widen
 from epo_lightning.forecast import Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.solvers.general.dense import gauss_newton, gradient
-from epo_lightning.solvers.general.gradient_descent import GradientDescent
+from epo_lightning.solvers.general.gradient_descent import GradientDescent, Progress, descend
 from epo_lightning.solvers.general.langevin import Langevin
 
 GAME = FeatureEnergy(own=ALL, pair=["proximity"], bounds=BOUNDS)
@@ -116,3 +116,36 @@ def test_a_stopped_chain_stays_stopped():
     assert torch.equal(solution.status == Status.STOPPED, stopped)
     assert solution.controls[1].isfinite().all()
     assert torch.equal(solution.controls[0, 1], start[0, 1])
+
+
+def test_shorter_steps_have_the_noise_of_their_length():
+    """A step of eta / 4 has half the noise: the variance is 2 eta at any length, or the samples would not be of exp(-E)."""
+    scene = random_scene(dtype=torch.float64)
+    parameters = random_game(scene)
+    start = parameters.initial_controls
+    value, slope = gradient(GAME, scene, parameters, start)
+    progress = Progress(torch.full_like(value, 0.25), value, torch.ones_like(value, dtype=torch.bool))
+    delta, scale = 0.02, torch.tensor([1.0, 0.5], dtype=torch.float64)
+    torch.manual_seed(3)
+    found, _ = descend(GAME, scene, parameters, 1, 0.5 * delta**2, scale.tolist(), delta, progress)
+    torch.manual_seed(3)
+    noise = 0.5 * delta * scale * torch.randn_like(start)
+    expected = start - 0.25 * 0.5 * delta**2 * scale.square() * slope + noise
+    torch.testing.assert_close(found.controls, expected, rtol=0, atol=1e-12)
+
+
+def test_chains_do_not_drift_away_from_their_lowest_energy():
+    """What counts is the lowest energy so far, and not the present one: else the energy could rise at every step."""
+    scene = random_scene(dtype=torch.float64)
+    parameters = random_game(scene)
+    start = parameters.initial_controls
+    value, _ = gradient(GAME, scene, parameters, start)
+    slack = 10.0 * (5.0 + start[0, 0].numel() / 2)  # ten times the n / 2 of n controls, and some more for few of them
+    full, taken = torch.ones_like(value), torch.ones_like(value, dtype=torch.bool)
+    for above, good in ((0.9 * slack, True), (1.1 * slack, False)):
+        torch.manual_seed(3)
+        found, progress = descend(
+            GAME, scene, parameters, 1, 1e-8, [1.0, 1.0], 1e-4, Progress(full, value - above, taken)
+        )
+        assert (progress.length == (1.0 if good else 0.5)).all()
+        assert (found.controls != start).all() == good
