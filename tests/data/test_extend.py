@@ -1,4 +1,4 @@
-"""The recording format of docs/extend.md, run unchanged."""
+"""The recording format of docs/tutorial.md, with the settings of docs/extend.md."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.experiment.config.compose import tree
 
-PAGE = Path(__file__).parents[2] / "docs" / "extend.md"
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 @pytest.fixture
 def settings(tmp_path: Path):
-    """The page's format, registered, and its YAML over those that it builds on."""
-    section = PAGE.read_text().split("## A recording format")[1].split("\n## ")[0]
-    (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    """The tutorial's format, registered, and the YAML of extend.md over those that it builds on."""
+    section = (DOCS / "extend.md").read_text().split("## A recording format")[1].split("\n## ")[0]
+    (code,) = re.findall(
+        r"^`my_format.py`:\n\n```python\n(.*?)```", (DOCS / "tutorial.md").read_text(), re.DOTALL | re.MULTILINE
+    )
     (text,) = re.findall(r"```yaml\n(.*?)```", section, re.DOTALL)
     exec(code, {})
     merged: dict = {}
@@ -33,7 +35,7 @@ def settings(tmp_path: Path):
         merged = {**merged, **entries, "windows": windows}
     merged.pop("name")
     yield {**merged, "folder": str(tmp_path), "root": str(tmp_path / "cache")}
-    del registry._PARTS["format"]["plain_csv"]
+    del registry._PARTS["format"]["my_csv"]
 
 
 def walkers(seed: int) -> pl.DataFrame:

@@ -23,7 +23,6 @@ EXAMPLES = {
     "test_curvature",
     "rpi_curvature",
     "v_lstm_epo_curvature",
-    "plain_csv",
 }
 """Files that the pages tell a reader to write."""
 
