@@ -23,7 +23,15 @@ from epo_lightning.data.recorded.gathering import gather
 from epo_lightning.data.recorded.parts import Launch, Lazy, Parts
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
-from epo_lightning.data.recorded.sources import absent, altered, check_names, fingerprints, warn_of_copies, with_options
+from epo_lightning.data.recorded.sources import (
+    absent,
+    altered,
+    check_names,
+    code_of,
+    fingerprints,
+    warn_of_copies,
+    with_options,
+)
 from epo_lightning.data.recorded.splits import ALL, UNITS, SplitRule
 from epo_lightning.data.recorded.tables import selected
 from epo_lightning.data.recorded.tracks import RecordingSource
@@ -108,7 +116,7 @@ class RecordedData(SceneDataModule):
         super().__init__(batch_size, seed, share)
         self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
         self.options = dict(options or {})
-        self.list_sources = with_options(format, self.options)
+        self.list_sources, self.reader = with_options(format, self.options), code_of(format)
         self.windows = read(WindowConfig, windows, "data.windows")
         self.num_agents, self.history = self.windows.agents, self.windows.history
         if self.windows.lane_change and not map:
@@ -240,6 +248,7 @@ class RecordedData(SceneDataModule):
             "map": self.task.map,
             # Data sets without options keep the names that they had before formats had any.
             **({"options": self.options} if self.options else {}),
+            **({"reader": self.reader} if self.reader else {}),
             # A default is no part of the configuration, so that data sets of older versions keep theirs.
             **({} if self.duplicates == "keep" else {"duplicates": self.duplicates}),
         }

@@ -17,9 +17,9 @@ from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded import sources
 from epo_lightning.data.recorded.recordings import RecordedData
-from epo_lightning.data.recorded.sources import fingerprint
+from epo_lightning.data.recorded.sources import SHIPPED, code_of, fingerprint
 from epo_lightning.data.recorded.tracks import RecordingSource
-from epo_lightning.registry import ConfigError, register
+from epo_lightning.registry import ConfigError, parts, register
 
 from .roads import FOUR, curve, recording
 
@@ -186,6 +186,22 @@ def test_the_digest_depends_on_the_contents_of_the_files(folder):
     assert data(folder, windows={"dt": 0.2, "radius": 50.0}).digest != before
     (folder / "a-0.road").write_text("3.0")
     assert data(folder).digest != before
+
+
+def test_the_digest_depends_on_the_file_of_an_own_format_and_on_no_shipped_one(folder, tmp_path):
+    """Scenes of an earlier reader are not taken for those of a mended one; shipped formats have a version instead."""
+    file, found = tmp_path / "mine.py", []
+    text = "from pathlib import Path\n\ndef mine(folder: Path) -> list:\n    return shown(folder)\n"
+    for content in (text, text, text + "# mended\n"):
+        file.write_text(content)
+        module = {"__name__": "elsewhere", "shown": roads}
+        exec(compile(content, file, "exec"), module)
+        register("format", "mine")(module["mine"])
+        found.append(data(folder, format="mine").digest)
+    assert found[0] == found[1] != found[2]
+    own = {name for name, part in parts("format").items() if part.__module__.startswith("epo_lightning.")}
+    assert own == set(SHIPPED)
+    assert not any(code_of(name) for name in SHIPPED)
 
 
 def test_fingerprints_cover_small_files_and_samples_of_large_ones(tmp_path):
