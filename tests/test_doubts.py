@@ -13,6 +13,7 @@ from games import highway_scene
 import epo_lightning
 from epo_lightning import Scene, pretrained
 from epo_lightning.doubts import of_goal_headings, of_motion
+from epo_lightning.forecasters.base import PLAUSIBLE
 from epo_lightning.forecasters.constant_velocity import ConstantVelocity
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.optimizers import Adam
@@ -138,12 +139,14 @@ def test_a_prediction_warns() -> None:
     name = "rpi/v_lstm_epo"
     forecaster, scene = epo_lightning.load(name), pretrained.examples(name)
     wrong = dataclasses.replace(scene, history=scene.history.flip(2))
+    for _ in range(PLAUSIBLE - 1):
+        forecaster.predict(scene)
     with pytest.warns(UserWarning, match="do not move in the direction of their headings"):
         forecaster.predict(wrong)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         forecaster.predict(scene)
-        forecaster.predict(wrong)  # motions are looked at up to the first batch without a doubt
+        forecaster.predict(wrong)  # motions are looked at until so many batches had no doubt
 
 
 @pytest.mark.parametrize("name", ["rpi/v_lstm_epo", "rpi/v_lstm_epo_game_refined"])

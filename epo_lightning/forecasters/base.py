@@ -22,6 +22,10 @@ from epo_lightning.solvers.base import Minimiser
 from epo_lightning.task import Task
 
 
+PLAUSIBLE = 20
+"""Number of plausible batches after which :meth:`Forecaster.predict` looks at motions and coordinates no more."""
+
+
 class Forecaster(LightningModule):
     """A model from a :class:`Scene` to a :class:`JointForecast`, as a LightningModule.
 
@@ -49,7 +53,7 @@ class Forecaster(LightningModule):
 
     def __init__(self, task: Task, optimizer: Adam) -> None:
         super().__init__()
-        self._plausible = False  # whether `predict` has seen a batch whose motions are plausible
+        self._plausible = 0  # number of batches whose motions `predict` has found plausible
         self.task = task
         self.optimizer = optimizer
         self.val_metrics = ForecastMetrics(task.subsets, task.shape)
@@ -65,8 +69,8 @@ class Forecaster(LightningModule):
 
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
         other scenes of the batch are the same as without it. Warnings say how many joint modes violate hard constraints, and
-        which scenes are probably wrong (:mod:`epo_lightning.doubts`). Motions and coordinates are looked at up to the first
-        batch without a doubt: for every batch, this would take a tenth of a single scene's forecast.
+        which scenes are probably wrong (:mod:`epo_lightning.doubts`). Motions and coordinates are looked at until
+        :data:`PLAUSIBLE` batches had no doubt: for every batch, this would take a tenth of a single scene's forecast.
 
         Several threads may predict at once with a forecaster in evaluation mode, as ``epo_lightning.load`` returns it.
 
@@ -78,8 +82,8 @@ class Forecaster(LightningModule):
             raise TypeError(f"predict takes an epo_lightning.scene.Scene, not a {type(scene).__name__}")
         self._check_dt(scene)
         scene.validate_values()
-        motions = () if self._plausible else (doubts.of_motion(scene), doubts.of_coordinates(scene))
-        self._plausible = self._plausible or (not any(motions) and len(scene.history) > 0)
+        motions = () if self._plausible >= PLAUSIBLE else (doubts.of_motion(scene), doubts.of_coordinates(scene))
+        self._plausible += not any(motions) and len(scene.history) > 0
         length = doubts.of_history(scene, self.task.history) if self.reads_history else None
         headings = doubts.of_goal_headings(scene) if self.reads_goal_headings else None
         end = doubts.of_game_end(scene, self.longest_game)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from epo_lightning.data.recorded.tracks import TrackTable
 
 MOVING = 1.0
-"""Speed [m/s] above which a step counts; slower ones have no reliable direction."""
+"""Stated speed [m/s] above which a step counts, and twice the speed below which a displacement has no clear direction."""
 FEWEST = 20
 """Number of such steps from which on a recording is judged."""
 RATIO, ANGLE = 1.25, 30.0
@@ -30,11 +30,13 @@ def doubts(tracks: TrackTable) -> list[str]:
         moved = np.diff(tracks.position, axis=0)[same] * (tracks.rate / apart)[:, None]
     stated = 0.5 * (tracks.velocity[1:] + tracks.velocity[:-1])[same]
     ahead = np.stack((np.cos(tracks.heading), np.sin(tracks.heading)), -1)[1:][same]
-    fast = np.minimum(_length(moved), _length(stated)) > MOVING
+    fast = _length(stated) > MOVING
     if fast.sum() < FEWEST:
         return found
     moved, stated, ahead = moved[fast], stated[fast], ahead[fast]
-    if (angle := _angle(moved, stated)) > ANGLE:
+    clear = _length(moved) > MOVING / 2
+    enough = clear.sum() >= FEWEST
+    if enough and (angle := _angle(moved[clear], stated[clear])) > ANGLE:
         found.append(
             f"agents move in another direction than that of their velocities, by {angle:.0f} degrees in the median: have "
             "positions and velocities the same axes, x and y?"
@@ -47,7 +49,7 @@ def doubts(tracks: TrackTable) -> list[str]:
             f"agents move {ratio:.2g} times as fast in their positions as their velocities say, in the median: are both in "
             "m and m/s, and is the frame rate right?"
         )
-    if (angle := _angle(moved, ahead)) > ANGLE:
+    if enough and (angle := _angle(moved[clear], ahead[clear])) > ANGLE:
         found.append(
             f"agents move in another direction than that of their headings, by {angle:.0f} degrees in the median: headings "
             "are in rad, counter-clockwise from x"

@@ -51,6 +51,8 @@ def test_tracks_without_a_mistake_are_not_doubted() -> None:
     [
         (lambda t: {"position": 3.28 * t.position}, "agents move 3.3 times as fast in their positions"),
         (lambda t: {"velocity": 3.6 * t.velocity}, "agents move 0.28 times as fast in their positions"),
+        (lambda t: {"rate": 4.0}, "agents move 0.4 times as fast in their positions"),
+        (lambda t: {"rate": 1.0}, "agents move 0.1 times as fast in their positions"),
         (lambda t: {"rate": 25.0}, "agents move 2.5 times as fast in their positions"),
         (lambda t: {"position": t.position[:, ::-1]}, "another direction than that of their velocities"),
         (lambda t: {"heading": np.degrees(t.heading)}, "another direction than that of their headings"),
