@@ -18,6 +18,7 @@ from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report import EvaluatedRun, Report, build_tables, collect, write_report
+from epo_lightning.report.paper import has_values
 from epo_lightning.report.render import code
 from epo_lightning.report.results import read_results, results_name, save_results
 from epo_lightning.report.rows import Row
@@ -146,12 +147,14 @@ def preface(runs: Sequence[EvaluatedRun]) -> str:
     changed = sorted({word for word in words if word.lstrip("+").startswith(("trainer.", "data.")) and _matters(word)})
     if not budgets and not changed:
         return ""
-    changes = f" Changed by hand: {code(' '.join(changed))}." if changed else ""
-    return (
-        f"**Budget: {', '.join(budgets or ['paper'])}.**{changes} These runs saw other data or another number of steps than "
-        "the paper's, so the numbers show that everything works, not which row is best, and do not reproduce the table. The "
-        "paper's settings are those of `epo train` without `budget=`."
-    )
+    sentences = [f"**Budget: {', '.join(budgets or ['paper'])}.**"]
+    if changed:
+        sentences.append(f"Changed by hand: {code(' '.join(changed))}.")
+    if any(has_values(run.data) for run in runs):
+        sentences.append(
+            "These runs saw other data or another number of steps than the paper's, so they do not reproduce its table."
+        )
+    return " ".join([*sentences, "The paper's settings are those of `epo train` without `budget=`."])
 
 
 def _words(command: str) -> list[str]:

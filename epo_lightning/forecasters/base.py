@@ -21,7 +21,6 @@ from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import Minimiser
 from epo_lightning.task import Task
 
-
 PLAUSIBLE = 20
 """Number of plausible batches after which :meth:`Forecaster.predict` looks at motions and coordinates no more."""
 

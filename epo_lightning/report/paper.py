@@ -95,6 +95,11 @@ def papers_name(data: str) -> str:
     return re.sub(r"(, recipe \d+)?(, \S+ players)?$", "", data)
 
 
+def has_values(data: str) -> bool:
+    """Whether the paper has values for a data set (:func:`.runs.data_name`)."""
+    return any(papers_name(data) == known for known, *_ in PAPER)
+
+
 def paper_values(
     data: str,
     backbone: str,

@@ -144,7 +144,7 @@ class Results:
             if not runs:
                 raise ConfigError(f"results file {name} has no scored runs, so it cannot stand in the list of sources")
             data = dict.fromkeys(f"{run.data} ({run.data_digest})" for run in runs)
-            commits = sorted({run.git_commit[:7] for run in runs})
+            commits = sorted({run.git_commit[:7] + "+" * run.git_commit.endswith("+") for run in runs})
             seeds = sorted({run.seed for run in runs})
             steps = sorted({int(run.records.record["steps"]) for run in runs if run.learned}) or [0]
             lines.append(

@@ -15,6 +15,7 @@ from epo_lightning.report.choices import choices_to_yaml
 from epo_lightning.report.costs import cost_sheets, timings_of
 from epo_lightning.report.latex import comparisons_to_latex, sheet_to_latex, to_latex
 from epo_lightning.report.made import Made, how_made
+from epo_lightning.report.paper import has_values
 from epo_lightning.report.records import TIME, Records
 from epo_lightning.report.render import (
     COMPARISON_LEGEND,
@@ -220,7 +221,8 @@ def _caveat(tables: Sequence[Table]) -> str:
     """The preface in a sentence, for captions: tables are copied without the text around them."""
     budgets = sorted({run.budget for table in tables for row in table.rows for run in row.runs} - {"paper"})
     names = ", ".join(budgets or ["paper"])
-    return f"Budget: {names}, other data or steps than the paper's: does not reproduce its table."
+    others = ", other data or steps than the paper's: does not reproduce its table"
+    return f"Budget: {names}{others if any(has_values(table.data) for table in tables) else ''}."
 
 
 def _summary(left_out: Sequence[tuple[str, str]]) -> str:
