@@ -10,6 +10,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from epo_lightning.registry import ConfigError, nearest
+
 if TYPE_CHECKING:
     from epo_lightning.scene import Scene
 
@@ -43,17 +45,34 @@ def ships(folder: Path) -> bool:
 
 
 def card(run: str | Path) -> str:
-    """Model card of a shipped run, given by name or folder: data, budget, scores, limits, command, commit, seed."""
-    return ((folder_of(run) or Path(run)) / "card.md").read_text(encoding="utf-8")
+    """Model card of a shipped run, given by name or folder: data, budget, scores, limits, command, commit, seed.
+
+    Raises:
+        ConfigError: no forecaster of this name ships with the package.
+    """
+    return _shipped(run, "card.md").read_text(encoding="utf-8")
 
 
 def examples(run: str | Path) -> Scene:
-    """Scenes of the test split that ship with a run, given by name or folder, for forecasts without its data set."""
+    """Scenes of the test split that ship with a run, given by name or folder, for forecasts without its data set.
+
+    Raises:
+        ConfigError: no forecaster of this name ships with the package.
+    """
     import safetensors
 
     from epo_lightning.scene import Scene
 
-    folder = folder_of(run) or Path(run)
-    with safetensors.safe_open(folder / "scenes.safetensors", framework="pt") as file:
+    with safetensors.safe_open(_shipped(run, "scenes.safetensors"), framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         return Scene(**tensors, dt=float((file.metadata() or {})["dt"]))
+
+
+def _shipped(run: str | Path, name: str) -> Path:
+    """A file that ships with a run."""
+    file = (folder_of(run) or Path(run)) / name
+    if not file.is_file():
+        raise ConfigError(
+            f"no {file}: give the name of a forecaster that ships with the package ({nearest(str(run), names())})"
+        )
+    return file

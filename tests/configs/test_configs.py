@@ -256,6 +256,8 @@ MISTAKES = {
     "train -m sweeps=rpi_mein": "'rpi_main'",
     "train -m solver.steps=1,x": "solver.steps must be a whole number",
     "train --multrun": "'--multirun'",
+    "train experimnt=rpi/v_lstm": "did you mean 'experiment'?",
+    "train seed = 1": "without blanks",
     "train resume=nowhere": "does not exist",
     "config chekc": "'check'",
     "config check solver.step=3": "'steps'",
@@ -382,11 +384,23 @@ def test_other_folders_beside_the_tree_are_not_groups() -> None:
         ),
         (
             "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, override /backbone hivt_m, _self_]",
+            "experiment=mine",
+            r"experiment/mine\.yaml, `- override /backbone hivt_m` lacks a colon",
+        ),
+        (
+            "experiment/mine.yaml",
             "title: mine",
             "experiment=mine",
             "mine.yaml must begin with the line `# @package _glo",
         ),
         ("experiment/mine.yaml", b"\xe9: 1", "experiment=mine", r"experiment/mine\.yaml is not YAML: 'utf-8' codec"),
+        (
+            "sweeps/mine.yaml",
+            "# @package _global_\nhydra: {sweeper: {parms: {seed: '0,1'}}}",
+            "sweeps=mine",
+            r"sweeps/mine\.yaml has an unknown key 'parms' under hydra: .* hydra: \{sweeper: \{params: \.\.\.\}\}",
+        ),
         (
             "backbone/mine.yaml",
             "name: v_lstm\n  width: 3",

@@ -30,6 +30,12 @@ def test_every_recipe_has_a_forecaster() -> None:
     assert {ROW, "rpi/v_lstm_sc", "rpi/v_lstm_epo_game_refined", "highway_sim/hivt_m_epo"} <= set(NAMES)
 
 
+def test_a_name_that_does_not_ship_is_answered_by_those_that_do() -> None:
+    for read in (pretrained.card, pretrained.examples):
+        with pytest.raises(ConfigError, match=r"did you mean 'rpi/v_lstm_epo'\? known: highway_sim/"):
+            read("rpi/v_lstm_ep")
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_it_loads_by_name_and_has_the_scores_of_its_card(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

@@ -96,6 +96,12 @@ class TrackTable:
                 raise RecordingError(
                     path, f"track {track} has frame {frame} twice: is its id that of two agents, or a row repeated?"
                 )
+            if by_agent[row - 1] < 0:
+                raise RecordingError(
+                    path,
+                    f"frame {frame} of track {track} comes after frames of track {self.ids[self.agent[row - 1]]}: tracks are "
+                    "sorted by agent, and then by frame",
+                )
             raise RecordingError(
                 path,
                 f"frame {frame} of track {track} comes after its frame {before}: frames of a track must increase, and an id "

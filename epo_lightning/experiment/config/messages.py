@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from epo_lightning.experiment.config.sources import GROUP as SWEEPS
 from epo_lightning.experiment.config.sources import file_of, options_of
 from epo_lightning.registry import ConfigError, nearest, parts
 
@@ -35,7 +36,7 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
         yield
     except OverrideParseException as error:
         raise ConfigError(
-            f"cannot read the override {error.override!r}: write key=value, for example seed=1; "
+            f"cannot read the override {error.override!r}: write key=value without blanks, for example seed=1; "
             "a value with other than plain letters, digits and ._-/ needs quotes, \"key='value'\""
         ) from error
     except MissingConfigException as error:
@@ -51,11 +52,22 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
             raise ConfigError(_override(instance, relative.group(1), "<option>", overrides)) from error
         if unknown and "Multiple values" not in str(error):
             raise ConfigError(_unknown_key(instance, name, unknown.group(1), overrides)) from error
-        raise ConfigError(sentence(error)) from error
+        raise ConfigError(_in_file(str(error)) or sentence(error)) from error
     except ValueError as error:  # Hydra's own, for example debug=null
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(sentence(error)) from error
+
+
+def _in_file(message: str) -> str:
+    """The error message for a key that Hydra's own sections do not have, in the file that has it; empty for other errors."""
+    found = re.search(
+        r"In '([^']+)': ConfigKeyError raised while composing config:\s*Key '(\w+)' not in '\w+'", message
+    )
+    if found is None:
+        return ""
+    file, key = found.groups()
+    return f"{file}.yaml has an unknown key {key!r} under hydra: a sweep lists its runs in hydra: {{sweeper: {{params: ...}}}}"
 
 
 def without_header(instance: Hydra, experiment: str) -> str:
@@ -132,7 +144,7 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
     for word in key.replace("/", ".").split("."):
         names = [str(known) for known in config] if isinstance(config, DictConfig) else []
         if not walked and word != "hydra":
-            names = [known for known in names if known != "hydra"]
+            names = sorted({*names, *instance.config_loader.list_groups("")} - {"hydra", SWEEPS})
         if word == "gate" and not walked and "." in key:  # the group's settings are those of the forecaster
             return f"unknown key {key!r}: with gate=<one of {', '.join(options_of(instance, word))}> it is forecaster.{key}"
         if walked == ["forecaster"] and word == "gate" and word not in names:

@@ -67,7 +67,7 @@ class TreeSource(ParsedOnce):
         if row is None:
             found = super().load_config(config_path)
             if config_path.startswith(f"{EXPERIMENTS}/"):
-                _check_order(Path(self.path) / self._normalize_file_name(config_path), found.config)
+                _check_defaults(Path(self.path) / self._normalize_file_name(config_path), found.config)
             return found
         data, name = row
         return ConfigResult(
@@ -108,13 +108,18 @@ class TreeSource(ParsedOnce):
         return folder.partition("/")[2], name
 
 
-def _check_order(file: Path, config: Container) -> None:
-    """Refuse a row that lists itself before the row that it is based on, whose settings would replace its own.
+def _check_defaults(file: Path, config: Container) -> None:
+    """Refuse overrides without a colon, and a row that lists itself before its base, whose settings would replace its own.
 
     Raises:
         ConfigError: the file, and what to change.
     """
     defaults = list(config.get("defaults") or []) if isinstance(config, DictConfig) else []
+    for entry in defaults:
+        if isinstance(entry, str) and entry.startswith("override "):
+            raise ConfigError(
+                f"in the defaults list of {file}, `- {entry}` lacks a colon: write `- override /<group>: <option>`"
+            )
     later = defaults[defaults.index("_self_") + 1 :] if "_self_" in defaults else []
     if based := [entry for entry in later if isinstance(entry, str)]:
         raise ConfigError(

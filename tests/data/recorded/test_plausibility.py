@@ -84,3 +84,11 @@ def test_mistakes_are_named(mistake: Callable[[TrackTable], dict[str, np.ndarray
 def test_numbers_of_another_type_are_refused(name: str, given: np.ndarray, said: str) -> None:
     with pytest.raises(RecordingError, match=said):
         dataclasses.replace(walking(), **{name: given}).check("walking.csv")
+
+
+def test_tracks_that_are_not_sorted_by_agent_are_refused() -> None:
+    tracks = walking()
+    with pytest.raises(
+        RecordingError, match=r"frame 0 of track 0 comes after frames of track 1: tracks are sorted by agent"
+    ):
+        dataclasses.replace(tracks, agent=(tracks.agent + 1) % 2).check("walking.csv")
