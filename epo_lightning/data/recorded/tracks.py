@@ -99,8 +99,8 @@ class TrackTable:
             if by_agent[row - 1] < 0:
                 raise RecordingError(
                     path,
-                    f"frame {frame} of track {track} comes after frames of track {self.ids[self.agent[row - 1]]}: tracks are "
-                    "sorted by agent, and then by frame",
+                    f"frame {frame} of track {track} comes after frames of track {self.ids[self.agent[row - 1]]}: tracks "
+                    "are sorted by agent, and then by frame",
                 )
             raise RecordingError(
                 path,

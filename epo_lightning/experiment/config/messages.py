@@ -67,7 +67,7 @@ def _in_file(message: str) -> str:
     if found is None:
         return ""
     file, key = found.groups()
-    return f"{file}.yaml has an unknown key {key!r} under hydra: a sweep lists its runs in hydra: {{sweeper: {{params: ...}}}}"
+    return f"{file}.yaml has an unknown key {key!r} under hydra: a sweep's values stand in hydra.sweeper.params"
 
 
 def without_header(instance: Hydra, experiment: str) -> str:
