@@ -1,4 +1,4 @@
-# make run         from a bare machine to a first table with pictures: eight minutes on 2 idle cores, installation included
+# make run         from a bare machine to a first table with pictures: six to nine minutes on 2 cores, installation included
 # make install     the package and its command `epo` in .venv (`make run` does it)
 # make dev         install what the tests and checks need as well
 # make test        install everything and run the tests      make test-slow   the tests that take minutes

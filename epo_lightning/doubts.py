@@ -72,6 +72,12 @@ def of_motion(scene: Scene) -> str | None:
     )
 
 
+def shows_motion(scene: Scene) -> bool:
+    """Whether an agent moves, so that :func:`of_motion` can tell if units and axes are right."""
+    moves = abs(array(scene.current)[..., SPEED]) > SLACK  # False for NaN
+    return scene.history.shape[2] > 1 and bool((moves & array(scene.agent_mask)).any())
+
+
 @np.errstate(invalid="ignore", over="ignore")
 def of_goal_headings(scene: Scene) -> str | None:
     """A sentence on scenes whose goal headings were wrapped; None if there are none."""

@@ -12,7 +12,7 @@ from games import highway_scene
 
 import epo_lightning
 from epo_lightning import Scene, pretrained
-from epo_lightning.doubts import of_goal_headings, of_motion
+from epo_lightning.doubts import of_goal_headings, of_motion, shows_motion
 from epo_lightning.forecasters.base import PLAUSIBLE
 from epo_lightning.forecasters.constant_velocity import ConstantVelocity
 from epo_lightning.game.dynamics import Unicycle
@@ -139,8 +139,10 @@ def test_a_prediction_warns() -> None:
     name = "rpi/v_lstm_epo"
     forecaster, scene = epo_lightning.load(name), pretrained.examples(name)
     wrong = dataclasses.replace(scene, history=scene.history.flip(2))
-    for _ in range(PLAUSIBLE - 1):
-        forecaster.predict(scene)
+    standing = dataclasses.replace(scene, history=scene.history * torch.tensor([1.0, 1.0, 1.0, 0.0]))
+    for tried in (*[scene] * (PLAUSIBLE - 1), standing[:0]):
+        forecaster.predict(tried)
+    assert not shows_motion(standing)
     with pytest.warns(UserWarning, match="do not move in the direction of their headings"):
         forecaster.predict(wrong)
     with warnings.catch_warnings():

@@ -80,8 +80,15 @@ def refuse_changed(run: RunFolder, data: Any) -> None:
         )
     raise ConfigError(
         f"the data of {run.path} has changed since the run began (digest {began_with}, now {data.digest}): "
-        "restore the data of that digest, or train a new run"
+        f"{_restore(data)}, or train a new run"
     )
+
+
+def _restore(data: Any) -> str:
+    """What has to be restored for data to be that of a run."""
+    if isinstance(data, RecordedData) and data.reader:
+        return f"restore the recordings, or the file in which format {data.format!r} is registered"
+    return "restore the data of that digest"
 
 
 def split_of(data: Any, split: str) -> Any:

@@ -187,11 +187,13 @@ def check(settings: Settings, forecaster: Forecaster) -> None:
         return
     solver = forecaster.solver
     if solver is not None and solver.on_host:
-        name = settings.solver["name"]
+        named = " and ".join(
+            f"solver.{key}={settings.solver[key]}" for key in ("name", "backend") if key in settings.solver
+        )
         raise ConfigError(
-            f"trainer.graph=true with solver.name={name} and solver.backend={solver.backend}: its games are solved on "
-            "the host, which a CUDA graph cannot contain; set trainer.graph=false, or take solver=levenberg_marquardt with "
-            "solver.adaptive=false and solver.backend=warp (pip install 'epo_lightning[gpu]') or pytorch"
+            f"trainer.graph=true with {named}: its games are solved on the host, which a CUDA graph cannot contain; set "
+            "trainer.graph=false, or use levenberg_marquardt with solver.backend=pytorch, or with solver.backend=warp "
+            "(pip install 'epo_lightning[gpu]') and solver.adaptive=false"
         )
     for section in ("forecaster", "objective"):
         for name in SCHEDULES:

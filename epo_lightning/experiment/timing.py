@@ -50,7 +50,7 @@ def measure(run: RunFolder, settings: Settings) -> dict[str, Any]:
     solver = None if forecaster.solver is None else forecaster.solver.for_test()
     measured = {
         "agents": scenes[0].history.shape[1],
-        "steps": None if solver is None else solver.steps,
+        "steps": getattr(solver, "steps", None),
         "modes": forecast.states.shape[1],
         "batch": 1,
         "samples": SAMPLES,

@@ -22,7 +22,7 @@ from epo_lightning.solvers.base import Minimiser
 from epo_lightning.task import Task
 
 PLAUSIBLE = 20
-"""Number of plausible batches after which :meth:`Forecaster.predict` looks at motions and coordinates no more."""
+"""Number of plausible batches with moving agents after which :meth:`Forecaster.predict` does not look at motions again."""
 
 
 class Forecaster(LightningModule):
@@ -40,8 +40,8 @@ class Forecaster(LightningModule):
     """Whether forecasts depend on the headings that are wanted at goals."""
     reads_history: bool = True
     """Whether forecasts depend on states before the present one."""
-    solver: Minimiser | None = None
-    """The minimiser of its games, if it has games."""
+    solver: Minimiser | None
+    """The minimiser of its games; None for forecasters without games."""
     longest_game: int | None = None
     """Steps from t0 to the end of the longest game, if games go on after the forecast."""
     configuration: dict[str, Any]
@@ -52,6 +52,7 @@ class Forecaster(LightningModule):
 
     def __init__(self, task: Task, optimizer: Adam) -> None:
         super().__init__()
+        self.solver = None
         self._plausible = 0  # number of batches whose motions `predict` has found plausible
         self.task = task
         self.optimizer = optimizer
@@ -69,7 +70,7 @@ class Forecaster(LightningModule):
         The forecast of a scene with non-finite numbers is NaN, with a warning that names the scene; the forecasts of the
         other scenes of the batch are the same as without it. Warnings say how many joint modes violate hard constraints, and
         which scenes are probably wrong (:mod:`epo_lightning.doubts`). Motions and coordinates are looked at until
-        :data:`PLAUSIBLE` batches had no doubt: for every batch, this would take a tenth of a single scene's forecast.
+        :data:`PLAUSIBLE` batches with moving agents had no doubt: this takes a sixth of a single scene's forecast.
 
         Several threads may predict at once with a forecaster in evaluation mode, as ``epo_lightning.load`` returns it.
 
@@ -81,8 +82,9 @@ class Forecaster(LightningModule):
             raise TypeError(f"predict takes an epo_lightning.scene.Scene, not a {type(scene).__name__}")
         self._check_dt(scene)
         scene.validate_values()
-        motions = () if self._plausible >= PLAUSIBLE else (doubts.of_motion(scene), doubts.of_coordinates(scene))
-        self._plausible += not any(motions) and len(scene.history) > 0
+        looks = self._plausible < PLAUSIBLE
+        motions = (doubts.of_motion(scene), doubts.of_coordinates(scene)) if looks else ()
+        self._plausible += looks and not any(motions) and doubts.shows_motion(scene)
         length = doubts.of_history(scene, self.task.history) if self.reads_history else None
         headings = doubts.of_goal_headings(scene) if self.reads_goal_headings else None
         end = doubts.of_game_end(scene, self.longest_game)

@@ -72,7 +72,6 @@ def _shipped(run: str | Path, name: str) -> Path:
     """A file that ships with a run."""
     file = (folder_of(run) or Path(run)) / name
     if not file.is_file():
-        raise ConfigError(
-            f"no {file}: give the name of a forecaster that ships with the package ({nearest(str(run), names())})"
-        )
+        hint = nearest(str(run), names())
+        raise ConfigError(f"{str(run)!r} is no forecaster that ships with the package ({hint}): there is no {file}")
     return file

@@ -126,22 +126,24 @@ class Row:
 
 
 def of_different_code(rows: Sequence[Row]) -> list[str]:
-    """Notes on the data sets whose runs were trained by different code, as far as it was recorded."""
+    """Notes on the data sets whose runs were trained by different code; where it was not recorded, at different commits."""
     notes = []
     for data in dict.fromkeys(row.runs[0].data for row in rows):
         codes: dict[str, dict[str, list[str]]] = {}
         for row in rows:
             for run in row.runs:
-                if run.data == data and run.learned and run.code:
-                    codes.setdefault(run.code, {}).setdefault(row.name, []).append(str(run.seed))
+                if run.data == data and run.learned:
+                    code = run.code or f" at commit {run.git_commit[:7]}, whose code was not recorded"
+                    codes.setdefault(code, {}).setdefault(row.name, []).append(str(run.seed))
         if len(codes) < 2:
             continue
         groups = (
             ", ".join(f"{name} (seed {', '.join(dict.fromkeys(seeds))})" for name, seeds in trained.items())
-            for trained in codes.values()
+            + (code if code.startswith(" ") else "")
+            for code, trained in codes.items()
         )
         notes.append(
-            f"Runs on {data} were trained by {len(codes)} versions of the code, which may explain differences between them: "
+            f"Runs on {data} were trained by different code, which may explain differences between them: "
             f"{'; '.join(groups)}. To train all of them with the present code, choose another folder (runs=<folder>)."
         )
     return notes

@@ -128,7 +128,8 @@ class Implicit(Backward):
         if (own := minimiser.attach(energy, scene, games, solution, exact)) is not None:
             controls, status = own
         elif isinstance(energy, FeatureEnergy):
-            controls, status = implicit.attach(energy, scene, games, solution.controls, exact, minimiser.backend)
+            backend = getattr(minimiser, "backend", "auto")  # a setting of those that take Gauss-Newton steps
+            controls, status = implicit.attach(energy, scene, games, solution.controls, exact, backend)
         else:
             controls, status = dense.attach(energy, scene, games, solution.controls, exact)
         states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)

@@ -31,14 +31,9 @@ class Minimiser(ABC):
 
     Attributes:
         needs_from_energy: properties that the energy must offer (:mod:`epo_lightning.game.energy`).
-        steps: number of steps, where it is a setting.
-        backend: setting that chooses the implementation of Gauss-Newton computations
-            (:mod:`epo_lightning.solvers.gauss_newton.backends`); ``auto`` for minimisers without this setting.
     """
 
     needs_from_energy: ClassVar[frozenset[str]] = frozenset()
-    steps: int | None = None
-    backend: str = "auto"
 
     @property
     def provides(self) -> frozenset[str]:

@@ -257,6 +257,9 @@ MISTAKES = {
     "train -m solver.steps=1,x": "solver.steps must be a whole number",
     "train --multrun": "'--multirun'",
     "train experimnt=rpi/v_lstm": "did you mean 'experiment'?",
+    "train debug.foo=1": "needs a choice of debug",
+    "predict solver=game": "solver is a choice of epo train, and a run keeps it",
+    "report dat=x": "unknown key 'dat'",
     "train seed = 1": "without blanks",
     "train resume=nowhere": "does not exist",
     "config chekc": "'check'",
@@ -381,6 +384,12 @@ def test_other_folders_beside_the_tree_are_not_groups() -> None:
             "# @package _global_\ndefaults: [_self_, rpi/v_lstm]\ntitle: mine",
             "experiment=mine",
             r"in the defaults list of /.*experiment/mine\.yaml, `- _self_` stands before `- rpi/v_lstm`, .* `- _self_` last",
+        ),
+        (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [_self_, {/experiment/rpi: v_lstm}]\ntitle: mine",
+            "experiment=mine",
+            r"`- _self_` stands before `- /experiment/rpi`",
         ),
         (
             "experiment/mine.yaml",

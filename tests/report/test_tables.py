@@ -8,6 +8,7 @@ import math
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, write_report
 from epo_lightning.report.paper import papers_name
 from epo_lightning.report.render import legend
-from epo_lightning.report.rows import Cell, Row, untaught
+from epo_lightning.report.rows import Cell, Row, of_different_code, untaught
 from epo_lightning.report.runs import collect, data_name, find_runs
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import build_tables, distinct, over_folds
@@ -570,3 +571,13 @@ def test_runs_whose_modes_miss_a_side_are_named(tmp_path: Path) -> None:
     (note,) = untaught(list(rows.values()))
     assert "(score `missed`): V-LSTM + EPO (rpi; 2 of 3 runs). A mode may be" in note
     assert untaught([row for name, row in rows.items() if name != "V-LSTM + EPO"]) == []
+
+
+def test_runs_whose_code_was_not_recorded_are_told_apart_by_their_commits() -> None:
+    def row(name: str, *runs: tuple[int, str, str]) -> Row:
+        made = [SimpleNamespace(seed=s, code=c, git_commit=g, data="rpi", learned=True) for s, c, g in runs]
+        return Row(name, ("", ""), tuple(made), {})  # type: ignore[arg-type]
+
+    assert of_different_code([row("A", (0, "x", "1" * 40), (1, "x", "2" * 40)), row("B", (0, "x", "3" * 40))]) == []
+    (note,) = of_different_code([row("A", (0, "", "1" * 40), (1, "x", "2" * 40)), row("B", (0, "x", "2" * 40))])
+    assert "A (seed 0) at commit 1111111, whose code was not recorded; A (seed 1), B (seed 0). To train" in note

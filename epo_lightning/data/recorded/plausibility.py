@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from epo_lightning.data.recorded.tracks import TrackTable
 
-MOVING = 1.0
-"""Stated speed [m/s] above which a step counts, and twice the speed below which a displacement has no clear direction."""
+MOVING, CLEAR = 1.0, 0.5
+"""Stated speed [m/s] above which a step counts, and speed of a displacement above which it has a clear direction."""
 FEWEST = 20
 """Number of such steps from which on a recording is judged."""
 RATIO, ANGLE = 1.25, 30.0
@@ -34,7 +34,7 @@ def doubts(tracks: TrackTable) -> list[str]:
     if fast.sum() < FEWEST:
         return found
     moved, stated, ahead = moved[fast], stated[fast], ahead[fast]
-    clear = _length(moved) > MOVING / 2
+    clear = _length(moved) > CLEAR
     enough = clear.sum() >= FEWEST
     if enough and (angle := _angle(moved[clear], stated[clear])) > ANGLE:
         found.append(

@@ -300,8 +300,12 @@ class RecordedData(SceneDataModule):
 
     def is_older(self, digest: str) -> bool:
         """Whether a digest is that of the same recordings, splits and settings, extracted by an older version."""
-        versions = range(1, self.config["version"])
-        return any(self._digest({**self.config, "version": version}) == digest for version in versions)
+        now = self.config["version"]
+        older = [{**self.config, "version": version} for version in range(1, now)]
+        if self.reader:  # older versions did not know the readers of own formats
+            without = {key: value for key, value in self.config.items() if key != "reader"}
+            older += [{**without, "version": version} for version in range(1, now + 1)]
+        return any(self._digest(config) == digest for config in older)
 
     @property
     def command(self) -> str:

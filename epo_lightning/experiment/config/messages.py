@@ -8,7 +8,6 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from epo_lightning.experiment.config.sources import GROUP as SWEEPS
 from epo_lightning.experiment.config.sources import file_of, options_of
 from epo_lightning.registry import ConfigError, nearest, parts
 
@@ -144,7 +143,7 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
     for word in key.replace("/", ".").split("."):
         names = [str(known) for known in config] if isinstance(config, DictConfig) else []
         if not walked and word != "hydra":
-            names = sorted({*names, *instance.config_loader.list_groups("")} - {"hydra", SWEEPS})
+            names = [known for known in names if known != "hydra"]
         if word == "gate" and not walked and "." in key:  # the group's settings are those of the forecaster
             return f"unknown key {key!r}: with gate=<one of {', '.join(options_of(instance, word))}> it is forecaster.{key}"
         if walked == ["forecaster"] and word == "gate" and word not in names:
@@ -158,6 +157,10 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
         if word not in names and len(walked) == 1 and names and word in _arguments(walked[0], config):
             return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
         if word not in names:
+            if not walked and word != "hydra":  # groups whose options have no section of their own, such as experiment
+                defaults = instance.config_loader.compute_defaults_list(name, overrides=[], run_mode=RunMode.RUN)
+                groups = {str(group).partition("/")[0] for group in defaults.overrides.known_choices}
+                names = sorted({*names, *groups} - {"hydra"})
             level = f" in {'.'.join(walked)}" if walked else ""
             return f"unknown key {key!r}{level}: {nearest(word, names)}"
         walked.append(word)

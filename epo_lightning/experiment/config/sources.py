@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult
-from omegaconf import Container, DictConfig, OmegaConf
+from omegaconf import Container, DictConfig, ListConfig, OmegaConf
 from yaml import YAMLError
 
 from epo_lightning.registry import ConfigError
@@ -114,17 +114,23 @@ def _check_defaults(file: Path, config: Container) -> None:
     Raises:
         ConfigError: the file, and what to change.
     """
-    defaults = list(config.get("defaults") or []) if isinstance(config, DictConfig) else []
+    defaults = config.get("defaults") if isinstance(config, DictConfig) else None
+    if not isinstance(defaults, ListConfig):
+        return
+    names: list[str] = []
     for entry in defaults:
         if isinstance(entry, str) and entry.startswith("override "):
             raise ConfigError(
                 f"in the defaults list of {file}, `- {entry}` lacks a colon: write `- override /<group>: <option>`"
             )
-    later = defaults[defaults.index("_self_") + 1 :] if "_self_" in defaults else []
-    if based := [entry for entry in later if isinstance(entry, str)]:
+        names += [entry] if isinstance(entry, str) else map(str, entry or ())
+    later = names[len(names) - names[::-1].index("_self_") :] if "_self_" in names else []
+    # Rows are named from the root of the tree or, relative to this one, without a slash.
+    rows = [name for name in later if name.startswith(f"/{EXPERIMENTS}") or not name.startswith(("/", "override "))]
+    if rows:
         raise ConfigError(
-            f"in the defaults list of {file}, `- _self_` stands before `- {based[0]}`, whose settings would replace those "
-            "of this file: put `- _self_` last"
+            f"in the defaults list of {file}, `- _self_` stands before `- {rows[0]}`, whose settings would replace those of "
+            "this file: put `- _self_` last"
         )
 
 

@@ -123,9 +123,9 @@ def missed(
 
 @dataclass(frozen=True)
 class Errors:
-    """The distance of every agent from its future in every joint mode [m], as one average over steps or at the last step.
+    """Distances of all agents from their futures in every joint mode [m].
 
-    The metrics above follow from it; several metrics of the same forecast share one.
+    They are averages over the steps, or those of step K. Several metrics of one forecast share them.
 
     Attributes:
         distance: of the agents, [B, M, N]; zero for agents that are not counted.
@@ -162,21 +162,21 @@ class Errors:
         return self._of_modes().amin(1)
 
     def joint_of_likely(self, probabilities: Float[Tensor, "B M"]) -> Float[Tensor, "B M"]:
-        """min_m mean_i among the k most likely modes; see :func:`min_sade_of_likely`."""
+        """min_m mean_i among the k most likely modes, k = 1 .. M; equally likely modes keep their order."""
         order = probabilities.argsort(dim=1, descending=True, stable=True)
         return self._of_modes().gather(1, order).cummin(1).values
 
     def closest(self) -> Int[Tensor, " B"]:
-        """argmin_m mean_i; see :func:`closest_mode`."""
+        """argmin_m mean_i, the first mode if several are equally close; 0 for a scene without a value."""
         return self.distance.sum(-1).argmin(1)
 
     def brier(self, probabilities: Float[Tensor, "B M"]) -> Float[Tensor, " B"]:
-        """min_m mean_i plus the squared error of that mode's probability; see :func:`brier_min_sade`."""
+        """min_m mean_i plus (1 - p)^2, with the probability p of that mode; infinite if p is not a number."""
         wrong = (1.0 - probabilities.gather(1, self.closest()[:, None])[:, 0]).square()
         return self.joint() + wrong.nan_to_num(nan=torch.inf)
 
     def missed(self, radius: float = RADIUS) -> Float[Tensor, " B"]:
-        """1 where min_m mean_i is above the radius [m]; see :func:`missed`."""
+        """1 where min_m mean_i is above the radius [m], else 0; NaN for a scene without a value."""
         error = self.joint()
         return torch.where(error.isnan(), error, (error > radius).to(error.dtype))
 

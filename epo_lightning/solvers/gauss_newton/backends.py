@@ -104,7 +104,7 @@ def choose(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParam
 
 
 def on_host(name: str, fixed: bool) -> bool:
-    """Whether :func:`choose` has games on a GPU solved by the host, unless only PyTorch can solve them."""
+    """Whether the host solves games on a GPU (:func:`choose`); those that only PyTorch can solve stay on the GPU."""
     return name in ("compiled", "host") or (name == "auto" and not (fixed and installed()))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import shutil
@@ -192,15 +193,18 @@ def test_the_digest_depends_on_the_file_of_an_own_format_and_on_no_shipped_one(f
     """Scenes of an earlier reader are not taken for those of a mended one; shipped formats have a version instead."""
     file, found = tmp_path / "mine.py", []
     text = "from pathlib import Path\n\ndef mine(folder: Path) -> list:\n    return shown(folder)\n"
-    for content in (text, text, text + "# mended\n"):
+    for content in (text, text + "\n# a comment\n", text.replace("return", "return [] or")):
         file.write_text(content)
         module = {"__name__": "elsewhere", "shown": roads}
         exec(compile(content, file, "exec"), module)
-        register("format", "mine")(module["mine"])
-        found.append(data(folder, format="mine").digest)
-    assert found[0] == found[1] != found[2]
-    own = {name for name, part in parts("format").items() if part.__module__.startswith("epo_lightning.")}
-    assert own == set(SHIPPED)
+        register("format", "mine")(functools.wraps(module["mine"])(functools.partial(module["mine"])))
+        found.append(data(folder, format="mine"))
+    digests = [each.digest for each in found]
+    assert digests[0] == digests[1] != digests[2]
+    before = {key: value for key, value in found[0].config.items() if key != "reader"}
+    assert found[0].is_older(found[0]._digest(before)), "the digest that it had when readers did not count"
+    assert not found[2].is_older(digests[0])
+    assert set(SHIPPED) <= set(parts("format"))
     assert not any(code_of(name) for name in SHIPPED)
 
 
