@@ -6,13 +6,14 @@ import dataclasses
 import math
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from games import highway_scene
 
 import epo_lightning
 from epo_lightning import Scene, pretrained
-from epo_lightning.doubts import of_goal_headings, of_motion, shows_motion
+from epo_lightning.doubts import contradict, of_coordinates, of_goal_headings, of_motion, shows_motion
 from epo_lightning.forecasters.base import PLAUSIBLE
 from epo_lightning.forecasters.constant_velocity import ConstantVelocity
 from epo_lightning.game.dynamics import Unicycle
@@ -161,3 +162,38 @@ def test_goal_headings_are_looked_at_where_forecasts_depend_on_them(name: str) -
         forecaster.predict(wrapped)
     said = ["a goal heading differs" in str(warning.message) for warning in caught]
     assert said == ([True] if forecaster.reads_goal_headings else [])
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "time", "contradicts"),
+    [
+        *((0.0, 0.99, 1.0, False), (0.0, 1.01, 1.0, True)),  # 0.5 + 0.4 v + 0.1 / t = v at v = 1 m/s after 1 s,
+        *((0.0, 2.49, 0.1, False), (0.0, 2.51j, 0.1, True)),  # and at 2.5 m/s after 0.1 s
+        *((10.0, 17.6, 1.0, False), (18.2, 10.0, 1.0, True)),
+        (10.0, 10.0j, 1.0, True),
+    ],
+)
+def test_velocities_may_differ_by_slack_a_share_and_noise_of_positions(
+    one: complex, other: complex, time: float, contradicts: bool
+) -> None:
+    assert contradict(np.array(one), np.array(other), time) == contradicts
+
+
+def test_states_of_controls_that_change_fast_are_not_doubted() -> None:
+    """A step goes with the speed and the heading before it."""
+    start = torch.tensor([0.0, 0.0, 0.0, 1.0])
+    driven = Unicycle().rollout(start, torch.tensor([[8.0, 3.0], [-4.0, 0.0]]), 1.0)
+    history = torch.cat((start[None], driven))[None, None]
+    assert history[0, 0, :, SPEED].tolist() == [1.0, 9.0, 5.0]
+    assert not doubts(Scene(history=history[:, :, :2], dt=1.0))
+    assert not doubts(Scene(history=history, dt=1.0))
+
+
+def test_far_positions_of_absent_agents_and_wrapped_headings_of_absent_goals_are_not_doubted() -> None:
+    far = changed(walking(), 0, 1e6)
+    assert of_coordinates(far)
+    assert not of_coordinates(dataclasses.replace(far, agent_mask=torch.tensor([[False, True]])))
+    wrapped = walking(goal_headings=torch.tensor([[[-math.pi], [0.0]]]))
+    assert of_goal_headings(wrapped)
+    for mask in ({"goal_mask": torch.tensor([[[False], [True]]])}, {"agent_mask": torch.tensor([[False, True]])}):
+        assert not of_goal_headings(dataclasses.replace(wrapped, **mask))

@@ -28,6 +28,7 @@ def changed(key: str, value: Any) -> dict[str, Any]:
     [
         *(("solver.steps", 4), ("optimizer.lr", 0.1), ("trainer.max_epochs", 3), ("energy.own", ["goal"])),
         *(("data.batch_size", 16), ("goal", "all"), ("objective.weights.goal", 7.0), ("callbacks.patience", 2)),
+        *(("dynamics.integrator", "heun"), ("backward.name", "implicit"), ("backbone.width", 3), ("energy.pair", [])),
     ],
 )
 def test_settings_that_affect_the_result_change_the_identity(key: str, value: Any) -> None:
@@ -49,6 +50,8 @@ def test_settings_that_affect_the_result_change_the_identity(key: str, value: An
         ),
         *(("trainer.threads", 8), ("trainer.devices", 2), ("trainer.accelerator", "gpu"), ("data.root", "/cache")),
         *(("callbacks.progress", "bar"), ("budget", {"name": "other"}), ("experiment", "rpi/other")),
+        *(("trainer.share", 2), ("trainer.graph", True), ("trainer.profiler", True), ("trainer.log_every", 1)),
+        *(("callbacks.refresh", 1), ("data.folder", "/recordings")),
     ],
 )
 def test_names_paths_and_hardware_do_not_change_the_identity(key: str, value: Any) -> None:
@@ -81,6 +84,15 @@ def test_a_setting_that_runs_did_not_have_yet_leaves_their_identity() -> None:
     before = copy.deepcopy(CONFIG)
     del before["optimizer"]["shared_factor"]
     assert identity(before, "d") == identity(CONFIG, "d") != identity(changed("optimizer.shared_factor", 10), "d")
+
+
+def test_calibrations_from_one_start_are_those_of_runs_without_the_setting() -> None:
+    now = compose("train", ["experiment=rpi/v_lstm_epo_game", "forecaster.calibration.starts=[0.0]"])
+    before = copy.deepcopy(now)
+    del before["forecaster"]["calibration"]["starts"]
+    assert identity(before, "d") == identity(now, "d")
+    now["forecaster"]["calibration"]["starts"] = [0.0, 1.0]
+    assert identity(before, "d") != identity(now, "d")
 
 
 def test_a_setting_that_is_gone_leaves_the_identity_of_runs_that_have_it_off() -> None:

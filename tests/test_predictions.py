@@ -48,6 +48,16 @@ def test_what_is_written_is_read_again(channels: int, tmp_path: Path) -> None:
         write_predictions(file, states, probabilities, scene)
 
 
+def test_numbers_have_the_precision_of_the_futures(tmp_path: Path) -> None:
+    (states, probabilities), scene = forecasts(), traffic()
+    for index, (futures, of_scene) in enumerate([(torch.float64, torch.float32), (torch.float32, torch.float64)]):
+        path = tmp_path / f"{index}.npz"
+        shifted = states.to(futures) * (1.0 + 1e-12)
+        read = read_predictions(write_predictions(path, shifted, probabilities.to(futures), scene.to(of_scene)))
+        assert torch.equal(read.states, shifted)
+        assert {read.scene.history.dtype, read.scene.size.dtype, read.probabilities.dtype} == {futures}
+
+
 def test_absent_agents_may_hold_anything(tmp_path: Path) -> None:
     states, probabilities = forecasts()
     wide = torch.cat((states, torch.full_like(states[:, :, :2], torch.nan)), 2)

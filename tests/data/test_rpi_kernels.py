@@ -103,6 +103,27 @@ def test_the_exact_step_is_newtons():
     assert promised == pytest.approx(float(-(gradient @ newton)), rel=1e-8)
 
 
+def test_second_derivatives_of_own_costs_equal_differences_of_the_first_ones_beyond_the_bounds():
+    start, u = situation(np.random.default_rng(2), steps=6)
+    u *= np.array([9.0, 0.2, 9.0, 0.2])
+    x = kernels.rollout(start, u, CONSTANTS.dt)
+    for value, limit in ((u[:, 0::2], CONSTANTS.acceleration_limit), (u[:, 1::2], CONSTANTS.turn_limit)):
+        assert 0 < (np.abs(value) > limit).sum() < value.size
+    assert (x[1:, 3::4] < CONSTANTS.speed_min).any()
+
+    def own(x, u):
+        Q, q, R, r = np.zeros((7, 8, 8)), np.zeros((7, 8)), np.zeros((6, 4, 4)), np.zeros((6, 4))
+        for i in range(2):
+            kernels.add_own(i, x, u, C, GOALS, Q, q, R, r)
+        return Q, q, R, r
+
+    Q, _, R, _ = own(x, u)
+    for j, bump in enumerate(1e-6 * np.eye(8)):
+        np.testing.assert_allclose((own(x + bump, u)[1] - own(x - bump, u)[1]) / 2e-6, Q[:, j], atol=1e-5)
+    for j, bump in enumerate(1e-6 * np.eye(4)):
+        np.testing.assert_allclose((own(x, u + bump)[3] - own(x, u - bump)[3]) / 2e-6, R[:, j], atol=1e-5)
+
+
 def test_the_proximity_cost_is_harmless_where_agents_coincide():
     start = np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.5])
     u = np.zeros((4, 4))
@@ -118,6 +139,14 @@ def test_passage_measures_side_and_distance():
         assert (distance, when) == (pytest.approx(0.3), 10)
         assert np.sign(rotation) == side
         assert slowest == 1.0
+
+
+@pytest.mark.parametrize("agent", [0, 1])
+def test_the_smallest_speed_is_that_of_either_agent(agent):
+    start = np.array([-1.0, 0.0, 0.0, 1.0, 1.0, 0.3, np.pi, 1.0])
+    u = np.zeros((5, 4))
+    u[2, 2 * agent], u[3, 2 * agent] = -8.0, 5.0
+    assert kernels.passage(kernels.rollout(start, u, CONSTANTS.dt))[3] == pytest.approx(1.0 - 8.0 * CONSTANTS.dt)
 
 
 def test_main_games_place_the_agents_as_documented():

@@ -87,6 +87,31 @@ def test_differences_equal_up_to_rounding_count_as_equal() -> None:
     assert compare(one, other).reason == "equal for every seed"
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1e6])
+def test_rounding_is_relative_to_the_scores(scale: float) -> None:
+    one, other, shaken = ([scale * value for value in values] for values in ((0.3, 0.2), (0.2, 0.1), (0.2, 0.1 + 1e-6)))
+    assert compare(one, other).reason == "equal for every seed"
+    assert compare(one, shaken).reason == ""
+
+
+def test_scores_are_paired_by_seed_whatever_their_order(tmp_path: Path) -> None:
+    epo, sc = {2: 0.2, 0: 0.1, 1: 0.12}, {0: 0.3, 1: 0.1, 2: 0.25}
+    for title, forecaster, values in (("EPO", "epo", epo), ("SC", "scene_consistent", sc)):
+        for seed, value in values.items():
+            make_run(tmp_path / f"{title}-{seed}", title, forecaster, scores(value), seed=seed)
+    ((pair,),) = (found.pairs for found in build_comparisons(build_tables(collect(tmp_path))))
+    expected = scipy.stats.ttest_rel([epo[seed] for seed in range(3)], [sc[seed] for seed in range(3)])
+    assert pair.differences["minSADE"].p == pytest.approx(expected.pvalue)
+
+
+def test_rows_with_parts_that_the_paper_does_not_have_are_no_epo_of_a_comparison(tmp_path: Path) -> None:
+    make_run(tmp_path / "sc", "SC", "scene_consistent", scores(0.2))
+    make_run(tmp_path / "epo", "EPO", "epo", scores(0.1))
+    make_run(tmp_path / "other", "Another", "epo", scores(0.1), settings={"solver.name": "gradient_descent"})
+    (found,) = build_comparisons(build_tables(collect(tmp_path)))
+    assert [pair.one.name for pair in found.pairs] == ["EPO"]
+
+
 def test_epo_against_sc_of_the_same_backbone_and_goal_over_common_seeds(tmp_path: Path) -> None:
     def row(title: str, forecaster: str, values: dict[int, float], **options: str) -> None:
         for seed, value in values.items():

@@ -335,6 +335,17 @@ def test_runs_of_one_row_must_have_the_same_metrics(tmp_path: Path) -> None:
         build_tables(collect(tmp_path))
 
 
+def test_runs_of_a_row_are_in_the_order_of_their_seeds_and_may_lack_metrics_of_the_game(tmp_path: Path) -> None:
+    for path, seed in (("a", 2), ("b", 0), ("c", 1)):
+        gap = {"nash_gap": 0.5} if seed else {}
+        make_run(tmp_path / path, "V-LSTM + EPO", "epo", scores(0.1 * seed) | gap, seed=seed)
+    row = rows_of(tmp_path)["V-LSTM + EPO"]
+    assert [run.seed for run in row.runs] == [0, 1, 2]
+    assert [run.metrics["minSADE"] for run in row.runs] == pytest.approx([0.0, 0.1, 0.2])
+    assert math.isnan(row.cells["nash_gap"].mean), "not the mean of the runs that have it"
+    assert row.cells["nash_gap"].deviation is None
+
+
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.floats(0, 1e3), min_size=1, max_size=5))
 def test_means_and_deviations_equal_those_of_numpy(tmp_path: Path, values: list[float]) -> None:
@@ -540,8 +551,10 @@ def test_over_folds_rows_are_those_of_equal_settings(tmp_path: Path) -> None:
     found = {row.name: [run.metrics["minSADE"] for run in row.runs] for row in table.rows}
     assert found == {"EPO, steps=2": [0.1], "EPO, steps=8": [0.3, 0.2]}
     assert (table.data, table.title) == ("s", "s, 2 test splits")
-    run("a2", ["a"], 2, 0.1, split="val")
-    assert len(over_folds(build_tables(collect(tmp_path)))) == 1, "validation splits may be the same in several folds"
+    run("a2", ["a"], 2, 0.7, split="val")
+    (table,) = over_folds(build_tables(collect(tmp_path)))
+    same = {row.name: [run.metrics["minSADE"] for run in row.runs] for row in table.rows}
+    assert same == found, "validation splits, which may be the same in several folds, do not count"
     run("ab", ["a", "b"], 8, 0.3)
     assert not over_folds(build_tables(collect(tmp_path))), "folds with a group in common are no cross-validation"
 
@@ -566,6 +579,7 @@ def test_runs_whose_modes_miss_a_side_are_named(tmp_path: Path) -> None:
         make_run(tmp_path / f"game-{seed}", "game", "epo", metrics, seed=seed, settings=solved)
         elsewhere = {**scores(0.1), "interactive/missed": 0.9}
         make_run(tmp_path / f"road-{seed}", "VIBES", "epo", elsewhere, seed=seed)
+        make_run(tmp_path / f"cv-{seed}", "CV", "constant_velocity", metrics, seed=seed).update(parameters=0)
     rows = rows_of(tmp_path)
     assert rows["V-LSTM + EPO"].missing == [0, 2]
     (note,) = untaught(list(rows.values()))

@@ -46,6 +46,27 @@ def test_tracks_without_a_mistake_are_not_doubted() -> None:
     assert not doubts(dataclasses.replace(walking(), velocity=0.0 * walking().velocity)), "agents that stand"
 
 
+def test_agents_that_accelerate_between_frames_are_not_doubted() -> None:
+    """Two frames of each agent, a second apart: it moves with the mean of both velocities."""
+    velocity = np.tile([[1.5, 0.0], [3.5, 0.0]], (25, 1))
+    tracks = TrackTable(
+        rate=1.0,
+        agent=np.repeat(np.arange(25), 2),
+        frame=np.tile([0, 1], 25),
+        position=np.tile([[0.0, 0.0], [2.5, 0.0]], (25, 1)),
+        heading=np.zeros(50),
+        velocity=velocity,
+        ids=np.arange(25),
+        size=np.full((25, 2), 0.5),
+        kind=np.full(25, KINDS.index("pedestrian")),
+    ).check("accelerating.csv")
+    assert not doubts(tracks)
+    wrong = dataclasses.replace(tracks, velocity=0.7 * velocity)
+    assert doubts(wrong)
+    few = {name: getattr(wrong, name)[:38] for name in ("agent", "frame", "position", "heading", "velocity")}
+    assert not doubts(dataclasses.replace(wrong, **few)), "19 steps are too few"
+
+
 @pytest.mark.parametrize(
     ("mistake", "said"),
     [

@@ -332,3 +332,33 @@ def test_moved_limits_reach_pairs_that_are_apart():
         violation = max(0.0, 0.6 + shift - apart)
         assert float(found.energy) == pytest.approx(alone + 3 * 4 * 0.5 * 10.0 * violation**2)
         assert (violation > 0) == (shift > 1)
+
+
+@pytest.mark.parametrize(("moved", "limit"), [("lower", 0.7), ("upper", -0.75)])
+def test_of_limits_that_have_passed_each_other_the_one_with_a_multiplier_counts(moved, limit):
+    """Limits -0.3 and 0.25, one of which is moved by 1 beyond the other one: what remains is the distance from it."""
+    scene, parameters = meeting(2, steps=3)
+    game = ConstrainedGame(ENERGY, ("accb",), scene, parameters)
+    for acceleration in (-1.0, -0.5, 0.0, 0.5, 1.0):
+        controls = torch.zeros_like(parameters.initial_controls)
+        controls[..., 0] = acceleration
+        multipliers = {name: torch.zeros_like(value) for name, value in game.excess(controls).items()}
+        multipliers[f"accb, {moved}"] += 10.0
+        energy, *augmented = game.augmented(multipliers, torch.full((1, 1), 10.0, dtype=torch.double), controls)
+        added = energy(*augmented, controls) - game.objective(scene, parameters, controls)
+        assert float(added) == pytest.approx(2 * 3 * 0.5 * 10.0 * (acceleration - limit) ** 2)
+
+
+def test_there_are_no_constraints_after_the_end_of_a_game():
+    scene, parameters = meeting(2, steps=5)
+    scene = dataclasses.replace(scene, game_steps=torch.tensor([3]))
+    game = ConstrainedGame(ENERGY, AugmentedLagrangian().hard(ENERGY), scene, parameters)
+    controls = torch.ones_like(parameters.initial_controls)
+    assert len(game.excess(controls)) == 3
+    for name, excess in game.excess(controls).items():
+        assert excess[..., :3].isfinite().all(), name
+        assert (excess[..., 3:] == -torch.inf).all(), name
+    later = controls.clone().requires_grad_()
+    torch.cat([h[h.isfinite()] for h in game.excess(later).values()]).sum().backward()
+    assert (later.grad[..., 3:, :] == 0).all()
+    assert (later.grad[..., :3, :] != 0).any()

@@ -74,6 +74,17 @@ def test_no_round_raises_the_energy(order: str) -> None:
     assert (energies[-1] < energies[0]).all()
 
 
+@ORDERS
+def test_a_first_round_with_too_little_damping_is_not_the_end(order: str) -> None:
+    """Agents with cheap controls that stand: the first step of each goes too far, and the next one has more damping."""
+    scene, game = crossing(2, modes=1)
+    weights = {name: 0.01 * value if name in ("acc", "turnr") else value for name, value in game.own_weights.items()}
+    game = dataclasses.replace(game, own_weights=weights, initial_controls=torch.zeros_like(game.initial_controls))
+    first, more = (BestResponse(rounds, order, 1, 0.01)(ENERGY, scene, game) for rounds in (1, 10))
+    assert torch.equal(first.energy, first.initial_energy), "no step was taken"
+    assert (more.energy < 0.98 * first.energy).all()
+
+
 def test_agents_that_do_not_interact_need_no_exchange() -> None:
     """All at once: every agent's steps are then those that it takes alone."""
     scene, game = crossing(3, weight=0.0)

@@ -170,13 +170,14 @@ def test_without_damping_the_matrix_of_a_short_game_is_regular(backend):
     assert torch.equal(solution.controls[0, ..., 2:, :], parameters.initial_controls[0, ..., 2:, :])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(("backend", "pair"), [*((backend, "clearance") for backend in BACKENDS), ("pytorch", "soft")])
 @pytest.mark.parametrize("backward", [Unrolled(), Implicit()], ids=["unrolled", "implicit"])
-def test_gradients_by_margins_and_headings_equal_finite_differences(backend, backward):
+def test_gradients_by_margins_and_headings_equal_finite_differences(backend, pair, backward):
+    """The margin of ``soft`` changes also the slope by the distance; that of ``clearance`` does not."""
     own = ("goal", "heading", "vel", "acc", "turnr")
-    scene, parameters = make(8, 2, 3, 5, own, ("clearance",), size=0.7, spread=0.1)
+    scene, parameters = make(8, 2, 3, 5, own, (pair,), size=0.7, spread=0.1)
     scene = dataclasses.replace(scene, game_steps=torch.tensor([5, 3]))
-    energy = FeatureEnergy(own, ["clearance"])
+    energy = FeatureEnergy(own, [pair])
     implicit = isinstance(backward, Implicit)
     solver = (
         LevenbergMarquardt(40, 1.0, 0.1, backend=backend)
@@ -191,12 +192,12 @@ def test_gradients_by_margins_and_headings_equal_finite_differences(backend, bac
     leaves = leaves_of(parameters)
     total(leaves).backward()
     for name in ("margins", "goal_headings"):
-        pick = (lambda game: game.margins["clearance"]) if name == "margins" else (lambda game: game.goal_headings)
+        pick = (lambda game: game.margins[pair]) if name == "margins" else (lambda game: game.goal_headings)
         for direction in torch.randn(2, *pick(parameters).shape, dtype=torch.float64):
             ends = []
             for sign in (1.0, -1.0):
                 moved = pick(parameters) + sign * 1e-6 * direction
-                value = {"clearance": moved} if name == "margins" else moved
+                value = {pair: moved} if name == "margins" else moved
                 ends.append(total(dataclasses.replace(parameters, **{name: value})).item())
             slope = (pick(leaves).grad * direction).sum().item()
             assert slope == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5, abs=1e-7)
@@ -273,3 +274,17 @@ def test_missing_and_negative_margins_are_refused():
     assert LevenbergMarquardt()(energy, scene, parameters).status.tolist() == [[2, 0], [0, 0], [0, 0]]
     scene.agent_mask[0, 0] = False
     assert (LevenbergMarquardt()(energy, scene, parameters).status == 0).all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("margin", [torch.nan, torch.inf])
+def test_margins_that_are_no_numbers_stop_games_also_where_agents_never_touch(backend, margin):
+    own = ("goal", "acc", "turnr")
+    scene, parameters = make(0, own=own, pair=("clearance",), spread=0.1)
+    scene.history[:, 1, :, 0] += 1e3
+    parameters.goals[:, :, 1, 0] += 1e3
+    solver = LevenbergMarquardt(3, backend=backend)
+    energy = FeatureEnergy(own, ["clearance"])
+    assert (solver(energy, scene, parameters).status == 0).all()
+    parameters.margins["clearance"][1, 1, 0] = margin
+    assert solver(energy, scene, parameters).status.tolist() == [[0, 0], [0, 2], [0, 0]]

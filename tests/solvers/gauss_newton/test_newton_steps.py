@@ -176,6 +176,60 @@ def test_without_a_gradient_scenes_at_a_minimum_take_no_further_steps(exact) -> 
     torch.testing.assert_close(found.controls, most.controls, rtol=0, atol=1e-5)
 
 
+def test_a_step_that_changes_nothing_shows_a_minimum_only_with_little_damping() -> None:
+    energy, scene, game = make(2, torch.float32, own=("goal", "acc", "turnr"), pair=())
+    solver = LevenbergMarquardt(backend="pytorch", **ADAPTIVE)
+    taken = 0
+
+    def step(rows: torch.Tensor | slice, controls: torch.Tensor, damping: torch.Tensor):
+        nonlocal taken
+        taken += 1
+        some = dataclasses.replace(game[rows], initial_controls=controls)
+        return structured.solve(energy, scene[rows], some, 1, 1.0, damping)
+
+    with torch.no_grad():
+        start, _ = solver.run(energy, scene, game, 0)
+        much = start.gradient_norm.square() / (1e-5 * start.energy)  # a step lowers the energy by about 1e-5 of it
+        assert (much > 1.0).all()
+        _, once = adaptive.descend(step, start, 1, much)
+        assert (once < much).any(), "some step is accepted"
+        found, _ = adaptive.descend(step, start, 200, much)
+        best, _ = solver.run(energy, scene, game, 200)
+        torch.testing.assert_close(found.energy, best.energy, rtol=1e-3, atol=0)
+        taken = 0
+        adaptive.descend(step, best, 200, torch.full_like(much, 1e-6))
+    assert taken < 4, "at a minimum, with little damping"
+
+
+def test_modes_and_agents_go_on_while_others_are_at_their_minimum_or_held() -> None:
+    """The first mode begins at its minimum, and the last agent is held; first steps of the second mode are rejected."""
+    energy, scene, game = make(2, own=("goal", "acc", "turnr"), pair=())
+    game.initial_controls.mul_(3.0)
+    scene = dataclasses.replace(scene, dt=1.0)  # long ways, on which a linearised heading is far from the truth
+    damping = torch.full((3, 2, 3), 1e-5, dtype=torch.float64)
+    damping[..., 2] = torch.inf
+    pytorch, both = (LevenbergMarquardt(backend=backend, **ADAPTIVE) for backend in ("pytorch", "compiled"))
+    with torch.no_grad():
+        best, _ = both.run(energy, scene, game, 300, damping.clone())
+        game.initial_controls[:, 0] = best.controls[:, 0]
+        first, _ = pytorch.run(energy, scene, game, 1, damping.clone())
+        rejected = (first.controls[:, 1] == game.initial_controls[:, 1]).flatten(1).all(1)
+        assert rejected.any()
+        assert (best.energy < 0.9 * first.initial_energy)[:, 1].all()
+        found, _ = pytorch.run(energy, scene, game, 300, damping.clone())
+    torch.testing.assert_close(found.energy, best.energy, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("backend", ["pytorch", "compiled"])
+def test_games_whose_energy_is_infinite_are_stopped(backend) -> None:
+    energy, scene, game = make(2, own=("goal", "acc", "turnr"), pair=())
+    game.goals[1, 0, 2] = 1e200
+    with torch.no_grad():
+        found = LevenbergMarquardt(4, backend=backend, **ADAPTIVE)(energy, scene, game)
+    assert found.status.tolist() == [[Status.SOLVED] * 2, [Status.STOPPED, Status.SOLVED], [Status.SOLVED] * 2]
+    assert torch.equal(found.controls[1, 0], game.initial_controls[1, 0])
+
+
 def test_a_given_damping_is_not_overwritten() -> None:
     energy, scene, game = make(1)
     given_damping = torch.ones(3, 2, dtype=torch.float64)

@@ -1,0 +1,68 @@
+"""Reference lines and goal candidates on straight roads, compared with closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph
+from epo_lightning.data.recorded.routes import Routes, pieces, reach
+
+from .crossings import graph
+from .roads import WIDTH, curve, road
+
+
+@pytest.mark.parametrize("speed", [-2.0, 0.0, 3.0, 15.0, 40.0])
+def test_the_range_is_that_of_agents_that_brake_and_accelerate_in_small_steps(speed: float) -> None:
+    time, dt = 4.0, 1e-4
+    ways = []
+    for acceleration in (-4.0, 3.0):
+        now, gone = max(speed, 0.0), 0.0
+        for _ in range(round(time / dt)):
+            after = max(now + acceleration * dt, 0.0)
+            gone, now = gone + 0.5 * (now + after) * dt, after
+        ways.append(gone)
+    near, far = (float(end[0]) for end in reach(np.array([speed]), time))
+    assert far == pytest.approx(ways[1])
+    assert near == pytest.approx(min(ways[0], far - 10.0), abs=1e-3)
+
+
+def lines_of(lanes: LaneGraph, x: float, speed: float = 10.0) -> list[float]:
+    """The y of the left, own and right reference line of an agent on lane 1, at their last points."""
+    position = np.array([[x, WIDTH]])
+    route = Routes(lanes).of(position, np.array([speed]), lanes.locate(position, np.zeros(1)), 4.0)
+    return route.references[0, :, -1, 1].tolist()
+
+
+def test_boundaries_stand_for_neighbours_that_are_shoulders_or_begin_too_far_ahead() -> None:
+    lanes = road(curve(None), sections=2)  # from right to left at y = 0, WIDTH, 2 WIDTH; the sections meet at x = 200
+    assert lines_of(lanes, 150.0) == pytest.approx([2 * WIDTH, WIDTH, 0.0])
+    shoulder = dataclasses.replace(lanes, kind=np.where(np.arange(6) % 3 == 0, SHOULDER, lanes.kind))
+    assert lines_of(shoulder, 150.0) == pytest.approx([2 * WIDTH, WIDTH, 0.5 * WIDTH])
+    later = dataclasses.replace(lanes, left_of=np.array([-1, -1, -1, *lanes.left_of[3:]]))
+    # An agent that accelerates from 10 m/s by 3 m/s^2 gets 64 m far in 4 s.
+    assert lines_of(later, 137.0) == pytest.approx([2 * WIDTH, WIDTH, 0.0])
+    assert lines_of(later, 135.0) == pytest.approx([1.5 * WIDTH, WIDTH, 0.0])
+
+
+def test_lanes_are_cut_into_the_fewest_equal_pieces() -> None:
+    for length, count in ((20.0, 1), (20.0 * (1 + 1e-12), 1), (20.5, 2), (61.0, 4)):
+        found = pieces(road(curve(None), lanes=1, sections=1, length=length), vectors=4, spacing=5.0)
+        assert found.shape == (count, 5, 2)
+        np.testing.assert_allclose(np.diff(found[..., 0]), length / count / 4, rtol=1e-9)
+        np.testing.assert_allclose(found[1:, 0], found[:-1, -1], atol=1e-9)
+
+
+def test_a_line_goes_back_along_the_lane_that_ends_in_its_direction() -> None:
+    bend = np.sin(np.linspace(0.0, np.pi / 2, 20)), 1.0 - np.cos(np.linspace(0.0, np.pi / 2, 20))
+    to_the_north = np.stack((20.0 * bend[0] - 20.0, 20.0 * bend[1] - 20.0), 1)  # begins as the lane, and ends across it
+    from_the_south = np.stack((20.0 * bend[1] - 20.0, 20.0 * bend[0] - 20.0), 1)  # begins across it
+    ahead = np.stack((np.linspace(0.0, 200.0, 21), np.zeros(21)), 1)
+    lanes = graph([to_the_north, from_the_south, ahead], [(2,), (2,), ()])
+    position = np.array([[2.0, 0.0]])
+    route = Routes(lanes).of(position, np.array([10.0]), lanes.locate(position, np.zeros(1)), 4.0)
+    x, y = route.references[0, 1, 0]
+    assert y > -0.5, "3 m before the lane, the bend from the south is nearly on its line"
+    assert x == pytest.approx(-3.0, abs=0.1)
