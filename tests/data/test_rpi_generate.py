@@ -161,6 +161,16 @@ def test_executed_modes_satisfy_bellman_and_futures_become_history(records):
     assert pairs > 100
 
 
+def test_records_end_where_the_agents_pass_each_other(records):
+    """Up to the step of the smallest distance, beyond which nothing is left to decide."""
+    for rows in records.values():
+        position = rows["history"].astype(float)[..., :2]
+        distance = np.linalg.norm(position[:, 1] - position[:, 0], axis=-1)
+        assert (distance[:, -1] <= distance.min(1) + 1e-9).all()
+        assert rows["step"].min() == 18
+        assert rows["step"].max() <= 100 - 40
+
+
 def test_modes_pass_on_different_sides_and_without_contact(records):
     rows = records["train"]
     two = rows["modes"] == 2

@@ -13,7 +13,7 @@ from epo_lightning.data.rpi.kernels import costs, passage, rollout
 from epo_lightning.data.rpi.modes import cheapest
 from epo_lightning.data.rpi.scenes import SOLVERS
 from epo_lightning.data.rpi.solve import SETTINGS, solve
-from epo_lightning.data.rpi.subgames import main_starts, random_starts
+from epo_lightning.data.rpi.subgames import best_response_gain, main_starts, random_starts
 
 from . import dense
 
@@ -93,6 +93,23 @@ def test_a_strategy_that_is_no_equilibrium_is_detected():
     mode = sub_games(1)[0]
     mode.controls = mode.controls + 0.02
     assert max(gains(mode, 0.0, np.random.default_rng(0))) > 1e-4
+
+
+@pytest.mark.parametrize("agent", [0, 1])
+def test_the_recorded_gain_is_the_largest_relative_one_of_an_independent_optimiser(agent):
+    """One agent leaves the equilibrium, which changes what both could gain."""
+    mode = sub_games(1)[0]
+    mode.controls = mode.controls.copy()
+    mode.controls[:, 2 * agent : 2 * agent + 2] += 0.02
+    expected = gains(mode, 0.0, np.random.default_rng(0))
+    assert np.argmax(expected) == agent
+    *own, pair = costs(
+        rollout(mode.start, mode.controls, CONSTANTS.dt), mode.controls, C, mode.game.goals, mode.game.weight
+    )
+    both = np.array(own) + pair
+    noise = 0.01 * np.random.default_rng(1).normal(size=mode.controls.shape)
+    found = best_response_gain(mode.start, mode.controls, C, mode.game, both, noise)
+    assert found == pytest.approx(max(expected), rel=1e-4)
 
 
 def test_every_placement_has_two_modes():
