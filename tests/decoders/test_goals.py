@@ -125,3 +125,24 @@ def test_given_goal_headings_are_the_same_in_every_mode():
     headings = GivenGoals(2)(torch.zeros(3, 2, 4), one).headings
     assert headings.tolist() == [[[1.0, 2.0]] * 2, [[3.0, 0.0]] * 2, [[5.0, 6.0]] * 2]
     assert GivenGoals(2)(torch.zeros(3, 2, 4), random_scene(3, 2)).headings is None
+
+
+def test_a_mode_is_as_likely_as_its_choices_of_all_agents_that_have_a_goal():
+    """Products of the chosen candidates' shares among those that exist, which only the goal loss may change."""
+    scene = pad(highway_scene(3, 2), agents=1, candidates=2)
+    scene.goal_mask[1, 1] = False
+    decoder = GoalDecoder(8, scale=50.0, variants=4)
+    goals = decoder(torch.randn(3, 3, 8), scene)
+    for b in range(3):
+        for m in range(4):
+            expected = 1.0
+            for i in range(3):
+                exists = scene.goal_mask[b, i] & scene.agent_mask[b, i]
+                weights = torch.where(exists, goals.logits[b, i].exp(), 0.0)
+                shares = weights / weights.sum() if exists.any() else weights
+                torch.testing.assert_close(goals.probabilities[b, i], shares)
+                if exists.any():
+                    expected = expected * shares[goals.chosen[b, m, i]]
+            torch.testing.assert_close(goals.log_probability[b, m].exp(), expected.detach())
+    assert goals.logits.requires_grad
+    assert not goals.log_probability.requires_grad
