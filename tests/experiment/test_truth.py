@@ -82,3 +82,28 @@ def test_constant_costs_have_no_rank_correlation() -> None:
     found = truth.compare({"true": torch.arange(1.0, 4.0).double(), "pair": one, "goal": 300 * one})
     assert "pair_rank" not in found
     assert found["goal_error"] == pytest.approx(0.0)
+
+
+def test_only_equal_scores_of_the_same_data_share_a_file(tmp_path: Path) -> None:
+    run, checkpoint = RunFolder(tmp_path), tmp_path / "best.ckpt"
+    checkpoint.write_bytes(b"weights")
+    scored = {"split": "test", "data_digest": "a", "checkpoint": "best"}
+    metrics = {"minSADE": 1.0, "minFDE": 2.0, "nash_gap": math.nan}
+    first = keep(run, {**scored, "metrics": metrics}, checkpoint)
+    assert first == run.metrics_file()
+    content = first.read_bytes()
+    assert keep(run, {**scored, "metrics": {**metrics, "minSADE": 1.0 + 5e-6}}, checkpoint) == first, "the last digits"
+    files = [
+        keep(run, {**scored, **changes}, checkpoint)
+        for changes in (
+            {"metrics": {**metrics, "minSADE": 1.0 + 5e-5}},
+            {"metrics": metrics, "data_digest": "b"},
+            {"metrics": {name: value for name, value in metrics.items() if name != "minFDE"}},
+            {"metrics": {**metrics, "nash_gap": 0.0}},
+        )
+    ]
+    assert len({first, *files}) == 5
+    assert first.read_bytes() == content
+    write_json(first, {**scored, "metrics": metrics, "truth": {"pair_error": None}})  # damaged: written again
+    assert keep(run, {**scored, "metrics": metrics}, checkpoint) == first
+    assert "truth" not in read_json(first)
