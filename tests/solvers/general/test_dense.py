@@ -15,11 +15,13 @@ from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
 from epo_lightning.game.pairs import pair_mask
+from epo_lightning.scene import TURN_RATE
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.gauss_newton import implicit
 from epo_lightning.solvers.general import descent
-from epo_lightning.solvers.general.dense import attach, factorise, gauss_newton, gradient, hessian
+from epo_lightning.solvers.general.dense import attach, factorise, gauss_newton, gradient, hessian, with_zeros
 from epo_lightning.solvers.general.newton import Newton
 
 FEATURES = FeatureEnergy(["goal", "vel", "acc", "turnr"], ["proximity"])
@@ -74,6 +76,31 @@ def test_dense_equals_structured(own, exact):
     found = (hessian if exact else gauss_newton)(energy, scene, game, game.initial_controls)
     torch.testing.assert_close(found, matrix, rtol=1e-10, atol=1e-9)
     torch.testing.assert_close(gradient(energy, scene, game, game.initial_controls)[1], slope, rtol=1e-10, atol=1e-10)
+
+
+@pytest.fixture
+def curved():
+    """Declared features with functions of every linear signal and of the distance, all with second derivatives."""
+    for source in (Source.CONTROL, Source.RATE, Source.SPEED):
+        own_feature(f"curved_{source.value}", source, TURN_RATE)(lambda signal: (0.5 * signal).sin() + signal.square())
+    pair_feature("curved", Source.DISTANCE)(lambda distance, reach: (reach - distance).exp() * distance)
+    yield [name for name in OWN_FEATURES if name.startswith("curved")]
+    for known in (OWN_FEATURES, PAIR_FEATURES):
+        for name in [name for name in known if name.startswith("curved")]:
+            del known[name]
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_dense_equals_structured_for_custom_features(curved, exact):
+    assert len(curved) == 3
+    scene = random_scene(2, 3, history=2, size=1.0, dtype=torch.float64)
+    game = random_game(scene, 2, 5, tuple(curved), pair=("curved",))
+    for energy in [FeatureEnergy([name]) for name in curved] + [FeatureEnergy(["acc"], ["curved"])]:
+        some = dataclasses.replace(game, own_weights={**game.own_weights, "acc": game.own_weights[curved[0]]})
+        some = dataclasses.replace(some, pair_weights={**some.pair_weights, "proximity": some.pair_weights["curved"]})
+        _, matrix = normal_equations(energy, scene, some, game.initial_controls, exact)
+        found = (hessian if exact else gauss_newton)(energy, scene, some, game.initial_controls)
+        torch.testing.assert_close(found, matrix, rtol=1e-10, atol=1e-9)
 
 
 def test_hessians_equal_central_differences_of_gradients():
@@ -317,6 +344,19 @@ def test_a_nan_scene_gives_networks_no_gradient():
     assert (status[1] == Status.SOLVED).all()
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+
+
+def test_games_that_are_left_out_hold_zeros():
+    scene, game = learned_game()
+    kept = torch.tensor([[True, False], [False, False]])
+    found_scene, found = with_zeros(scene, game, kept)
+    assert torch.equal(found_scene.agent_mask, scene.agent_mask & torch.tensor([[True], [False]]))
+    assert torch.equal(found.context[0], game.context[0]), "modes share it, and one of them is kept"
+    assert (found.context[1] == 0).all()
+    for name in ("initial_controls", "goals"):
+        one, other = getattr(found, name), getattr(game, name)
+        assert torch.equal(one[kept], other[kept])
+        assert (one[~kept] == 0).all()
 
 
 def test_padding_and_batches_do_not_change_gradients():
