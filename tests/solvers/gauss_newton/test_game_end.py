@@ -277,8 +277,9 @@ def test_missing_and_negative_margins_are_refused():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("margin", [torch.nan, torch.inf])
-def test_margins_that_are_no_numbers_stop_games_also_where_agents_never_touch(backend, margin):
+@pytest.mark.parametrize("field", ["margins", "pair_weights"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_margins_and_weights_that_are_no_numbers_stop_games_also_where_agents_never_touch(backend, field, value):
     own = ("goal", "acc", "turnr")
     scene, parameters = make(0, own=own, pair=("clearance",), spread=0.1)
     scene.history[:, 1, :, 0] += 1e3
@@ -286,5 +287,5 @@ def test_margins_that_are_no_numbers_stop_games_also_where_agents_never_touch(ba
     solver = LevenbergMarquardt(3, backend=backend)
     energy = FeatureEnergy(own, ["clearance"])
     assert (solver(energy, scene, parameters).status == 0).all()
-    parameters.margins["clearance"][1, 1, 0] = margin
+    getattr(parameters, field)["clearance"][1, 1, 0] = value
     assert solver(energy, scene, parameters).status.tolist() == [[0, 0], [0, 2], [0, 0]]
